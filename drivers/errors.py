@@ -1,0 +1,206 @@
+"""Everything the driver can complain about, as one tree.
+
+::
+
+    DriverError
+    ├── PacketError          bytes that are not the packet they should be
+    ├── DriveTrainError      a drive train that cannot be (zero gear ratio, no wrist to couple)
+    ├── RequestError         a motion asked for at a moment when none can be promised
+    ├── TransportClosed      the link was closed, or its far end is gone for good
+    └── RefusalError         a set-point that never left, and why
+        ├── SourceFailed     the motion source raised, or gave arrays of the wrong shape
+        ├── AxisLeft         an axis is not in the open mode that the motion needs
+        └── GuardError       a number outside its bound: joint, value, bound, cycle
+            ├── NotFinite
+            ├── PositionLimit, VelocityLimit, AccelerationLimit, JerkLimit
+            ├── VelocityMismatch   velocity is not the derivative of the positions
+            ├── FollowingError
+            ├── CurrentLimit
+            └── FirstSetPoint      away from the arm
+                └── NotAtStandstill
+"""
+
+# ruff: noqa: N818  the leaves are named for what is wrong; their roots end in Error
+
+from __future__ import annotations
+
+
+class DriverError(Exception):
+    """Root of every error raised on purpose by this package."""
+
+
+class PacketError(DriverError):
+    """Bytes that are not the packet they should be.
+
+    Attributes:
+        field: what is wrong with it ("length", "number", "n_axes", "open_axes_map", ...).
+        value: what was found.
+        expected: what would have been valid, in words.
+    """
+
+    def __init__(self, field: str, value: object, expected: str) -> None:
+        super().__init__(f"packet {field} is {value!r}; expected {expected}")
+        self.field = field
+        self.value = value
+        self.expected = expected
+
+
+class DriveTrainError(DriverError):
+    """A drive train that cannot be.
+
+    Attributes:
+        field: name of the offending field.
+        value: what was given.
+        expected: what would have been valid, in words.
+    """
+
+    def __init__(self, field: str, value: object, expected: str) -> None:
+        super().__init__(f"drive train {field} is {value!r}; expected {expected}")
+        self.field = field
+        self.value = value
+        self.expected = expected
+
+
+class RequestError(DriverError):
+    """A motion was requested at a moment when none can be promised.
+
+    Attributes:
+        state: name of the session's state.
+        reason: why not, and what has to happen first.
+    """
+
+    def __init__(self, state: str, reason: str) -> None:
+        super().__init__(f"no motion can be requested in state '{state}': {reason}")
+        self.state = state
+        self.reason = reason
+
+
+class TransportClosed(DriverError):
+    """The link was closed on this side, or its far end is gone for good."""
+
+
+class RefusalError(DriverError):
+    """Why a set-point did not leave.
+
+    Attributes:
+        cycle: the controller's cycle in which it would have left.
+    """
+
+    def __init__(self, message: str, cycle: int) -> None:
+        super().__init__(f"{message} (cycle {cycle})")
+        self.cycle = cycle
+
+
+class SourceFailed(RefusalError):
+    """The motion source raised, or gave arrays of the wrong shape; the cause is chained."""
+
+
+class AxisLeft(RefusalError):
+    """An axis is not in the open mode that the motion needs.
+
+    Attributes:
+        joint: index from 0.
+        mode: mode that the controller reports for it.
+        wanted: mode that the motion needs.
+    """
+
+    def __init__(self, joint: int, mode: int, wanted: int, cycle: int) -> None:
+        super().__init__(f"joint {joint + 1} is in mode {mode}; the motion needs {wanted}", cycle)
+        self.joint = joint
+        self.mode = mode
+        self.wanted = wanted
+
+
+class GuardError(RefusalError):
+    """A number outside its bound.
+
+    Attributes:
+        check: name of the check.
+        joint: index from 0.
+        value: what was found, in `unit`.
+        bound: largest magnitude allowed (or the nearer position limit), in `unit`.
+        unit: unit of both.
+        cycle: the controller's cycle.
+    """
+
+    check = "guard"
+    unit = ""
+
+    def __init__(self, joint: int, value: float, bound: float, cycle: int) -> None:
+        super().__init__(
+            f"{self.check} of joint {joint + 1} is {value:.9g} {self.unit}; "
+            f"allowed is {bound:.9g} {self.unit}",
+            cycle,
+        )
+        self.joint = joint
+        self.value = value
+        self.bound = bound
+
+
+class NotFinite(GuardError):
+    """NaN or infinity where a number must be."""
+
+    check = "finiteness"
+
+
+class PositionLimit(GuardError):
+    """Set-point outside the joint's range."""
+
+    check = "position"
+    unit = "rad"
+
+
+class VelocityLimit(GuardError):
+    """Step between two sent set-points, or the stated velocity, too fast."""
+
+    check = "velocity"
+    unit = "rad/s"
+
+
+class AccelerationLimit(GuardError):
+    """Second difference of the sent set-points too large."""
+
+    check = "acceleration"
+    unit = "rad/s²"
+
+
+class JerkLimit(GuardError):
+    """Third difference of the sent set-points too large."""
+
+    check = "jerk"
+    unit = "rad/s³"
+
+
+class VelocityMismatch(GuardError):
+    """The source's velocity is not the derivative of its positions."""
+
+    check = "difference between stated velocity and step"
+    unit = "rad/s"
+
+
+class FollowingError(GuardError):
+    """The axis does not follow; the controller is told with mode 508 in this axis."""
+
+    check = "following error"
+    unit = "motor revolutions"
+
+
+class CurrentLimit(GuardError):
+    """The servo asks for more current than the narrower of cell and controller allows."""
+
+    check = "target current"
+    unit = "A"
+
+
+class FirstSetPoint(GuardError):
+    """The first set-point is not where the arm is, or the arm is not at rest."""
+
+    check = "distance between received target and actual position"
+    unit = "motor revolutions"
+
+
+class NotAtStandstill(FirstSetPoint):
+    """The axis moves in the cycle in which it would get its first set-point."""
+
+    check = "velocity at the first set-point"
+    unit = "motor revolutions per cycle"

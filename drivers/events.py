@@ -1,0 +1,126 @@
+"""What a session tells whoever runs it. Drained by `Session.events`, in order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import RefusalError
+from drivers.packets import InitPacket
+from drivers.states import State
+
+Outcome = Literal["completed", "stopped", "refused", "lost"]
+Rejection = Literal["malformed", "stale", "ended"]
+
+
+@dataclass
+class Counters:
+    """How many packets had which fate since the session was made; `missed` never arrived."""
+
+    answered: int = 0
+    duplicates: int = 0
+    malformed: int = 0
+    stale: int = 0
+    ended: int = 0
+    missed: int = 0
+    refused: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class InitReceived:
+    """The controller started a session.
+
+    Attributes:
+        init: its init packet.
+        unusable: why this session cannot move the arm, or None if it can.
+    """
+
+    init: InitPacket = field(repr=False)
+    unusable: str | None
+
+
+@dataclass(frozen=True)
+class StateChanged:
+    """The session went from one state to another in `cycle`."""
+
+    before: State
+    after: State
+    cycle: int
+
+
+@dataclass(frozen=True)
+class GapSeen:
+    """`missed` packets before the one of `cycle` never arrived."""
+
+    missed: int
+    cycle: int
+
+
+@dataclass(frozen=True)
+class MotionStarted:
+    """The first set-point left in `cycle`; records carry `interval`."""
+
+    interval: int
+    cycle: int
+
+
+@dataclass(frozen=True)
+class MotionEnded:
+    """The end of a requested motion.
+
+    Attributes:
+        outcome: "completed" and "stopped": open mode was left after coming to rest; "refused":
+            a set-point was refused; "lost": drive, open mode or link went away.
+        reason: in words.
+        interval: of its records, -1 if it never saw open mode.
+        cycle: when.
+    """
+
+    outcome: Outcome
+    reason: str
+    interval: int
+    cycle: int
+
+
+@dataclass(frozen=True)
+class PacketRejected:
+    """`count` packets since the last drain got no answer."""
+
+    kind: Rejection
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Refused:
+    """A set-point did not leave.
+
+    Attributes:
+        error: why.
+        flight_recorder: (k,) of `cycle_dtype`, the last records up to and including this cycle.
+    """
+
+    error: RefusalError
+    flight_recorder: NDArray[np.void] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class LinkLost:
+    """Nothing was heard for `silence` s; `state` is the state in which that happened."""
+
+    silence: float
+    state: State
+
+
+Event = (
+    InitReceived
+    | StateChanged
+    | GapSeen
+    | MotionStarted
+    | MotionEnded
+    | PacketRejected
+    | Refused
+    | LinkLost
+)

@@ -1,0 +1,131 @@
+"""State, interval and requested motion of a session, and the events of their changes."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from drivers.errors import RequestError
+from drivers.events import Event, MotionEnded, MotionStarted, Outcome, StateChanged
+from drivers.execution import Execution
+from drivers.open_mode import Array
+from drivers.states import HAS_SET_POINTS, TRANSITIONS, Input, State, keeps_request
+
+_LOSS: Final = {
+    Input.SYNC: "the controller started anew",
+    Input.INIT: "the controller started over",
+    Input.OFF: "the drive went off",
+    Input.DRIVING_ON: "the drive was switched on again",
+    Input.CLOSED: "the controller closed open mode",
+    Input.PARTLY_OPEN: "axes were open before the controller reported them closed",
+    Input.OPEN: "axes were open before the controller reported them closed",
+    Input.PAUSE: "the controller paused the exchange",
+    Input.UNAVAILABLE: "the controller reports a mode that is not known here",
+    Input.END: "the controller ended the session",
+    Input.SILENCE: "nothing was heard from the controller",
+}
+
+
+class Machine:
+    """Walks the state table and says what that does to the motion.
+
+    Attributes:
+        state: where the session stands.
+        cycle: the controller's cycle, for events.
+        interval: index of the last interval in open mode, -1 before the first.
+        in_interval: whether that interval goes on.
+        entering: open mode was reached and the first set-point is still to be taken.
+        execution: the motion requested, None without one.
+        stop_reason: why open mode is to be left, None while it is not.
+        offending: joint whose following error was reported, None where drive-off is asked for.
+        events: since they were last drained.
+    """
+
+    def __init__(self) -> None:
+        self.state = State.SYNC
+        self.cycle = 0
+        self.interval = -1
+        self.in_interval = False
+        self.entering = False
+        self.execution: Execution | None = None
+        self.stop_reason: str | None = None
+        self.offending: int | None = None
+        self.events: list[Event] = []
+
+    def request(self, execution: Execution, unusable: str | None) -> None:
+        """Keep a motion for the next time in open mode.
+
+        Raises:
+            RequestError: none can be promised now.
+        """
+        reason = None
+        if self.execution is not None:
+            reason = "another motion was requested before and has not ended"
+        elif self.state is State.ENDED:
+            reason = "the controller ended the session; make a new one"
+        elif self.state is State.FAULTED:
+            reason = "the controller has to report its axes closed first"
+        elif self.state is State.EXITING:
+            reason = "open mode is being left; wait for closed axes"
+        elif unusable is not None:
+            reason = unusable
+        if reason is not None:
+            raise RequestError(self.state.name.lower(), reason)
+        self.execution = execution
+        self.stop_reason = None
+
+    def stop(self, reason: str) -> None:
+        """Leave open mode, after coming to rest; drop a motion that has not begun."""
+        if self.execution is not None and not self.execution.started:
+            self.end("stopped", reason)
+        if self.state in (State.OPENING, State.OPEN):
+            self.stop_reason = self.stop_reason or reason
+
+    def begin_motion(self, position: Array) -> None:
+        """The first set-point of the motion is `position`, (n,) rad.
+
+        Raises:
+            SourceFailed: it cannot begin there.
+        """
+        assert self.execution is not None
+        self.execution.begin(position, self.cycle)
+        self.events.append(MotionStarted(self.interval, self.cycle))
+
+    def take(self, what: Input) -> None:
+        """Go to the state that follows, and end a motion that does not survive it."""
+        before, after = self.state, TRANSITIONS[self.state][what]
+        if after is not before:
+            self._enter(before, after)
+        if what in (Input.INIT, Input.SILENCE):
+            self.in_interval = False
+        execution = self.execution
+        if execution is None or what is Input.REFUSAL:
+            return
+        if not execution.started:
+            if not keeps_request(before, after):
+                self.end("lost", _LOSS[what])
+        elif after not in HAS_SET_POINTS:
+            if execution.leaving:
+                self.end(execution.outcome, execution.reason)
+            else:
+                self.end("lost", _LOSS[what])
+
+    def _enter(self, before: State, after: State) -> None:
+        self.state = after
+        self.events.append(StateChanged(before, after, self.cycle))
+        if after is State.OPEN:
+            self.entering = True
+            self.in_interval = True
+            self.interval += 1
+        if after not in HAS_SET_POINTS:
+            self.stop_reason = None
+        self.offending = None
+
+    def end(self, outcome: Outcome, reason: str) -> None:
+        """The requested motion, if there is one, is over."""
+        if self.execution is None:
+            return
+        # A motion refused at its first set-point was in the interval without having begun.
+        reached = self.execution.started or self.in_interval
+        self.execution = None
+        interval = self.interval if reached else -1
+        self.events.append(MotionEnded(outcome, reason, interval, self.cycle))

@@ -1,0 +1,334 @@
+"""C4G Open packets: bytes to numbers and back, bit for bit.
+
+All fields are little-endian int32 or IEEE float32 without padding. The same cyclic layout goes
+both ways; the controller sends first and every answer carries the received number plus one.
+Quantities are those of the wire (motor revolutions, revolutions per cycle, A).
+Layout and codes: facts on the C4G Open wire, sections 2 to 4.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drivers.errors import PacketError
+
+LAST_NUMBER: Final = 0x7FFF
+INIT_NUMBER: Final = 10
+INIT_LENGTH: Final = 1200
+HEADER_LENGTH: Final = 12
+AXIS_LENGTH: Final = 36
+MAX_AXES: Final = 20
+MAX_CYCLIC_LENGTH: Final = HEADER_LENGTH + AXIS_LENGTH * MAX_AXES
+N_ARMS: Final = 4
+AXES_PER_ARM: Final = 10
+NO_SLOT: Final = 0xFF
+
+DRIVE_ON: Final = 5
+"""Status byte of an arm whose drive is on, controller to PC."""
+EXIT_FROM_OPEN: Final = 1
+"""Status byte that asks for the end of open mode, PC to controller."""
+
+_HEADER: Final = struct.Struct("<i4s4s")
+_NUMBER: Final = struct.Struct("<i")
+
+
+class Mode(IntEnum):
+    """Mode of one axis, as it stands on the wire. 3 and 6 exist but their meaning is unknown."""
+
+    CLOSED = 0
+    POSITION_FEED_FORWARD = 1
+    FEED_FORWARD = 2
+    POSITION = 4
+    POSITION_RELATIVE = 5
+    DELTA_POSITION = 7
+    VELOCITY = 8
+    DELTA_CURRENT = 9
+    CLOSED_MIRRORED = 10
+    POSITION_FEED_FORWARD_PRIMED = 11
+    FEED_FORWARD_PRIMED = 12
+    POSITION_PRIMED = 14
+    POSITION_RELATIVE_PRIMED = 15
+    DELTA_POSITION_PRIMED = 17
+    PAUSE_BY_PC = 500
+    DRIVING_ON = 501
+    PAUSE_BY_CONTROLLER = 502
+    END_OF_SESSION = 504
+    DRIVE_OFF_REQUEST = 505
+    RESTART = 506
+    FOLLOWING_ERROR = 508
+
+
+AXIS_DTYPE: Final = np.dtype([("mode", "<i4"), ("d", "<f4", (5,)), ("extra", "<f4", (3,))])
+"""One axis block: mode, D1..D5, extra1..extra3."""
+
+_PER_ARM: Final = (N_ARMS, AXES_PER_ARM)
+INIT_DTYPE: Final = np.dtype(
+    [
+        ("number", "<i4"),
+        ("fields_per_packet", "<i4"),
+        ("fields_per_axis", "<i4"),
+        ("n_axes", "<i4"),
+        ("open_mode", "<i4", _PER_ARM),
+        ("header_types", "<i4", (3,)),
+        ("axis_types", "<i4", (9,)),
+        ("sample_time", "<i4"),
+        ("open_axes_map", "<i4", _PER_ARM),
+        ("calibration", "<f4", _PER_ARM),
+        ("current_limit", "<f4", _PER_ARM),
+        ("version", "<i4", (3,)),
+        ("kinematic_influence", "<f4", _PER_ARM),
+        ("gear_ratio", "<f4", _PER_ARM),
+        ("following_error", "<f4", _PER_ARM),
+    ]
+)
+"""The init packet. Arrays (4, 10) are indexed [arm - 1, axis - 1]."""
+
+
+def next_number(number: int) -> int:
+    """Number of the answer to packet `number`; 0x7FFF is followed by 1."""
+    return 1 if number >= LAST_NUMBER else number + 1
+
+
+def cyclic_length(n_axes: int) -> int:
+    """Bytes of a cyclic packet with `n_axes` open axes."""
+    return HEADER_LENGTH + AXIS_LENGTH * n_axes
+
+
+def packet_number(packet: bytes) -> int:
+    """Sequence number of any packet.
+
+    Raises:
+        PacketError: shorter than a header, or a number outside 1..0x7FFF.
+    """
+    if len(packet) < HEADER_LENGTH:
+        raise PacketError("length", len(packet), f"at least the {HEADER_LENGTH} bytes of a header")
+    number: int = _NUMBER.unpack_from(packet)[0]
+    if not 1 <= number <= LAST_NUMBER:
+        raise PacketError("number", number, f"1..{LAST_NUMBER}")
+    return number
+
+
+def is_init(packet: bytes) -> bool:
+    """Whether this is the init packet: number 10 *and* 1200 bytes.
+
+    A cyclic packet carries number 10 too, each time the numbers wrap around.
+    """
+    return len(packet) == INIT_LENGTH and _NUMBER.unpack_from(packet)[0] == INIT_NUMBER
+
+
+def echo(packet: bytes) -> bytes:
+    """The packet itself with the number of its answer: what sync and init packets get."""
+    return _NUMBER.pack(next_number(packet_number(packet))) + packet[4:]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CyclicPacket:
+    """One packet of the running exchange, either way.
+
+    Attributes:
+        number: sequence number, 1..0x7FFF.
+        status: 4 bytes, one per arm (arm 1 first).
+        functionality: 4 bytes, one per arm; always zero towards the controller.
+        axes: (n_axes,) of `AXIS_DTYPE`, in slot order. Read-only after `decode`.
+    """
+
+    number: int
+    status: bytes
+    functionality: bytes
+    axes: NDArray[np.void]
+
+    @classmethod
+    def decode(cls, packet: bytes, n_axes: int) -> CyclicPacket:
+        """Read a packet with `n_axes` slots; what follows them is ignored.
+
+        Raises:
+            PacketError: shorter than 12 + 36 n bytes, longer than 732, or number not 1..0x7FFF.
+        """
+        if not HEADER_LENGTH + AXIS_LENGTH * n_axes <= len(packet) <= MAX_CYCLIC_LENGTH:
+            raise PacketError(
+                "length",
+                len(packet),
+                f"{cyclic_length(n_axes)} bytes for {n_axes} axes, or up to "
+                f"{MAX_CYCLIC_LENGTH} with an unused tail",
+            )
+        number, status, functionality = _HEADER.unpack_from(packet)
+        if not 1 <= number <= LAST_NUMBER:
+            raise PacketError("number", number, f"1..{LAST_NUMBER}")
+        axes = np.frombuffer(packet, AXIS_DTYPE, n_axes, HEADER_LENGTH)
+        return cls(number, status, functionality, axes)
+
+    @classmethod
+    def zeros(cls, number: int, n_axes: int) -> CyclicPacket:
+        """A packet with every field zero, whose `axes` may be filled in place."""
+        return cls(number, bytes(N_ARMS), bytes(N_ARMS), np.zeros(n_axes, AXIS_DTYPE))
+
+    def encode(self) -> bytes:
+        """The 12 + 36 n bytes."""
+        return _HEADER.pack(self.number, self.status, self.functionality) + self.axes.tobytes()
+
+
+class OpenAxis(NamedTuple):
+    """Where an open axis stands: arm from 1, logical axis and slot from 0."""
+
+    arm: int
+    axis: int
+    slot: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class InitPacket:
+    """What the controller says about itself before the exchange starts.
+
+    Attributes:
+        record: (1,) of `INIT_DTYPE`, every field as received. Entries of axes that are not open
+            may hold anything, NaN included.
+    """
+
+    record: NDArray[np.void] = field(repr=False)
+
+    @classmethod
+    def decode(cls, packet: bytes) -> InitPacket:
+        """Read 1200 bytes.
+
+        Raises:
+            PacketError: wrong length or number, or a number of axes outside 1..20.
+        """
+        if len(packet) != INIT_LENGTH:
+            raise PacketError("length", len(packet), f"{INIT_LENGTH} bytes")
+        init = cls(np.frombuffer(packet, INIT_DTYPE))
+        if init.number != INIT_NUMBER:
+            raise PacketError("number", init.number, f"{INIT_NUMBER} (init)")
+        if not 1 <= init.n_axes <= MAX_AXES:
+            raise PacketError("n_axes", init.n_axes, f"1..{MAX_AXES}")
+        return init
+
+    @classmethod
+    def build(
+        cls, n_axes: int, sample_time: int, arm_1: Mapping[str, ArrayLike], **fields: ArrayLike
+    ) -> InitPacket:
+        """An init packet with arm 1's first `n_axes` axes open in slots 0..n_axes-1.
+
+        Args:
+            n_axes: open axes, 1..10.
+            sample_time: ms.
+            arm_1: per-axis fields of arm 1 (`calibration`, `gear_ratio`, ...), (k,) with k <= 10;
+                the remaining axes stay zero.
+            fields: any whole field of `INIT_DTYPE`, to override.
+        """
+        record = np.zeros(1, INIT_DTYPE)
+        record["number"] = INIT_NUMBER
+        record["fields_per_packet"] = 3
+        record["fields_per_axis"] = 9
+        record["n_axes"] = n_axes
+        record["sample_time"] = sample_time
+        record["open_mode"] = -1
+        record["open_mode"][0, 0, :n_axes] = Mode.CLOSED
+        record["open_axes_map"] = NO_SLOT
+        record["open_axes_map"][0, 0, :n_axes] = np.arange(n_axes)
+        for name, values in arm_1.items():
+            row = np.asarray(values)
+            record[name][0, 0, : len(row)] = row
+        for name, value in fields.items():
+            record[name] = value
+        return cls(record)
+
+    def encode(self) -> bytes:
+        """The 1200 bytes."""
+        return self.record.tobytes()
+
+    def _field(self, name: str) -> Any:
+        return self.record[name][0]
+
+    @property
+    def number(self) -> int:
+        """Always 10 from a controller, 11 in the answer."""
+        return int(self._field("number"))
+
+    @property
+    def n_axes(self) -> int:
+        """Open axes over all arms: the axis blocks of each cyclic packet."""
+        return int(self._field("n_axes"))
+
+    @property
+    def sample_time(self) -> int:
+        """Cycle in ms, as on the wire."""
+        return int(self._field("sample_time"))
+
+    @property
+    def period(self) -> float:
+        """Cycle in s."""
+        return self.sample_time / 1000.0
+
+    @property
+    def version(self) -> tuple[int, int, int]:
+        """Major, minor and build number of the controller's software."""
+        major, minor, build = (int(part) for part in self._field("version"))
+        return major, minor, build
+
+    @property
+    def open_mode(self) -> NDArray[np.int32]:
+        """Mode of each logical axis, (4, 10)."""
+        return np.asarray(self._field("open_mode"))
+
+    @property
+    def open_axes_map(self) -> NDArray[np.int32]:
+        """Slot of each logical axis, (4, 10); 0xFF (or -1) where the axis is not open."""
+        return np.asarray(self._field("open_axes_map"))
+
+    @property
+    def calibration(self) -> NDArray[np.float32]:
+        """Motor revolutions at the joints' zero, (4, 10)."""
+        return np.asarray(self._field("calibration"))
+
+    @property
+    def current_limit(self) -> NDArray[np.float32]:
+        """A, (4, 10)."""
+        return np.asarray(self._field("current_limit"))
+
+    @property
+    def kinematic_influence(self) -> NDArray[np.float32]:
+        """Coupling coefficients, (4, 10); entries 3, 4, 5 are k54, k64, k65."""
+        return np.asarray(self._field("kinematic_influence"))
+
+    @property
+    def gear_ratio(self) -> NDArray[np.float32]:
+        """TxRate: signed motor revolutions per joint revolution, (4, 10)."""
+        return np.asarray(self._field("gear_ratio"))
+
+    @property
+    def following_error(self) -> NDArray[np.float32]:
+        """Thresholds in motor revolutions, (4, 10)."""
+        return np.asarray(self._field("following_error"))
+
+    def wrist_coupling(self, arm: int = 1) -> tuple[float, float, float]:
+        """(k54, k64, k65) of one arm."""
+        k54, k64, k65 = (float(k) for k in self.kinematic_influence[arm - 1, 3:6])
+        return k54, k64, k65
+
+    def open_axes(self) -> Sequence[OpenAxis]:
+        """The open axes of all arms in slot order.
+
+        Raises:
+            PacketError: the map does not give each of the n_axes slots to exactly one axis.
+        """
+        table = self.open_axes_map
+        axes = [
+            OpenAxis(arm + 1, axis, int(table[arm, axis]))
+            for arm in range(N_ARMS)
+            for axis in range(AXES_PER_ARM)
+            if table[arm, axis] not in (NO_SLOT, -1)
+        ]
+        axes.sort(key=lambda open_axis: open_axis.slot)
+        slots = [open_axis.slot for open_axis in axes]
+        if slots != list(range(self.n_axes)):
+            raise PacketError(
+                "open_axes_map", slots, f"each slot 0..{self.n_axes - 1} for exactly one axis"
+            )
+        return axes

@@ -1,0 +1,84 @@
+"""What a cyclic packet says apart from its numbers: worked out once per change of modes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.packets import DRIVE_ON
+from drivers.replies import SafeAnswer, Words, safe_answer
+from drivers.states import HOLDABLE, OPEN_MODES, Input, read_input
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Status bytes and modes of a packet, understood.
+
+    Attributes:
+        input: what it is to the state machine.
+        answer: the safe answer.
+        status: status byte of the arm.
+        modes: (n,) mode of each joint.
+        ready: (n,) joints in the mode wanted.
+        held: (n,) joints in an open mode whose safe answer is the target received.
+        powered: some wanted axis is in an open mode and the drive is on.
+        any_open: some wanted axis is in an open mode.
+        strayed: first joint in an open mode that is not the one wanted, or None.
+    """
+
+    input: Input
+    answer: SafeAnswer
+    status: int
+    modes: NDArray[np.int32]
+    ready: NDArray[np.bool_]
+    held: NDArray[np.bool_]
+    powered: bool
+    any_open: bool
+    strayed: int | None
+
+
+class Reader:
+    """Reads packets of one session; remembers the last, because modes rarely change.
+
+    Args:
+        slots: (n,) slot of each wanted axis.
+        arms: arm of each slot, from 1.
+        arm: the arm that is moved, from 1.
+        mode: the open mode wanted.
+    """
+
+    def __init__(self, slots: NDArray[np.intp], arms: tuple[int, ...], arm: int, mode: int) -> None:
+        self._slots = slots
+        self._arms = arms
+        self._arm = arm
+        self._mode = mode
+        self._key: tuple[bytes, bytes] | None = None
+        self._last: Reading | None = None
+
+    def read(self, status: bytes, modes: Words) -> Reading:
+        """Understand 4 status bytes and the modes of all slots."""
+        key = (status, modes.tobytes())
+        if self._last is None or key != self._key:
+            self._key = key
+            self._last = self._understand(status, modes.copy())
+        return self._last
+
+    def _understand(self, status: bytes, modes: Words) -> Reading:
+        wanted = modes[self._slots]
+        drive_on = status[self._arm - 1] == DRIVE_ON
+        is_open = np.isin(wanted, list(OPEN_MODES))
+        ready = wanted == self._mode
+        strayed = np.flatnonzero(is_open & ~ready)
+        return Reading(
+            input=read_input(drive_on, modes.tolist(), wanted.tolist(), self._mode),
+            answer=safe_answer(status, modes, self._arms),
+            status=status[self._arm - 1],
+            modes=wanted,
+            ready=ready,
+            held=np.isin(wanted, list(HOLDABLE)),
+            powered=drive_on and bool(is_open.any()),
+            any_open=bool(is_open.any()),
+            strayed=int(strayed[0]) if strayed.size else None,
+        )

@@ -1,0 +1,359 @@
+"""The PC's end of a C4G Open session: bytes in, bytes and events out. No socket, no clock.
+
+====================  ======================================  =====================================
+state                 what the controller reports             what it is answered
+====================  ======================================  =====================================
+sync                  sync packets, before init               the same bytes, number plus one
+init                  init packet; two more sync after a      the same bytes, number plus one
+                      cold start
+drive off             drive not on                            everything echoed
+driving on            mode 501                                target position, velocity given back
+closed                mode 0 (or 10) in every wanted axis     the same
+opening               some wanted axes open, not all          open axes: target, zero velocity;
+                                                              the others as when closed
+open                  all wanted axes open                    guarded set-points, see below
+exiting               still open, end of open mode asked for  the last set-point, zero velocity
+freezing              mode 500 or 502                         mode 0, zeros; silence may last long
+faulted               open after a fault, a mode unknown      505 (508 for a following error) while
+                      here, or nothing at all                 open and powered; else the safe answer
+ended                 mode 504, answered once                 nothing
+====================  ======================================  =====================================
+
+Which state follows which is the table `drivers.states.TRANSITIONS`. Open mode is entered only
+from driving on, closed, opening or freezing, so after an init packet, a drive-off or a fault the
+controller has to report closed axes first, and a new motion has to be requested.
+
+Every fresh, well-formed packet gets exactly one answer, a duplicate the same bytes again; stale
+and malformed ones get none and are counted. Motion advances one period per answered packet,
+whatever was missed; more than `max_gap` missed in a row bring it to rest on its path.
+
+In open mode the first set-point is the target received in the packet in which the last wanted
+axis opened, at zero velocity, held against actual position and standstill. D2 is the step of the
+motor from one sent set-point to the next, formed in float64. After the motion the end is held
+for `settle_cycles`; the next answer asks for the end of open mode (status byte 1), and asks again
+every `EXIT_RETRY_CYCLES` in case that answer was lost. Without a requested motion the first
+set-point is held.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from drivers.answers import Answers
+from drivers.drive_train import DriveTrain
+from drivers.errors import AxisLeft, PacketError, RefusalError
+from drivers.events import (
+    Counters,
+    Event,
+    GapSeen,
+    InitReceived,
+    LinkLost,
+    PacketRejected,
+    Refused,
+    Rejection,
+)
+from drivers.execution import Execution
+from drivers.guard import Guard
+from drivers.machine import Machine
+from drivers.motion_source import MotionSource
+from drivers.packets import (
+    INIT_LENGTH,
+    INIT_NUMBER,
+    N_ARMS,
+    CyclicPacket,
+    InitPacket,
+    Mode,
+    echo,
+    is_init,
+    packet_number,
+)
+from drivers.reading import Reading
+from drivers.record import CycleRing
+from drivers.replies import MODE, Words, words_of
+from drivers.sequence import Sequence
+from drivers.states import Input, State
+
+FLIGHT_RECORDER: Final = 50
+"""Records that go with a refusal."""
+SERVED_MODES: Final = (Mode.POSITION, Mode.POSITION_RELATIVE)
+"""Open modes a motion can run in: those whose set-point is D1 and D2."""
+_SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
+
+
+class Session:
+    """One arm's session with one controller. Every method belongs to one thread.
+
+    Args:
+        drive_train: of the arm.
+        guard: checks each set-point; its period must be the controller's cycle.
+        ring: one record per cyclic packet answered goes there.
+        mode: open mode in which the arm is moved, 4 or 5.
+        max_gap: packets that may be missed in a row without stopping a motion.
+        arm: number of the arm, 1..4.
+        settle_cycles: how long the end of a motion is held before open mode is left.
+        init_timeout: s of silence allowed before the init packet and in a pause.
+        silence_timeout: s of silence allowed otherwise.
+
+    Attributes:
+        deadline: when silence becomes a fault, on the clock of `now`. Each packet that is answered
+            afresh moves it; duplicates and rejected packets do not. Infinite until the first
+            `reply` or `tick`, after a silence was reported, and in state ended.
+        counters: fates of packets.
+    """
+
+    def __init__(
+        self,
+        drive_train: DriveTrain,
+        guard: Guard,
+        ring: CycleRing,
+        *,
+        mode: int = Mode.POSITION,
+        max_gap: int = 2,
+        arm: int = 1,
+        settle_cycles: int = 200,
+        init_timeout: float = 300.0,
+        silence_timeout: float = 1.0,
+    ) -> None:
+        n = drive_train.n_joints
+        if not n == guard.limits.n_joints == ring.n_joints:
+            raise ValueError(
+                f"drive train, guard and ring are for {n}, {guard.limits.n_joints} and "
+                f"{ring.n_joints} joints"
+            )
+        if mode not in SERVED_MODES:
+            raise ValueError(f"motion in mode {mode} is not served; modes 4 and 5 are")
+        if not 1 <= arm <= N_ARMS:
+            raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
+        self.deadline = math.inf
+        self.counters = Counters()
+        self._drive_train = drive_train
+        self._guard = guard
+        self._ring = ring
+        self._mode = mode
+        self._max_gap = max_gap
+        self._arm = arm
+        self._settle_cycles = settle_cycles
+        self._init_timeout = init_timeout
+        self._silence_timeout = silence_timeout
+        self._machine = Machine()
+        self._sequence = Sequence()
+        self._answers: Answers | None = None
+        self._cold_start = False
+        self._heard_at: float | None = None
+        self._last_packet = b""
+        self._last_reply = b""
+        self._rejected: dict[Rejection, int] = {}
+
+    @property
+    def state(self) -> State:
+        """Where the session stands."""
+        return self._machine.state
+
+    @property
+    def interval(self) -> int:
+        """Index of the last interval in open mode, -1 before the first."""
+        return self._machine.interval
+
+    @property
+    def init(self) -> InitPacket | None:
+        """The controller's init packet, None before it."""
+        return None if self._answers is None else self._answers.init
+
+    @property
+    def period(self) -> float:
+        """The controller's cycle, s; before its init packet the one the guard was built for."""
+        return self._guard.period if self._answers is None else self._answers.init.period
+
+    def events(self) -> list[Event]:
+        """What happened since the last call, in order; rejected packets come last, summed up."""
+        events, self._machine.events = self._machine.events, []
+        events.extend(PacketRejected(kind, count) for kind, count in self._rejected.items())
+        self._rejected.clear()
+        return events
+
+    def request(self, source: MotionSource) -> None:
+        """Run a motion as soon as every wanted axis is open, then leave open mode.
+
+        Raises:
+            RequestError: none can be promised now.
+        """
+        execution = Execution(source, self._drive_train.n_joints, self._settle_cycles)
+        self._machine.request(execution, self._answers.unusable if self._answers else None)
+
+    def stop(self, reason: str = "a stop was asked for") -> None:
+        """Bring the motion to rest on its path and leave open mode; drop one not begun yet."""
+        self._machine.stop(reason)
+
+    def tick(self, now: float) -> None:
+        """Say what time it is when nothing came; past `deadline` the link counts as lost.
+
+        Motion is over then, and whatever comes next is taken as a new packet, so that a controller
+        that was only paused is answered, safely, and one that starts anew is followed.
+        """
+        if self._heard_at is None:
+            self._heard(now)
+        if now < self.deadline or self.state is State.ENDED:
+            return
+        assert self._heard_at is not None
+        self._machine.events.append(LinkLost(now - self._heard_at, self.state))
+        self.deadline = math.inf
+        self._sequence.broken = True
+        self._machine.take(Input.SILENCE)
+
+    def reply(self, packet: bytes, now: float) -> bytes | None:
+        """The answer to a packet that arrived at `now` (s, any monotonic clock), if it gets one."""
+        if self._heard_at is None or now >= self.deadline:
+            self.tick(now)
+        if self.state is State.ENDED:
+            self.counters.ended += 1
+            self._reject("ended")
+            return None
+        try:
+            # Bytes may hold any number; what is not finite is for the guard, not for numpy.
+            with np.errstate(all="ignore"):
+                if is_init(packet):
+                    return self._start_over(packet, now)
+                number = packet_number(packet)
+                if self._expects_sync(number):
+                    return self._sync(packet, number, now)
+                return self._cyclic(packet, number, now)
+        except PacketError:
+            self.counters.malformed += 1
+            self._reject("malformed")
+            return None
+
+    def _start_over(self, packet: bytes, now: float) -> bytes:
+        if self.state is State.INIT and packet == self._last_packet:
+            self.counters.duplicates += 1
+            return self._last_reply
+        init = InitPacket.decode(packet)
+        self._cold_start = self.state is State.SYNC and self._sequence.last > 0
+        self._machine.take(Input.INIT)
+        self._answers = Answers(init, self._drive_train, self._guard, self._arm, self._mode)
+        self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
+        self._machine.cycle = 0
+        self._machine.events.append(InitReceived(init, self._answers.unusable))
+        return self._answered(packet, echo(packet), now)
+
+    def _expects_sync(self, number: int) -> bool:
+        if self.state is State.SYNC:
+            return True
+        if self.state is State.INIT:
+            return self._cold_start and number in _SYNC_AFTER_INIT
+        # A controller that was silent and counts from the beginning was started anew.
+        sequence = self._sequence
+        return sequence.broken and number < INIT_NUMBER and sequence.distance(number) != 1
+
+    def _sync(self, packet: bytes, number: int, now: float) -> bytes:
+        if len(packet) >= INIT_LENGTH:
+            raise PacketError("length", len(packet), f"less than {INIT_LENGTH} bytes")
+        self._machine.take(Input.SYNC)
+        if self.state is State.SYNC:
+            self._answers = None
+        self._sequence.accept(number)
+        return self._answered(packet, echo(packet), now)
+
+    def _cyclic(self, packet: bytes, number: int, now: float) -> bytes | None:
+        answers, machine, ring = self._answers, self._machine, self._ring
+        assert answers is not None
+        decoded = CyclicPacket.decode(packet, answers.init.n_axes)
+        if self._sequence.is_duplicate(number):
+            self.counters.duplicates += 1
+            return self._last_reply
+        if self._sequence.is_stale(number):
+            self.counters.stale += 1
+            self._reject("stale")
+            return None
+        missed = self._sequence.accept(number)
+        machine.cycle = self._sequence.cycle
+        words = words_of(decoded)
+        reading = answers.reader.read(decoded.status, words[:, MODE])
+        row = self._record(answers, number, now, missed, reading, words)
+        refusal = None
+        try:
+            self._note_gap(missed)
+            self._require_axes(reading)
+            machine.take(reading.input)
+            measured, commanded = ring.measured[row], ring.commanded[row]
+            status = answers.answer(machine, reading, words, measured, commanded)
+        except RefusalError as error:
+            refusal = error
+            ring.commanded[row] = math.nan
+            status = answers.refuse(machine, error, reading, words)
+        machine.in_interval = machine.in_interval and reading.any_open
+        ring.interval[row] = machine.interval if machine.in_interval else -1
+        ring.state[row] = machine.state
+        ring.commit()
+        if refusal is not None:
+            self.counters.refused += 1
+            machine.events.append(Refused(refusal, ring.last(FLIGHT_RECORDER)))
+            machine.end("refused", str(refusal))
+        return self._answered(packet, answers.finish(number, status), now)
+
+    def _note_gap(self, missed: int) -> None:
+        if missed:
+            self.counters.missed += missed
+            self._machine.events.append(GapSeen(missed, self._sequence.cycle))
+        if missed > self._max_gap and self.state is State.OPEN and self._machine.execution:
+            self._machine.stop(f"{missed} packets were missed in a row")
+
+    def _require_axes(self, reading: Reading) -> None:
+        """A motion needs every wanted axis in its mode, from its beginning to its end."""
+        execution = self._machine.execution
+        if execution is None or not reading.powered:
+            return
+        joint = reading.strayed
+        if execution.started and self.state is State.OPEN and reading.input is not Input.OPEN:
+            joint = int(np.argmin(reading.ready))
+        if joint is not None:
+            mode = int(reading.modes[joint])
+            raise AxisLeft(joint, mode, self._mode, self._sequence.cycle)
+
+    def _record(
+        self,
+        answers: Answers,
+        number: int,
+        now: float,
+        missed: int,
+        reading: Reading,
+        words: Words,
+    ) -> int:
+        """Begin the record of this cycle; returns its row."""
+        ring = self._ring
+        row = ring.slot
+        ring.cycle[row] = self._sequence.cycle
+        ring.arrival[row] = now
+        ring.number[row] = number
+        ring.gap[row] = missed
+        ring.status[row] = reading.status
+        ring.commanded[row] = math.nan
+        if answers.wire is None:
+            ring.mode[row] = -1
+            ring.measured[row] = math.nan
+        else:
+            ring.mode[row] = reading.modes
+            answers.wire.read(words.view(np.float32), ring.measured[row])
+        return row
+
+    def _answered(self, packet: bytes, reply: bytes, now: float) -> bytes:
+        self.counters.answered += 1
+        self._last_packet = packet
+        self._last_reply = reply
+        self._heard(now)
+        return reply
+
+    def _heard(self, now: float) -> None:
+        self._heard_at = now
+        state = self.state
+        if state is State.ENDED:
+            self.deadline = math.inf
+        elif state is State.SYNC or state is State.FREEZING:
+            self.deadline = now + self._init_timeout
+        else:
+            self.deadline = now + self._silence_timeout
+
+    def _reject(self, kind: Rejection) -> None:
+        self._rejected[kind] = self._rejected.get(kind, 0) + 1

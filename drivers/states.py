@@ -1,0 +1,175 @@
+"""The session's state machine, as a table.
+
+A cyclic packet is first read as one `Input`, by `read_input`; the table then says which state
+follows. What else the session notices (an init packet, silence, its own refusal, its own exit)
+are inputs too, so that every change of state is a line here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import Final
+
+from drivers.packets import Mode
+
+
+class State(IntEnum):
+    """Where a session stands."""
+
+    SYNC = 0
+    INIT = 1
+    DRIVE_OFF = 2
+    DRIVING_ON = 3
+    CLOSED = 4
+    OPENING = 5
+    OPEN = 6
+    EXITING = 7
+    FREEZING = 8
+    FAULTED = 9
+    ENDED = 10
+
+
+class Input(IntEnum):
+    """What makes a state follow another."""
+
+    SYNC = 0
+    """A packet before the init packet, or the two after it."""
+    INIT = 1
+    """An init packet."""
+    OFF = 2
+    """The arm's drive is not on, whatever the modes."""
+    DRIVING_ON = 3
+    """Mode 501 in a wanted axis."""
+    CLOSED = 4
+    """Every wanted axis in mode 0 or 10."""
+    PARTLY_OPEN = 5
+    """Some wanted axis in an open mode, not all of them in the mode wanted."""
+    OPEN = 6
+    """Every wanted axis in the mode wanted."""
+    PAUSE = 7
+    """Mode 500 or 502 in a wanted axis: the exchange rests."""
+    UNAVAILABLE = 8
+    """A mode that nobody here knows an answer to."""
+    END = 9
+    """Mode 504 in every axis."""
+    REFUSAL = 10
+    """The session refused a set-point."""
+    EXIT = 11
+    """The session asked for the end of open mode."""
+    SILENCE = 12
+    """Nothing came for too long."""
+
+
+HOLDABLE: Final = frozenset(
+    {
+        Mode.POSITION_FEED_FORWARD,
+        Mode.POSITION,
+        Mode.POSITION_RELATIVE,
+        Mode.POSITION_FEED_FORWARD_PRIMED,
+        Mode.POSITION_PRIMED,
+        Mode.POSITION_RELATIVE_PRIMED,
+    }
+)
+"""Open modes in which D1 is an absolute position: the target received is the safe answer."""
+INCREMENTAL: Final = frozenset(
+    {
+        Mode.FEED_FORWARD,
+        Mode.DELTA_POSITION,
+        Mode.VELOCITY,
+        Mode.DELTA_CURRENT,
+        Mode.FEED_FORWARD_PRIMED,
+        Mode.DELTA_POSITION_PRIMED,
+    }
+)
+"""Open modes in which zero is the safe answer."""
+OPEN_MODES: Final = HOLDABLE | INCREMENTAL
+CLOSED_MODES: Final = frozenset({Mode.CLOSED, Mode.CLOSED_MIRRORED})
+PAUSE_MODES: Final = frozenset({Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER})
+
+
+def read_input(
+    drive_on: bool, all_modes: Sequence[int], wanted_modes: Sequence[int], mode: int
+) -> Input:
+    """What a cyclic packet says.
+
+    Args:
+        drive_on: whether the arm's status byte is 5.
+        all_modes: mode of every slot.
+        wanted_modes: modes of the axes that are to be moved.
+        mode: the open mode they are wanted in.
+    """
+    if all(m == Mode.END_OF_SESSION for m in all_modes):
+        return Input.END
+    if not drive_on:
+        return Input.OFF
+    if any(m in PAUSE_MODES for m in wanted_modes):
+        return Input.PAUSE
+    if all(m == mode for m in wanted_modes):
+        return Input.OPEN
+    if any(m in OPEN_MODES for m in wanted_modes):
+        return Input.PARTLY_OPEN
+    if all(m in CLOSED_MODES for m in wanted_modes):
+        return Input.CLOSED
+    if all(m in CLOSED_MODES or m == Mode.DRIVING_ON for m in wanted_modes):
+        return Input.DRIVING_ON
+    return Input.UNAVAILABLE
+
+
+_ANY: Final[Mapping[Input, State]] = {
+    Input.INIT: State.INIT,
+    Input.OFF: State.DRIVE_OFF,
+    Input.DRIVING_ON: State.DRIVING_ON,
+    Input.CLOSED: State.CLOSED,
+    Input.PAUSE: State.FREEZING,
+    Input.UNAVAILABLE: State.FAULTED,
+    Input.END: State.ENDED,
+    Input.REFUSAL: State.FAULTED,
+    Input.SILENCE: State.FAULTED,
+}
+_MAY_OPEN: Final = {Input.PARTLY_OPEN: State.OPENING, Input.OPEN: State.OPEN}
+_MUST_CLOSE_FIRST: Final = {Input.PARTLY_OPEN: State.FAULTED, Input.OPEN: State.FAULTED}
+_LEAVING: Final = {Input.PARTLY_OPEN: State.EXITING, Input.OPEN: State.EXITING}
+
+TRANSITIONS: Final[Mapping[State, Mapping[Input, State]]] = {
+    State.SYNC: {
+        Input.SYNC: State.SYNC,
+        Input.INIT: State.INIT,
+        Input.SILENCE: State.SYNC,
+    },
+    State.INIT: {**_ANY, **_MUST_CLOSE_FIRST, Input.SYNC: State.INIT},
+    State.DRIVE_OFF: {**_ANY, **_MUST_CLOSE_FIRST},
+    State.DRIVING_ON: {**_ANY, **_MAY_OPEN},
+    State.CLOSED: {**_ANY, **_MAY_OPEN},
+    State.OPENING: {**_ANY, **_MAY_OPEN},
+    State.OPEN: {
+        **_ANY,
+        Input.OPEN: State.OPEN,
+        Input.PARTLY_OPEN: State.EXITING,
+        Input.EXIT: State.EXITING,
+    },
+    State.EXITING: {**_ANY, **_LEAVING, Input.EXIT: State.EXITING},
+    State.FREEZING: {**_ANY, **_MAY_OPEN},
+    # A cold start of the controller begins with sync packets, after a silence.
+    State.FAULTED: {**_ANY, **_MUST_CLOSE_FIRST, Input.SYNC: State.SYNC},
+    State.ENDED: {},
+}
+"""`TRANSITIONS[state][input]` is the state that follows; what is missing cannot happen."""
+
+HAS_SET_POINTS: Final = frozenset({State.OPENING, State.OPEN, State.EXITING})
+"""States in which open axes are given set-points."""
+
+_WAITING: Final = frozenset({State.DRIVE_OFF, State.DRIVING_ON, State.CLOSED, State.FREEZING})
+
+
+def keeps_request(before: State, after: State) -> bool:
+    """Whether a motion that was requested but has not begun survives this step.
+
+    It waits for the controller to start, for the drive and for open mode; it does not survive a
+    restart, a fault, or open mode going away by more than closing again.
+    """
+    if after in (State.SYNC, State.INIT):
+        return before in (State.SYNC, State.INIT)
+    if after in _WAITING:
+        return before not in HAS_SET_POINTS or after is State.CLOSED
+    return after in (State.OPENING, State.OPEN)

@@ -1,0 +1,234 @@
+"""The file under an archive being written: MCAP records, flushed so that a crash costs little."""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePath
+
+from mcap.writer import CompressionType, Writer
+
+from hil.archive.messages import LogMessage, encode_log
+from hil.archive.schema import (
+    EVENT_CHANNEL,
+    FORMAT_VERSION,
+    METADATA,
+    OUTCOME,
+    PROFILE,
+    Batch,
+    Channel,
+)
+from hil.errors import ArchiveWriteError
+
+LIBRARY = "hil"  # without version: the same recording gives the same bytes
+_ONE_CHUNK = 1 << 62  # chunks end where we flush, never because of their size
+_MEDIA_TYPES = {
+    ".toml": "application/toml",
+    ".urdf": "application/xml",
+    ".json": "application/json",
+    ".csv": "text/csv",
+    ".txt": "text/plain",
+}
+
+
+def checksum(entries: Mapping[str, str]) -> str:
+    """CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
+    text = json.dumps(dict(entries), sort_keys=True, separators=(",", ":"))
+    return f"{zlib.crc32(text.encode()):08x}"
+
+
+class _Sink:
+    """Collects what the MCAP writer produces; each flush is one write to the file."""
+
+    def __init__(self, descriptor: int, *, durable: bool) -> None:
+        self._descriptor = descriptor
+        self._durable = durable
+        self._parts: list[bytes] = []
+        self._position = 0
+
+    def write(self, data: bytes) -> int:
+        self._parts.append(bytes(data))
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        data = memoryview(b"".join(self._parts))
+        self._parts.clear()
+        while data:
+            data = data[os.write(self._descriptor, data) :]
+        if self._durable:
+            os.fdatasync(self._descriptor)
+
+
+class ArchiveFile:
+    """An MCAP file of the archive profile, open for writing.
+
+    The file gets its final name at once; one without footer is torn and readable up to its last
+    whole chunk. An existing file is never overwritten.
+
+    Args:
+        path: where to write.
+        channels: the channels whose messages come in batches.
+        metadata: entries of the ``hil`` metadata record.
+        attachments: file name to content.
+        durable: wait at each flush until the disk has the data.
+
+    Raises:
+        ArchiveWriteError: the file exists or cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        channels: Sequence[Channel],
+        metadata: Mapping[str, str],
+        attachments: Mapping[str, bytes],
+        durable: bool,
+    ) -> None:
+        self.path = path
+        self._descriptor = _create(path, durable=durable)
+        self._closed = False
+        self._written = 0
+        self._events = 0
+        self._writer = Writer(
+            _Sink(self._descriptor, durable=durable),
+            chunk_size=_ONE_CHUNK,
+            compression=CompressionType.ZSTD,
+        )
+        with self._guarded():
+            self._start(metadata, attachments)
+            self._channels = [self._register(channel) for channel in channels]
+            self._event_channel = self._register(EVENT_CHANNEL)
+
+    @property
+    def samples(self) -> int:
+        """Number of instants written so far."""
+        return self._written
+
+    @property
+    def events(self) -> int:
+        """Number of events written so far."""
+        return self._events
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file is closed, by `finish` or by a failure of the disk."""
+        return self._closed
+
+    def add(self, batch: Batch) -> None:
+        """Add a batch of messages to the chunk in progress."""
+        blobs = [(rows.tobytes(), rows.itemsize) for rows in batch.messages]
+        add_message = self._writer.add_message
+        with self._guarded():
+            for row, stamp in enumerate(batch.stamp.tolist()):
+                for channel, (blob, size) in zip(self._channels, blobs, strict=True):
+                    message = blob[row * size : (row + 1) * size]
+                    add_message(channel, stamp, message, stamp, self._written & 0xFFFFFFFF)
+                self._written += 1
+
+    def add_event(self, message: LogMessage) -> None:
+        """Add an event to the chunk in progress."""
+        with self._guarded():
+            self._writer.add_message(
+                self._event_channel,
+                message.stamp,
+                encode_log(message),
+                message.stamp,
+                self._events & 0xFFFFFFFF,
+            )
+        self._events += 1
+
+    def flush(self) -> None:
+        """End the chunk in progress and hand everything to the operating system, or the disk."""
+        with self._guarded():
+            self._writer.flush()
+
+    def finish(self, outcome: Mapping[str, str]) -> None:
+        """Write the outcome, index and footer, and close the file."""
+        if self._closed:
+            return
+        with self._guarded():
+            self._writer.flush()
+            self._add_metadata(OUTCOME, outcome)
+            self._writer.finish()
+            self._writer.flush()
+        self._close()
+
+    def _start(self, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> None:
+        self._writer.start(PROFILE, LIBRARY)
+        own = {
+            "format_version": str(FORMAT_VERSION),
+            "attachments": json.dumps(sorted(attachments)),
+        }
+        self._add_metadata(METADATA, {**metadata, **own})
+        for name, data in sorted(attachments.items()):
+            media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
+            self._writer.add_attachment(0, 0, name, media_type, data)
+        self._writer.flush()
+
+    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        self._writer.add_metadata(name, {**entries, "checksum": checksum(entries)})
+
+    def _register(self, channel: Channel) -> int:
+        schema = self._writer.register_schema(
+            channel.schema, "ros2msg", channel.definition.encode()
+        )
+        return int(self._writer.register_channel(channel.topic, "cdr", schema))
+
+    def _guarded(self) -> _DiskGuard:
+        if self._closed:
+            raise ArchiveWriteError(self.path, "the archive is closed")
+        return _DiskGuard(self)
+
+    def _close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            os.close(self._descriptor)
+
+
+class _DiskGuard:
+    """Turns a failure of the disk into our error, and closes the file for good."""
+
+    def __init__(self, file: ArchiveFile) -> None:
+        self._file = file
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, OSError):
+            self._file._close()
+            raise ArchiveWriteError(
+                self._file.path,
+                f"cannot be written further: {error.strerror}",
+                remedy="what was flushed before can be read; free space and record again",
+            ) from error
+
+
+def _create(path: Path, *, durable: bool) -> int:
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        if durable:
+            _sync_folder(path.parent)
+    except FileExistsError as error:
+        raise ArchiveWriteError(
+            path, "exists already", remedy="archives are never overwritten; choose another name"
+        ) from error
+    except OSError as error:
+        raise ArchiveWriteError(path, f"cannot be created: {error.strerror}") from error
+    return descriptor
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the name of a new file survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,190 @@
+"""Opens archives: whole ones, and torn ones up to their last whole chunk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.record import cycle_dtype
+from hil.archive.cdr import Rows
+from hil.archive.container import Damage
+from hil.archive.content import Content
+from hil.archive.events import ArchivedEvent
+from hil.archive.schema import CYCLE, FORMAT_VERSION, METADATA
+from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
+
+
+@dataclass(frozen=True)
+class ArchiveDamage:
+    """What an archive lost.
+
+    Attributes:
+        offset: byte in the file from which nothing was read.
+        reason: what is wrong there.
+        bytes_dropped: bytes from there to the end of the file.
+        samples: samples that could be read.
+        duration: time from the first of them to the last [s].
+        outcome_missing: whether the outcome is among the losses.
+    """
+
+    offset: int
+    reason: str
+    bytes_dropped: int
+    samples: int = 0
+    duration: float = 0.0
+    outcome_missing: bool = True
+
+    def __str__(self) -> str:
+        read = f"{self.samples} samples ({self.duration:.6g} s) could be read"
+        lost = f"the record at byte {self.offset} {self.reason}"
+        lost += f" ({self.bytes_dropped} bytes from there on are unused)"
+        outcome = "; the outcome is missing" if self.outcome_missing else ""
+        return f"{lost}; {read}{outcome}"
+
+
+@dataclass(frozen=True, eq=False)
+class Archive:
+    """What an archive holds.
+
+    Attributes:
+        path: the file.
+        metadata: entries of the ``hil`` record.
+        outcome: entries of the ``hil.outcome`` record, None when it is missing.
+        attachments: content by file name.
+        joint_names: joints in the order of the columns.
+        columns: contiguous read-only arrays (m,) or (m, n) by name: the fields of the cycle
+            message, or ``position``, ``velocity``, ``torque`` and ``motor_current`` of an imported
+            recording as far as it has them; and ``stamp`` (m,), nanoseconds.
+        events: what happened, in the order of writing.
+        damage: what was lost, None when nothing was.
+    """
+
+    path: Path
+    metadata: Mapping[str, str]
+    outcome: Mapping[str, str] | None
+    attachments: Mapping[str, bytes]
+    joint_names: tuple[str, ...]
+    columns: Mapping[str, NDArray[Any]]
+    events: tuple[ArchivedEvent, ...]
+    damage: ArchiveDamage | None
+
+    @property
+    def complete(self) -> bool:
+        """Whether the archive is whole: closed, and every byte as it was written."""
+        return self.damage is None
+
+    @property
+    def missing(self) -> str | None:
+        """What is missing, as a sentence; None when the archive is complete."""
+        return None if self.damage is None else f"{self.path}: {self.damage}"
+
+    @property
+    def kind(self) -> str:
+        """Why the arm moved, one of `hil.archive.KINDS`."""
+        return self.metadata["kind"]
+
+    @property
+    def period(self) -> float | None:
+        """Cycle time [s]; None for an imported recording without a fixed one."""
+        text = self.metadata.get("period")
+        return None if text is None else float(text)
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples."""
+        return len(self.columns["stamp"])
+
+    def cycles(self) -> Rows:
+        """The cycle records as the session wrote them, structure of `drivers.cycle_dtype`.
+
+        Raises:
+            ArchiveError: the archive was opened without all fields, or holds no cycles.
+        """
+        dtype = cycle_dtype(len(self.joint_names))
+        names = [name for name in dtype.names or () if name != "reserved"]
+        absent = [name for name in names if name not in self.columns]
+        if absent:
+            raise ArchiveError(self.path, f"has no column {absent[0]}", field=CYCLE)
+        rows = np.zeros(self.n_samples, dtype)
+        for name in names:
+            rows[name] = self.columns[name]
+        return rows
+
+
+def open_archive(path: str | PathLike[str], *, fields: Collection[str] | None = None) -> Archive:
+    """Read an archive.
+
+    A file that was cut off or damaged is read up to its last whole chunk before the damage; what
+    is read is what was written, or the archive says what it lost.
+
+    Args:
+        path: the file.
+        fields: columns wanted, None for all.
+
+    Raises:
+        NotAnArchiveError: another kind of file, or one torn before it held anything.
+        ArchiveVersionError: written by a newer version of the profile.
+        ArchiveError: the file cannot be read.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            size = path.stat().st_size
+            content = Content(fields)
+            damage = content.collect(stream, size)
+    except OSError as error:
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+    metadata = _checked_metadata(path, size, content, damage)
+    columns = content.columns()
+    return Archive(
+        path=path,
+        metadata=metadata,
+        outcome=content.outcome,
+        attachments=content.attachments,
+        joint_names=tuple(json.loads(metadata["joint_names"])),
+        columns=columns,
+        events=tuple(content.events),
+        damage=None if damage is None else _damage(damage, size, content, columns["stamp"]),
+    )
+
+
+def _checked_metadata(
+    path: Path, size: int, content: Content, damage: Damage | None
+) -> Mapping[str, str]:
+    """The ``hil`` record, whose version we know."""
+    if content.metadata is not None:
+        version = content.metadata.get("format_version")
+        if version != str(FORMAT_VERSION):
+            raise ArchiveVersionError(
+                path,
+                f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
+                remedy="install a newer hil",
+            )
+        return content.metadata
+    if size == 0:
+        problem = "is empty: the recording ended before anything was written"
+    elif damage is None:
+        problem = f"is an MCAP file, but not an archive: it has no {METADATA!r} metadata record"
+    elif damage.offset == 0:
+        problem = "is not an MCAP file"
+    else:
+        problem = f"is torn before its first data: the record at byte {damage.offset} {damage}"
+    raise NotAnArchiveError(path, problem, remedy="record again, or bring it in with `hil import`")
+
+
+def _damage(damage: Damage, size: int, content: Content, stamp: NDArray[np.int64]) -> ArchiveDamage:
+    return ArchiveDamage(
+        offset=damage.offset,
+        reason=damage.reason,
+        bytes_dropped=size - damage.offset,
+        samples=len(stamp),
+        duration=float(stamp[-1] - stamp[0]) * 1e-9 if len(stamp) else 0.0,
+        outcome_missing=content.outcome is None,
+    )

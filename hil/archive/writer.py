@@ -1,0 +1,243 @@
+"""Writes cycle records to an archive while they arrive."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive.cdr import Rows
+from hil.archive.events import ArchivedEvent, Level
+from hil.archive.file_writer import ArchiveFile
+from hil.archive.names import KINDS, ArchiveName
+from hil.archive.schema import CycleEncoder
+from hil.errors import ArchiveWriteError
+
+Array = NDArray[np.float64]
+
+FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash costs at most that
+
+_OWN_KEYS = frozenset(("format_version", "attachments", "checksum", "joint_names", "period"))
+
+
+class ArchiveWriter:
+    """An archive being recorded.
+
+    Chunks end at fixed cycles, every 100 ms of the controller's time, wherever the caller cuts his
+    batches: the same records give the same bytes. A killed process loses what came after the last
+    whole chunk. Used as a context manager it is closed in any case: ``interrupted`` with the reason
+    when an exception passes, ``unknown`` when nobody told the outcome.
+
+    Args:
+        path: the file, which must not exist.
+        joint_names: joints in the order of the records' columns.
+        period: cycle time of the controller [s].
+        metadata: entries of the ``hil`` metadata record. Kind, index and attempt are read from the
+            file name where it is an `ArchiveName`; otherwise ``kind``, one of `KINDS`, must be
+            among them. Times of day belong here only when a real arm moved.
+        attachments: what the archive needs to be understood alone, by file name: ``cell.toml``,
+            ``robot.urdf``, ``drive_train.json``, ``plan.json``.
+        durable: wait at each flush until the disk has the data.
+
+    Raises:
+        ArchiveWriteError: the file exists, the disk refuses, or the metadata cannot stand.
+    """
+
+    def __init__(
+        self,
+        path: str | PathLike[str],
+        *,
+        joint_names: Sequence[str],
+        period: float,
+        metadata: Mapping[str, str],
+        attachments: Mapping[str, bytes] | None = None,
+        durable: bool = True,
+    ) -> None:
+        self._path = Path(path)
+        if not (math.isfinite(period) and period > 0.0):
+            raise ArchiveWriteError(self._path, f"period is {period!r} s", field="period")
+        self._period = period
+        self._n_joints = len(joint_names)
+        self._encoder = CycleEncoder(joint_names, period)
+        self._cycles_per_chunk = max(1, round(FLUSH_PERIOD / period))
+        self._pending: list[tuple[Rows, Array]] = []
+        self._first: int | None = None
+        self._last: int | None = None
+        self._newest = 0
+        self._lost = 0
+        self._file = ArchiveFile(
+            self._path,
+            channels=self._encoder.channels,
+            metadata=checked_metadata(
+                self._path, metadata, {"joint_names": list(joint_names), "period": period}
+            ),
+            attachments=attachments or {},
+            durable=durable,
+        )
+
+    @property
+    def path(self) -> Path:
+        """The file being written."""
+        return self._path
+
+    @property
+    def closed(self) -> bool:
+        """Whether the archive is closed."""
+        return self._file.closed
+
+    def write(self, records: Rows, torque: Array | None = None) -> None:
+        """Append cycle records.
+
+        Args:
+            records: shape (k,), structure of `drivers.cycle_dtype`.
+            torque: joint torque of each record, shape (k, n) [N·m]; None when it is not known.
+
+        Raises:
+            ArchiveWriteError: the disk refuses, or the archive is closed.
+        """
+        if self._file.closed:
+            raise ArchiveWriteError(self._path, "the archive is closed")
+        if not len(records):
+            return
+        shape = (len(records), self._n_joints)
+        torques = np.full(shape, np.nan) if torque is None else np.asarray(torque, np.float64)
+        if torques.shape != shape or records["position"].shape != shape:
+            raise ValueError(
+                f"records are {records['position'].shape}, torques {torques.shape}, "
+                f"expected {shape}"
+            )
+        if self._first is None:
+            self._first = int(records["cycle"][0])
+        self._newest = int(records["cycle"][-1])
+        self._lost += int(records["gap"].sum())
+        self._pending.append((records, torques))
+        oldest = int(self._pending[0][0]["cycle"][0])
+        if self._slot(oldest) != self._slot(self._newest) or self._ends_slot(self._newest):
+            self._emit(everything=False)
+
+    def event(
+        self,
+        cycle: int | None,
+        name: str,
+        text: str,
+        *,
+        level: Level = Level.INFO,
+        data: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Note an event; it is flushed with the cycles that follow.
+
+        Args:
+            cycle: cycle of the controller in which it happened, None for the newest one written.
+            name: kind of event.
+            text: one line for a person.
+            level: severity.
+            data: the same for a program, anything JSON can hold.
+        """
+        if cycle is None:
+            cycle = self._newest
+        event = ArchivedEvent(cycle * self._period, name, text, level, data or {})
+        self._file.add_event(event.to_log())
+
+    def flush(self) -> None:
+        """Write out what is pending, chunk or not; for links that have fallen silent."""
+        self._emit(everything=True)
+        self._file.flush()
+
+    def close(
+        self, outcome: str, *, reason: str = "", details: Mapping[str, str] | None = None
+    ) -> None:
+        """Complete the archive.
+
+        Args:
+            outcome: how the interval ended, such as ``completed``, ``stopped``, ``refused``.
+            reason: why, in a sentence, when it did not complete.
+            details: further entries of the ``hil.outcome`` metadata record.
+        """
+        if self._file.closed:
+            return
+        self._emit(everything=True)
+        cycles = {
+            "samples": self._file.samples,
+            "events": self._file.events,
+            "lost_packets": self._lost,
+        }
+        if self._first is not None and self._last is not None:
+            cycles |= {"first_cycle": self._first, "last_cycle": self._last}
+        counted = {key: str(value) for key, value in cycles.items()}
+        self._file.finish({**(details or {}), "outcome": outcome, "reason": reason, **counted})
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self.close("unknown", reason="the recording ended without an outcome")
+        else:
+            self.close("interrupted", reason=f"{type(error).__name__}: {error}")
+
+    def _slot(self, cycle: int) -> int:
+        return (cycle - (self._first or 0)) // self._cycles_per_chunk
+
+    def _ends_slot(self, cycle: int) -> bool:
+        return self._slot(cycle + 1) != self._slot(cycle)
+
+    def _emit(self, *, everything: bool) -> None:
+        """Write the pending records slot by slot; the slot still open only if all is wanted."""
+        if not self._pending:
+            return
+        records = np.concatenate([part for part, _ in self._pending])
+        torque = np.concatenate([part for _, part in self._pending])
+        slots = (records["cycle"] - (self._first or 0)) // self._cycles_per_chunk
+        cuts = [0, *(np.flatnonzero(np.diff(slots)) + 1).tolist(), len(records)]
+        if not everything and not self._ends_slot(int(records["cycle"][-1])):
+            cuts.pop()
+        for start, stop in zip(cuts, cuts[1:], strict=False):
+            self._file.add(self._encoder.encode(records[start:stop], torque[start:stop]))
+            self._last = int(records["cycle"][stop - 1])
+            self._file.flush()
+        rest = cuts[-1]
+        self._pending = [(records[rest:], torque[rest:])] if rest < len(records) else []
+
+
+def checked_metadata(
+    path: Path, metadata: Mapping[str, str], own: Mapping[str, object]
+) -> dict[str, str]:
+    """Join the caller's entries with our own, and with what the file name says.
+
+    Raises:
+        ArchiveWriteError: a key that is ours, no kind or an unknown one, or a contradiction
+            between entries and file name.
+    """
+    taken = _OWN_KEYS.intersection(metadata)
+    if taken:
+        raise ArchiveWriteError(
+            path, f"{', '.join(sorted(taken))} is written by the archive itself"
+        )
+    name = ArchiveName.parse(path)
+    named = name.metadata() if name else {}
+    entries = {**named, **{key: str(value) for key, value in metadata.items()}}
+    for key, value in named.items():
+        if entries[key] != value:
+            raise ArchiveWriteError(
+                path, f"{key} is {entries[key]!r}, but the file name says {value!r}", field=key
+            )
+    if entries.get("kind") not in KINDS:
+        raise ArchiveWriteError(
+            path,
+            f"{entries.get('kind')!r} is no kind of archive",
+            field="kind",
+            remedy=f"use {', '.join(KINDS)}",
+        )
+    return {**entries, **{key: json.dumps(value) for key, value in own.items()}}

@@ -1,0 +1,225 @@
+"""A campaign: all motions of one plan on one cell, each checked, run once and archived once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import ArchiveWriter
+from hil.cell import Cell
+from hil.progress import Reporter
+from hil.version import software
+from identification.excitation import CollisionChecker, CurrentModel, MotionCheck, check_motion
+from planner import PiecewiseCubic, TrajectoryPlayer, plan
+
+from .errors import CampaignFolderError, MotionFailedError, MotionRefusedError
+from .folder import CampaignFolder
+from .link import Link, Stop
+from .plan import CampaignPlan, current_model
+
+Array = NDArray[np.float64]
+
+AT_REST_TOLERANCE = 1e-6
+"""rad; a move shorter than this is not worth an interval."""
+
+
+@dataclass(frozen=True, eq=False)
+class Interval:
+    """One interval of motion: what kind it is and the trajectory to run."""
+
+    kind: str
+    index: int
+    trajectory: PiecewiseCubic
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.index}"
+
+
+@dataclass(frozen=True, eq=False)
+class Campaign:
+    """One folder: a cell, a plan, and what of it has been done."""
+
+    folder: CampaignFolder
+    cell: Cell
+    plan: CampaignPlan
+
+    @classmethod
+    def create(cls, root: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
+        """A new campaign folder with its own copies of cell, URDF and plan.
+
+        Raises:
+            CampaignFolderError: the folder holds something already.
+        """
+        if root.exists() and any(root.iterdir()):
+            raise CampaignFolderError(root, "is not empty", "name a new folder")
+        folder = CampaignFolder(root)
+        folder.archives.mkdir(parents=True)
+        urdf = root / Path(cell.file.cell.urdf).name
+        urdf.write_text(cell.urdf, encoding="utf-8")
+        folder.cell.write_text(cell.text, encoding="utf-8")
+        plan.save(folder.plan)
+        return cls(folder, cell, plan)
+
+    @classmethod
+    def open(cls, root: Path) -> Campaign:
+        """An existing campaign folder.
+
+        Raises:
+            CampaignFolderError: it is not one.
+            InputError: its cell or plan cannot be read.
+        """
+        folder = CampaignFolder(root)
+        if not folder.plan.exists():
+            raise CampaignFolderError(root, "is not a campaign folder", "name one that has plan.json")
+        return cls(folder, Cell.load(folder.cell), CampaignPlan.load(folder.plan))
+
+    def run(
+        self,
+        link: Link,
+        stop: Stop,
+        reporter: Reporter,
+        *,
+        provenance: Mapping[str, str],
+        durable: bool = True,
+    ) -> None:
+        """Run what is still missing, in order, and return to where the arm was.
+
+        Every motion is checked before the first one is sent.
+
+        Args:
+            link: to the controller.
+            stop: set from outside to bring the arm to rest on its path.
+            reporter: told of the progress.
+            provenance: goes into the metadata of every archive, e.g. whether it is simulated.
+            durable: wait at each flush until the disk has the data.
+
+        Raises:
+            MotionRefusedError: a motion failed its check; nothing was sent.
+            MotionFailedError: a motion ended otherwise than planned; it is archived.
+            ControllerFault: the controller did not come up.
+        """
+        intervals = self._missing(link.connect())
+        checks = _Checks(self.cell)
+        for interval in intervals:
+            checks.check(interval)
+        total = sum(interval.trajectory.duration for interval in intervals)
+        with reporter.task("running the campaign (s of motion)", total) as task:
+            for interval in intervals:
+                self._run_one(interval, link, stop, provenance, durable=durable)
+                task.advance(interval.trajectory.duration, str(interval))
+        link.close()
+
+    def _missing(self, where: Array) -> list[Interval]:
+        """What is still to be run with the arm at `where` (n,), there and back."""
+        settings, home, archived = self.cell.campaign, self.cell.home, self.folder
+        wanted = [
+            Interval("standstill", 0, hold(home, settings.standstill_s)),
+            *(
+                Interval("excitation", i, self.plan.excitation.trajectory)
+                for i in range(settings.repetitions)
+            ),
+            *(Interval("validation", i, m) for i, m in enumerate(self.plan.validation)),
+        ]
+        missing = [w for w in wanted if archived.whole(w.kind, w.index) is None]
+        if missing and np.max(np.abs(home - where)) > AT_REST_TOLERANCE:
+            missing = [self._move(0, where, home), *missing, self._move(1, home, where)]
+        return missing
+
+    def _move(self, index: int, start: Array, end: Array) -> Interval:
+        slow = self.cell.campaign.approach_speed
+        motion = plan(np.array([start, end]), self.cell.joint_limits, speed=slow)
+        return Interval("move", index, motion)
+
+    def _run_one(
+        self,
+        interval: Interval,
+        link: Link,
+        stop: Stop,
+        provenance: Mapping[str, str],
+        *,
+        durable: bool,
+    ) -> None:
+        cell, bounds = self.cell, self.cell.file.bounds.stop
+        player = TrajectoryPlayer(
+            interval.trajectory,
+            cell.period,
+            cell.joint_limits,
+            stop_acceleration=bounds.acceleration,
+            stop_jerk=bounds.jerk,
+        )
+        name = self.folder.next_name(interval.kind, interval.index)
+        writer = ArchiveWriter(
+            self.folder.archives / name.filename,
+            joint_names=cell.joint_names,
+            attachments=self._attachments(interval),
+            metadata=name.metadata() | self._metadata() | dict(provenance),
+            period=cell.period,
+            durable=durable,
+        )
+        with writer:
+            ended = link.run(player, writer, stop)
+            writer.close(ended.outcome, reason=ended.reason)
+        self.folder.add(name.filename, ended.outcome)
+        if ended.outcome != "completed":
+            raise MotionFailedError(str(interval), ended.outcome, ended.reason)
+
+    def _attachments(self, interval: Interval) -> dict[str, bytes]:
+        cell = self.cell
+        return {
+            "cell.toml": cell.text.encode(),
+            "robot.urdf": cell.urdf.encode(),
+            "drive_train.json": cell.drive_table.model_dump_json().encode(),
+            "plan.json": json.dumps(self._plan_of(interval)).encode(),
+        }
+
+    def _plan_of(self, interval: Interval) -> dict[str, Any]:
+        """What was planned for an interval: its trajectory, and how an excitation was found."""
+        if interval.kind == "excitation":
+            return {"excitation": self.plan.excitation.to_dict()}
+        return {"trajectory": interval.trajectory.to_dict()}
+
+    def _metadata(self) -> dict[str, str]:
+        return {
+            "campaign": self.folder.root.name,
+            "cell": self.cell.name,
+            **{f"software.{name}": version for name, version in software().items()},
+        }
+
+
+class _Checks:
+    """Limits, current and collision check of every motion, made once per trajectory."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._limits = cell.joint_limits
+        self._checker = CollisionChecker(cell.urdf, cell.workspace)
+        self._currents: CurrentModel = current_model(cell)
+        self._passed: set[int] = set()
+
+    def check(self, interval: Interval) -> None:
+        """Raise MotionRefusedError unless `interval` may be sent."""
+        if id(interval.trajectory) in self._passed:
+            return
+        result: MotionCheck = check_motion(
+            interval.trajectory, self._limits, checker=self._checker, currents=self._currents
+        )
+        if result.violations:
+            raise MotionRefusedError(
+                str(interval),
+                str(result.violations[0]),
+                "jog the arm or design another motion",
+            )
+        self._passed.add(id(interval.trajectory))
+
+
+def hold(position: Array, duration: float) -> PiecewiseCubic:
+    """Rest at `position` (n,) [rad] for `duration` [s]."""
+    return PiecewiseCubic(
+        knots=tuple(np.array([0.0, duration]) for _ in position),
+        coefficients=tuple(np.array([[q, 0.0, 0.0, 0.0]]) for q in position),
+    )

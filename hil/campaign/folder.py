@@ -1,0 +1,128 @@
+"""The campaign folder: what lies where, and which archives are whole.
+
+`manifest.json` names every closed archive with its checksum and outcome. It is replaced
+atomically after each archive, so a killed run loses at most the archive being written, and that
+file is recognised as torn because the manifest does not name it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from hil.archive import ArchiveName
+
+from .errors import CampaignFolderError
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One closed archive."""
+
+    name: str
+    outcome: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class CampaignFolder:
+    """Paths below one campaign folder."""
+
+    root: Path
+
+    @property
+    def archives(self) -> Path:
+        """Folder of the MCAP files."""
+        return self.root / "archives"
+
+    @property
+    def cell(self) -> Path:
+        """The campaign's own copy of the cell file."""
+        return self.root / "cell.toml"
+
+    @property
+    def plan(self) -> Path:
+        """Excitation and validation motions, as planned."""
+        return self.root / "plan.json"
+
+    @property
+    def results(self) -> Path:
+        """What the identification found."""
+        return self.root / "results.json"
+
+    @property
+    def report(self) -> Path:
+        """The report for people."""
+        return self.root / "report.html"
+
+    @property
+    def _manifest(self) -> Path:
+        return self.root / "manifest.json"
+
+    def manifest(self) -> list[Entry]:
+        """Closed archives in the order they were made.
+
+        Raises:
+            CampaignFolderError: the manifest cannot be read.
+        """
+        if not self._manifest.exists():
+            return []
+        try:
+            return [Entry(**entry) for entry in json.loads(self._manifest.read_text("utf-8"))]
+        except (ValueError, TypeError) as error:
+            raise CampaignFolderError(
+                self.root, f"manifest.json is damaged ({error})", "restore it or start a new folder"
+            ) from error
+
+    def add(self, name: str, outcome: str) -> None:
+        """Enter a closed archive into the manifest."""
+        digest = hashlib.sha256((self.archives / name).read_bytes()).hexdigest()
+        entries = [asdict(entry) for entry in self.manifest()] + [
+            asdict(Entry(name, outcome, digest))
+        ]
+        write_atomically(self._manifest, json.dumps(entries, indent=1) + "\n")
+
+    def whole(self, kind: str, index: int) -> str | None:
+        """Name of the whole archive of this interval, if there is one with outcome `completed`."""
+        for entry in reversed(self.manifest()):
+            name = ArchiveName.parse(entry.name)
+            if (
+                name is not None
+                and (name.kind, name.index, entry.outcome) == (kind, index, "completed")
+                and self._unchanged(entry)
+            ):
+                return entry.name
+        return None
+
+    def completed(self, kind: str) -> list[Path]:
+        """Whole archives of one kind, by index; of several attempts the last completed one."""
+        latest: dict[int, str] = {}
+        for entry in self.manifest():
+            name = ArchiveName.parse(entry.name)
+            if name is not None and name.kind == kind and entry.outcome == "completed":
+                latest[name.index] = entry.name
+        return [self.archives / latest[index] for index in sorted(latest)]
+
+    def next_name(self, kind: str, index: int) -> ArchiveName:
+        """Name of the next attempt at an interval; never that of an existing file."""
+        attempt = 1
+        while (self.archives / ArchiveName(kind, index, attempt).filename).exists():
+            attempt += 1
+        return ArchiveName(kind, index, attempt)
+
+    def _unchanged(self, entry: Entry) -> bool:
+        path = self.archives / entry.name
+        return path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() == entry.sha256
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace `path` by `text` so that a crash leaves the old or the new file, never half of one."""
+    temporary = path.with_suffix(path.suffix + ".tmp")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)

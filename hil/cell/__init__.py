@@ -1,0 +1,6 @@
+"""The cell: robot + drive train + controller link + limits, from one TOML file."""
+
+from .cell import Cell
+from .errors import CellError
+
+__all__ = ["Cell", "CellError"]

@@ -1,0 +1,350 @@
+"""The cell file, checked, and the three descriptions built from it."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from drivers.drive_train import DriveTrain
+from drivers.guard import GuardLimits
+from identification.errors import ModelError
+from identification.friction import FrictionLaw
+from identification.model import RobotModel
+from identification.excitation import Workspace
+from identification.excitation.constraints import Box
+from planner import JointLimits
+
+from .errors import CellError, first_error
+from .schema import (
+    BoundsTable,
+    CampaignTable,
+    CellTable,
+    ControllerTable,
+    DriveTrainTable,
+    LimitsTable,
+    NominalTable,
+    RobotTable,
+    SimulationTable,
+    WorkspaceTable,
+)
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+class CellFile(BaseModel):
+    """The whole file. Tables that a use does not need may be left out."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cell: CellTable
+    robot: RobotTable = RobotTable()
+    nominal: NominalTable | None = None
+    limits: LimitsTable | None = None
+    bounds: BoundsTable = BoundsTable()
+    drive_train: DriveTrainTable | None = None
+    controller: ControllerTable | None = None
+    workspace: WorkspaceTable = WorkspaceTable()
+    campaign: CampaignTable | None = None
+    simulation: SimulationTable | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One cell: its file's text, its URDF's text, and what both describe.
+
+    Angles are those of the URDF everywhere above `drivers`; the controller's own angles appear
+    in the file and in `controller_angles` only.
+    """
+
+    path: Path
+    text: str
+    urdf: str
+    file: CellFile
+
+    @classmethod
+    def load(cls, path: Path | str) -> Cell:
+        """Read and check a cell file and the URDF it names.
+
+        Raises:
+            CellError: names file, field, value and remedy.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise CellError(path, "", None, f"cannot be read ({error})", "name a TOML file") from error
+        file = _parse(path, text)
+        urdf_path = path.parent / file.cell.urdf
+        try:
+            urdf = urdf_path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise CellError(
+                path, "cell.urdf", file.cell.urdf, "cannot be read", f"put a URDF at {urdf_path}"
+            ) from error
+        return cls.from_texts(text, urdf, path)
+
+    @classmethod
+    def from_texts(cls, text: str, urdf: str, path: Path) -> Cell:
+        """The cell from its texts (an archive carries both); `path` only names it in errors."""
+        cell = cls(path, text, urdf, _parse(path, text))
+        try:
+            n_joints = cell.model.n_joints
+        except ModelError as error:
+            raise CellError(
+                path, "cell.urdf", cell.file.cell.urdf, str(error), "correct the URDF"
+            ) from error
+        _check_lengths(cell, n_joints)
+        return cell
+
+    @property
+    def name(self) -> str:
+        """The cell's short name."""
+        return self.file.cell.name
+
+    @cached_property
+    def model(self) -> RobotModel:
+        """Rigid body model with rotor inertias and friction law, from the URDF."""
+        return model_from(self.urdf, self.file.robot)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints in the order of the URDF."""
+        return tuple(self.model.joint_names)
+
+    @property
+    def period(self) -> float:
+        """The controller's cycle, s."""
+        return self.controller.cycle_ms / 1000
+
+    @property
+    def controller(self) -> ControllerTable:
+        """`[controller]`, which a campaign needs."""
+        return _required(self, self.file.controller, "controller")
+
+    @property
+    def campaign(self) -> CampaignTable:
+        """`[campaign]`."""
+        return _required(self, self.file.campaign, "campaign")
+
+    @property
+    def simulation(self) -> SimulationTable:
+        """`[simulation]`: the planted truth; only a simulated cell has one."""
+        return _required(self, self.file.simulation, "simulation")
+
+    @cached_property
+    def joint_limits(self) -> JointLimits:
+        """Limits of the plan in URDF angles (rad, rad/s, rad/s², rad/s³)."""
+        limits = _required(self, self.file.limits, "limits")
+        lower, upper = np.radians(limits.lower_deg), np.radians(limits.upper_deg)
+        if limits.frame == "controller":
+            a, b = self.urdf_angles(lower), self.urdf_angles(upper)
+            lower, upper = np.minimum(a, b), np.maximum(a, b)
+        return JointLimits(
+            lower=lower,
+            upper=upper,
+            velocity=np.radians(limits.velocity_deg),
+            acceleration=np.radians(limits.acceleration_deg),
+            jerk=np.radians(limits.jerk_deg),
+        )
+
+    @cached_property
+    def drive_train(self) -> DriveTrain:
+        """Motors, gears and wrist coupling."""
+        table = self.drive_table
+        return DriveTrain(
+            gear_ratio=np.array(table.gear_ratio),
+            calibration=np.array(table.calibration),
+            k54=table.k54,
+            k64=table.k64,
+            k65=table.k65,
+            joint_sign=np.array(table.joint_sign, dtype=float),
+            joint_offset=np.radians(table.joint_offset_deg),
+            torque_constant=np.array(table.torque_constant),
+            current_limit=np.array(table.current_limit),
+        )
+
+    @property
+    def drive_table(self) -> DriveTrainTable:
+        """`[drive_train]` as written in the file."""
+        return _required(self, self.file.drive_train, "drive_train")
+
+    @property
+    def guard_limits(self) -> GuardLimits:
+        """What the guard enforces on every set-point."""
+        limits, bounds = self.joint_limits, self.file.bounds
+        return GuardLimits(
+            lower=limits.lower,
+            upper=limits.upper,
+            velocity=limits.velocity,
+            acceleration=limits.acceleration,
+            jerk=limits.jerk,
+            following_error=np.array(self.drive_table.following_error),
+            current=self.drive_train.current_limit,
+            override_acceleration=bounds.override.acceleration,
+            override_jerk=bounds.override.jerk,
+            stop_acceleration=bounds.stop.acceleration,
+            stop_jerk=bounds.stop.jerk,
+        )
+
+    @property
+    def workspace(self) -> Workspace:
+        """Floor, walls and clearance."""
+        table = self.file.workspace
+        return Workspace(
+            floor=table.floor,
+            boxes=tuple(Box(lower=tuple(b.lower), upper=tuple(b.upper)) for b in table.walls),
+            margin=table.margin,
+        )
+
+    @property
+    def home(self) -> Array:
+        """Start posture of every excitation (n,), URDF angles, rad."""
+        return self._posture(self.campaign.home_deg)
+
+    @property
+    def initial(self) -> Array:
+        """Where the simulated arm stands at first (n,), URDF angles, rad."""
+        return self._posture(self.simulation.initial_deg)
+
+    def with_campaign(
+        self,
+        *,
+        repetitions: int | None = None,
+        validation_runs: int | None = None,
+        simulation_seed: int | None = None,
+    ) -> Cell:
+        """This cell with some campaign settings replaced, in its text too; None keeps a setting."""
+        wanted = {
+            ("campaign", "repetitions"): repetitions,
+            ("campaign", "validation_runs"): validation_runs,
+            ("simulation", "seed"): simulation_seed,
+        }
+        text = self.text
+        for (table, key), value in wanted.items():
+            if value is not None:
+                text = replaced_value(text, table, key, value)
+        return Cell.from_texts(text, self.urdf, self.path)
+
+    @property
+    def nominal(self) -> NominalTable:
+        """`[nominal]`."""
+        return _required(self, self.file.nominal, "nominal")
+
+    def nominal_values(self) -> Array:
+        """The manufacturer's parameter vector (p,): URDF inertias and `[nominal]`."""
+        table = self.nominal
+        return self.parameter_values(
+            rotor_inertia=np.array(table.rotor_inertia),
+            coulomb=np.array(table.coulomb),
+            viscous=np.array(table.viscous),
+            third=np.array(table.third),
+        )
+
+    def parameter_values(
+        self, *, rotor_inertia: Array, coulomb: Array, viscous: Array, third: Array
+    ) -> Array:
+        """Parameter vector (p,) of the URDF's inertias with these joint-side figures (n,)."""
+        model = self.model
+        standard = model.nominal.copy()
+        for joint, inertia in enumerate(rotor_inertia, 1):
+            if (rotor := f"I{joint}m") in model.standard_names:
+                standard[model.standard_names.index(rotor)] = inertia
+        known = {"f0": coulomb, "f1": viscous, "f2": third}
+        none = np.zeros(model.n_joints)
+        friction = [known.get(symbol, none) for symbol in model.friction.symbols]
+        return np.concatenate([model.base.grouping @ standard, *friction])
+
+    def urdf_angles(self, controller_angles: Array) -> Array:
+        """URDF angles (n,) from the teach pendant's, rad."""
+        table = self.drive_table
+        result: Array = (controller_angles - np.radians(table.joint_offset_deg)) * np.array(
+            table.joint_sign
+        )
+        return result
+
+    def controller_angles(self, urdf_angles: Array) -> Array:
+        """The teach pendant's angles (n,) from those of the URDF, rad."""
+        table = self.drive_table
+        result: Array = urdf_angles * np.array(table.joint_sign) + np.radians(
+            table.joint_offset_deg
+        )
+        return result
+
+    def _posture(self, degrees: list[float]) -> Array:
+        angles: Array = np.radians(degrees)
+        limits = _required(self, self.file.limits, "limits")
+        return self.urdf_angles(angles) if limits.frame == "controller" else angles
+
+
+def model_from(urdf: str, robot: RobotTable) -> RobotModel:
+    """The model a `[robot]` table describes.
+
+    Raises:
+        ModelError: the URDF cannot be used.
+    """
+    friction = robot.friction
+    return RobotModel.from_urdf(
+        urdf,
+        gravity=tuple(robot.gravity),
+        rotor_inertia=robot.rotor_inertia,
+        friction=FrictionLaw(
+            coulomb=friction.coulomb,
+            viscous=friction.viscous,
+            third=None if friction.third == "none" else friction.third,
+            offset=friction.offset,
+            standstill=friction.standstill,
+        ),
+    )
+
+
+def _parse(path: Path, text: str) -> CellFile:
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise CellError(path, "", None, f"is not TOML ({error})", "correct that line") from error
+    try:
+        return CellFile.model_validate(raw)
+    except ValidationError as error:
+        raise first_error(path, error, CellFile) from error
+
+
+def _required(cell: Cell, table: T | None, name: str) -> T:
+    if table is None:
+        raise CellError(cell.path, name, None, "is missing", f"add a table [{name}]")
+    return table
+
+
+def replaced_value(text: str, table: str, key: str, value: int) -> str:
+    """The TOML `text` with `key` of `[table]` set to `value`; comments and order stay."""
+    pattern = rf"(?ms)(^\[{table}\]$(?:(?!^\[).)*?^{key} *= *)[^\n#]*"
+    changed, count = re.subn(pattern, rf"\g<1>{value}", text, count=1)
+    if count:
+        return changed
+    return re.sub(rf"(?m)^\[{table}\]$", f"[{table}]\n{key} = {value}", text, count=1)
+
+
+_NOT_PER_JOINT = {"gravity", "assumed", "elasticity"}
+
+
+def _check_lengths(cell: Cell, n_joints: int) -> None:
+    """Every list that has one entry per joint has as many as the URDF has joints."""
+    for table_name in ("nominal", "limits", "drive_train", "campaign", "simulation"):
+        table = getattr(cell.file, table_name)
+        for name, value in table or ():
+            if isinstance(value, list) and name not in _NOT_PER_JOINT and len(value) != n_joints:
+                raise CellError(
+                    cell.path,
+                    f"{table_name}.{name}",
+                    value,
+                    f"has {len(value)} entries but the URDF has {n_joints} joints",
+                    f"give one entry for each of {', '.join(cell.joint_names)}",
+                )

@@ -1,0 +1,91 @@
+"""Errors of the `hil` package.
+
+```
+HilError                   exit status 1
+├── UnsafeError            3: a motion was refused before anything was sent
+├── ControllerFault        4: the controller, the link or the guard ended a motion
+└── InputError             2: something the user gave cannot be used: file, field, problem, remedy
+    ├── ArchiveError       an archive that cannot be read or written
+    │   ├── NotAnArchiveError       no archive of ours: other format, empty, torn before its first data
+    │   ├── ArchiveVersionError     written by a newer version of the archive profile
+    │   └── ArchiveWriteError       the file cannot be created or the disk refuses
+    └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
+```
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import ClassVar
+
+
+class HilError(Exception):
+    """Anything `hil` refuses to do; the message is a sentence for the person at the keyboard.
+
+    Attributes:
+        exit_code: exit status of the command line when this error ends it.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+
+class InputError(HilError):
+    """Something given by the user that cannot be used.
+
+    Attributes:
+        path: the file to blame, None when it is not a file.
+        field: the part of it (table and key, column, topic, record), "" for the whole.
+        problem: what is wrong with it, with the value found.
+        remedy: what would be right, "" when nothing can be advised.
+    """
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(
+        self,
+        path: str | PathLike[str] | None,
+        problem: str,
+        *,
+        field: str = "",
+        remedy: str = "",
+    ) -> None:
+        self.path = None if path is None else Path(path)
+        self.field = field
+        self.problem = problem
+        self.remedy = remedy
+        place = [str(part) for part in (self.path, field) if part]
+        sentence = ": ".join([*place, problem])
+        super().__init__(f"{sentence}; {remedy}" if remedy else sentence)
+
+
+class ArchiveError(InputError):
+    """An archive that cannot be read or written."""
+
+
+class NotAnArchiveError(ArchiveError):
+    """A file that is not an archive of ours, or was torn before it held anything."""
+
+
+class ArchiveVersionError(ArchiveError):
+    """An archive written with a profile version this software does not know."""
+
+
+class ArchiveWriteError(ArchiveError):
+    """An archive that cannot be created, or whose disk refuses to take more."""
+
+
+class SourceError(InputError):
+    """A foreign recording that cannot be imported."""
+
+
+class UnsafeError(HilError):
+    """A motion that was refused before anything was sent."""
+
+    exit_code: ClassVar[int] = 3
+
+
+class ControllerFault(HilError):
+    """The controller, the link or the guard ended a motion."""
+
+    exit_code: ClassVar[int] = 4

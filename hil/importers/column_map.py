@@ -1,0 +1,164 @@
+"""Which columns of a log hold what: the map that makes a CSV file readable.
+
+It is a small TOML file, or the same built in Python. `docs/archive-format.md` has an example.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from os import PathLike
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+
+from hil.errors import SourceError
+
+ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "rev": 6.283185307179586, "m": 1.0}
+RATES = {
+    "rad/s": 1.0,
+    "deg/s": ANGLES["deg"],
+    "rev/s": ANGLES["rev"],
+    "rpm": ANGLES["rev"] / 60.0,
+    "m/s": 1.0,
+}
+TORQUES = {"N.m": 1.0, "N·m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "kN.m": 1e3, "N": 1.0}
+CURRENTS = {"A": 1.0, "mA": 1e-3}
+UNITS = {"position": ANGLES, "velocity": RATES, "torque": TORQUES, "motor_current": CURRENTS}
+QUANTITIES = tuple(UNITS)
+TIMES = {"s": 0, "ms": 3, "us": 6, "ns": 9}  # decimal places to shift
+
+Vector = tuple[FiniteFloat, ...]
+Column = Annotated[int, Field(ge=0)] | str
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Quantity(_Table):
+    """Where a joint quantity stands.
+
+    Attributes:
+        columns: one per joint, by name or by index from 0; or one name with ``{}`` in the place of
+            the joint's number, from 1.
+        file: the file, relative to the log that is imported; None for that log itself.
+        unit: a unit of the quantity; None for the SI one.
+        scale: further factor, one for all joints or one each; a sign, or a current sensor's gain.
+        side: ``joint``, or ``motor`` when it was measured before the gears.
+    """
+
+    columns: Annotated[tuple[Column, ...], Field(min_length=1)] | str
+    file: str | None = None
+    unit: str | None = None
+    scale: FiniteFloat | Vector = 1.0
+    side: Literal["joint", "motor"] = "joint"
+
+
+class TimeColumn(_Table):
+    """Where the time stands: a column by name or index, in s, ms, us or ns."""
+
+    column: Column
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+
+
+class Drive(_Table):
+    """What lies between motors and joints, for quantities of the motor side.
+
+    Attributes:
+        gear_ratio: motor turns per joint turn, with sign.
+        coupling: further influences ``[motor, joint, motor turns per joint turn]``, numbered from
+            1: ``[6, 5, 32.0]`` says that joint 5 turns motor 6.
+        joint_offset: angle of the URDF where the recorded angle is zero [rad].
+        torque_constant: N·m/A on the motor side; makes torques of motor currents where the log
+            has no torque.
+    """
+
+    gear_ratio: Vector | None = None
+    coupling: tuple[
+        tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], FiniteFloat], ...
+    ] = ()
+    joint_offset: Vector | None = None
+    torque_constant: Vector | None = None
+
+
+class Format(_Table):
+    """How the text is written; what is None is found out.
+
+    Attributes:
+        delimiter: between columns.
+        decimal: the decimal mark.
+        skip_rows: lines before the header, or before the data.
+        header: whether a line of column names comes first.
+    """
+
+    delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = None
+    decimal: Literal[".", ","] = "."
+    skip_rows: Annotated[int, Field(ge=0)] = 0
+    header: bool | None = None
+
+
+class ColumnMap(_Table):
+    """The whole map.
+
+    Attributes:
+        position: always needed.
+        velocity, torque, motor_current: as far as they were recorded.
+        time: the time column; either it or `sample_rate`.
+        sample_rate: samples per second of a log without time column [Hz].
+        joints: the URDF's joint of each column, where their order is not that of the URDF.
+        drive: gears, for quantities of the motor side.
+        format: delimiter and the like.
+    """
+
+    position: Quantity
+    velocity: Quantity | None = None
+    torque: Quantity | None = None
+    motor_current: Quantity | None = None
+    time: TimeColumn | None = None
+    sample_rate: Annotated[FiniteFloat, Field(gt=0.0)] | None = None
+    joints: tuple[str, ...] | None = None
+    drive: Drive = Drive()
+    format: Format = Format()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.time is None) == (self.sample_rate is None):
+            raise ValueError("give either a time column or sample_rate")
+        for name, quantity in self.quantities().items():
+            if quantity.unit not in (None, *UNITS[name]):
+                raise ValueError(
+                    f"{quantity.unit!r} is no unit of {name}; known are {', '.join(UNITS[name])}"
+                )
+            if quantity.side == "motor" and name != "motor_current" and not self.drive.gear_ratio:
+                raise ValueError(f"{name} is of the motor side, so drive.gear_ratio is needed")
+        return self
+
+    def quantities(self) -> dict[str, Quantity]:
+        """The quantities in the log, by name."""
+        found = {name: getattr(self, name) for name in QUANTITIES}
+        return {name: quantity for name, quantity in found.items() if quantity is not None}
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> ColumnMap:
+        """Read a map from a TOML file.
+
+        Raises:
+            SourceError: the file cannot be read, or says something a map cannot say.
+        """
+        path = Path(path)
+        try:
+            return cls.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise SourceError(
+                path, f"cannot be read ({error})", remedy="name a TOML file"
+            ) from error
+        except ValidationError as error:
+            detail = error.errors(include_url=False)[0]
+            place = ".".join(str(part) for part in detail["loc"])
+            problem = detail["msg"].removeprefix("Value error, ")
+            if detail["type"] == "extra_forbidden":
+                problem = "is not an entry of a column map"
+            raise SourceError(
+                path, problem, field=place, remedy="see the column map in docs/archive-format.md"
+            ) from error

@@ -1,0 +1,84 @@
+"""The last step of every importer: samples are checked and become an archive."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from hil.archive import Samples, write_samples
+from hil.errors import SourceError
+from hil.importers.robot import Robot
+
+
+def write_imported(
+    output: str | PathLike[str],
+    samples: Samples,
+    *,
+    source: Sequence[Path],
+    robot: Robot,
+    metadata: Mapping[str, str],
+    held_joints: Sequence[str] = (),
+    period: float | None = None,
+) -> Path:
+    """Write the samples of a recording, joints in the order of the robot's, as an archive.
+
+    Raises:
+        SourceError: no sample, or a value that is not finite.
+        ArchiveWriteError: the archive cannot be written.
+    """
+    _check(samples, source[0], robot.joint_names)
+    unknown = [name for name in held_joints if name not in robot.joint_names]
+    if unknown:
+        raise SourceError(
+            source[0],
+            f"no joint is called {unknown[0]!r}",
+            field="held joints",
+            remedy=f"the robot's joints are {', '.join(robot.joint_names)}",
+        )
+    entries = {
+        **metadata,
+        "source": json.dumps([path.name for path in source]),
+        "source_sha256": json.dumps([_digest(path) for path in source]),
+        "held_joints": json.dumps(list(held_joints)),
+    }
+    return write_samples(
+        output,
+        samples,
+        joint_names=robot.joint_names,
+        metadata=entries,
+        attachments=robot.attachments(),
+        period=period,
+    )
+
+
+def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
+    if not len(samples.stamp):
+        raise SourceError(source, "holds no sample")
+    quantities = {
+        "position": samples.position,
+        "velocity": samples.velocity,
+        "torque": samples.torque,
+        "motor current": samples.motor_current,
+    }
+    elapsed = (samples.stamp - samples.stamp[0]) * 1e-9
+    for name, values in quantities.items():
+        if values is None:
+            continue
+        rows, columns = np.nonzero(~np.isfinite(values))
+        if rows.size:
+            raise SourceError(
+                source,
+                f"{name} of joint {joints[columns[0]]} is {values[rows[0], columns[0]]} in sample "
+                f"{rows[0]} ({elapsed[rows[0]]:.6g} s; {rows.size} such values)",
+                remedy="cut the recording there, or leave the quantity out",
+            )
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

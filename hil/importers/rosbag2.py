@@ -1,0 +1,255 @@
+"""Imports joint states from a rosbag2 recording (sqlite3 storage)."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from hil.archive import Samples
+from hil.errors import SourceError
+from hil.importers.output import write_imported
+from hil.importers.robot import Robot
+
+Array = NDArray[np.float64]
+Effort = Literal["torque", "motor_current", "ignore"]
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+
+def import_rosbag2(
+    source: str | PathLike[str],
+    output: str | PathLike[str],
+    *,
+    robot: Robot,
+    topic: str | None = None,
+    effort: Effort = "torque",
+    joint_names: Mapping[str, str] | None = None,
+    held_joints: Sequence[str] = (),
+) -> Path:
+    """Turn the joint states of a bag into an archive of kind ``imported``.
+
+    Joints are found by name and put into the order of the robot's. Messages that have none of them
+    (a gripper on the same topic) are passed over. Stamps are those in the messages' headers; where
+    all headers are empty, the bag's.
+
+    Args:
+        source: the ``.db3`` file, or the bag's folder.
+        output: the archive to write.
+        robot: whose joints these are.
+        topic: the topic, None where only one carries joint states.
+        effort: what the messages' effort is: joint torque [N·m] as the message defines it, motor
+            current [A] as some drivers have it, or nothing to be relied on.
+        joint_names: name in the URDF by name in the bag, for the joints where they differ.
+        held_joints: joints known to have been held still.
+
+    Returns:
+        The archive's path.
+
+    Raises:
+        SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.
+        ArchiveWriteError: the archive cannot be written.
+    """
+    files = _files(Path(source))
+    states = _States(files[0], robot.joint_names, joint_names or {})
+    chosen = topic
+    for file in files:
+        with closing(_connect(file)) as bag:
+            chosen = _choose(bag, file, chosen)
+            for stamp, data in _messages(bag, chosen):
+                states.add(stamp, data)
+    return write_imported(
+        output,
+        states.samples(effort),
+        source=files,
+        robot=robot,
+        metadata={
+            "importer": "rosbag2",
+            "topic": str(chosen),
+            "clock": states.clock,
+            "effort": effort,
+        },
+        held_joints=held_joints,
+    )
+
+
+def _files(source: Path) -> list[Path]:
+    if not source.exists():
+        raise SourceError(source, "does not exist", remedy="name a .db3 file or a bag's folder")
+    files = sorted(source.glob("*.db3")) if source.is_dir() else [source]
+    if not files:
+        raise SourceError(
+            source, "has no .db3 file in it", remedy="only bags in sqlite3 storage can be imported"
+        )
+    return files
+
+
+def _connect(file: Path) -> sqlite3.Connection:
+    """Open for reading only; leave no side files beside a bag that nobody writes."""
+    options = "mode=ro" if file.with_name(file.name + "-wal").exists() else "mode=ro&immutable=1"
+    try:
+        bag = sqlite3.connect(f"{file.resolve().as_uri()}?{options}", uri=True)
+        bag.execute("SELECT id, name, type, serialization_format FROM topics").close()
+        bag.execute("SELECT topic_id, timestamp, data FROM messages LIMIT 1").close()
+    except sqlite3.Error as error:
+        raise SourceError(
+            file, f"is not a rosbag2 in sqlite3 storage ({error})", remedy="name the .db3 file"
+        ) from error
+    return bag
+
+
+def _choose(bag: sqlite3.Connection, file: Path, topic: str | None) -> str:
+    """The topic asked for, or the only one that carries joint states."""
+    query = "SELECT name, type, serialization_format FROM topics ORDER BY name"
+    topics = {name: (kind, encoding) for name, kind, encoding in bag.execute(query)}
+    listing = ", ".join(f"{name} ({kind})" for name, (kind, _) in topics.items()) or "none"
+    fitting = [name for name, (kind, _) in topics.items() if kind == JOINT_STATE]
+    if topic is None:
+        if len(fitting) != 1:
+            raise SourceError(
+                file,
+                f"{len(fitting) or 'no'} topics carry {JOINT_STATE}",
+                field="topic",
+                remedy=f"name one of its topics: {listing}",
+            )
+        topic = fitting[0]
+    if topic not in topics:
+        raise SourceError(
+            file, f"there is no topic {topic}", field="topic", remedy=f"its topics are: {listing}"
+        )
+    kind, encoding = topics[topic]
+    if kind != JOINT_STATE or encoding != "cdr":
+        raise SourceError(
+            file,
+            f"topic {topic} carries {kind} in {encoding}, not measured joint states",
+            field="topic",
+            remedy=f"name a topic of type {JOINT_STATE}; the bag has: {listing}",
+        )
+    return topic
+
+
+def _messages(bag: sqlite3.Connection, topic: str) -> Iterator[tuple[int, bytes]]:
+    yield from bag.execute(
+        "SELECT messages.timestamp, messages.data FROM messages"
+        " JOIN topics ON topics.id = messages.topic_id WHERE topics.name = ?"
+        " ORDER BY messages.timestamp, messages.id",
+        (topic,),
+    )
+
+
+@dataclass(eq=False)
+class _States:
+    """Collects joint state messages, joints in the order wanted.
+
+    Attributes:
+        source: the bag, for errors.
+        joints: the joints wanted, by their names in the URDF.
+        renamed: name in the URDF by name in the bag.
+    """
+
+    source: Path
+    joints: Sequence[str]
+    renamed: Mapping[str, str]
+    header_stamps: list[int] = field(default_factory=list)
+    bag_stamps: list[int] = field(default_factory=list)
+    rows: dict[str, list[Array]] = field(
+        default_factory=lambda: {"position": [], "velocity": [], "effort": []}
+    )
+
+    def __post_init__(self) -> None:
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._orders: dict[tuple[str, ...], list[int]] = {}
+        self._seen: list[str] = []
+
+    @property
+    def clock(self) -> str:
+        """Whose stamps the samples have."""
+        return "header" if any(self.header_stamps) else "bag"
+
+    def add(self, bag_stamp: int, data: bytes) -> None:
+        """Take a message in, unless it has none of the joints."""
+        try:
+            message: Any = self._store.deserialize_cdr(data, JOINT_STATE)
+        except (SerdeError, ValueError, IndexError, UnicodeDecodeError) as error:
+            raise SourceError(
+                self.source, f"message {len(self.bag_stamps)} cannot be decoded ({error})"
+            ) from error
+        order = self._order(tuple(message.name))
+        if not order:
+            return
+        stamp = message.header.stamp
+        self.header_stamps.append(stamp.sec * 10**9 + stamp.nanosec)
+        self.bag_stamps.append(bag_stamp)
+        for name, rows in self.rows.items():
+            values = getattr(message, name)
+            if len(values) == len(message.name):
+                rows.append(values[order])
+            elif len(values):
+                raise SourceError(
+                    self.source,
+                    f"message {len(self.bag_stamps) - 1} has {len(values)} values for "
+                    f"{len(message.name)} joints",
+                    field=name,
+                )
+
+    def samples(self, effort: Effort) -> Samples:
+        """Everything taken in."""
+        if not self.bag_stamps:
+            recorded = f"recorded are {', '.join(self._seen)}" if self._seen else "it is empty"
+            raise SourceError(
+                self.source,
+                f"none of the joints {', '.join(self.joints)} was recorded; {recorded}",
+                field="joints",
+                remedy="give the URDF of this robot, or map the names",
+            )
+        position = self._column("position")
+        if position is None:
+            raise SourceError(self.source, "the messages have no positions", field="position")
+        strength = None if effort == "ignore" else self._column("effort")
+        stamps = self.header_stamps if self.clock == "header" else self.bag_stamps
+        return Samples(
+            stamp=np.array(stamps, np.int64),
+            position=position,
+            velocity=self._column("velocity"),
+            torque=strength if effort == "torque" else None,
+            motor_current=strength if effort == "motor_current" else None,
+        )
+
+    def _column(self, name: str) -> Array | None:
+        """A quantity that all messages have; None when none has it."""
+        rows = self.rows[name]
+        if not rows:
+            return None
+        if len(rows) != len(self.bag_stamps):
+            raise SourceError(
+                self.source,
+                f"only {len(rows)} of {len(self.bag_stamps)} messages have it",
+                field=name,
+                remedy="record it throughout",
+            )
+        return np.array(rows, np.float64)
+
+    def _order(self, names: tuple[str, ...]) -> list[int]:
+        """Where the wanted joints stand in a message; empty when it has none of them."""
+        if names not in self._orders:
+            self._seen += [name for name in names if name not in self._seen]
+            ours = [self.renamed.get(name, name) for name in names]
+            missing = [joint for joint in self.joints if joint not in ours]
+            if missing and len(missing) < len(self.joints):
+                raise SourceError(
+                    self.source,
+                    f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}",
+                    field="joints",
+                    remedy="map the names, or fix the joints that were not recorded",
+                )
+            self._orders[names] = [] if missing else [ours.index(joint) for joint in self.joints]
+        return self._orders[names]

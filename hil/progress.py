@@ -1,0 +1,131 @@
+"""How long work reports itself: a progress bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+
+class Reporter(Protocol):
+    """What long work tells a person."""
+
+    def say(self, text: str) -> None:
+        """One line that stays."""
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        """A piece of work of `total` units; advance it through the yielded task."""
+
+
+class Task(Protocol):
+    """The running piece of work."""
+
+    def advance(self, units: float, note: str = "") -> None:
+        """`units` more are done; `note` says what is being done now."""
+
+
+class Silent:
+    """Says nothing (tests, scripts)."""
+
+    def say(self, text: str) -> None:
+        """Drop the line."""
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        """A task nobody sees."""
+        del title, total
+        yield _SilentTask()
+
+
+class _SilentTask:
+    def advance(self, units: float, note: str = "") -> None:
+        del units, note
+
+
+class Plain:
+    """One line per tenth of a task: for logs and pipes."""
+
+    def __init__(self) -> None:
+        self._out = sys.stdout
+
+    def say(self, text: str) -> None:
+        """Print the line at once."""
+        self._out.write(text + "\n")
+        self._out.flush()
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        """Print `title` and every tenth of the way."""
+        self.say(title)
+        yield _PlainTask(self, title, total)
+
+
+class _PlainTask:
+    def __init__(self, reporter: Plain, title: str, total: float) -> None:
+        self._reporter, self._title, self._total = reporter, title, max(total, 1e-12)
+        self._done, self._said = 0.0, 0
+
+    def advance(self, units: float, note: str = "") -> None:
+        self._done += units
+        tenth = int(10 * self._done / self._total + 1e-9)
+        if tenth > self._said:
+            self._said = tenth
+            self._reporter.say(f"{self._title}: {10 * tenth} %  {note}".rstrip())
+
+
+class Bar:
+    """rich progress bars."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+
+    def say(self, text: str) -> None:
+        """Print the line above the bar."""
+        self._console.print(text, highlight=False, markup=False)
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        """A bar with what is done, the time taken and the time left."""
+        progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=self._console,
+            transient=True,
+        )
+        with progress:
+            yield _BarTask(progress, progress.add_task(title, total=round(total), note=""))
+
+
+class _BarTask:
+    def __init__(self, progress: Progress, task: TaskID) -> None:
+        self._progress, self._task, self._done = progress, task, 0.0
+
+    def advance(self, units: float, note: str = "") -> None:
+        self._done += units
+        self._progress.update(self._task, completed=round(self._done), note=note)
+
+
+def reporter(*, quiet: bool = False) -> Reporter:
+    """Bars on a terminal, lines elsewhere, nothing if `quiet`."""
+    if quiet:
+        return Silent()
+    console = Console()
+    return Bar(console) if console.is_terminal else Plain()

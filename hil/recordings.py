@@ -1,0 +1,105 @@
+"""From archive files to what identification reads."""
+
+from __future__ import annotations
+
+import json
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import Archive, open_archive
+from hil.errors import ArchiveError
+from identification.recording import Recording
+
+Array = NDArray[np.float64]
+
+_FIELDS = (
+    "cycle",
+    "gap",
+    "position",
+    "torque",
+    "target_current",
+    "motor_current",
+    "commanded_position",
+)
+
+
+def open_recording(path: str | PathLike[str]) -> Recording:
+    """Read an archive as a recording.
+
+    Works on archives of this package and on imported ones. An archive that was cut off gives what
+    is whole of it; the recording's provenance then has an entry ``missing`` that says what is not.
+    The recording is as it was taken: `Recording.checked` decides whether it can be identified from.
+
+    Args:
+        path: the archive.
+
+    Raises:
+        ArchiveError: the file is no archive, cannot be read, or holds no sample.
+    """
+    return recording_of(open_archive(path, fields=_FIELDS))
+
+
+def recording_of(archive: Archive) -> Recording:
+    """The recording in an opened archive; see `open_recording`.
+
+    Its time begins at zero and is counted in the controller's cycles (samples, where an imported
+    recording has a fixed rate), not in times of arrival.
+
+    Raises:
+        ArchiveError: the archive holds no sample.
+    """
+    columns = archive.columns
+    if not archive.n_samples or "position" not in columns:
+        raise ArchiveError(
+            archive.path,
+            f"holds no sample{f' ({archive.damage})' if archive.damage else ''}",
+            remedy="record it again",
+        )
+    current = columns.get("target_current", columns.get("motor_current"))
+    return Recording(
+        time=_time(archive),
+        position=columns["position"],
+        joint_names=archive.joint_names,
+        torque=_known(columns.get("torque")),
+        motor_current=current,
+        commanded_position=columns.get("commanded_position"),
+        gap_before=_gaps(archive),
+        held_joints=tuple(json.loads(archive.metadata.get("held_joints", "[]"))),
+        provenance=_provenance(archive),
+    )
+
+
+def _time(archive: Archive) -> Array:
+    """Seconds since the first sample."""
+    columns, period = archive.columns, archive.period
+    if "cycle" in columns:
+        if period is None:
+            raise ArchiveError(archive.path, "has cycles but no period", field="period")
+        cycles = columns["cycle"]
+        return np.asarray((cycles - cycles[0]) * period)
+    elapsed = np.asarray((columns["stamp"] - columns["stamp"][0]) * 1e-9)
+    return elapsed if period is None else np.asarray(np.rint(elapsed / period) * period)
+
+
+def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
+    """Where cycles are missing: reported lost by the link, or not archived."""
+    if "cycle" not in archive.columns:
+        return None
+    skipped = np.diff(archive.columns["cycle"], prepend=archive.columns["cycle"][0] - 1) > 1
+    return np.asarray(skipped | (archive.columns["gap"] > 0))
+
+
+def _known(torque: Array | None) -> Array | None:
+    """None where the recording has no torque at all."""
+    return None if torque is None or np.isnan(torque).all() else torque
+
+
+def _provenance(archive: Archive) -> dict[str, str]:
+    provenance = {"archive": archive.path.name, **archive.metadata}
+    for key, value in (archive.outcome or {}).items():
+        provenance[key if key == "outcome" else f"outcome.{key}"] = value
+    if archive.missing is not None:
+        provenance["missing"] = archive.missing
+    return provenance

@@ -1,0 +1,189 @@
+"""Parameters as dots: how far from the truth, and how far the routes to a std disagree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from hil.report import numbers
+from hil.report.figures.canvas import TICK_SIZE, blank, footed, place
+from hil.report.figures.palette import (
+    BAND,
+    GRID,
+    INK,
+    INSIDE,
+    MUTED,
+    OUTSIDE_2,
+    OUTSIDE_3,
+    PAPER,
+    ROUTES,
+)
+from hil.report.figures.svg import Panel, drawing, label, to_panel
+from hil.report.parameters import Route, deviation, short_label
+from hil.results import Results
+
+_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 370.0, 92.0, 14.0, 8.0, 40.0
+_ROW = 14.5
+_MOST_ROWS = 20
+_FURTHEST = 6.5
+_ROUTE_MARKERS = ("o", "D", "^", "s")
+
+
+def groups(results: Results) -> list[tuple[str, list[int]]]:
+    """Parameters in stretches of at most twenty; base parameters and friction never mixed."""
+    found = []
+    everything = list(range(len(results.parameters)))
+    for name, members in (
+        ("Base parameters", everything[: results.n_base]),
+        ("Friction", everything[results.n_base :]),
+    ):
+        count = math.ceil(len(members) / _MOST_ROWS)
+        parts = [part.tolist() for part in np.array_split(members, count)] if count else []
+        for k, part in enumerate(parts):
+            title = name if count == 1 else f"{name}, {k + 1} of {count}"
+            found.append((title, [int(i) for i in part]))
+    return found
+
+
+def deviation_panels(results: Results) -> list[Panel]:
+    """(estimate - truth) / std of every parameter that has a planted truth."""
+    values = [deviation(p) for p in results.parameters]
+    known = [z for z in values if z is not None]
+    if not known:
+        return []
+    reach = min(_FURTHEST, max(4.0, max(abs(z) for z in known) + 0.5))
+    return [
+        _deviation_panel(results, k, title, members, values, reach)
+        for k, (title, members) in enumerate(groups(results))
+    ]
+
+
+def _deviation_panel(
+    results: Results,
+    k: int,
+    title: str,
+    members: list[int],
+    values: Sequence[float | None],
+    reach: float,
+) -> Panel:
+    shown = [(row, z) for row, i in enumerate(members) if (z := values[i]) is not None]
+    outside = sum(abs(z) > 2.0 for _, z in shown)
+    alt = (
+        f"{title}: deviation of {len(shown)} estimates from the truth in standard deviations;"
+        f" {outside} outside 2, {sum(abs(z) > 3.0 for _, z in shown)} outside 3."
+    )
+    with drawing():
+        figure, axes = _rows(results, members)
+        axes.axvspan(-2.0, 2.0, color=BAND, linewidth=0.0)
+        for limit in (-3.0, 3.0):
+            axes.axvline(limit, color=MUTED, linewidth=0.8, linestyle=(0, (3, 3)))
+        axes.axvline(0.0, color=MUTED, linewidth=0.9)
+        for row, z in shown:
+            _deviation(axes, row, z, reach)
+        axes.set_xlim(-reach, reach)
+        axes.xaxis.set_major_locator(FixedLocator([-6, -4, -3, -2, 0, 2, 3, 4, 6]))
+        axes.set_xlim(-reach, reach)
+        footed(axes, "(estimate − truth) / std")
+        note = f"{outside} of {len(shown)} outside 2σ"
+        return to_panel(figure, key=f"d{k}", title=title, note=note, alt=alt)
+
+
+def _deviation(axes: Axes, row: int, z: float, reach: float) -> None:
+    size = abs(z)
+    marker, color, area = ("o", INSIDE, 26.0)
+    if size > 2.0:
+        marker, color, area = ("^", OUTSIDE_2, 38.0)
+    if size > 3.0:
+        marker, color, area = ("s", OUTSIDE_3, 34.0)
+    edge = math.copysign(min(size, reach - 0.25), z)
+    axes.scatter([edge], [row], s=area, marker=marker, color=color, linewidths=0.0, zorder=3)
+    if size > 2.0:
+        inward = z > 0
+        axes.annotate(
+            numbers.fixed(z, 1, sign=True).replace("-", "−"),
+            (edge, row),
+            xytext=(-7.0 if inward else 7.0, 0.0),
+            textcoords="offset points",
+            ha="right" if inward else "left",
+            va="center",
+            fontsize=TICK_SIZE,
+            color=INK,
+        )
+
+
+def uncertainty_panels(results: Results, routes: Sequence[Route]) -> list[Panel]:
+    """Standard deviation by each route over the reported one, on a logarithmic scale."""
+    ratios = [r for route in routes for r in route.ratio if math.isfinite(r) and r > 0.0]
+    if len(routes) < 2 or not ratios:
+        return []
+    low = max(min(*ratios, 0.5) / 1.25, 1e-3)
+    high = min(max(*ratios, 2.0) * 1.25, 1e3)
+    return [
+        _uncertainty_panel(results, k, title, members, routes, (low, high))
+        for k, (title, members) in enumerate(groups(results))
+    ]
+
+
+def _uncertainty_panel(
+    results: Results,
+    k: int,
+    title: str,
+    members: list[int],
+    routes: Sequence[Route],
+    limits: tuple[float, float],
+) -> Panel:
+    alt = (
+        f"{title}: standard deviation of {len(members)} parameters by each route over the reported."
+    )
+    with drawing():
+        figure, axes = _rows(results, members)
+        axes.set_xscale("log")
+        axes.axvline(1.0, color=MUTED, linewidth=0.9)
+        for route in routes:
+            _route_dots(axes, route, members)
+        axes.set_xlim(*limits)
+        ticks = [t for t in _LOG_TICKS if limits[0] <= t <= limits[1]]
+        axes.xaxis.set_major_locator(FixedLocator(ticks if len(ticks) < 9 else ticks[::3]))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.grid(True, axis="x", color=GRID, linewidth=0.8)
+        footed(axes, "std / reported std")
+        return to_panel(figure, key=f"u{k}", title=title, note="", alt=alt)
+
+
+_LOG_TICKS = [m * 10.0**e for e in range(-3, 4) for m in (1, 2, 5)]
+
+
+def _route_dots(axes: Axes, route: Route, members: list[int]) -> None:
+    # A ring for the reported route: it is 1 by definition, and the others may lie on it.
+    color = ROUTES[route.slot]
+    axes.scatter(
+        [route.ratio[i] for i in members],
+        list(range(len(members))),
+        s=34.0 if route.reported else 24.0,
+        marker=_ROUTE_MARKERS[route.slot],
+        facecolor=PAPER if route.reported else color,
+        edgecolor=color,
+        linewidths=1.3 if route.reported else 0.0,
+        alpha=0.95,
+        zorder=3 if route.reported else 4,
+    )
+
+
+def _rows(results: Results, members: list[int]) -> tuple[Figure, Axes]:
+    """A figure whose axes have one ruled, labelled row per parameter, the first on top."""
+    height = _ROW * len(members)
+    figure = blank(_WIDTH, _TOP + height + _BOTTOM)
+    axes = place(figure, _LEFT, _TOP, _WIDTH - _LEFT - _RIGHT, height)
+    axes.set_ylim(len(members) - 0.5, -0.5)
+    axes.set_yticks(range(len(members)))
+    axes.set_yticklabels([label(short_label(results.parameters[i])) for i in members])
+    axes.tick_params(axis="y", length=0.0)
+    axes.grid(True, axis="y", color=GRID, linewidth=0.8)
+    axes.spines["left"].set_visible(False)
+    return figure, axes

@@ -1,0 +1,72 @@
+"""Numbers as a reader wants them: as many digits as mean something, and no more.
+
+Minus is the ASCII hyphen, so that a table pasted into a spreadsheet stays a table of numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+
+MISSING = "–"
+_PLAIN_MINIMUM, _PLAIN_MAXIMUM = 1e-4, 1e6
+_MOST_DECIMALS = 6
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """`value` with `digits` significant digits; an exponent only where zeros would pile up."""
+    if value is None:
+        return MISSING
+    if not math.isfinite(value):
+        return str(value)
+    if value == 0.0:
+        return "0"
+    size = abs(value)
+    if not _PLAIN_MINIMUM <= size < _PLAIN_MAXIMUM:
+        return _short_exponent(f"{value:.{digits - 1}e}")
+    # Rounding first: 9.996 to three digits is 10.0, with one decimal and not two.
+    exponent = int(f"{size:.{digits - 1}e}".split("e")[1])
+    return fixed(value, max(0, digits - 1 - exponent))
+
+
+def fixed(value: float | None, decimals: int, *, sign: bool = False) -> str:
+    """`value` with `decimals` decimals; never "-0.00"."""
+    if value is None:
+        return MISSING
+    if not math.isfinite(value):
+        return str(value)
+    text = f"{value:+.{decimals}f}" if sign else f"{value:.{decimals}f}"
+    return text if float(text) else text.replace("-", "+" if sign else "")
+
+
+def beside(value: float | None, std: float) -> str:
+    """`value` rounded where the second significant digit of `std` stands."""
+    if value is None:
+        return MISSING
+    if value == 0.0:
+        return "0"
+    if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
+        return significant(value, 4)
+    place = int(f"{std:.1e}".split("e")[1]) - 1
+    if place > 0:
+        return fixed(value, 0)
+    if -place <= _MOST_DECIMALS:
+        return fixed(value, -place)
+    digits = max(1, math.floor(math.log10(abs(value))) - place)
+    return _short_exponent(f"{value:.{digits}e}")
+
+
+def percent(fraction: float | None) -> str:
+    """A fraction in per cent, without the sign: the column head carries it."""
+    if fraction is None:
+        return MISSING
+    size = abs(100.0 * fraction)
+    if math.isnan(size):
+        return "nan"
+    if size >= 1000.0:
+        return ">999"
+    return fixed(100.0 * fraction, 0 if size >= 99.5 else 1 if size >= 9.95 else 2)
+
+
+def _short_exponent(text: str) -> str:
+    return re.sub(r"e([+-])0*(\d)", lambda m: f"e{m[1].replace('+', '')}{m[2]}", text)

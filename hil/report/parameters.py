@@ -1,0 +1,237 @@
+"""The parameter table, and how the four standard deviations compare, as the page shows them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.report import numbers
+from hil.results import ParameterResult, Results
+
+Array = NDArray[np.float64]
+
+INTERVAL_95 = 1.959964
+"""Half-width of the 95 % interval in standard deviations (normal distribution)."""
+
+# Shares of a normal distribution outside 2 and 3 standard deviations.
+_OUTSIDE_2, _OUTSIDE_3 = 0.045500, 0.002700
+_VISCOUS_UNITS = frozenset({"N·m·s/rad", "N·m/(rad/s)", "N m s/rad", "Nms/rad"})
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One line of the table, every number already text."""
+
+    label: str
+    table2_id: str
+    name: str
+    expression: str
+    unit: str
+    truth: str
+    estimate: str
+    std: str
+    low: str
+    high: str
+    deviation: str
+    relative_std: str
+    repetition_mean: str
+    repetition_std: str
+    mark: str
+    """`out3`, `out2` or empty."""
+    significant: bool
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How many parameters are where; `expected_*` is what chance alone would give."""
+
+    compared: int
+    outside_2: list[str]
+    outside_3: list[str]
+    expected_2: str
+    expected_3: str
+    not_significant: list[str]
+    total: int
+
+
+@dataclass(frozen=True)
+class Route:
+    """One way to a standard deviation; `ratio` is (p,) std over the reported std."""
+
+    key: str
+    title: str
+    assumes: str
+    reported: bool
+    symbol: str
+    slot: int
+    ratio: list[float]
+    median_ratio: str
+    span: str
+    within_2: str
+    within_3: str
+
+
+_ROUTES = {
+    "least_squares": (
+        "Least squares",
+        "residuals white: independent from sample to sample. Too small where they are coloured",
+        "●",
+    ),
+    "independent_repetitions": (
+        "Independent repetitions",
+        "residuals of any colour within a repetition, none from one repetition to the next",
+        "◆",
+    ),
+    "phase_clustered": (
+        "Phase-clustered",
+        "residuals may also return at the same place of the motion in every repetition,"
+        " as what the model leaves out does",
+        "▲",
+    ),
+    "scatter_of_mean": (
+        "Scatter of the mean",
+        "nothing but independent repetitions: their scatter over the root of their number."
+        " Blind to an error that all of them share",
+        "■",
+    ),
+}
+
+
+def deviation(parameter: ParameterResult) -> float | None:
+    """(estimate - truth) / std; None without a truth or a usable standard deviation."""
+    if parameter.truth is None or not parameter.std > 0.0:
+        return None
+    z = (parameter.estimate - parameter.truth) / parameter.std
+    return z if math.isfinite(z) else None
+
+
+def is_significant(parameter: ParameterResult) -> bool:
+    """Whether the 95 % interval leaves zero out."""
+    return abs(parameter.estimate) > INTERVAL_95 * parameter.std
+
+
+def short_label(parameter: ParameterResult) -> str:
+    """Name for figures, led by the number it has in the paper's Table 2."""
+    number = "" if parameter.table2_id is None else f"{parameter.table2_id} "
+    return number + parameter.name
+
+
+def table_rows(results: Results) -> tuple[list[ParameterRow], list[ParameterRow]]:
+    """Rows of the base parameters and rows of the friction."""
+    rows = [_row(parameter) for parameter in results.parameters]
+    return rows[: results.n_base], rows[results.n_base :]
+
+
+def _row(p: ParameterResult) -> ParameterRow:
+    z = deviation(p)
+    half = INTERVAL_95 * p.std
+    return ParameterRow(
+        label=short_label(p),
+        table2_id="" if p.table2_id is None else str(p.table2_id),
+        name=p.name,
+        expression=_expression(p),
+        unit=p.unit.replace(" ", "·"),
+        truth=numbers.beside(p.truth, p.std),
+        estimate=numbers.beside(p.estimate, p.std),
+        std=numbers.significant(p.std, 2),
+        low=numbers.beside(p.estimate - half, p.std),
+        high=numbers.beside(p.estimate + half, p.std),
+        deviation=numbers.fixed(z, 2, sign=True),
+        relative_std=numbers.percent(p.std / abs(p.estimate) if p.estimate else math.inf),
+        repetition_mean=numbers.beside(p.repetition_mean, p.std),
+        repetition_std=numbers.significant(p.repetition_std, 2),
+        mark=_mark(z),
+        significant=is_significant(p),
+    )
+
+
+def _mark(z: float | None) -> str:
+    if z is None or abs(z) <= 2.0:
+        return ""
+    return "out3" if abs(z) > 3.0 else "out2"
+
+
+def _expression(p: ParameterResult) -> str:
+    """What the name stands for; viscous friction also in the unit that manufacturers print."""
+    text = p.expression if p.expression != p.name else ""
+    if p.unit not in _VISCOUS_UNITS:
+        return text
+    scale = math.pi / 180.0
+    per_degree = f"{numbers.beside(scale * p.estimate, scale * p.std)} N·m per °/s"
+    return f"{text}; {per_degree}" if text else per_degree
+
+
+def tally(results: Results) -> Tally:
+    """Count what the table marks."""
+    compared = [(p, z) for p in results.parameters if (z := deviation(p)) is not None]
+    return Tally(
+        compared=len(compared),
+        outside_2=[short_label(p) for p, z in compared if abs(z) > 2.0],
+        outside_3=[short_label(p) for p, z in compared if abs(z) > 3.0],
+        expected_2=numbers.fixed(_OUTSIDE_2 * len(compared), 1),
+        expected_3=numbers.fixed(_OUTSIDE_3 * len(compared), 1),
+        not_significant=[short_label(p) for p in results.parameters if not is_significant(p)],
+        total=len(results.parameters),
+    )
+
+
+def routes(results: Results) -> list[Route]:
+    """The standard-deviation routes that were computed, compared with the reported one."""
+    reported = np.array([p.std for p in results.parameters])
+    found = []
+    for slot, key in enumerate(_ROUTES):
+        values: list[float] | None = getattr(results.uncertainty, key)
+        if values is not None:
+            found.append(_route(results, key, slot, np.asarray(values, float), reported))
+    return found
+
+
+def _route(
+    results: Results,
+    key: str,
+    slot: int,
+    std: Array,
+    reported: Array,
+) -> Route:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = std / reported
+    usable = ratio[np.isfinite(ratio)]
+    title, assumes, symbol = _ROUTES[key]
+    within = [_within(results.parameters, std.tolist(), limit) for limit in (2.0, 3.0)]
+    return Route(
+        key=key,
+        title=title,
+        assumes=assumes,
+        reported=key == results.uncertainty.reported,
+        symbol=symbol,
+        slot=slot,
+        ratio=ratio.tolist(),
+        median_ratio=numbers.significant(float(np.median(usable)), 2) if usable.size else "–",
+        span=_span(usable.tolist()),
+        within_2=within[0],
+        within_3=within[1],
+    )
+
+
+def _span(values: Sequence[float]) -> str:
+    if not values:
+        return numbers.MISSING
+    return f"{numbers.significant(min(values), 2)} to {numbers.significant(max(values), 2)}"
+
+
+def _within(parameters: Sequence[ParameterResult], std: Sequence[float], limit: float) -> str:
+    compared = [(p, s) for p, s in zip(parameters, std, strict=True) if p.truth is not None]
+    if not compared:
+        return numbers.MISSING
+    inside = sum(abs(p.estimate - (p.truth or 0.0)) <= limit * s for p, s in compared)
+    return f"{inside} of {len(compared)}"
+
+
+def reported_title(results: Results) -> str:
+    """The reported route in words."""
+    key = results.uncertainty.reported
+    return _ROUTES[key][0] if key in _ROUTES else key

@@ -1,0 +1,122 @@
+"""Base parameters: the parameters that a torque can tell apart (numeric, for any chain)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# A column is kept when the part of it that no kept column explains is larger than this share of
+# the column. Exact geometry leaves 1e-15 of a dependent column; a URDF whose angles are rounded
+# (1.5708 for pi/2) leaves up to 4e-6, which no measurement could use.
+TOLERANCE = 1e-5
+
+_ROUNDING = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class BaseParameters:
+    """Which standard parameters are kept, and what is grouped into each.
+
+    Attributes:
+        names: names of the kept parameters, shape (b,): each stands for its group.
+        kept: indices of the kept standard parameters, rising, shape (b,).
+        grouping: ``base_values = grouping @ standard_values``, shape (b, s).
+        standard_names: names of all standard parameters, shape (s,).
+        smallest_kept: smallest share of a kept column that the columns kept before it do not
+            explain, 1 for an orthogonal one.
+        largest_dropped: the same for the columns that were dropped: zero but for rounding.
+    """
+
+    names: tuple[str, ...]
+    kept: NDArray[np.intp]
+    grouping: Array
+    standard_names: tuple[str, ...]
+    smallest_kept: float
+    largest_dropped: float
+
+    @property
+    def rank(self) -> int:
+        """Number b of base parameters."""
+        return len(self.names)
+
+    @property
+    def gap(self) -> float:
+        """How clear the rank decision is: smallest kept over largest dropped share."""
+        return self.smallest_kept / max(self.largest_dropped, np.finfo(np.float64).tiny)
+
+    @property
+    def unobservable(self) -> tuple[str, ...]:
+        """Standard parameters that no torque depends on."""
+        absent = ~np.any(self.grouping, axis=0)
+        return tuple(n for n, gone in zip(self.standard_names, absent, strict=True) if gone)
+
+    def expressions(self, digits: int = 6) -> tuple[str, ...]:
+        """Return each group in words: ``I1yy + I1m + 0.09 m2 + ...``."""
+        return tuple(self._expression(row, int(k), digits) for row, k in enumerate(self.kept))
+
+    def _expression(self, row: int, pivot: int, digits: int) -> str:
+        text = self.standard_names[pivot]
+        for column in np.flatnonzero(self.grouping[row]):
+            if column == pivot:
+                continue
+            value = self.grouping[row, column]
+            factor = f"{abs(value):.{digits}g}"
+            sign = "+" if value > 0.0 else "-"
+            name = self.standard_names[column]
+            text += f" {sign} {name}" if factor == "1" else f" {sign} {factor} {name}"
+        return text
+
+
+def select_base(regressor: Array, names: Sequence[str]) -> BaseParameters:
+    """Choose the first independent columns, left to right, and group the others into them.
+
+    A QR factorisation reduces the rows first; it keeps lengths and angles of the columns. Then
+    Gram-Schmidt walks through them in the given order, so that the choice is deterministic.
+
+    Args:
+        regressor: rows for states that excite everything, shape (rows, s).
+        names: standard names, shape (s,).
+    """
+    reduced = np.linalg.qr(regressor, mode="r")
+    lengths = np.linalg.norm(reduced, axis=0)
+    felt = lengths > _ROUNDING * max(float(lengths.max()), 1e-300)
+    scaled = np.where(felt, reduced / np.where(felt, lengths, 1.0), 0.0)
+    kept, shares = _first_independent(scaled)
+    dropped = np.setdiff1d(np.arange(len(names)), kept)
+    largest_dropped = float(shares[dropped].max(initial=0.0))
+
+    relation, *_ = np.linalg.lstsq(scaled[:, kept], scaled, rcond=None)
+    # What is no larger than the remainder of the dropped columns is rounding, not grouping.
+    relation[np.abs(relation) < max(_ROUNDING, 10.0 * largest_dropped)] = 0.0
+    grouping = np.round(relation * lengths / lengths[kept, None], 12)
+    grouping[:, kept] = np.eye(len(kept))
+    return BaseParameters(
+        names=tuple(names[k] for k in kept),
+        kept=kept,
+        grouping=grouping,
+        standard_names=tuple(names),
+        smallest_kept=float(shares[kept].min(initial=1.0)),
+        largest_dropped=largest_dropped,
+    )
+
+
+def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array]:
+    """Return the kept indices, and per unit column the share that earlier kept ones leave."""
+    basis = np.zeros_like(columns)
+    kept: list[int] = []
+    shares = np.zeros(columns.shape[1])
+    for index in range(columns.shape[1]):
+        rest = columns[:, index].copy()
+        for _ in range(2):  # twice is enough to be orthogonal to rounding
+            known = basis[:, : len(kept)]
+            rest -= known @ (known.T @ rest)
+        shares[index] = np.linalg.norm(rest)
+        if shares[index] > TOLERANCE and len(kept) < basis.shape[1]:
+            basis[:, len(kept)] = rest / shares[index]
+            kept.append(index)
+    return np.array(kept, dtype=np.intp), shares

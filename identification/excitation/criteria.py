@@ -1,0 +1,121 @@
+r"""How well a trajectory excites the parameters: the paper's two measures.
+
+All of them read the Gram matrix :math:`\Phi^T\Phi` (p, p) of the unweighted regressor, rows of
+all joints together (see :func:`information`). Columns have different units and sizes, so each is
+first divided by its length, ``C = S^-1 Phi^T Phi S^-1`` with ``S = diag(|Phi_i|)``; the paper's
+measures follow exactly, since S drops out of the coupling index and adds ``2 log10 |S|`` to the
+determinant, which itself would overflow.
+
+A trajectory that leaves a parameter without excitation makes the Gram matrix singular: the
+determinant's logarithm is then -inf and the coupling index inf, never an exception, so that a
+search can rank it last.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from identification.factor import Factor
+
+Array = NDArray[np.float64]
+
+
+def information(factor: Factor) -> Array:
+    """Return the Gram matrix of the stacked regressor, no joint weighted, shape (p, p)."""
+    total: Array = factor.gram.sum(axis=0)
+    return total[:-1, :-1]
+
+
+def log10_det(gram: Array, n_samples: int) -> float:
+    r"""Return :math:`\log_{10}(\det(\Phi^T\Phi) / N^{N_\pi})`, -inf for a singular matrix.
+
+    Args:
+        gram: the Gram matrix, shape (p, p).
+        n_samples: N, the number of time samples as in the paper's Table 1 (not of rows, of which
+            there are one per joint and sample).
+    """
+    scale, lower = _factorise(gram)
+    if lower is None:
+        return -np.inf
+    logs = np.log10(np.diag(lower)) + np.log10(scale) - 0.5 * np.log10(n_samples)
+    return float(2.0 * logs.sum())
+
+
+def correlation(gram: Array) -> Array:
+    r"""Return :math:`\psi_{ij} / \sqrt{\psi_{ii}\psi_{jj}}` of the inverse Gram (p, p).
+
+    Eq. 5 and Fig. 2: the correlation of the estimates under equal, uncorrelated torque noise.
+    All entries are NaN for a singular matrix.
+    """
+    _, lower = _factorise(gram)
+    if lower is None:
+        return np.full(np.shape(gram), np.nan)
+    half, _ = lapack.dpotri(lower, lower=1)
+    deviation = np.sqrt(np.diag(half))
+    correlated = np.tril(half) / deviation[:, None] / deviation
+    correlated += np.tril(correlated, -1).T
+    np.fill_diagonal(correlated, 1.0)
+    return np.asarray(correlated)
+
+
+def coupling_index(gram: Array) -> float:
+    """Return I_c of eq. 5, between 0 and :func:`coupling_index_max`; inf for a singular matrix."""
+    coupled = np.abs(np.tril(correlation(gram), -1)).sum()
+    return float(coupled) if np.isfinite(coupled) else np.inf
+
+
+def coupling_index_max(p: int) -> float:
+    """Return the largest coupling index of p parameters, p (p - 1) / 2."""
+    return p * (p - 1) / 2.0
+
+
+def fitness_eq7(
+    gram: Array, n_samples: int, *, weights: tuple[float, float] = (0.7, 0.3)
+) -> float:
+    r"""Return :math:`\lambda_1 \log_{10}|\det/N^{N_\pi}| + \lambda_2 I_{c,max}/I_c`, as printed.
+
+    The two terms differ in size by an order of magnitude, so the first one rules; it is the
+    paper's formula nonetheless. -inf for a singular matrix.
+    """
+    determinant = log10_det(gram, n_samples)
+    index = coupling_index(gram)
+    if not np.isfinite(determinant) or not np.isfinite(index):
+        return -np.inf
+    coupling = np.inf if index == 0.0 else coupling_index_max(len(gram)) / index
+    return weights[0] * determinant + weights[1] * coupling
+
+
+def condition_number(gram: Array, *, scaled: bool) -> float:
+    """Return the condition number of Phi (not of its Gram): raw, or with unit columns.
+
+    For information: the raw one depends on units. inf for a singular matrix.
+    """
+    matrix = np.asarray(gram, dtype=np.float64)
+    if scaled:
+        scale = np.sqrt(np.diag(matrix))
+        if not np.all(scale > 0.0):
+            return np.inf
+        matrix = matrix / scale[:, None] / scale
+    values = np.linalg.eigvalsh(matrix)
+    if values[0] <= _smallest_pivot(len(matrix)) * values[-1]:
+        return np.inf
+    return float(np.sqrt(values[-1] / values[0]))
+
+
+def _factorise(gram: Array) -> tuple[Array, Array | None]:
+    """Return column lengths, and the Cholesky factor of the scaled Gram, None if singular."""
+    matrix = np.asarray(gram, dtype=np.float64)
+    scale = np.sqrt(np.diag(matrix))
+    if not np.all(np.isfinite(scale) & (scale > 0.0)):
+        return scale, None
+    lower, info = lapack.dpotrf(matrix / scale[:, None] / scale, lower=1)
+    if info != 0 or np.min(np.diag(lower)) ** 2 <= _smallest_pivot(len(matrix)):
+        return scale, None
+    return scale, lower
+
+
+def _smallest_pivot(p: int) -> float:
+    """Return what rounding can leave of a pivot that should be zero, for unit columns."""
+    return 4.0 * p * float(np.finfo(np.float64).eps)

@@ -1,0 +1,299 @@
+"""From a recording to what a fit reads: smoothed motion, torque, and which rows count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.factor import Factor
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.recording import Recording, RecordingError
+from identification.regressor import Regressor
+from identification.smoothing_spline import fit_smoothing_spline, low_pass
+
+Array = NDArray[np.float64]
+
+# A smoothed signal is worse near the ends of its segment, where it is known from one side only.
+# Measured on sines with noise: the error of the acceleration has come down to its usual size two
+# periods of the smoother's bandwidth from the end. A joint that hardly moves is smoothed to
+# almost nothing and must not take the whole segment with it, hence the limit.
+END_PERIODS: Final = 2.0
+LONGEST_END: Final = 0.25  # s
+_SHORTEST_SEGMENT: Final = 12  # samples: twice what a quintic spline needs
+_HIGHEST_DIFFERENCE: Final = 8
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """How a recording is turned into samples.
+
+    Attributes:
+        smooth_torque: the paper's way. The torque is smoothed until its mean squared residual
+            is its noise variance, and the regressor goes through the same linear smoother. By
+            default the torque is left as measured: least squares averages it better.
+        torque_bandwidth: the recorded torque has come through a low-pass of this bandwidth [Hz]
+            before it was logged (many controllers do that); the regressor then goes through the
+            same low-pass and the torque is left alone. None: it has not.
+        torque_delay: time by which the recorded torque lags the recorded position [s].
+    """
+
+    smooth_torque: bool = False
+    torque_bandwidth: float | None = None
+    torque_delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.smooth_torque and self.torque_bandwidth is not None:
+            raise ValueError("either smooth the torque or name its bandwidth, not both")
+        if self.torque_bandwidth is not None and not self.torque_bandwidth > 0.0:
+            raise ValueError(f"torque_bandwidth is {self.torque_bandwidth} Hz, must be positive")
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """m samples of n joints, ready for a fit, in the rows of the recording they come from.
+
+    Attributes:
+        motion: smoothed positions and their derivatives, at the instants the torque belongs to.
+        torque: (m, n) [N·m or N].
+        usable: (m, n) rows that count: moving, and away from gaps and ends.
+        segments: stretches without a gap.
+        origin: time at which the planned motion begins [s]; repetitions are compared at equal
+            times since then.
+        position_bandwidth: of the smoothing, per joint (n,) [Hz].
+        torque_bandwidth: of the low-pass the torque has come through, per joint (n,) [Hz]; the
+            regressor has to go through it as well. None: it has come through none.
+    """
+
+    motion: Motion
+    torque: Array
+    usable: NDArray[np.bool_]
+    segments: tuple[slice, ...]
+    origin: float
+    position_bandwidth: Array
+    torque_bandwidth: Array | None = None
+
+    def as_measured(self, joint: int, columns: Array) -> Array:
+        """Columns (m, c) of a joint's row as the torque channel would have recorded them."""
+        if self.torque_bandwidth is None:
+            return columns
+        filtered = np.zeros_like(columns)
+        for segment in self.segments:
+            if segment.stop - segment.start >= _SHORTEST_SEGMENT:
+                filtered[segment] = low_pass(
+                    self.motion.time[segment], columns[segment], self.torque_bandwidth[joint]
+                )
+        return filtered
+
+    def regressor(self, model: RobotModel) -> Regressor:
+        """Regressor of every row, usable or not, as the torque channel would record it."""
+        blocks, columns = model.regressor(*self.motion[1:])
+        return Regressor(
+            tuple(self.as_measured(joint, block) for joint, block in enumerate(blocks)), columns
+        )
+
+    def predicted_torque(self, model: RobotModel, values: Array) -> Array:
+        """Torque (m, n) that parameters (p,) predict, as the torque channel would record it."""
+        torque = model.torque(values, *self.motion[1:])
+        for joint in range(model.n_joints):
+            torque[:, joint] = self.as_measured(joint, torque[:, joint : joint + 1])[:, 0]
+        return torque
+
+    def factor(self, model: RobotModel) -> Factor:
+        """All a fit needs of the usable rows."""
+        if self.torque_bandwidth is None:
+            return Factor.from_samples(model, self.motion, self.torque, self.usable)
+        blocks, columns = self.regressor(model)
+        factor = Factor.zero(model)
+        for joint, (block, used) in enumerate(zip(blocks, columns, strict=True)):
+            rows = self.usable[:, joint]
+            table = np.column_stack([block, self.torque[:, joint]])[rows]
+            index = np.append(used, model.n_parameters)
+            factor.gram[joint][np.ix_(index, index)] = table.T @ table
+            factor.samples[joint] = np.count_nonzero(rows)
+        return factor
+
+
+def standstill_variance(time: Array, values: Array) -> Array:
+    """Noise variance per channel (c,) of a recording at standstill (m, c).
+
+    About a straight line, because a servo may creep and a current may drift meanwhile.
+
+    Raises:
+        RecordingError: fewer than 3 samples.
+    """
+    if len(time) < 3:
+        raise RecordingError(
+            "shape", f"a variance at standstill needs 3 samples, the recording has {len(time)}"
+        )
+    line = np.column_stack([np.ones(len(time)), time - time.mean()])
+    residual = values - line @ np.linalg.lstsq(line, values, rcond=None)[0]
+    return np.asarray((residual**2).sum(axis=0) / (len(time) - 2))
+
+
+def difference_variance(time: Array, values: Array) -> Array:
+    """Variance of the white noise on smooth channels (m, c), from the channels themselves.
+
+    Divided differences of rising order, scaled to unit noise gain, remove ever more of the
+    smooth part and keep the noise (Gasser, Sroka and Jennen-Steinmetz 1986). Taken is the first
+    order at which the next one changes the estimate by less than 5 %; a channel without white
+    noise (filtered before it was logged) gives the highest order's, next to nothing.
+
+    Raises:
+        RecordingError: fewer samples than the highest order needs.
+    """
+    if len(time) < 2 * _HIGHEST_DIFFERENCE:
+        raise RecordingError(
+            "shape",
+            f"a noise variance needs {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}",
+        )
+    estimates = np.array(
+        [_difference_variance(time, values, order) for order in range(1, _HIGHEST_DIFFERENCE + 1)]
+    )
+    settled = estimates[1:] > 0.95 * estimates[:-1]
+    first = np.where(settled.any(axis=0), settled.argmax(axis=0), _HIGHEST_DIFFERENCE - 1)
+    return np.asarray(np.take_along_axis(estimates, first[None, :], axis=0)[0])
+
+
+def _difference_variance(time: Array, values: Array, order: int) -> Array:
+    windows = np.lib.stride_tricks.sliding_window_view(time, order + 1)
+    scale = windows[:, -1:] - windows[:, :1]
+    apart = (windows[:, :, None] - windows[:, None, :]) / scale[:, :, None]
+    apart[:, np.arange(order + 1), np.arange(order + 1)] = 1.0
+    weights = 1.0 / apart.prod(axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    stacked = np.lib.stride_tricks.sliding_window_view(values, order + 1, axis=0)
+    return np.asarray(np.mean(np.einsum("mck,mk->mc", stacked, weights) ** 2, axis=0))
+
+
+def smooth(
+    recording: Recording, noise_variance: Array | None = None, *, delay: float = 0.0
+) -> Motion:
+    """Smoothed motion in the rows of the recording, at each instant less the delay.
+
+    Rows of a segment too short to smooth keep their position, at rest; see :func:`prepare` for
+    which rows count.
+
+    Args:
+        recording: checked.
+        noise_variance: of the measured positions (n,) [rad² or m²], from standstill and at least
+            resolution²/12. None: estimated from the differences of the positions.
+        delay: time by which what the motion is to be compared with lags it [s].
+    """
+    return _smooth(recording, noise_variance, delay)[0]
+
+
+def prepare(
+    recording: Recording,
+    model: RobotModel,
+    *,
+    noise_variance: Array | None = None,
+    torque_variance: Array | None = None,
+    options: Preprocessing = Preprocessing(),
+    origin: float | None = None,
+) -> Samples:
+    """Samples of a recording for a model.
+
+    Args:
+        recording: with torque; joints in the model's order.
+        model: says below which speed a joint stands.
+        noise_variance: of the positions (n,), see :func:`smooth`.
+        torque_variance: of the torques (n,), for `options.smooth_torque` only; None: estimated.
+        options: what to do with the torque.
+        origin: time at which the planned motion begins [s]; the first sample by default.
+
+    Raises:
+        RecordingError: the recording does not pass its checks, or has no torque.
+    """
+    recording.checked(model.joint_names)
+    if recording.torque is None:
+        raise RecordingError("torque", "the recording has no joint torque to fit")
+    motion, bandwidth, clear = _smooth(recording, noise_variance, options.torque_delay)
+    segments = tuple(recording.segments())
+    torque, torque_bandwidth = recording.torque, None
+    if options.torque_bandwidth is not None:
+        torque_bandwidth = np.full(recording.n_joints, options.torque_bandwidth)
+    elif options.smooth_torque:
+        torque, torque_bandwidth = _smooth_torque(recording, torque_variance, segments)
+    if torque_bandwidth is not None:
+        ends = min(LONGEST_END, END_PERIODS / float(torque_bandwidth.min()))
+        clear &= _away_from_ends(recording.time, segments, ends)
+    return Samples(
+        motion=motion,
+        torque=torque,
+        usable=clear[:, None] & model.moving(motion.velocity),
+        segments=segments,
+        origin=float(recording.time[0]) if origin is None else origin,
+        position_bandwidth=bandwidth,
+        torque_bandwidth=torque_bandwidth,
+    )
+
+
+def _smooth(
+    recording: Recording, noise_variance: Array | None, delay: float
+) -> tuple[Motion, Array, NDArray[np.bool_]]:
+    """Motion, bandwidth (n,) of the longest segment, and rows (m,) that are away from ends."""
+    position = recording.position.copy()
+    velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
+    bandwidth = np.full(recording.n_joints, np.inf)
+    clear = np.zeros(recording.n_samples, dtype=np.bool_)
+    longest = 0
+    for segment in recording.segments():
+        time, measured = recording.time[segment], recording.position[segment]
+        if len(time) < 2 * _SHORTEST_SEGMENT:
+            continue
+        variance = difference_variance(time, measured) if noise_variance is None else noise_variance
+        # A reading without noise is interpolated as closely as its own rounding allows.
+        rounding = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2
+        spline = fit_smoothing_spline(
+            time, measured, np.maximum(variance, np.maximum(rounding, 1e-40))
+        )
+        at = time - delay
+        position[segment], velocity[segment] = spline(at), spline(at, 1)
+        acceleration[segment] = spline(at, 2)
+        moving = np.ptp(measured, axis=0) > 0.0
+        slowest = float(spline.bandwidth[moving].min()) if moving.any() else np.inf
+        end = min(LONGEST_END, END_PERIODS / slowest)
+        clear[segment] = (at >= time[0] + end) & (at <= time[-1] - end)
+        if len(time) > longest:
+            longest, bandwidth = len(time), spline.bandwidth
+    return Motion(recording.time, position, velocity, acceleration), bandwidth, clear
+
+
+def _smooth_torque(
+    recording: Recording, variance: Array | None, segments: tuple[slice, ...]
+) -> tuple[Array, Array]:
+    """Smoothed torque, and the bandwidth per joint at which it and the regressor are smoothed.
+
+    One bandwidth per joint, from the longest segment, so that the smoother is one and the same
+    linear filter everywhere.
+    """
+    assert recording.torque is not None
+    longest = max(segments, key=lambda segment: int(segment.stop - segment.start))
+    time, measured = recording.time[longest], recording.torque[longest]
+    if variance is None:
+        variance = difference_variance(time, measured)
+    tiny = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2
+    bandwidth = fit_smoothing_spline(
+        time, measured, np.maximum(variance, np.maximum(tiny, 1e-40))
+    ).bandwidth
+    smoothed = recording.torque.copy()
+    for segment in segments:
+        if segment.stop - segment.start >= _SHORTEST_SEGMENT:
+            for joint in range(recording.n_joints):
+                column = recording.torque[segment, joint : joint + 1]
+                smoothed[segment, joint] = low_pass(
+                    recording.time[segment], column, float(bandwidth[joint])
+                )[:, 0]
+    return smoothed, bandwidth
+
+
+def _away_from_ends(time: Array, segments: tuple[slice, ...], end: float) -> NDArray[np.bool_]:
+    clear = np.zeros(len(time), dtype=np.bool_)
+    for segment in segments:
+        inside = time[segment]
+        clear[segment] = (inside >= inside[0] + end) & (inside <= inside[-1] - end)
+    return clear

@@ -1,0 +1,267 @@
+"""What identification reads: one stretch of motion as it was measured, and what was commanded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError, ShapeError
+
+Array = NDArray[np.float64]
+
+Check = Literal["shape", "finite", "clock", "stuck", "joints", "torque"]
+
+# A joint is not held still to the last bit of its encoder while it is told to move this far.
+STUCK_MOVEMENT: Final = 0.02  # rad or m
+# A step of the clock this many times the usual one is a gap, whether it was reported or not.
+GAP_STEPS: Final = 5.0
+
+
+class RecordingError(IdentificationError, ValueError):
+    """A recording that must not be identified from.
+
+    Attributes:
+        check: which check failed.
+        joint: name of the joint to blame, None where it is not one joint.
+        sample: index of the first offending sample, None where it is the whole recording.
+    """
+
+    def __init__(
+        self, check: Check, message: str, *, joint: str | None = None, sample: int | None = None
+    ) -> None:
+        super().__init__(message)
+        self.check = check
+        self.joint = joint
+        self.sample = sample
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Measured joint motion and torque, m samples of n joints, joint side.
+
+    Attributes:
+        time: (m,) [s], the controller's clock.
+        position: measured (m, n) [rad or m].
+        joint_names: n names, in the order of the columns.
+        torque: joint torque or force (m, n) [N·m or N], None where only currents are known.
+        motor_current: (m, n) [A]; no use is made of it here but to carry it along.
+        commanded_position: (m, n) [rad or m], NaN where nothing was commanded.
+        gap_before: (m,) True at a sample before which samples are known to be missing.
+        held_joints: joints that are known to be clamped or switched off, so that a constant
+            position is no fault.
+        provenance: where the recording comes from, in words.
+    """
+
+    time: Array
+    position: Array
+    joint_names: tuple[str, ...]
+    torque: Array | None = None
+    motor_current: Array | None = None
+    commanded_position: Array | None = None
+    gap_before: NDArray[np.bool_] | None = None
+    held_joints: tuple[str, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = (len(self.time), len(self.joint_names))
+        if self.time.ndim != 1:
+            raise ShapeError("time", self.time.shape, "(m,)")
+        for name, array in self._channels():
+            if array.shape != shape:
+                raise ShapeError(name, array.shape, f"{shape} (samples, joints)")
+        if self.gap_before is not None and self.gap_before.shape != self.time.shape:
+            raise ShapeError("gap_before", self.gap_before.shape, f"{self.time.shape}")
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples m."""
+        return len(self.time)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    def checked(self, joint_names: Sequence[str] | None = None) -> Recording:
+        """Return the recording itself if it can be identified from.
+
+        Args:
+            joint_names: the model's joints; names and order have to be the recording's.
+
+        Raises:
+            RecordingError: too short, NaN or infinity, a repeated or falling clock, joints that
+                are not the model's, or a stuck joint.
+        """
+        if self.n_samples < 2:
+            raise RecordingError("shape", f"the recording has {self.n_samples} samples")
+        if joint_names is not None:
+            self._check_joints(tuple(joint_names))
+        self._check_finite()
+        self._check_clock()
+        self._check_stuck()
+        return self
+
+    def reordered(self, joint_names: Sequence[str]) -> Recording:
+        """Return the recording with its joints in the given order; others are left out.
+
+        Raises:
+            RecordingError: a joint that was not recorded.
+        """
+        missing = [name for name in joint_names if name not in self.joint_names]
+        if missing:
+            raise RecordingError(
+                "joints",
+                f"joint {missing[0]} was not recorded; recorded are {', '.join(self.joint_names)}",
+                joint=missing[0],
+            )
+        columns = [self.joint_names.index(name) for name in joint_names]
+        return replace(
+            self,
+            joint_names=tuple(joint_names),
+            held_joints=tuple(name for name in self.held_joints if name in joint_names),
+            **self._each_channel(lambda array: array[:, columns]),
+        )
+
+    def between(self, start: int, stop: int) -> Recording:
+        """Return samples start to stop (exclusive) as a recording of its own."""
+        return replace(
+            self,
+            time=self.time[start:stop],
+            gap_before=None if self.gap_before is None else self.gap_before[start:stop],
+            **self._each_channel(lambda array: array[start:stop]),
+        )
+
+    def segments(self) -> list[slice]:
+        """Stretches without a gap, in order.
+
+        A gap is where one was reported, and where the clock steps by more than `GAP_STEPS` of
+        its usual (median) step. Derivatives may not be taken across one.
+        """
+        steps = np.diff(self.time)
+        breaks = steps > GAP_STEPS * np.median(steps)
+        if self.gap_before is not None:
+            breaks |= self.gap_before[1:]
+        edges = [0, *(np.flatnonzero(breaks) + 1).tolist(), self.n_samples]
+        return [slice(a, b) for a, b in pairwise(edges)]
+
+    def _channels(self) -> list[tuple[str, Array]]:
+        """Channels present, each (m, n), by attribute name."""
+        channels = {
+            "position": self.position,
+            "torque": self.torque,
+            "motor_current": self.motor_current,
+            "commanded_position": self.commanded_position,
+        }
+        return [(name, array) for name, array in channels.items() if array is not None]
+
+    def _each_channel(self, select: Callable[[Array], Array]) -> dict[str, Any]:
+        return {name: select(array) for name, array in self._channels()}
+
+    def _check_joints(self, expected: tuple[str, ...]) -> None:
+        if self.joint_names == expected:
+            return
+        recorded = ", ".join(self.joint_names)
+        missing = [name for name in expected if name not in self.joint_names]
+        if missing:
+            raise RecordingError(
+                "joints",
+                f"the model has a joint {missing[0]} that was not recorded; recorded: {recorded}",
+                joint=missing[0],
+            )
+        extra = [name for name in self.joint_names if name not in expected]
+        if extra:
+            raise RecordingError(
+                "joints",
+                f"the recorded joint {extra[0]} is not in the model; its joints are "
+                f"{', '.join(expected)}",
+                joint=extra[0],
+            )
+        first = next(a for a, b in zip(self.joint_names, expected, strict=True) if a != b)
+        raise RecordingError(
+            "joints",
+            f"the joints are recorded in the order {recorded}, the model's order is "
+            f"{', '.join(expected)}",
+            joint=first,
+        )
+
+    def _check_finite(self) -> None:
+        bad = np.flatnonzero(~np.isfinite(self.time))
+        if bad.size:
+            raise RecordingError(
+                "finite", f"time is {self.time[bad[0]]} at sample {bad[0]}", sample=int(bad[0])
+            )
+        for name, array in self._channels():
+            # A packet without a set-point has no commanded position; that is legal.
+            wrong = np.isinf(array) if name == "commanded_position" else ~np.isfinite(array)
+            rows, columns = np.nonzero(wrong)
+            if rows.size:
+                sample, joint = int(rows[0]), self.joint_names[columns[0]]
+                raise RecordingError(
+                    "finite",
+                    f"{name} of joint {joint} is {array[rows[0], columns[0]]} at sample {sample}"
+                    f" (t = {self.time[sample]:.6g} s)",
+                    joint=joint,
+                    sample=sample,
+                )
+
+    def _check_clock(self) -> None:
+        steps = np.diff(self.time)
+        bad = np.flatnonzero(steps <= 0.0)
+        if bad.size:
+            sample = int(bad[0]) + 1
+            what = "repeats" if steps[bad[0]] == 0.0 else "falls back"
+            raise RecordingError(
+                "clock",
+                f"the clock {what} at sample {sample}: {self.time[sample - 1]:.9g} s, then "
+                f"{self.time[sample]:.9g} s ({bad.size} such samples)",
+                sample=sample,
+            )
+
+    def _check_stuck(self) -> None:
+        """Refuse a position reading that stays the same to the last bit when it should not.
+
+        With a commanded position: a stretch of identical readings during which the command
+        moves by more than `STUCK_MOVEMENT`. A joint commanded to stand still may do so. Without
+        one: a reading that never changes in a recording in which another joint moves; whether
+        that joint was held or its reading is dead cannot be told, so a joint that was held has
+        to be declared.
+        """
+        moves = np.ptp(self.position, axis=0) > STUCK_MOVEMENT
+        for j, name in enumerate(self.joint_names):
+            if name in self.held_joints:
+                continue
+            if self.commanded_position is not None:
+                start, travel = _frozen_travel(self.position[:, j], self.commanded_position[:, j])
+                if travel > STUCK_MOVEMENT:
+                    raise RecordingError(
+                        "stuck",
+                        f"joint {name} is stuck: its position stays {self.position[start, j]:.6g}"
+                        f" from sample {start} on while its command moves by {travel:.3g}",
+                        joint=name,
+                        sample=start,
+                    )
+            elif np.ptp(self.position[:, j]) == 0.0 and moves.any():
+                raise RecordingError(
+                    "stuck",
+                    f"joint {name} is stuck: its position is {self.position[0, j]:.6g} in all"
+                    f" {self.n_samples} samples while other joints move; declare it as held if"
+                    " it was meant to stand still",
+                    joint=name,
+                    sample=0,
+                )
+
+
+def _frozen_travel(position: Array, command: Array) -> tuple[int, float]:
+    """Stretch of identical readings with the widest travel of the command: (start, travel)."""
+    edges = np.flatnonzero(np.diff(position, prepend=np.nan, append=np.nan) != 0.0)
+    starts = edges[:-1]
+    highest = np.fmax.reduceat(command, starts)
+    lowest = np.fmin.reduceat(command, starts)
+    travel = np.nan_to_num(highest - lowest, nan=0.0)
+    worst = int(np.argmax(travel))
+    return int(starts[worst]), float(travel[worst])

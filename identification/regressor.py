@@ -1,0 +1,284 @@
+r"""Inverse dynamics, linear in the parameters: tau = W(q, qd, qdd) pi, vectorised over samples.
+
+The torque of joint j is the power of the wrenches on all links it moves, on their twists per
+unit speed of joint j (:mod:`identification.kinematics`, :mod:`identification.wrench`). A column
+is therefore one dot product per sample, and only the columns asked for are made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import ShapeError
+from identification.friction import FrictionLaw
+from identification.kinematics import Chain, LinkMotion
+from identification.wrench import N_INERTIA, N_PRIMITIVES, wrench_matrix, write_primitives
+
+Array = NDArray[np.float64]
+Rows = slice | NDArray[np.intp]
+
+# Samples worked on at a time: enough to make the cost of a numpy call small, few enough for the
+# working arrays to stay in the processor's cache.
+CHUNK = 1024
+
+# Working arrays kept for the next call: fresh memory costs more than the arithmetic on it.
+_SPARE = 4
+_GRAIN = 64  # sizes are multiples of this, so that a search meets few different ones
+
+
+class Regressor(NamedTuple):
+    """Regressor of m samples, joint by joint, without the columns that are zero by structure.
+
+    Attributes:
+        blocks: per joint j the columns that act on it, shape (m, c_j).
+        columns: per joint the parameter index of each of its columns, shape (c_j,).
+    """
+
+    blocks: tuple[Array, ...]
+    columns: tuple[NDArray[np.intp], ...]
+
+    def dense(self, p: int) -> Array:
+        """Return all p columns with their zeros, shape (m, n, p)."""
+        full = np.zeros((self.blocks[0].shape[0], len(self.blocks), p))
+        for joint, (block, columns) in enumerate(zip(self.blocks, self.columns, strict=True)):
+            full[:, joint, columns] = block
+        return full
+
+
+class RegressorPlan:
+    """Which columns of the regressor to make for a chain, and where they stand.
+
+    Args:
+        chain: the robot.
+        gravity: acceleration of gravity in base axes [m/s²], shape (3,).
+        links: per joint the kept :data:`identification.wrench.LINK_SYMBOLS` (0..9), rising.
+        rotors: joints whose rotor inertia has a column of its own.
+        friction: friction law of every joint, None for none.
+
+    Attributes:
+        columns: per joint j the parameter index of each column in its row, shape (c_j,).
+            Parameters are numbered link by link (inertial, then rotor), then friction.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        gravity: Array,
+        links: Sequence[Sequence[int]],
+        rotors: Sequence[bool],
+        friction: FrictionLaw | None,
+    ) -> None:
+        self.chain = chain
+        self.gravity = gravity
+        self.links = tuple(tuple(kept) for kept in links)
+        self.rotors = tuple(rotors)
+        self.friction = friction
+        # Order in the working array: columns of the links, then of the joint alone: friction,
+        # rotor, response.
+        self.first_own = sum(len(kept) for kept in links)
+        self.rotor_row = self.first_own + (len(friction.symbols) if friction else 0)
+        self.rows: tuple[Rows, ...]
+        self.columns: tuple[NDArray[np.intp], ...]
+        self.rows, self.columns = _lay_out(self)
+        self._spare: list[_Workspace] = []
+        self._lock = Lock()
+
+    def __getstate__(self) -> dict[str, object]:
+        return {k: v for k, v in self.__dict__.items() if k not in ("_spare", "_lock")}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state, _spare=[], _lock=Lock())
+
+    def chunks(
+        self, q: Array, qd: Array, qdd: Array, response: Array | None = None
+    ) -> Iterator[tuple[slice, list[Array]]]:
+        """Yield the regressor in chunks of samples: (which samples, per joint its rows).
+
+        The rows of joint j have shape (c_j, k) for k samples, one more with `response` (m, n)
+        as the last. They are views of a working array: valid until the next chunk.
+        """
+        m, n = q.shape
+        rows = self.rows
+        if response is not None:
+            rows = tuple(_append(r, self.response_row(j)) for j, r in enumerate(rows))
+        with self._borrowed(m) as work:
+            for start in range(0, m, work.size):
+                part = slice(start, min(start + work.size, m))
+                k = part.stop - start
+                work.update(q[part], qd[part], qdd[part])
+                if response is not None:
+                    for joint in range(n):
+                        work.rows[joint, self.response_row(joint), :k] = response[part, joint]
+                yield part, [work.rows[joint, rows[joint], :k] for joint in range(n)]
+
+    @contextmanager
+    def _borrowed(self, m: int) -> Iterator[_Workspace]:
+        """Lend working arrays that divide m samples evenly, to one user at a time."""
+        even = -(-m // max(1, -(-m // CHUNK)))
+        size = min(CHUNK, -(-max(even, 1) // _GRAIN) * _GRAIN)
+        with self._lock:
+            index = next((i for i, work in enumerate(self._spare) if work.size == size), None)
+            work = None if index is None else self._spare.pop(index)
+        work = work or _Workspace(self, size)
+        try:
+            yield work
+        finally:
+            with self._lock:
+                self._spare = [*self._spare, work][-_SPARE:]
+
+    def evaluate(self, q: Array, qd: Array, qdd: Array) -> Regressor:
+        """Return the whole regressor for motion arrays of shape (m, n)."""
+        m = q.shape[0]
+        full = [np.empty((len(columns), m)) for columns in self.columns]
+        for part, rows in self.chunks(q, qd, qdd):
+            for target, block in zip(full, rows, strict=True):
+                target[:, part] = block
+        return Regressor(tuple(block.T for block in full), self.columns)
+
+    def response_row(self, joint: int) -> int:
+        """Return the row behind all columns of a joint."""
+        return self.rotor_row + self.rotors[joint]
+
+
+class _Workspace:
+    """Arrays for one block of samples, and the views of them that the work needs.
+
+    Attributes:
+        size: samples in a block.
+        rows: per joint all columns, shape (n, columns, size); what a joint does not feel is not
+            written and means nothing.
+    """
+
+    def __init__(self, plan: RegressorPlan, size: int) -> None:
+        n = plan.chain.n_joints
+        self.rows = np.zeros((n, plan.rotor_row + 2, size))
+        self.size = size
+        self._plan = plan
+        self._motion = LinkMotion(plan.chain, plan.gravity, size)
+        self._primitives = np.empty((n, N_PRIMITIVES, size))
+        self._friction = self.rows[:, plan.first_own : plan.rotor_row].transpose(1, 0, 2)
+        self._contractions: list[_Contraction] = []
+        first = 0
+        for link, kept in enumerate(plan.links):
+            inertia = [s for s in kept if s < N_INERTIA]
+            for symbols, moments_only in ((inertia, True), (kept[len(inertia) :], False)):
+                if symbols:
+                    self._add(link, symbols, moments_only, first)
+                    first += len(symbols)
+
+    def _add(self, link: int, symbols: Sequence[int], moments_only: bool, first: int) -> None:
+        """Prepare the columns of one link: inertia makes no force, so half the work."""
+        size = self.rows.shape[2]
+        twists = self._motion.twists[link]
+        part = twists[:, 0] if moments_only else twists.reshape(len(twists), 6, size)
+        length = part.shape[1]
+        matrix = np.concatenate([wrench_matrix(symbol)[:length] for symbol in symbols])
+        wrenches = np.empty((len(matrix), size))
+        joints = _as_slice(self._plan.chain.ancestors(link))
+        columns = slice(first, first + len(symbols))
+        contiguous = isinstance(joints, slice)
+        self._contractions.append(
+            _Contraction(
+                matrix,
+                self._primitives[link],
+                wrenches,
+                part,
+                wrenches.reshape(len(symbols), length, size),
+                self.rows[joints, columns] if contiguous else self.rows[:, columns],
+                None if isinstance(joints, slice) else joints,
+            )
+        )
+
+    def update(self, q: Array, qd: Array, qdd: Array) -> None:
+        """Make all columns for k <= size samples (k, n); those behind mean nothing."""
+        motion, plan = self._motion, self._plan
+        motion.update(q, qd, qdd)
+        write_primitives(motion.motion, self._primitives)
+        for c in self._contractions:
+            np.matmul(c.matrix, c.primitives, out=c.flat_wrenches)
+            if c.joints is None:
+                np.einsum("jrt,crt->jct", c.twists, c.wrenches, out=c.target)
+            else:
+                c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
+        if plan.friction is not None:
+            plan.friction.columns(motion.velocity, self._friction)
+        if any(plan.rotors):
+            self.rows[:, plan.rotor_row] = motion.acceleration
+
+
+class _Contraction(NamedTuple):
+    """Some columns of one link, for all a joints that move it: twists times wrenches."""
+
+    matrix: Array  # (columns * r, 12): wrenches from primitives
+    primitives: Array  # (12, size)
+    flat_wrenches: Array  # (columns * r, size)
+    twists: Array  # (a, r, size), r = 3 (moments) or 6
+    wrenches: Array  # the same memory as flat_wrenches, (columns, r, size)
+    target: Array  # (a, columns, size), or of all joints
+    joints: NDArray[np.intp] | None  # which of all joints
+
+
+def check_motion(n_joints: int, **arrays: Array) -> tuple[Array, ...]:
+    """Return the motion arrays as float64 of one shape (m, n_joints).
+
+    Raises:
+        ShapeError: an array has another shape; the message names it.
+    """
+    checked = []
+    rows: int | None = None
+    for name, array in arrays.items():
+        values = np.asarray(array, dtype=np.float64)
+        m = "m" if rows is None else rows
+        if values.ndim != 2 or values.shape[1] != n_joints or rows not in (None, len(values)):
+            raise ShapeError(name, values.shape, f"({m}, {n_joints})")
+        rows = len(values)
+        checked.append(values)
+    return tuple(checked)
+
+
+def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.intp], ...]]:
+    """Return per joint its rows in the working array, and their parameter indices."""
+    chain, n = plan.chain, plan.chain.n_joints
+    sizes = [len(kept) + rotor for kept, rotor in zip(plan.links, plan.rotors, strict=True)]
+    offsets = np.concatenate([[0], np.cumsum(sizes)]).tolist()
+    rows: list[list[int]] = [[] for _ in range(n)]
+    columns: list[list[int]] = [[] for _ in range(n)]
+    place = 0
+    for link, kept in enumerate(plan.links):
+        for position, symbol in enumerate(kept):
+            for joint in chain.ancestors(link):
+                # A sliding joint does not feel moments: it has no inertia columns.
+                if chain.revolute[joint] or symbol >= N_INERTIA:
+                    rows[joint].append(place)
+                    columns[joint].append(offsets[link] + position)
+            place += 1
+    for joint in range(n):
+        for term in range(plan.rotor_row - plan.first_own):
+            rows[joint].append(plan.first_own + term)
+            columns[joint].append(offsets[-1] + term * n + joint)
+        if plan.rotors[joint]:
+            rows[joint].append(plan.rotor_row)
+            columns[joint].append(offsets[joint] + len(plan.links[joint]))
+    return (
+        tuple(_as_slice(r) for r in rows),
+        tuple(np.array(c, dtype=np.intp) for c in columns),
+    )
+
+
+def _append(rows: Rows, last: int) -> Rows:
+    if isinstance(rows, slice):
+        return slice(rows.start, last + 1)
+    return np.append(rows, last)
+
+
+def _as_slice(indices: Sequence[int]) -> Rows:
+    """Return a slice where the indices are consecutive: it costs no copy."""
+    if len(indices) > 0 and list(indices) == list(range(indices[0], indices[0] + len(indices))):
+        return slice(indices[0], indices[0] + len(indices))
+    return np.array(indices, dtype=np.intp)

@@ -1,0 +1,73 @@
+"""How far, how fast and how abruptly each joint may move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from planner.arrays import Array, read_only
+from planner.errors import InvalidLimits
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """Position range and largest rates of every joint, each (n,) and read-only.
+
+    Attributes:
+        lower: Smallest position [rad].
+        upper: Largest position [rad].
+        velocity: Largest |velocity| [rad/s].
+        acceleration: Largest |acceleration| [rad/s²].
+        jerk: Largest |jerk| [rad/s³].
+
+    Raises:
+        InvalidLimits: shapes differ, a value is not finite, lower >= upper, a rate <= 0.
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            values = read_only(getattr(self, field.name))
+            object.__setattr__(self, field.name, values)
+            if values.ndim != 1 or values.size == 0 or values.shape != self.lower.shape:
+                raise InvalidLimits(
+                    field.name, f"has shape {values.shape}; all five must share one (n_joints,)"
+                )
+            if not np.all(np.isfinite(values)):
+                raise InvalidLimits(field.name, f"must be finite, got {values.tolist()}")
+        if np.any(self.lower >= self.upper):
+            joint = int(np.argmax(self.lower >= self.upper))
+            raise InvalidLimits(
+                "lower", f"must be below upper; joint {joint}: {self.lower[joint]} >= "
+                f"{self.upper[joint]} rad",
+            )  # fmt: skip
+        for name in ("velocity", "acceleration", "jerk"):
+            if np.any(getattr(self, name) <= 0.0):
+                raise InvalidLimits(name, f"must be positive, got {getattr(self, name).tolist()}")
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        return int(self.lower.size)
+
+    def scaled(
+        self,
+        *,
+        velocity: ArrayLike = 1.0,
+        acceleration: ArrayLike = 1.0,
+        jerk: ArrayLike = 1.0,
+    ) -> JointLimits:
+        """Return the same range with rates multiplied by the factors, each a number or (n,)."""
+        return replace(
+            self,
+            velocity=self.velocity * np.asarray(velocity),
+            acceleration=self.acceleration * np.asarray(acceleration),
+            jerk=self.jerk * np.asarray(jerk),
+        )

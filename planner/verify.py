@@ -1,0 +1,80 @@
+"""The promise of a plan, checked on its finished table."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from planner.arrays import Array
+from planner.errors import LimitExceeded, NotSmooth
+from planner.limits import JointLimits
+from planner.piecewise_cubic import PiecewiseCubic
+
+# Rounding, not licence: a position may leave its range by this share of the range's size, and
+# neighbouring pieces may differ by this share of the limit of the quantity.
+_POSITION_ROUNDING = 1e-12
+_RATE_ROUNDING = 1e-9
+
+
+def check_limits(trajectory: PiecewiseCubic, limits: JointLimits) -> None:
+    """Refuse a trajectory that breaks a limit anywhere, analytically.
+
+    Raises:
+        LimitExceeded: naming the first offending quantity, its worst joint, value and bound.
+    """
+    extrema = trajectory.extrema()
+    slack = _POSITION_ROUNDING * _size(limits)
+    for quantity, value, bound, excess in (
+        ("position", extrema.lower, limits.lower, limits.lower - extrema.lower - slack),
+        ("position", extrema.upper, limits.upper, extrema.upper - limits.upper - slack),
+        ("velocity", extrema.velocity, limits.velocity, extrema.velocity - limits.velocity),
+        (
+            "acceleration",
+            extrema.acceleration,
+            limits.acceleration,
+            extrema.acceleration - limits.acceleration,
+        ),
+        ("jerk", extrema.jerk, limits.jerk, extrema.jerk - limits.jerk),
+    ):
+        if not np.all(excess <= 0.0):  # written so that NaN is refused too
+            joint = int(np.argmax(excess))
+            raise LimitExceeded(quantity, joint, float(value[joint]), float(bound[joint]))
+
+
+def check_smooth(trajectory: PiecewiseCubic, limits: JointLimits) -> None:
+    """Refuse a trajectory that is not C2, or not at rest at both ends.
+
+    Raises:
+        NotSmooth: naming the quantity, joint, time and jump.
+    """
+    scale = jump_rounding(limits, trajectory.duration)
+    for joint, ends in enumerate(trajectory.ends()):
+        starts = trajectory.coefficients[joint][:, :3]
+        rest_before = [[starts[0, 0], 0.0, 0.0]]
+        rest_after = [[ends[-1, 0], 0.0, 0.0]]
+        jumps = np.abs(np.concatenate((starts, rest_after)) - np.concatenate((rest_before, ends)))
+        if not np.all(jumps <= scale[joint]):
+            knot, which = np.unravel_index(int(np.argmax(jumps / scale[joint])), jumps.shape)
+            raise NotSmooth(
+                ("position", "velocity", "acceleration")[which],
+                joint,
+                float(trajectory.knots[joint][knot]),
+                float(jumps[knot, which]),
+            )
+
+
+def jump_rounding(limits: JointLimits, duration: float) -> Array:
+    """Return the jumps of position, velocity, acceleration that count as rounding, (n, 3)."""
+    # A knot is told no finer than the clock allows: late in a long motion that shows.
+    tick = 4.0 * np.spacing(duration)
+    return np.stack(
+        (
+            _POSITION_ROUNDING * _size(limits) + tick * limits.velocity,
+            _RATE_ROUNDING * limits.velocity + tick * limits.acceleration,
+            _RATE_ROUNDING * limits.acceleration + tick * limits.jerk,
+        ),
+        axis=1,
+    )
+
+
+def _size(limits: JointLimits) -> Array:
+    return np.maximum(np.abs(limits.lower), np.abs(limits.upper))

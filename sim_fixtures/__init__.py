@@ -1,0 +1,34 @@
+"""The simulated cell: a robot with its controller, the other end of the link in tests.
+
+Nothing here shares conversion, friction or regressor code with what it tests; only the packet codec
+is common, because captures of foreign programs pin it.
+"""
+
+from __future__ import annotations
+
+from sim_fixtures.controller import SimulatedController
+from sim_fixtures.drive import SimulatedDrive
+from sim_fixtures.effects import UnmodelledEffects
+from sim_fixtures.elastic_plant import ElasticPlant
+from sim_fixtures.errors import FixtureError, PlantDiverged, SettingError, SimulationError
+from sim_fixtures.plant import Plant
+from sim_fixtures.program import Phase
+from sim_fixtures.settings import ControllerSettings, ServoSettings
+from sim_fixtures.truth import PlantTruth, standard_parameters
+
+__all__ = [
+    "SimulatedController",
+    "ControllerSettings",
+    "ServoSettings",
+    "Phase",
+    "SimulatedDrive",
+    "Plant",
+    "ElasticPlant",
+    "PlantTruth",
+    "standard_parameters",
+    "UnmodelledEffects",
+    "SimulationError",
+    "FixtureError",
+    "SettingError",
+    "PlantDiverged",
+]

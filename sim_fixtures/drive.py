@@ -1,0 +1,173 @@
+"""How the simulated robot's motors are geared to its joints.
+
+Written per axis from the controller's own formulas: axes 1 to 4 stand alone, 4 turns 5 and 6 along,
+5 turns 6 along. It shares no code with the drive train that the PC uses, so that a wrong sign on
+one side cannot cancel on the other.
+
+With a the angles the teach pendant shows (a = sign * q + offset, q the joint angles of the URDF):
+
+    p_i = kr_i a_i / 2 pi + cal_i                                   all axes but 5 and 6
+    p_5 = kr_5 (a_5 - k54 a_4) / 2 pi + cal_5
+    p_6 = kr_6 (a_6 - k65 a_5 + (k65 k54 - k64) a_4) / 2 pi + cal_6
+
+Joint torques follow from motor torques by virtual work, so the coupling acts on them transposed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import isfinite, pi
+
+from sim_fixtures.errors import SettingError
+
+_PER_AXIS = (
+    "gear_ratio",
+    "calibration",
+    "joint_sign",
+    "joint_offset",
+    "torque_constant",
+    "current_limit",
+    "following_error",
+)
+_POSITIVE = ("torque_constant", "current_limit", "following_error")
+
+
+@dataclass(frozen=True)
+class SimulatedDrive:
+    """Gears, calibration, coupling and motors of one arm; per-axis values are (n,) sequences.
+
+    Attributes:
+        gear_ratio: signed motor revolutions per joint revolution.
+        calibration: motor revolutions at controller angle zero.
+        joint_sign: +1 or -1; controller angle = joint_sign * q + joint_offset.
+        joint_offset: rad.
+        torque_constant: N m/A on the motor side.
+        current_limit: A.
+        following_error: threshold in motor revolutions.
+        encoder_counts: counts per motor revolution.
+        k54, k64, k65: wrist coupling, 5 by 4, 6 by 4, 6 by 5; need six axes.
+
+    Raises:
+        SettingError: wrong sizes, zero or non-finite figures, coupling without a wrist.
+    """
+
+    gear_ratio: tuple[float, ...]
+    calibration: tuple[float, ...]
+    joint_sign: tuple[float, ...]
+    joint_offset: tuple[float, ...]
+    torque_constant: tuple[float, ...]
+    current_limit: tuple[float, ...]
+    following_error: tuple[float, ...]
+    encoder_counts: int
+    k54: float = 0.0
+    k64: float = 0.0
+    k65: float = 0.0
+    _coupled: bool = field(init=False, repr=False)
+    _k46: float = field(init=False, repr=False)
+    _signed_ratio: tuple[float, ...] = field(init=False, repr=False)
+    _motor_at_zero: tuple[float, ...] = field(init=False, repr=False)
+    _joint_at_zero: tuple[float, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in _PER_AXIS:
+            object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
+        self._check()
+        object.__setattr__(self, "_coupled", any((self.k54, self.k64, self.k65)))
+        # factor of angle 4 in the position of motor 6
+        object.__setattr__(self, "_k46", self.k65 * self.k54 - self.k64)
+        # motor revolutions per joint radian
+        signed = tuple(
+            s * kr / (2.0 * pi) for s, kr in zip(self.joint_sign, self.gear_ratio, strict=True)
+        )
+        object.__setattr__(self, "_signed_ratio", signed)
+        signed_offset = [s * a for s, a in zip(self.joint_sign, self.joint_offset, strict=True)]
+        geared = self.motor_speeds(signed_offset)
+        at_zero = tuple(p + cal for p, cal in zip(geared, self.calibration, strict=True))
+        object.__setattr__(self, "_motor_at_zero", at_zero)
+        object.__setattr__(self, "_joint_at_zero", tuple(self.joint_speeds(at_zero)))
+
+    def _check(self) -> None:
+        n = len(self.gear_ratio)
+        for name in _PER_AXIS:
+            values = getattr(self, name)
+            if len(values) != n or not all(isfinite(v) for v in values):
+                raise SettingError(name, values, f"{n} finite numbers, one per axis")
+        if not all(self.gear_ratio):
+            raise SettingError("gear_ratio", self.gear_ratio, "no zero")
+        if any(abs(sign) != 1.0 for sign in self.joint_sign):
+            raise SettingError("joint_sign", self.joint_sign, "+1 or -1")
+        for name in _POSITIVE:
+            if min(getattr(self, name)) <= 0.0:
+                raise SettingError(name, getattr(self, name), "greater than zero")
+        if self.encoder_counts < 1:
+            raise SettingError("encoder_counts", self.encoder_counts, "at least 1")
+        coupling = (self.k54, self.k64, self.k65)
+        if not all(isfinite(k) for k in coupling) or (any(coupling) and n < 6):
+            raise SettingError("k54, k64, k65", coupling, "finite, and zero below six axes")
+
+    @property
+    def n_axes(self) -> int:
+        """Number of axes."""
+        return len(self.gear_ratio)
+
+    def motor_revolutions(self, q: Sequence[float]) -> list[float]:
+        """Return the motor positions, calibration included, of joint angles [rad]."""
+        return [p + zero for p, zero in zip(self.motor_speeds(q), self._motor_at_zero, strict=True)]
+
+    def motor_speeds(self, qd: Sequence[float]) -> list[float]:
+        """Return motor speeds [rev/s] of joint speeds [rad/s]; calibration and offset drop out."""
+        speeds = [ratio * v for ratio, v in zip(self._signed_ratio, qd, strict=True)]
+        if self._coupled:
+            # the coupling is between controller angles, hence the signs
+            kr, sign = self.gear_ratio, self.joint_sign
+            a4, a5 = sign[3] * qd[3], sign[4] * qd[4]
+            speeds[4] -= kr[4] * self.k54 * a4 / (2.0 * pi)
+            speeds[5] += kr[5] * (self._k46 * a4 - self.k65 * a5) / (2.0 * pi)
+        return speeds
+
+    def joint_angles(self, revolutions: Sequence[float]) -> list[float]:
+        """Return joint angles [rad] of motor positions."""
+        return [
+            q - zero
+            for q, zero in zip(self.joint_speeds(revolutions), self._joint_at_zero, strict=True)
+        ]
+
+    def joint_speeds(self, revolutions_per_second: Sequence[float]) -> list[float]:
+        """Return joint speeds [rad/s] of motor speeds [rev/s]; accelerations map alike."""
+        speeds = [
+            v / ratio for v, ratio in zip(revolutions_per_second, self._signed_ratio, strict=True)
+        ]
+        if self._coupled:
+            sign = self.joint_sign
+            a4, own5 = sign[3] * speeds[3], sign[4] * speeds[4]
+            speeds[4] += sign[4] * self.k54 * a4
+            speeds[5] += sign[5] * (self.k65 * own5 + self.k64 * a4)
+        return speeds
+
+    def joint_torques(self, currents: Sequence[float]) -> list[float]:
+        """Return joint torques [N m] of motor currents [A]."""
+        motor = [kt * i for kt, i in zip(self.torque_constant, currents, strict=True)]
+        torque = [2.0 * pi * ratio * m for ratio, m in zip(self._signed_ratio, motor, strict=True)]
+        if self._coupled:
+            # motors 5 and 6 also push on joint 4, motor 6 on joint 5
+            kr, sign = self.gear_ratio, self.joint_sign
+            torque[3] += sign[3] * (kr[5] * self._k46 * motor[5] - kr[4] * self.k54 * motor[4])
+            torque[4] -= sign[4] * kr[5] * self.k65 * motor[5]
+        return torque
+
+    def currents(self, torques: Sequence[float]) -> list[float]:
+        """Return the motor currents [A] that give joint torques [N m]."""
+        motor = [
+            t / (2.0 * pi * ratio) for t, ratio in zip(torques, self._signed_ratio, strict=True)
+        ]
+        if self._coupled:
+            kr = self.gear_ratio
+            motor[4] += kr[5] * self.k65 * motor[5] / kr[4]
+            motor[3] += (kr[4] * self.k54 * motor[4] - kr[5] * self._k46 * motor[5]) / kr[3]
+        return [m / kt for m, kt in zip(motor, self.torque_constant, strict=True)]
+
+    def encoder(self, revolutions: Sequence[float]) -> list[float]:
+        """Return motor positions rounded to whole encoder counts."""
+        counts = self.encoder_counts
+        return [round(p * counts) / counts for p in revolutions]

@@ -1,0 +1,136 @@
+"""Write ns16.urdf from the figures: `python -m sim_fixtures.ns16.build_urdf`.
+
+Link frame i stands at O_{i-1} with the axes of DH frame i, so that the standard parameters that a
+rigid-body library reads from joint frame i *are* those of the paper: mass, first moment, and the
+tensor about the frame's origin. Joint i stands at p_{i-1} of link i-1, turned by Rx(alpha_i); its
+axis is Rx(-alpha_i) z, because DH turns about z before it twists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import pi, radians
+from pathlib import Path
+
+import numpy as np
+
+from sim_fixtures.errors import FixtureError
+from sim_fixtures.ns16 import geometry
+from sim_fixtures.ns16.shapes import COLOURS, RGBA, SHAPES, Cylinder, Shape
+from sim_fixtures.ns16.truth import LinkInertia, load_truth
+
+URDF_PATH = Path(__file__).with_name("ns16.urdf")
+
+EFFORT = (2100.0, 2800.0, 755.0, 63.0, 151.0, 138.0)
+"""Joint torque limits [N m]: what the assumed drives of the cell file give at their limits."""
+
+_HEADER = """\
+<?xml version="1.0"?>
+<!-- Written by `python -m sim_fixtures.ns16.build_urdf`; edit geometry.py, shapes.py, truth.json.
+     Joint angles are the DH angles of Table 2, not the angles of the teach pendant.
+     Rotor inertias are not part of a URDF; see truth.json. Efforts and velocities are assumed. -->
+<robot name="ns16">
+"""
+
+# Rotations that carry a cylinder's own axis, z, onto an axis of the link.
+_CYLINDER_RPY = {"x": (0.0, pi / 2, 0.0), "y": (-pi / 2, 0.0, 0.0), "z": (0.0, 0.0, 0.0)}
+
+
+def _numbers(values: Sequence[float]) -> str:
+    """Write numbers with as many digits (up to 17) as carry a double without loss."""
+    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)
+
+
+def _origin(xyz: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> str:
+    return f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>'
+
+
+def _shape(shape: Shape) -> str:
+    """Return origin and geometry of one shape."""
+    if isinstance(shape, Cylinder):
+        middle = list(shape.offset)
+        middle["xyz".index(shape.axis)] += 0.5 * (shape.start + shape.end)
+        length = shape.end - shape.start
+        geometry_xml = f'<cylinder radius="{shape.radius:g}" length="{length:g}"/>'
+        origin = _origin([round(value, 9) for value in middle], _CYLINDER_RPY[shape.axis])
+    else:
+        geometry_xml = f'<sphere radius="{shape.radius:g}"/>'
+        origin = _origin((0.0, 0.0, 0.0))
+    return f"{origin}<geometry>{geometry_xml}</geometry>"
+
+
+def _inertial(link: LinkInertia, name: str) -> str:
+    """Return the inertial element; raise FixtureError where no rigid body could have it."""
+    xx, xy, xz, yy, yz, zz = link.tensor_at_centre
+    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if link.mass <= 0.0 or moments[0] <= 0.0 or moments[2] >= moments[0] + moments[1]:
+        raise FixtureError(f"{name}: no rigid body has mass {link.mass} and moments {moments}")
+    tensor = " ".join(
+        f'i{key}="{_numbers([value])}"'
+        for key, value in zip(
+            ("xx", "xy", "xz", "yy", "yz", "zz"), link.tensor_at_centre, strict=True
+        )
+    )
+    return (
+        f"    <inertial>{_origin(link.centre_of_mass)}"
+        f'<mass value="{_numbers([link.mass])}"/><inertia {tensor}/></inertial>\n'
+    )
+
+
+def _link(name: str, inertia: LinkInertia | None) -> str:
+    """Return one link with its inertia and shapes."""
+    parts = [f'  <link name="{name}">\n']
+    if inertia is not None:
+        parts.append(_inertial(inertia, name))
+    material = f'<material name="{COLOURS[name]}"/>'
+    for shape in SHAPES[name]:
+        if shape.visible:
+            parts.append(f"    <visual>{_shape(shape)}{material}</visual>\n")
+        if shape.collides:
+            parts.append(f"    <collision>{_shape(shape)}</collision>\n")
+    parts.append("  </link>\n")
+    return "".join(parts)
+
+
+def _joint(i: int) -> str:
+    """Return revolute joint `i` (0-based) between link i and link i + 1."""
+    parent = "base_link" if i == 0 else f"link_{i}"
+    xyz = (0.0, 0.0, geometry.D[0]) if i == 0 else geometry.next_origin(i - 1)
+    lower, upper = geometry.joint_limits_deg()[i]
+    return (
+        f'  <joint name="joint_{i + 1}" type="revolute">\n'
+        f'    <parent link="{parent}"/><child link="link_{i + 1}"/>\n'
+        f"    {_origin(xyz, (geometry.ALPHA_QUARTER_TURNS[i] * pi / 2, 0.0, 0.0))}\n"
+        f'    <axis xyz="{_numbers(geometry.joint_axis(i))}"/>\n'
+        f'    <limit lower="{_numbers([radians(lower)])}" upper="{_numbers([radians(upper)])}"'
+        f' effort="{EFFORT[i]:g}" velocity="{_numbers([radians(geometry.VELOCITY_DEG[i])])}"/>\n'
+        f"  </joint>\n"
+    )
+
+
+def build_urdf() -> str:
+    """Return the URDF text."""
+    truth = load_truth()
+    parts = [_HEADER]
+    for name, rgba in RGBA.items():
+        parts.append(f'  <material name="{name}"><color rgba="{rgba}"/></material>\n')
+    parts.append(_link("base_link", None))
+    for i, link in enumerate(truth.links):
+        parts += [_joint(i), _link(f"link_{i + 1}", link)]
+    parts.append(
+        '  <link name="flange"/>\n'
+        '  <joint name="flange_mount" type="fixed">\n'
+        '    <parent link="link_6"/><child link="flange"/>\n'
+        f"    {_origin((0.0, 0.0, geometry.D[5]))}\n"
+        "  </joint>\n</robot>\n"
+    )
+    return "".join(parts)
+
+
+def main() -> None:
+    """Write the file beside this module."""
+    URDF_PATH.write_text(build_urdf(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

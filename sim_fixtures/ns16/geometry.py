@@ -1,0 +1,77 @@
+"""Where the links of the NS 16 are: the Denavit-Hartenberg table, and how the teach pendant counts.
+
+Standard DH, T_i = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Link frame i has the axes of DH frame i but
+stands at O_{i-1}, a point of the link's own joint axis, because the parameters of the paper's
+Table 2 are taken about that point.
+
+Table 2 fixes a_1, a_2, a_3, d_4 and the twists alpha_2 ... alpha_5. It leaves open the sign of
+alpha_1 (a mirror image of the arm has the same table), d_1, d_6, every zero position and every
+direction of rotation. Chosen here: alpha_1 = -90 deg with z0 up, d_1 and d_6 of the data sheet,
+and the published directions of rotation. One consequence can be seen: with the forearm level, the
+elbow offset a_3 puts the forearm *below* the elbow axis and home turns the flange up, the mirror
+image of the real arm. Dynamics and identification are the same in both.
+
+The zero of the teach pendant: link 2 stands upright at 0; the forearm continues it straight up at
+0 and points level forward at -90 deg while link 2 is upright.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+A: Final = (0.300, 0.700, 0.185, 0.0, 0.0, 0.0)
+"""Link lengths a_i [m]."""
+
+D: Final = (0.600, 0.0, 0.0, -0.624, 0.0, 0.135)
+"""Link offsets d_i [m]; the first and the last are not in Table 2 but on the data sheet."""
+
+ALPHA_QUARTER_TURNS: Final = (-1, 0, -1, -1, -1, 0)
+"""Twists alpha_i in units of 90 deg, so that sines and cosines are exact."""
+
+JOINT_SIGN: Final = (-1, 1, -1, -1, 1, -1)
+"""Controller angle = sign * DH angle + offset."""
+
+JOINT_OFFSET_DEG: Final = (0.0, 90.0, 90.0, 0.0, 0.0, 0.0)
+
+LOWER_DEG: Final = (-180.0, -50.0, -170.0, -360.0, -120.0, -360.0)
+"""Controller angles: what both the catalogue and the published URDF allow."""
+
+UPPER_DEG: Final = (180.0, 95.0, 110.0, 360.0, 120.0, 360.0)
+
+VELOCITY_DEG: Final = (155.0, 155.0, 170.0, 360.0, 350.0, 550.0)
+"""Maximum speeds [deg/s]; assumed, the data sheet was not at hand."""
+
+HOME_DEG: Final = (0.0, 0.0, -90.0, 0.0, 90.0, 0.0)
+"""The maker's home posture, controller angles."""
+
+
+def quarter_turn_sine(quarter_turns: int) -> int:
+    """Return the exact sine of a number of right angles."""
+    return (0, 1, 0, -1)[quarter_turns % 4]
+
+
+def joint_axis(i: int) -> tuple[int, int, int]:
+    """Return the axis of joint `i` (0-based) in the axes of link frame `i`: Rx(-alpha_i) z."""
+    turns = -ALPHA_QUARTER_TURNS[i]
+    return (0, -quarter_turn_sine(turns), quarter_turn_sine(turns + 1))
+
+
+def next_origin(i: int) -> tuple[float, float, float]:
+    """Return p_i = O_i - O_{i-1} of link `i` (0-based) in its own axes [m].
+
+    The height d_1 is left out: O_0 is placed on the axis of joint 1 at the height of joint 2.
+    """
+    offset = 0.0 if i == 0 else D[i]
+    x, y, z = joint_axis(i)
+    return (A[i] + offset * x, offset * y + 0.0, offset * z + 0.0)
+
+
+def joint_limits_deg() -> tuple[tuple[float, float], ...]:
+    """Return (lower, upper) of every joint as DH angles [deg]."""
+    limits = []
+    for lower, upper, sign, offset in zip(
+        LOWER_DEG, UPPER_DEG, JOINT_SIGN, JOINT_OFFSET_DEG, strict=True
+    ):
+        ends = (sign * (lower - offset), sign * (upper - offset))
+        limits.append((min(ends), max(ends)))
+    return tuple(limits)

@@ -1,0 +1,211 @@
+"""The simulated arm: rigid bodies of a URDF, rotor inertias, friction with a real standstill.
+
+Forward dynamics are pinocchio's articulated-body algorithm with the rotor inertias as armature
+(link side, diagonal). One step drifts half, kicks, drifts half:
+
+    q_mid = q + h/2 v;   v' = v + h a(q_mid, v + h/2 a_before, torque);   q' = q_mid + h/2 v'
+
+It is exact for constant acceleration, symplectic for a system with constant inertia, and of second
+order otherwise, at the price of one evaluation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from sim_fixtures.errors import PlantDiverged, SettingError
+from sim_fixtures.standstill import resolve_dry_friction
+from sim_fixtures.truth import PlantTruth
+
+Array = NDArray[np.float64]
+
+
+def build_model(urdf: str, gravity: ArrayLike, armature: ArrayLike) -> pin.Model:
+    """Return pinocchio's model of a URDF text with gravity [m/s2] and armature [kg m2] set.
+
+    Raises:
+        SettingError: the joints are not as many as the armatures, or not simple revolute ones.
+    """
+    model = pin.buildModelFromXML(urdf)
+    inertias = np.asarray(armature, dtype=np.float64)
+    if not model.nq == model.nv == inertias.size:
+        raise SettingError(
+            "urdf", f"{model.nv} degrees of freedom", f"{inertias.size} joints with one angle each"
+        )
+    model.gravity.linear = np.asarray(gravity, dtype=np.float64)
+    model.armature = inertias
+    return model
+
+
+def joint_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
+    """Return the joint-space inertia matrix (n, n) [kg m2], armature included."""
+    upper = np.triu(pin.crba(model, data, q))
+    full: Array = upper + np.triu(upper, 1).T
+    return full
+
+
+class Plant:
+    """A rigid arm under joint torques.
+
+    Attributes:
+        truth: the planted rotor inertias and friction.
+        model: pinocchio's model; its armature holds the rotor inertias.
+        position, velocity, acceleration: state (n,), rad, rad/s, rad/s2. The acceleration is the
+            mean over the last step.
+        friction_torque: friction during the last step, (n,) [N m], positive against positive speed.
+        time: simulated time [s].
+    """
+
+    def __init__(
+        self,
+        urdf: str,
+        truth: PlantTruth,
+        *,
+        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        position: ArrayLike | None = None,
+        brake_torque: ArrayLike = 0.0,
+    ) -> None:
+        """Put the arm at rest.
+
+        Args:
+            urdf: URDF text.
+            truth: rotor inertias and friction.
+            gravity: m/s2 in the base frame.
+            position: joint angles [rad]; the URDF's zero if not given.
+            brake_torque: dry friction of each joint's brake when it is closed [N m].
+        """
+        n = truth.n_joints
+        self.truth = truth
+        self.model = build_model(urdf, gravity, truth.rotor_inertia)
+        self.data = self.model.createData()
+        start = np.zeros(n) if position is None else np.array(position, dtype=np.float64)
+        if start.shape != (n,) or not np.isfinite(start).all():
+            raise SettingError("position", start.tolist(), f"{n} finite angles")
+        self.position: Array = start
+        self.velocity: Array = np.zeros(n)
+        self.acceleration: Array = np.zeros(n)
+        self.friction_torque: Array = np.zeros(n)
+        self.time = 0.0
+        self._brake: Array = np.broadcast_to(np.asarray(brake_torque, dtype=np.float64), (n,))
+        self._braked = False
+        self._scale: Array | None = None
+        self._coulomb: Array = truth.coulomb
+        self._dry: Array = np.zeros(n)
+        self._holding: Array | None = None
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        return self.truth.n_joints
+
+    @property
+    def motor_position(self) -> Array:
+        """Where the motors stand, as joint angles (n,) [rad]; the joints', for gears are rigid."""
+        return self.position
+
+    def set_state(self, position: ArrayLike, velocity: ArrayLike) -> None:
+        """Put the arm somewhere, moving: (n,) [rad] and (n,) [rad/s]."""
+        self.position = np.array(position, dtype=np.float64)
+        self.velocity = np.array(velocity, dtype=np.float64)
+        self.acceleration = np.zeros(self.n_joints)
+        self._holding = None
+
+    def close_brakes(self, closed: bool) -> None:
+        """Close or release the brakes of all joints."""
+        if closed is not self._braked:
+            self._braked = closed
+            self._set_coulomb()
+
+    def scale_friction(self, factor: Array) -> None:
+        """Set the factor on all friction but the brakes', (n,)."""
+        self._scale = factor
+        self._set_coulomb()
+
+    def _set_coulomb(self) -> None:
+        """Set the dry friction that each joint can muster [N m]."""
+        coulomb = self.truth.coulomb
+        if self._scale is not None:
+            coulomb = coulomb * self._scale
+        self._coulomb = coulomb + self._brake if self._braked else coulomb
+
+    def energy(self) -> float:
+        """Return kinetic (rotors included) plus potential energy [J]."""
+        # From the inertia matrix: pinocchio's own kinetic energy (4.1) leaves the armature of
+        # joints out whose axis is not +x, +y or +z.
+        momentum = joint_inertia(self.model, self.data, self.position) @ self.velocity
+        potential = pin.computePotentialEnergy(self.model, self.data, self.position)
+        return float(0.5 * self.velocity @ momentum + potential)
+
+    def step(self, torque: Array, step: float) -> None:
+        """Advance by `step` [s] under joint torques (n,) [N m] that are constant over it.
+
+        Raises:
+            PlantDiverged: the state left the finite numbers.
+        """
+        self.time += step
+        if self._rests_on(torque):
+            return
+        half = 0.5 * step
+        middle = self.position + half * self.velocity
+        predicted = self.velocity + half * self.acceleration
+        smooth = self._smooth_friction(predicted)
+        self._advance(torque - smooth, self._coulomb, middle, predicted, step)
+        self.friction_torque = self._dry + smooth
+        self.position = middle + half * self.velocity
+
+    def _smooth_friction(self, velocity: Array) -> Array:
+        """Return the friction that vanishes with the velocity, warm or cold as it is [N m]."""
+        smooth = self.truth.smooth_friction(velocity)
+        return smooth if self._scale is None else smooth * self._scale
+
+    def _rests_on(self, torque: Array) -> bool:
+        """Return whether an arm resting under gravity torque `_holding` stays so."""
+        if self._holding is None:
+            return False
+        friction = torque - self._holding
+        if (np.abs(friction) <= self._coulomb).all():
+            self._dry = self.friction_torque = friction
+            return True
+        self._holding = None
+        return False
+
+    def _advance(
+        self, torque: Array, coulomb: Array, middle: Array, predicted: Array, step: float
+    ) -> None:
+        """Set velocity, acceleration and dry friction from torques without dry friction."""
+        before = self.velocity.tolist()
+        if 0.0 not in before:
+            sliding = np.copysign(coulomb, self.velocity)
+            a = pin.aba(self.model, self.data, middle, predicted, torque - sliding)
+            after = self.velocity + step * a
+            if all(v * w > 0.0 for v, w in zip(before, after.tolist(), strict=True)):
+                self._dry = sliding
+                self.velocity, self.acceleration = after, a
+                return
+        self._stop_or_turn(torque, coulomb, middle, predicted, step)
+
+    def _stop_or_turn(
+        self, torque: Array, coulomb: Array, middle: Array, predicted: Array, step: float
+    ) -> None:
+        """Do the same where a joint stands, starts, stops or turns within the step."""
+        free = pin.aba(self.model, self.data, middle, predicted, torque)
+        inverse = pin.computeMinverse(self.model, self.data, middle)
+        result = resolve_dry_friction(
+            (self.velocity + step * free).tolist(),
+            inverse,
+            coulomb.tolist(),
+            step,
+            self._dry.tolist(),
+        )
+        after = np.array(result.velocity)
+        if not np.isfinite(after).all():
+            joint = int(np.argmin(np.isfinite(after)))
+            raise PlantDiverged(joint, self.time)
+        if not after.any() and not self.velocity.any():
+            gravity = pin.computeGeneralizedGravity(self.model, self.data, self.position)
+            self._holding = np.array(gravity)
+        self.acceleration = (after - self.velocity) / step
+        self.velocity = after
+        self._dry = np.array(result.torque)

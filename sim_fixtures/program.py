@@ -1,0 +1,207 @@
+"""The program that runs on the simulated controller: which phase it is in and when it moves on.
+
+It plays the usual loop program: start the link, switch the drive on, open all axes (one after the
+other), wait until the PC wants out, close, pause, open again. It knows nothing of packets, motors
+or robots; once a cycle it is told what the PC's answer asked for.
+
+    START -> DRIVE_OFF -> DRIVING_ON -> CLOSED -> OPENING -> OPEN -> CLOSING -+
+                  ^           ^           ^                                   |
+                  |           |           +-----------------------------------+
+    TRIPPED (drive lost, axes still open for some cycles) -> DRIVE_OFF
+    finish() or the last interval: CLOSED -> SHUTDOWN -> ENDING (504) -> ENDED
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, auto
+from typing import NamedTuple
+
+from sim_fixtures.settings import ControllerSettings
+
+
+class Phase(IntEnum):
+    """What the controller is doing."""
+
+    START = auto()
+    DRIVE_OFF = auto()
+    DRIVING_ON = auto()
+    CLOSED = auto()
+    OPENING = auto()
+    OPEN = auto()
+    CLOSING = auto()
+    TRIPPED = auto()
+    SHUTDOWN = auto()
+    ENDING = auto()
+    ENDED = auto()
+
+
+POWERED = frozenset({Phase.DRIVING_ON, Phase.CLOSED, Phase.OPENING, Phase.OPEN, Phase.CLOSING})
+UNBRAKED = POWERED - {Phase.DRIVING_ON}
+AXES_OPEN = frozenset({Phase.OPEN, Phase.CLOSING, Phase.TRIPPED})
+LISTENING = frozenset({Phase.OPENING, Phase.OPEN})
+
+
+class StartStep(IntEnum):
+    """What the packets of the start are."""
+
+    SYNC = auto()
+    INIT = auto()
+
+
+COLD_START = (*[StartStep.SYNC] * 9, StartStep.INIT, StartStep.SYNC, StartStep.SYNC)
+WARM_START = (StartStep.INIT,)
+
+
+class Answer(NamedTuple):
+    """What one reply of the PC asked for.
+
+    Attributes:
+        valid: a reply came, with the right number and length.
+        exit: end of open mode asked for (status byte 1).
+        drive_off: mode 505 on some axis.
+        following_error: mode 508 on some axis.
+    """
+
+    valid: bool = False
+    exit: bool = False
+    drive_off: bool = False
+    following_error: bool = False
+
+
+MISSING = Answer()
+
+
+class LoopProgram:
+    """Phase of the controller, cycle by cycle.
+
+    Attributes:
+        phase: the present one.
+        powered: whether the drive is on (status DRIVE_ON).
+        braked: whether the brakes are closed.
+        listening: whether targets of open axes are taken from the PC.
+        open_axes: which axes stand in open mode in the packet of this cycle, (n,).
+        reason: why the drive was last lost or the session ended, in words; "" if neither.
+        intervals: how often all axes have been open.
+    """
+
+    def __init__(self, n_axes: int, settings: ControllerSettings) -> None:
+        self._settings = settings
+        self._n_axes = n_axes
+        self._start = COLD_START if settings.cold_start else WARM_START
+        self._age = 0
+        self._missed = 0
+        self._stays_off = False
+        self._finishing = False
+        self.reason = ""
+        self.intervals = 0
+        self._enter(Phase.START)
+
+    @property
+    def start_step(self) -> StartStep:
+        """What the present packet of the start is; only in phase START."""
+        return self._start[self._age]
+
+    def finish(self) -> None:
+        """End the session: at once where no axis is open, else when the arm stands."""
+        self._finishing = True
+
+    def drive_on(self) -> None:
+        """Press the button that brings the drive back after it was lost."""
+        self._stays_off = False
+
+    def trip(self, reason: str) -> None:
+        """Lose the drive now, as at a following error or an emergency stop."""
+        if self.powered:
+            self.reason = reason
+            self._stays_off = True
+            opened = self.phase in (Phase.OPENING, Phase.OPEN, Phase.CLOSING)
+            self._enter(Phase.TRIPPED if opened else Phase.DRIVE_OFF)
+
+    def advance(self, answer: Answer, standing: bool) -> None:
+        """End the cycle.
+
+        Args:
+            answer: what the PC replied to this cycle's packet.
+            standing: the target of every axis stands still.
+        """
+        self._age += 1
+        self._missed = 0 if answer.valid else self._missed + 1
+        if self._missed >= self._settings.silence_limit and self.phase < Phase.SHUTDOWN:
+            self.reason = f"no valid reply in {self._missed} cycles"
+            self._enter(Phase.SHUTDOWN)
+        elif self.phase is Phase.START:
+            self._advance_start(answer)
+        elif self.listening:
+            self._advance_open(answer, standing)
+        else:
+            self._advance_timed()
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase = phase
+        self.powered = phase in POWERED
+        self.braked = phase not in UNBRAKED
+        self.listening = phase in LISTENING
+        self._age = 0
+        self.open_axes = [phase in AXES_OPEN] * self._n_axes
+        if phase is Phase.OPENING:
+            self._open_due_axes()
+
+    def _open_due_axes(self) -> None:
+        """Open one axis after the other."""
+        stagger = self._settings.opening_stagger
+        self.open_axes = [self._age >= i * stagger for i in range(self._n_axes)]
+
+    def _advance_start(self, answer: Answer) -> None:
+        """Go through the packets of the start; an init packet that nobody answers ends it."""
+        if self._start[self._age - 1] is StartStep.INIT and not answer.valid:
+            self.reason = "the init packet was not answered"
+            self._enter(Phase.ENDED)
+        elif self._age == len(self._start):
+            self._enter(Phase.DRIVE_OFF)
+
+    def _advance_open(self, answer: Answer, standing: bool) -> None:
+        """React to the PC while axes are open or opening."""
+        settings = self._settings
+        if answer.drive_off:
+            self.reason = "the PC asked for drive off (505)"
+            self._stays_off = True
+            self._enter(Phase.DRIVE_OFF)
+        elif answer.following_error:
+            self.reason = "the PC reported a following error (508)"
+            self._enter(Phase.CLOSED)
+        elif self._missed >= settings.missed_replies:
+            self.reason = f"no valid reply in {self._missed} cycles of open mode"
+            self._enter(Phase.CLOSED)
+        elif answer.exit or (self._finishing and standing):
+            self._enter(Phase.CLOSING)
+        elif self.phase is Phase.OPENING:
+            if all(self.open_axes):
+                self.intervals += 1
+                self._enter(Phase.OPEN)
+            else:
+                self._open_due_axes()
+
+    def _advance_timed(self) -> None:
+        """Leave the phases that last a number of cycles."""
+        settings = self._settings
+        phase, age = self.phase, self._age
+        if phase is Phase.DRIVE_OFF and age >= settings.drive_off_cycles:
+            if self._finishing:
+                self._enter(Phase.ENDING)
+            elif not self._stays_off:
+                self._enter(Phase.DRIVING_ON)
+        elif phase is Phase.DRIVING_ON and age >= settings.driving_on_cycles:
+            self._enter(Phase.CLOSED)
+        elif phase is Phase.CLOSED and age >= settings.closed_cycles:
+            done = settings.open_intervals is not None and (
+                self.intervals >= settings.open_intervals
+            )
+            self._enter(Phase.SHUTDOWN if self._finishing or done else Phase.OPENING)
+        elif phase is Phase.CLOSING and age >= settings.closing_cycles:
+            self._enter(Phase.CLOSED)
+        elif phase is Phase.TRIPPED and age >= settings.closing_cycles:
+            self._enter(Phase.DRIVE_OFF)
+        elif phase is Phase.SHUTDOWN and age >= settings.drive_off_cycles:
+            self._enter(Phase.ENDING)
+        elif phase is Phase.ENDING:
+            self._enter(Phase.ENDED)

@@ -1,0 +1,221 @@
+"""The servo of the simulated controller: position, velocity and current loops of every axis.
+
+All loops run on the motor side, once per cycle, on positions as the encoders give them:
+
+    speed demanded  = speed of the target + position gain * (target - measured)
+    target current  = model current + velocity gain * (error of the speed + its integral)
+
+The model current is the dynamic model's for the target motion of the cycle that begins. What leaves
+here is the *target* current; the current that flows follows with a lag and noise (`CurrentLoop`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import exp, inf, pi
+
+import numpy as np
+
+from sim_fixtures.drive import SimulatedDrive
+from sim_fixtures.nominal_model import NominalModel
+from sim_fixtures.settings import ServoSettings
+
+_TURN = 2.0 * pi
+
+
+class Servo:
+    """Position and velocity loops; per-axis values are lists (n,), motor side.
+
+    Attributes:
+        target: position demanded at the present tick [motor rev].
+        delta: its speed [motor rev per cycle].
+        measured: encoder position at the present tick [motor rev].
+        measured_delta: difference to the tick before [motor rev per cycle].
+        current: target current computed in the last cycle [A].
+        model_current: the dynamic model's share of it [A].
+        inertia: diagonal of the model's inertia matrix on the *joint* side [kg m2].
+    """
+
+    def __init__(
+        self,
+        drive: SimulatedDrive,
+        model: NominalModel,
+        settings: ServoSettings,
+        *,
+        period: float,
+        current_resolution: float = 0.0,
+    ) -> None:
+        n = drive.n_axes
+        self._drive = drive
+        self._model = model
+        self._settings = settings
+        self._period = period
+        self._resolution = current_resolution
+        self._deadband = settings.deadband_counts / drive.encoder_counts
+        self._rotor_gain = [
+            settings.rotor_bandwidth * inertia if inertia > 0.0 else inf
+            for inertia in model.rotor_inertia.tolist()
+        ]
+        self._gear_squared = [ratio * ratio for ratio in drive.gear_ratio]
+        self.target = [0.0] * n
+        self.measured = [0.0] * n
+        self.release()
+
+    def release(self) -> None:
+        """Forget everything: no current, integrals empty, target where the motors stand."""
+        n = self._drive.n_axes
+        self.target = list(self.measured)
+        self.delta = [0.0] * n
+        self._delta_before = [0.0] * n
+        self.measured_delta = [0.0] * n
+        self.current = [0.0] * n
+        self.model_current = [0.0] * n
+        self.inertia = [0.0] * n
+        self._integral = [0.0] * n
+
+    def measure(self, revolutions: Sequence[float]) -> None:
+        """Take the encoders' positions of a new tick."""
+        self.measured_delta = [p - q for p, q in zip(revolutions, self.measured, strict=True)]
+        self.measured = list(revolutions)
+
+    def start_at(self, revolutions: Sequence[float]) -> None:
+        """Take the encoders' positions of the very first tick, where there is no tick before."""
+        self.measured = list(revolutions)
+        self.release()
+
+    def following_error(self) -> list[float]:
+        """Return target minus measured [motor rev]."""
+        return [t - p for t, p in zip(self.target, self.measured, strict=True)]
+
+    def advance(self, target: Sequence[float], delta: Sequence[float]) -> list[float]:
+        """Close the loops for the cycle that begins and move on to its target.
+
+        Args:
+            target: position at the next tick, (n,) [motor rev].
+            delta: speed there, (n,) [motor rev per cycle].
+
+        Returns:
+            Target currents of the cycle, (n,) [A].
+        """
+        self.model_current = self._feed_forward(target, delta)
+        self.current = self._close_loops(self._velocity_gains())
+        self._delta_before = self.delta
+        self.target, self.delta = list(target), list(delta)
+        return self.current
+
+    def _feed_forward(self, target: Sequence[float], delta: Sequence[float]) -> list[float]:
+        """Return the model's currents for the motion in the middle of the cycle."""
+        rate = 1.0 / self._period
+        drive = self._drive
+        middle = [0.5 * (a + b) for a, b in zip(self.target, target, strict=True)]
+        speed = [0.5 * rate * (a + b) for a, b in zip(self.delta, delta, strict=True)]
+        acceleration = [rate * rate * (b - a) for a, b in zip(self.delta, delta, strict=True)]
+        q = np.array(drive.joint_angles(middle))
+        qd = np.array(drive.joint_speeds(speed))
+        qdd = np.array(drive.joint_speeds(acceleration))
+        self.inertia = self._model.diagonal_inertia(q).tolist()
+        return drive.currents(self._model.torque(q, qd, qdd).tolist())
+
+    def _velocity_gains(self) -> list[float]:
+        """Return A per motor rev/s of each velocity loop."""
+        bandwidth = self._settings.velocity_bandwidth
+        return [
+            _TURN * min(bandwidth * inertia, rotor) / (squared * kt)
+            for inertia, rotor, squared, kt in zip(
+                self.inertia,
+                self._rotor_gain,
+                self._gear_squared,
+                self._drive.torque_constant,
+                strict=True,
+            )
+        ]
+
+    def _close_loops(self, gains: Sequence[float]) -> list[float]:
+        """Return the target currents [A]; `gains` in A per motor rev/s."""
+        settings, rate = self._settings, 1.0 / self._period
+        resolution, integral = self._resolution, self._integral
+        currents = []
+        for i, (target, delta, before, measured, moved, gain, model, limit) in enumerate(
+            zip(
+                self.target,
+                self.delta,
+                self._delta_before,
+                self.measured,
+                self.measured_delta,
+                gains,
+                self.model_current,
+                self._drive.current_limit,
+                strict=True,
+            )
+        ):
+            error = target - measured
+            # the encoder's difference is the speed half a cycle ago, as the mean of the targets'
+            lag = rate * (0.5 * (delta + before) - moved) + settings.position_gain * error
+            total = integral[i]
+            if delta != 0.0 or abs(error) > self._deadband:
+                total += settings.integral_rate * self._period * lag
+            wanted = model + gain * (lag + total)
+            current = max(-limit, min(limit, wanted))
+            if current == wanted or lag * wanted < 0.0:  # no winding up against the limit
+                integral[i] = total
+            if resolution > 0.0:
+                current = round(current / resolution) * resolution
+                current = max(-limit, min(limit, current))
+            currents.append(current)
+        return currents
+
+
+class CurrentLoop:
+    """The current that flows: target through a first-order lag, plus noise.
+
+    Currents are means over a sub-step, so that the lag is the stated one whatever the sub-steps.
+    """
+
+    def __init__(
+        self, n_axes: int, lag: float, noise: float, substep: float, delay_substeps: int,
+        rng: np.random.Generator,
+    ) -> None:  # fmt: skip
+        """Start without current.
+
+        Args:
+            n_axes: number of axes.
+            lag: time constant [s].
+            noise: standard deviation [A], redrawn every cycle.
+            substep: duration of a sub-step [s].
+            delay_substeps: sub-steps before a target takes effect.
+            rng: source of the noise.
+        """
+        decay = exp(-substep / lag) if lag > 0.0 else 0.0
+        self._decay = decay
+        # mean of exp(-t / lag) over the sub-step
+        self._mean = lag / substep * (1.0 - decay) if lag > 0.0 else 0.0
+        self._state = [0.0] * n_axes
+        self._queue: list[Sequence[float]] = [[0.0] * n_axes for _ in range(delay_substeps)]
+        self._noise = noise
+        self._rng = rng
+        self._n_axes = n_axes
+        self._block: list[list[float]] = []
+        self._disturbance = [0.0] * n_axes
+
+    def new_cycle(self) -> None:
+        """Draw the noise of the cycle that begins."""
+        if self._noise > 0.0:
+            if not self._block:
+                draws = self._rng.standard_normal((1024, self._n_axes)) * self._noise
+                self._block = draws.tolist()
+            self._disturbance = self._block.pop()
+
+    def substep(self, target: Sequence[float]) -> list[float]:
+        """Return the mean current (n,) [A] of the next sub-step under a target current."""
+        if self._queue:
+            self._queue.append(target)
+            target = self._queue.pop(0)
+        decay, mean = self._decay, self._mean
+        lag = [s - t for s, t in zip(self._state, target, strict=True)]
+        self._state = [t + decay * x for t, x in zip(target, lag, strict=True)]
+        return [t + mean * x + e for t, x, e in zip(target, lag, self._disturbance, strict=True)]
+
+    def cut(self) -> None:
+        """Interrupt the current at once, as a drive does that is switched off."""
+        self._state = [0.0] * self._n_axes
+        self._queue = [list(self._state) for _ in self._queue]

@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from drivers import DriveTrain, DriveTrainError
+
+TURN = 2.0 * np.pi
+FIELDS = {
+    "gear_ratio": [-120.0, 150.0, -110.0, 90.0, 80.0, -60.0],
+    "calibration": [0.5, -1.25, 2.0, 0.0, 0.25, -0.75],
+    "joint_sign": [-1.0, 1.0, -1.0, -1.0, 1.0, -1.0],
+    "joint_offset": [0.0, 0.1, -np.pi / 2, 0.0, np.pi / 2, -0.3],
+    "torque_constant": [0.4, 0.5, 0.45, 0.2, 0.21, 0.15],
+    "current_limit": [20.0, 20.0, 16.0, 8.0, 8.0, 6.0],
+}
+COUPLING = {"k54": 0.01, "k64": 0.002, "k65": 0.03}
+
+
+def build(**changes) -> DriveTrain:
+    fields = {name: np.array(value) for name, value in FIELDS.items()}
+    return DriveTrain(**{**fields, **COUPLING, **changes})
+
+
+def vectors(limit):
+    return arrays(np.float64, 6, elements=st.floats(-limit, limit))
+
+
+@st.composite
+def drive_trains(draw):
+    ratio = draw(arrays(np.float64, 6, elements=st.floats(5.0, 300.0)))
+    sign = st.sampled_from([-1.0, 1.0])
+    k = [draw(st.floats(-0.5, 0.5)) for _ in range(3)]
+    return build(
+        gear_ratio=ratio * draw(arrays(np.float64, 6, elements=sign)),
+        joint_sign=draw(arrays(np.float64, 6, elements=sign)),
+        calibration=draw(vectors(100.0)),
+        joint_offset=draw(vectors(3.2)),
+        torque_constant=draw(arrays(np.float64, 6, elements=st.floats(0.05, 2.0))),
+        k54=k[0],
+        k64=k[1],
+        k65=k[2],
+    )
+
+
+def by_the_published_formulas(train: DriveTrain, q):
+    """Motor revolutions axis by axis, as the wire's description prints them."""
+    kr, cal = train.gear_ratio, train.calibration
+    a = train.joint_sign * q + train.joint_offset
+    p = kr * a / TURN + cal
+    p[4] = kr[4] * (a[4] - train.k54 * a[3]) / TURN + cal[4]
+    last = a[5] - train.k65 * a[4] + (train.k65 * train.k54 - train.k64) * a[3]
+    p[5] = kr[5] * last / TURN + cal[5]
+    return p
+
+
+@given(drive_trains(), vectors(7.0))
+def test_motor_revolutions_follow_the_published_formulas(train, q):
+    np.testing.assert_allclose(
+        train.motor_revolutions(q), by_the_published_formulas(train, q), rtol=1e-12, atol=1e-11
+    )
+
+
+@given(drive_trains(), vectors(7.0))
+def test_joint_position_is_the_inverse(train, q):
+    np.testing.assert_allclose(train.joint_position(train.motor_revolutions(q)), q, atol=1e-11)
+
+
+@given(drive_trains(), vectors(10.0), st.sampled_from([0.001, 0.002]))
+def test_joint_velocity_is_the_inverse(train, qd, period):
+    per_cycle = train.motor_revolutions_per_cycle(qd, period)
+    np.testing.assert_allclose(train.joint_velocity(per_cycle, period), qd, atol=1e-10)
+
+
+@given(drive_trains(), vectors(3.0), vectors(5.0))
+def test_velocity_on_the_wire_is_the_step_of_the_position(train, q, qd):
+    period = 0.002
+    step = train.motor_revolutions(q) - train.motor_revolutions(q - qd * period)
+    np.testing.assert_allclose(
+        train.motor_revolutions_per_cycle(qd, period), step, atol=1e-11
+    )
+
+
+@given(drive_trains(), vectors(20.0), vectors(5.0))
+def test_power_is_the_same_on_both_sides(train, current, qd):
+    motor_velocity = train.motor_from_joint @ qd
+    electrical = (train.torque_constant * current) @ motor_velocity
+    mechanical = train.joint_torque(current) @ qd
+    scale = np.abs(train.torque_constant * current) @ np.abs(motor_velocity) + 1.0
+    assert abs(electrical - mechanical) <= 1e-12 * scale
+
+
+@given(drive_trains(), vectors(20.0))
+def test_motor_current_is_the_inverse_of_joint_torque(train, current):
+    back = train.motor_current(train.joint_torque(current))
+    np.testing.assert_allclose(back, current, atol=1e-10)
+
+
+def test_coupling_acts_transposed_on_torques():
+    """A current in motor 5 alone loads joint 4 through k54; a per-axis factor would not."""
+    train = build()
+    current = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    torque = train.joint_torque(current)
+    direct = train.gear_ratio[4] * train.torque_constant[4]
+    assert torque[4] == pytest.approx(direct * train.joint_sign[4])
+    assert torque[3] == pytest.approx(-train.k54 * direct * train.joint_sign[3])
+    assert torque[5] == 0.0
+
+
+def test_many_samples_at_once_equal_one_at_a_time():
+    train = build()
+    rng = np.random.default_rng(1)
+    q = rng.uniform(-2, 2, (7, 6))
+    for method in (
+        train.motor_revolutions,
+        train.joint_position,
+        train.joint_torque,
+        train.motor_current,
+    ):
+        np.testing.assert_allclose(method(q), [method(row) for row in q], rtol=1e-13)
+
+
+def test_an_arm_without_a_coupled_wrist_may_have_any_number_of_joints():
+    train = DriveTrain(*(np.array(FIELDS[name][:3]) for name in FIELDS))
+    assert train.n_joints == 3
+    np.testing.assert_allclose(train.joint_position(train.motor_revolutions([1, 2, 3])), [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("gear_ratio", [1.0, 0.0, 1.0, 1.0, 1.0, 1.0]),
+        ("calibration", [0.0, 0.0]),
+        ("calibration", [0.0, 0.0, np.nan, 0.0, 0.0, 0.0]),
+        ("joint_sign", [1.0, 1.0, 0.5, 1.0, 1.0, 1.0]),
+        ("torque_constant", [1.0, 1.0, -1.0, 1.0, 1.0, 1.0]),
+        ("current_limit", [1.0, 1.0, 0.0, 1.0, 1.0, 1.0]),
+    ],
+)
+def test_an_impossible_drive_train_is_named(field, value):
+    with pytest.raises(DriveTrainError) as caught:
+        build(**{field: np.array(value)})
+    assert caught.value.field == field
+
+
+def test_wrist_coupling_needs_a_wrist():
+    with pytest.raises(DriveTrainError):
+        DriveTrain(*(np.array(FIELDS[name][:5]) for name in FIELDS), k54=0.1)

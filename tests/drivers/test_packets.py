@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from captures import CAPTURES, read_datagrams
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers import CyclicPacket, InitPacket, Mode, PacketError
+from drivers.packets import (
+    AXIS_DTYPE,
+    INIT_DTYPE,
+    INIT_LENGTH,
+    LAST_NUMBER,
+    MAX_AXES,
+    NO_SLOT,
+    cyclic_length,
+    echo,
+    is_init,
+    next_number,
+    packet_number,
+)
+
+
+class TestNumbers:
+    def test_an_answer_carries_the_next_number(self):
+        assert next_number(1) == 2
+        assert next_number(0x7FFE) == 0x7FFF
+
+    def test_after_0x7fff_comes_1(self):
+        assert next_number(0x7FFF) == 1
+
+    @pytest.mark.parametrize("number", [0, -1, 0x8000, -(2**31)])
+    def test_numbers_outside_the_range_are_refused(self, number):
+        with pytest.raises(PacketError) as caught:
+            packet_number(struct.pack("<i", number) + bytes(44))
+        assert caught.value.value == number
+
+    def test_echo_changes_nothing_but_the_number(self):
+        packet = struct.pack("<i", 7) + bytes(range(200))
+        assert echo(packet) == struct.pack("<i", 8) + bytes(range(200))
+
+
+class TestCyclicPacket:
+    def test_layout_is_that_of_the_worked_example(self):
+        # 6 axes, arm 1 drive on, number 291; axis 1: target 0.5, actual 0.4995, current 0.5 A
+        head = bytes.fromhex("23010000 05000000 00000000")
+        axis_1 = bytes.fromhex(
+            "00000000 0000003f 00000000 77beff3e 6f1283b9 0000003f 0000803e 0000003e 00000000"
+        )
+        packet = CyclicPacket.decode(head + axis_1 + bytes(5 * 36), 6)
+        assert packet.number == 291
+        assert packet.status == bytes([5, 0, 0, 0])
+        assert packet.axes["mode"][0] == Mode.CLOSED
+        np.testing.assert_array_equal(
+            packet.axes["d"][0], np.float32([0.5, 0.0, 0.4995, -0.00025, 0.5])
+        )
+        np.testing.assert_array_equal(packet.axes["extra"][0], np.float32([0.25, 0.125, 0.0]))
+
+    def test_answer_is_encoded_as_in_the_worked_example(self):
+        packet = CyclicPacket.zeros(293, 6)
+        packet.axes["mode"] = Mode.POSITION
+        packet.axes["d"][:, 0] = 1.5125
+        packet.axes["d"][:, 1] = 0.0125
+        block = bytes.fromhex("04000000 9a99c13f cdcc4c3c") + bytes(24)
+        assert packet.encode() == bytes.fromhex("25010000 00000000 00000000") + 6 * block
+
+    @given(data=st.data(), n=st.integers(1, MAX_AXES))
+    def test_any_bytes_decode_and_encode_unchanged(self, data, n):
+        number = data.draw(st.integers(1, LAST_NUMBER))
+        rest = data.draw(st.binary(min_size=cyclic_length(n) - 4, max_size=cyclic_length(n) - 4))
+        packet = struct.pack("<i", number) + rest
+        assert CyclicPacket.decode(packet, n).encode() == packet
+
+    def test_nan_payloads_survive(self):
+        odd_nans = struct.pack("<8I", *[0x7F800001 + 3 * k for k in range(4)], *[0xFFC12345] * 4)
+        packet = struct.pack("<i", 1) + bytes(8) + struct.pack("<i", 4) + odd_nans
+        assert CyclicPacket.decode(packet, 1).encode() == packet
+
+    def test_what_follows_the_axes_is_ignored(self):
+        packet = CyclicPacket.zeros(5, 6).encode()
+        longer = packet + b"\xa5" * (732 - len(packet))
+        assert CyclicPacket.decode(longer, 6).encode() == packet
+
+    @pytest.mark.parametrize("length", [0, 3, 12, 227, 733, INIT_LENGTH])
+    def test_other_lengths_are_refused(self, length):
+        packet = (struct.pack("<i", 5) + bytes(INIT_LENGTH))[:length]
+        with pytest.raises(PacketError) as caught:
+            CyclicPacket.decode(packet, 6)
+        assert caught.value.field == "length"
+
+    def test_a_decoded_packet_cannot_be_changed_by_mistake(self):
+        packet = CyclicPacket.decode(CyclicPacket.zeros(5, 2).encode(), 2)
+        with pytest.raises(ValueError, match="read-only"):
+            packet.axes["mode"] = 4
+
+    def test_axis_block_is_36_bytes(self):
+        assert AXIS_DTYPE.itemsize == 36
+
+
+class TestInitPacket:
+    # Offsets as documented for the wire.
+    OFFSETS = {
+        "number": 0,
+        "fields_per_packet": 4,
+        "fields_per_axis": 8,
+        "n_axes": 12,
+        "open_mode": 16,
+        "header_types": 176,
+        "axis_types": 188,
+        "sample_time": 224,
+        "open_axes_map": 228,
+        "calibration": 388,
+        "current_limit": 548,
+        "version": 708,
+        "kinematic_influence": 720,
+        "gear_ratio": 880,
+        "following_error": 1040,
+    }
+
+    def test_layout(self):
+        assert INIT_DTYPE.itemsize == INIT_LENGTH
+        assert {name: INIT_DTYPE.fields[name][1] for name in INIT_DTYPE.names} == self.OFFSETS
+
+    def test_worked_example(self):
+        raw = bytearray(INIT_LENGTH)
+        raw[0:16] = bytes.fromhex("0a000000 03000000 09000000 06000000")
+        raw[40:176] = b"\xff" * 136
+        raw[224:228] = bytes.fromhex("02000000")
+        raw[228:388] = struct.pack("<40i", *range(6), *[NO_SLOT] * 34)
+        raw[708:720] = bytes.fromhex("03000000 14000000 31010000")
+        raw[732:744] = bytes.fromhex("0ad7233c 6f12033b 8fc2f53c")
+        raw[880:904] = bytes.fromhex("0000f0c2 00001643 0000dcc2 0000b442 0000a042 000070c2")
+        raw[1040:1064] = bytes.fromhex("00000040") * 6
+        init = InitPacket.decode(bytes(raw))
+        assert init.n_axes == 6
+        assert init.sample_time == 2
+        assert init.period == 0.002
+        assert init.version == (3, 20, 305)
+        assert init.wrist_coupling() == pytest.approx((0.01, 0.002, 0.03))
+        np.testing.assert_array_equal(init.gear_ratio[0, :6], [-120, 150, -110, 90, 80, -60])
+        np.testing.assert_array_equal(init.following_error[0, :6], 2.0)
+        assert [axis.slot for axis in init.open_axes()] == list(range(6))
+        assert init.encode() == bytes(raw)
+
+    @given(st.binary(min_size=INIT_LENGTH - 16, max_size=INIT_LENGTH - 16))
+    def test_any_bytes_decode_and_encode_unchanged(self, rest):
+        packet = struct.pack("<iiii", 10, 3, 9, 6) + rest
+        assert InitPacket.decode(packet).encode() == packet
+
+    def test_number_10_alone_is_not_init(self):
+        assert not is_init(CyclicPacket.zeros(10, 6).encode())
+        assert not is_init(struct.pack("<i", 11) + bytes(1196))
+        assert is_init(struct.pack("<i", 10) + bytes(1196))
+
+    @pytest.mark.parametrize("n_axes", [0, -1, 21, 2**30])
+    def test_an_impossible_number_of_axes_is_refused(self, n_axes):
+        packet = struct.pack("<iiii", 10, 3, 9, n_axes) + bytes(1184)
+        with pytest.raises(PacketError) as caught:
+            InitPacket.decode(packet)
+        assert caught.value.field == "n_axes"
+
+    def test_axes_of_two_arms_in_any_slot(self):
+        axes_map = np.full((4, 10), NO_SLOT)
+        axes_map[0, [0, 2]] = [2, 0]
+        axes_map[1, 5] = 1
+        init = InitPacket.build(3, 1, {}, open_axes_map=axes_map)
+        assert list(init.open_axes()) == [(1, 2, 0), (2, 5, 1), (1, 0, 2)]
+
+    def test_minus_one_means_not_open_too(self):
+        axes_map = np.full((4, 10), -1)
+        axes_map[0, :2] = [0, 1]
+        assert len(InitPacket.build(2, 2, {}, open_axes_map=axes_map).open_axes()) == 2
+
+    @pytest.mark.parametrize("slots", [[1, 1], [0, 2], [0]])
+    def test_a_map_that_is_no_map_is_refused(self, slots):
+        axes_map = np.full((4, 10), NO_SLOT)
+        axes_map[0, : len(slots)] = slots
+        with pytest.raises(PacketError) as caught:
+            InitPacket.build(2, 2, {}, open_axes_map=axes_map).open_axes()
+        assert caught.value.field == "open_axes_map"
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_every_packet_of_a_foreign_controller_survives_bit_for_bit(shared_data: Path, name: str):
+    """Every init, sync and cyclic packet, both ways, up to its declared length."""
+    n_axes = 7 if "7ax" in name else None
+    checked = 0
+    for datagram in read_datagrams(shared_data / "c4g_captures" / f"{name}.pcap"):
+        payload = datagram.payload
+        if len(payload) == INIT_LENGTH:
+            if not datagram.from_controller:
+                payload = struct.pack("<i", 10) + payload[4:]
+            init = InitPacket.decode(payload)
+            n_axes = init.n_axes
+            assert init.encode() == payload
+        elif n_axes is not None:
+            assert CyclicPacket.decode(payload, n_axes).encode() == payload[: cyclic_length(n_axes)]
+        else:
+            assert echo(payload)[4:] == payload[4:]
+        checked += 1
+    assert checked > 10

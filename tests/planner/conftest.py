@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from planner import JointLimits
+
+DEG = np.pi / 180.0
+
+
+@pytest.fixture(scope="session")
+def six_axis_limits() -> JointLimits:
+    """Limits like those of a 16 kg industrial arm: full speed in 0.3 s, full acceleration in 0.1 s."""  # noqa: E501
+    velocity = DEG * np.array([155.0, 155.0, 170.0, 360.0, 350.0, 550.0])
+    return JointLimits(
+        lower=DEG * np.array([-180.0, -60.0, -170.0, -720.0, -120.0, -720.0]),
+        upper=DEG * np.array([180.0, 155.0, 110.0, 720.0, 120.0, 720.0]),
+        velocity=velocity,
+        acceleration=velocity / 0.3,
+        jerk=velocity / 0.3 / 0.1,
+    )
+
+
+@pytest.fixture(scope="session")
+def random_points(six_axis_limits: JointLimits):
+    """Make `count` via points uniformly within the limits from a seed."""
+
+    def points(seed: int, count: int = 6) -> np.ndarray:
+        span = six_axis_limits.upper - six_axis_limits.lower
+        shares = np.random.default_rng(seed).random((count, six_axis_limits.n_joints))
+        return six_axis_limits.lower + shares * span
+
+    return points

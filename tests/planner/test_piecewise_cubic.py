@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.interpolate import PPoly
+
+from planner import InvalidTrajectory, PiecewiseCubic, plan
+from planner.piecewise_cubic import concatenate
+
+numbers = st.floats(-10.0, 10.0)
+
+
+@st.composite
+def tables(draw):
+    """Any integrable table: 1-3 joints, 1-5 constant jerks, some pieces of no length."""
+    n, m = draw(st.integers(1, 3)), draw(st.integers(1, 5))
+    start = draw(arrays(np.float64, (n, 3), elements=numbers))
+    jerks = draw(arrays(np.float64, (n, m), elements=numbers))
+    lengths = draw(arrays(np.float64, (n, m), elements=st.sampled_from([0.0, 0.1, 0.3, 1.0, 2.0])))
+    lengths[:, -1] += 0.5
+    lengths *= 2.0 / lengths.sum(axis=1, keepdims=True)
+    knots = np.concatenate((np.zeros((n, 1)), np.cumsum(lengths, axis=1)), axis=1)
+    knots[:, -1] = 2.0
+    knots = np.minimum(knots, 2.0)
+    return PiecewiseCubic.from_jerks(start, knots, jerks)
+
+
+def reference(table: PiecewiseCubic, joint: int) -> PPoly:
+    keep = np.diff(table.knots[joint]) > 0
+    breaks = np.append(table.knots[joint][:-1][keep], table.duration)
+    p, v, a, j = table.coefficients[joint][keep].T
+    return PPoly(np.array([j / 6, a / 2, v, p]), breaks)
+
+
+@given(tables(), arrays(np.float64, 20, elements=st.floats(0.0, 2.0)))
+def test_samples_agree_with_an_independent_polynomial_and_with_the_scalar_face(table, t):
+    q, qd, qdd = table.sample(t)
+    for joint in range(table.n_joints):
+        polynomial = reference(table, joint)
+        np.testing.assert_allclose(q[:, joint], polynomial(t), atol=1e-10)
+        np.testing.assert_allclose(qd[:, joint], polynomial(t, 1), atol=1e-10)
+        np.testing.assert_allclose(qdd[:, joint], polynomial(t, 2), atol=1e-10)
+    one = [table.sample_one(x) for x in t.tolist()]
+    for ours, scalar in zip((q, qd, qdd), zip(*one, strict=True), strict=True):
+        np.testing.assert_allclose(ours, scalar, atol=1e-12)
+
+
+@given(tables())
+def test_outside_its_time_the_ends_are_held_at_rest(table):
+    q, qd, qdd = table.sample(np.array([-1.0, 0.0, 2.0, 2.0 + 1e-9, 50.0]))
+    np.testing.assert_array_equal(q[0], q[1])
+    np.testing.assert_array_equal(q[3:], q[[2, 2]])
+    assert not np.any(qd[[0, 3, 4]]) and not np.any(qdd[[0, 3, 4]])
+    for t, row in ((-1.0, 0), (2.5, 4)):
+        one = table.sample_one(t)
+        np.testing.assert_allclose(one[0], q[row], atol=1e-12)
+        assert not np.any(one[1]) and not np.any(one[2])
+
+
+@given(tables())
+def test_extrema_bound_every_sample_and_are_reached(table):
+    extrema = table.extrema()
+    t = np.union1d(np.linspace(0.0, 2.0, 4001), np.concatenate(table.knots))
+    q, qd, qdd = table.sample(t)
+    for exact, sampled, slope in (
+        (extrema.upper, q.max(axis=0), extrema.velocity),
+        (-extrema.lower, (-q).max(axis=0), extrema.velocity),
+        (extrema.velocity, np.abs(qd).max(axis=0), extrema.acceleration),
+        (extrema.acceleration, np.abs(qdd).max(axis=0), extrema.jerk),
+    ):
+        assert np.all(exact >= sampled - 1e-9)
+        assert np.all(exact <= sampled + 0.0005 * slope + 1e-9)
+
+
+@given(tables())
+def test_storing_and_restoring_keeps_every_bit(table):
+    restored = PiecewiseCubic.from_dict(json.loads(json.dumps(table.to_dict())))
+    for ours, theirs in zip(
+        (*table.knots, *table.coefficients),
+        (*restored.knots, *restored.coefficients),
+        strict=True,
+    ):
+        assert ours.tobytes() == theirs.tobytes()
+
+
+@given(tables(), st.lists(st.floats(0.0, 2.0), min_size=2, max_size=2))
+def test_a_part_is_the_same_motion_and_parts_make_the_whole_again(table, times):
+    first, second = sorted(times)
+    part = table.restricted(first, second)
+    assert part.duration == pytest.approx(second - first)
+    t = np.linspace(0.0, part.duration, 23)[1:-1]
+    for ours, whole in zip(part.sample(t), table.sample(t + first), strict=True):
+        if second - first > 1e-9:
+            np.testing.assert_allclose(ours, whole, atol=1e-6)
+    again = concatenate(
+        [table.restricted(a, b) for a, b in ((0.0, first), (first, second), (second, 2.0))]
+    )
+    t = np.linspace(0.0, 2.0, 50)
+    np.testing.assert_allclose(again.sample(t)[0], table.sample(t)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"type": "spline"},
+        {"knots": [[0.0, 1.0]]},
+        {"knots": [[0.0, 1.0], [0.0, 2.0]]},
+        {"knots": [[0.5, 1.0], [0.5, 1.0]]},
+        {"knots": [[0.0, 1.0, 0.5], [0.0, 1.0]]},
+        {"coefficients": [[[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]]]},
+        {"coefficients": [[[0.0, 0.0, float("nan"), 0.0]], [[0.0, 0.0, 0.0, 0.0]]]},
+        {"coefficients": [["text"], []]},
+        {"coefficients": None},
+    ],
+)
+def test_refuses_stored_data_that_are_no_trajectory(damage):
+    good = {
+        "type": "piecewise_cubic",
+        "knots": [[0.0, 1.0], [0.0, 1.0]],
+        "coefficients": [[[0.0, 1.0, 2.0, 3.0]], [[0.0, 1.0, 2.0, 3.0]]],
+    }
+    PiecewiseCubic.from_dict(good)
+    with pytest.raises(InvalidTrajectory):
+        PiecewiseCubic.from_dict({**good, **damage})
+
+
+def test_tables_are_read_only(six_axis_limits, random_points):
+    motion = plan(random_points(0), six_axis_limits)
+    with pytest.raises(ValueError, match="read-only"):
+        motion.coefficients[0][0, 0] = 1.0
+    restored = PiecewiseCubic.from_dict(motion.to_dict())
+    with pytest.raises(ValueError, match="read-only"):
+        restored.knots[0][0] = 1.0

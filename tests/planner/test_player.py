@@ -1,0 +1,267 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from planner import InvalidSetting, JointLimits, NotBegun, StartMismatch, TrajectoryPlayer, plan
+from planner.stop import slowing_bounds, stop_law
+
+PERIOD = 0.002
+
+
+@pytest.fixture(scope="module")
+def motions(six_axis_limits, random_points):
+    """Some motions at full speed, and one as short as motions get."""
+    short = random_points(0, 1) + np.array([[0.0], [1e-4]])
+    return [plan(random_points(seed, 4), six_axis_limits) for seed in range(6)] + [
+        plan(short, six_axis_limits)
+    ]
+
+
+def play(player, stop_after=None, extra=5):
+    """Everything a link would see: the first set-point, then one per cycle."""
+    positions, velocities = [player._last], [np.zeros(6)]
+    while not player.finished:
+        if len(positions) - 1 == stop_after:
+            player.stop()
+            stop_after = None
+            continue
+        position, velocity = player.advance()
+        positions.append(position)
+        velocities.append(velocity)
+        assert len(positions) < 100_000
+    for _ in range(extra):
+        position, velocity = player.advance()
+        positions.append(position)
+        velocities.append(velocity)
+    return np.array(positions), np.array(velocities)
+
+
+def test_it_gives_the_trajectory_out_one_period_per_call(motions, six_axis_limits):
+    motion = motions[0]
+    player = TrajectoryPlayer(motion, PERIOD, six_axis_limits)
+    player.begin(player.start)
+    assert not player.finished
+    assert player.bounds == "plan"
+    positions, velocities = play(player)
+    q, qd, _ = motion.sample(PERIOD * np.arange(len(positions)))
+    np.testing.assert_allclose(positions, q, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(velocities, qd, rtol=0, atol=1e-9)
+    assert len(positions) - 1 - 5 == int(np.ceil(motion.duration / PERIOD))
+
+
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=20)
+def test_what_separates_the_arm_from_the_start_is_carried_unchanged(motions, six_axis_limits, seed):
+    offset = np.random.default_rng(seed).uniform(-1e-3, 1e-3, 6)
+    reference = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+    reference.begin(reference.start)
+    player = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+    player.begin(player.start + offset)
+    exact, shifted = play(reference, 300), play(player, 300)
+    np.testing.assert_allclose(shifted[0] - exact[0], np.tile(offset, (len(exact[0]), 1)))
+    np.testing.assert_array_equal(shifted[1], exact[1])
+
+
+@pytest.mark.parametrize("away", [1.001e-3, -0.5, np.nan, np.inf])
+def test_an_arm_that_is_elsewhere_is_refused(motions, six_axis_limits, away):
+    player = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+    position = player.start.copy()
+    position[3] += away
+    with pytest.raises(StartMismatch) as refusal:
+        player.begin(position)
+    assert refusal.value.joint == 3
+    assert refusal.value.expected == player.start[3]
+    assert refusal.value.tolerance == 1e-3
+    with pytest.raises(NotBegun):
+        player.advance()
+
+
+@given(which=st.integers(0, 6), share=st.floats(0.0, 1.0), period=st.sampled_from([0.001, 0.002]))
+@settings(max_examples=60)
+@example(which=0, share=0.0, period=0.002)
+@example(which=0, share=1.0, period=0.002)
+@example(which=6, share=0.5, period=0.001)
+def test_a_stop_at_any_instant_stays_on_the_path_and_within_the_stop_bounds(
+    motions, six_axis_limits, which, share, period
+):
+    motion, limits = motions[which], six_axis_limits
+    player = TrajectoryPlayer(motion, period, limits)
+    offset = np.linspace(-9e-4, 9e-4, 6)
+    player.begin(player.start + offset)
+    played = int(share * motion.duration / period)
+    positions, velocities = play(player, played, extra=10)
+
+    # Exactly what a guard sees: differences of consecutive set-points, at rest before and after.
+    seen = np.concatenate((np.tile(positions[0], (5, 1)), positions))
+    slack = 1 + 1e-5
+    for order, bound in (
+        (1, limits.velocity),
+        (2, 2.0 * limits.acceleration),
+        (3, 3.0 * limits.jerk),
+    ):
+        assert np.all(np.abs(np.diff(seen, order, axis=0)) / period**order <= bound * slack)
+    assert np.all(np.abs(velocities) <= limits.velocity * slack)
+
+    # At rest in the end, and for as long as anyone asks.
+    assert player.finished
+    np.testing.assert_array_equal(positions[-11:], np.tile(positions[-1], (11, 1)))
+    assert not np.any(velocities[-11:])
+
+    # On the path: no set-point is farther from a fine sampling of it than that can resolve.
+    fine = motion.sample(np.arange(0.0, motion.duration + 1e-3, 2e-4))[0] + offset
+    chord = 2e-4**2 / 8 * limits.acceleration.max() + 1e-9
+    for position in positions[played:][::7]:
+        nearest = np.argmin(np.abs(fine - position).max(axis=1))
+        near = fine[max(nearest - 1, 0) : nearest + 2]
+        assert distance_to_polyline(position, near) <= chord
+
+
+def distance_to_polyline(point, corners):
+    best = np.abs(corners - point).max(axis=1).min()
+    for a, b in pairwise(corners):
+        along = b - a
+        square = along @ along
+        share = np.clip((point - a) @ along / square, 0.0, 1.0) if square > 0.0 else 0.0
+        best = min(best, np.abs(a + share * along - point).max())
+    return best
+
+
+@given(which=st.integers(0, 5), share=st.floats(0.01, 0.99))
+@settings(max_examples=40)
+def test_a_stop_keeps_its_bounds_between_the_set_points_too(motions, six_axis_limits, which, share):
+    motion, limits = motions[which], six_axis_limits
+    law = stop_law(slowing_bounds(limits, 2.0, 3.0))
+    t = np.linspace(0.0, law.duration, 4000)
+    s, r, dr = law.sample(t)
+    s += share * motion.duration
+    ddr = law.coefficients[0][np.searchsorted(law.knots[0][1:-1], t, side="right"), 3][:, None]
+    _, v, a = motion.sample(s[:, 0])
+    jerk = np.empty_like(v)
+    for joint, knots in enumerate(motion.knots):
+        piece = np.searchsorted(knots[1:-1], s[:, 0], side="right")
+        jerk[:, joint] = motion.coefficients[joint][piece, 3]
+    jerk[s[:, 0] > motion.duration] = 0.0
+    assert np.all(np.abs(v * r) <= limits.velocity)
+    assert np.all(np.abs(a * r**2 + v * dr) <= 2.0 * limits.acceleration)
+    assert np.all(np.abs(jerk * r**3 + 3 * a * r * dr + v * ddr) <= 3.0 * limits.jerk)
+    assert r[0, 0] == 1.0
+    assert np.all(np.diff(r[:, 0]) <= 1e-12)
+    assert abs(law.ends()[0][-1, 1]) < 1e-12
+
+
+def test_the_worst_conceivable_path_just_keeps_the_stop_bounds():
+    # All of velocity, acceleration and jerk at their limits at once, signs chosen against us.
+    limits = JointLimits([-1.0, -1.0], [1.0, 1.0], [2.0, 1.0], [8.0, 1.0], [90.0, 4.0])
+    bounds = slowing_bounds(limits, 2.0, 3.0)
+    a = limits.acceleration + limits.velocity * bounds.rate
+    j = limits.jerk + 3 * limits.acceleration * bounds.rate + limits.velocity * bounds.change
+    assert np.all(a <= 2.0 * limits.acceleration * (1 + 1e-12))
+    assert np.all(j <= 3.0 * limits.jerk * (1 + 1e-12))
+    # and at least one joint uses all that it may
+    assert np.isclose(np.max(j / limits.jerk), 3.0)
+
+
+def test_a_six_axis_arm_stops_within_half_a_second(motions, six_axis_limits):
+    player = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+    player.begin(player.start)
+    positions, _ = play(player, 200, extra=0)
+    assert (len(positions) - 201) * PERIOD < 0.5
+
+
+def test_bounds_tell_the_guard_when_a_stop_began(motions, six_axis_limits):
+    player = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+    player.begin(player.start)
+    player.advance()
+    assert player.bounds == "plan"
+    player.stop()
+    assert player.bounds == "stop"
+    assert not player.finished
+    while not player.finished:
+        player.advance()
+    assert player.bounds == "stop"
+
+
+def test_asking_twice_to_stop_changes_nothing(motions, six_axis_limits):
+    runs = []
+    for again in (False, True):
+        player = TrajectoryPlayer(motions[1], PERIOD, six_axis_limits)
+        player.begin(player.start)
+        for _ in range(100):
+            player.advance()
+        player.stop()
+        player.advance()
+        if again:
+            player.stop()
+        runs.append(play(player)[0])
+    np.testing.assert_array_equal(*runs)
+
+
+def test_a_stop_before_the_first_step_keeps_the_arm_where_it_is(motions, six_axis_limits):
+    player = TrajectoryPlayer(motions[1], PERIOD, six_axis_limits)
+    player.begin(player.start + 5e-4)
+    player.stop()
+    assert player.finished
+    position, velocity = player.advance()
+    np.testing.assert_array_equal(position, player.start + 5e-4)
+    assert not np.any(velocity)
+
+
+def test_a_stop_after_the_end_does_nothing(motions, six_axis_limits):
+    player = TrajectoryPlayer(motions[6], PERIOD, six_axis_limits)
+    player.begin(player.start)
+    positions, _ = play(player)
+    player.stop()
+    assert player.bounds == "plan"
+    assert player.finished
+    np.testing.assert_array_equal(player.advance()[0], positions[-1])
+
+
+def test_beginning_again_plays_the_whole_motion_again(motions, six_axis_limits):
+    player = TrajectoryPlayer(motions[2], PERIOD, six_axis_limits)
+    player.begin(player.start)
+    first = play(player)[0]
+    player.begin(player.start)
+    interrupted = play(player, 100)[0]
+    player.begin(player.start)
+    assert player.bounds == "plan"
+    np.testing.assert_array_equal(play(player)[0], first)
+    assert len(interrupted) < len(first)
+
+
+def test_a_motion_of_no_length_gives_one_set_point_and_is_over(six_axis_limits, random_points):
+    point = random_points(0, 1)[0]
+    player = TrajectoryPlayer(plan([point, point], six_axis_limits), PERIOD, six_axis_limits)
+    player.begin(point)
+    position, velocity = player.advance()
+    np.testing.assert_array_equal(position, point)
+    assert not np.any(velocity)
+    assert player.finished
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("period", 0.0),
+        ("period", np.inf),
+        ("period", np.nan),
+        ("stop_acceleration", 1.0),
+        ("stop_jerk", 0.9),
+        ("start_tolerance", -1e-3),
+    ],
+)
+def test_settings_outside_their_range_are_refused(motions, six_axis_limits, name, value):
+    settings = {"period": PERIOD, name: value}
+    with pytest.raises(InvalidSetting) as refusal:
+        TrajectoryPlayer(motions[0], limits=six_axis_limits, **settings)
+    assert refusal.value.name == name
+
+
+def test_limits_of_another_arm_are_refused(motions):
+    limits = JointLimits([-1.0], [1.0], [1.0], [1.0], [1.0])
+    with pytest.raises(InvalidSetting, match="joints"):
+        TrajectoryPlayer(motions[0], PERIOD, limits)

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ruckig
+from hypothesis import given
+from hypothesis import strategies as st
+
+from planner import PiecewiseCubic
+from planner.scurve import ramp_down, rest_to_rest
+
+magnitude = st.floats(-3.0, 3.0).map(lambda exponent: 10.0**exponent)
+
+
+@given(magnitude, magnitude, magnitude, magnitude)
+def test_rest_to_rest_arrives_at_rest_within_the_limits(distance, velocity, acceleration, jerk):
+    law, ramp = rest_to_rest(distance, velocity, acceleration, jerk)
+    extrema = law.extrema()
+    within = 1 + 1e-9
+    tick = 4 * jerk * np.spacing(law.duration)  # a knot is no finer than the clock it is told in
+    assert extrema.velocity[0] <= velocity * within
+    assert extrema.acceleration[0] <= acceleration * within + tick
+    assert extrema.jerk[0] == jerk
+    assert extrema.lower[0] >= -1e-12 * distance
+    end = law.ends()[0][-1]
+    assert end[0] == pytest.approx(distance, rel=1e-13)
+    assert abs(end[1]) <= 1e-12 * velocity + law.duration * tick
+    assert abs(end[2]) <= 1e-12 * acceleration + tick
+    assert ramp == pytest.approx(law.knots[0][3])
+    assert np.all(np.diff(law.knots[0]) >= 0.0)
+
+
+@given(magnitude, magnitude, magnitude, magnitude)
+def test_its_pieces_are_what_integrating_their_jerks_gives(distance, velocity, acceleration, jerk):
+    law, _ = rest_to_rest(distance, velocity, acceleration, jerk)
+    integrated = PiecewiseCubic.from_jerks(
+        np.zeros((1, 3)), law.knots[0][None], law.coefficients[0][None, :, 3]
+    )
+    scale = [distance, velocity, acceleration, jerk]
+    gap = np.abs(law.coefficients[0] - integrated.coefficients[0]) / scale
+    assert np.max(gap[:, 1:]) < 1e-9
+    assert np.max(gap[:, 0]) < 1e-7  # a blind integration drifts along a long cruise
+
+
+@given(magnitude, magnitude, magnitude, magnitude)
+def test_rest_to_rest_is_as_fast_as_an_independent_time_optimal_planner(
+    distance, velocity, acceleration, jerk
+):
+    problem = ruckig.InputParameter(1)
+    problem.target_position = [distance]
+    problem.max_velocity, problem.max_acceleration = [velocity], [acceleration]
+    problem.max_jerk = [jerk]
+    solution = ruckig.Trajectory(1)
+    ruckig.Ruckig(1).calculate(problem, solution)
+    law, _ = rest_to_rest(distance, velocity, acceleration, jerk)
+    assert law.duration == pytest.approx(solution.duration, rel=1e-6)
+
+
+@given(magnitude, magnitude, magnitude)
+def test_ramp_down_takes_all_velocity_away_within_the_limits(velocity, acceleration, jerk):
+    law = ramp_down(velocity, acceleration, jerk)
+    extrema = law.extrema()
+    within = 1 + 1e-9
+    assert extrema.velocity[0] == velocity
+    assert extrema.acceleration[0] <= acceleration * within
+    assert extrema.jerk[0] <= jerk * within
+    end = law.ends()[0][-1]
+    assert abs(end[1]) <= 1e-9 * velocity
+    assert abs(end[2]) <= 1e-9 * acceleration
+    assert end[0] == pytest.approx(velocity * law.duration / 2.0)  # symmetric
+    # One of the two limits is used in full, or there would be a faster way.
+    assert max(extrema.acceleration[0] / acceleration, extrema.jerk[0] / jerk) > 1 - 1e-9
