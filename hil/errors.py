@@ -6,7 +6,7 @@ HilError                   exit status 1
 ├── ControllerFault        4: the controller, the link or the guard ended a motion
 └── InputError             2: something the user gave cannot be used: file, field, problem, remedy
     ├── ArchiveError       an archive that cannot be read or written
-    │   ├── NotAnArchiveError       no archive of ours: other format, empty, torn before its first data
+    │   ├── NotAnArchiveError       not ours: other format, empty, torn at its head
     │   ├── ArchiveVersionError     written by a newer version of the archive profile
     │   └── ArchiveWriteError       the file cannot be created or the disk refuses
     └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
@@ -85,7 +85,7 @@ class UnsafeError(HilError):
     exit_code: ClassVar[int] = 3
 
 
-class ControllerFault(HilError):
+class ControllerFault(HilError):  # noqa: N818 - the controller's own word
     """The controller, the link or the guard ended a motion."""
 
     exit_code: ClassVar[int] = 4

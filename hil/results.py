@@ -7,6 +7,7 @@ Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
@@ -25,8 +26,8 @@ class CriteriaResult(_Frozen):
     coupling_index_max: float
     fitness: float
     n_samples: int
-    condition: float
-    scaled_condition: float
+    condition: float | None
+    scaled_condition: float | None
 
 
 class ExcitationResult(_Frozen):
@@ -81,12 +82,22 @@ class VerdictResult(_Frozen):
     good: bool
     line: str
     reasons: list[str]
+    """What is wrong; empty if good."""
+    doubts: list[str]
+    """What is not as it should be, but too small or too uncertain to say no."""
 
 
 class UncertaintyResult(_Frozen):
-    """Standard deviation of each parameter by four routes; `reported` names the one used."""
+    """Standard deviation of each parameter by four routes."""
 
-    reported: str
+    reported: Literal[
+        "least_squares", "independent_repetitions", "phase_clustered", "scatter_of_mean"
+    ]
+    """The route that `ParameterResult.std` was taken from."""
+    method: str
+    """How estimate and reported standard deviation were made, in words."""
+    interval_factor: float
+    """Standard deviations in half a 95 % interval."""
     least_squares: list[float]
     independent_repetitions: list[float] | None
     phase_clustered: list[float] | None

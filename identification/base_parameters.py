@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# A column is kept when the part of it that no kept column explains is larger than this share of
-# the column. Exact geometry leaves 1e-15 of a dependent column; a URDF whose angles are rounded
-# (1.5708 for pi/2) leaves up to 4e-6, which no measurement could use.
+# A column is kept when the part of it that no kept column explains is longer than this share of
+# the longest column of its unit. Exact geometry leaves 1e-15 of a dependent column; a URDF whose
+# angles are rounded (1.5708 for pi/2) leaves up to 4e-6, which no measurement could use.
 TOLERANCE = 1e-5
 
-_ROUNDING = 1e-11
+_ROUNDING = 1e-13
+# Factors below this (a lever of a nanometre) are in the grouping, but not in the words for it.
+_UNSPEAKABLE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +29,9 @@ class BaseParameters:
         kept: indices of the kept standard parameters, rising, shape (b,).
         grouping: ``base_values = grouping @ standard_values``, shape (b, s).
         standard_names: names of all standard parameters, shape (s,).
-        smallest_kept: smallest share of a kept column that the columns kept before it do not
-            explain, 1 for an orthogonal one.
-        largest_dropped: the same for the columns that were dropped: zero but for rounding.
+        smallest_kept: how much of a kept column the columns kept before it leave unexplained,
+            as a share of the longest column of its unit; the smallest over all kept.
+        largest_dropped: the same, the largest over all dropped: zero but for rounding.
     """
 
     names: tuple[str, ...]
@@ -52,7 +54,7 @@ class BaseParameters:
     @property
     def unobservable(self) -> tuple[str, ...]:
         """Standard parameters that no torque depends on."""
-        absent = ~np.any(self.grouping, axis=0)
+        absent = ~np.any(np.abs(self.grouping) > _UNSPEAKABLE, axis=0)
         return tuple(n for n, gone in zip(self.standard_names, absent, strict=True) if gone)
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
@@ -61,7 +63,7 @@ class BaseParameters:
 
     def _expression(self, row: int, pivot: int, digits: int) -> str:
         text = self.standard_names[pivot]
-        for column in np.flatnonzero(self.grouping[row]):
+        for column in np.flatnonzero(np.abs(self.grouping[row]) > _UNSPEAKABLE):
             if column == pivot:
                 continue
             value = self.grouping[row, column]
@@ -72,7 +74,7 @@ class BaseParameters:
         return text
 
 
-def select_base(regressor: Array, names: Sequence[str]) -> BaseParameters:
+def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) -> BaseParameters:
     """Choose the first independent columns, left to right, and group the others into them.
 
     A QR factorisation reduces the rows first; it keeps lengths and angles of the columns. Then
@@ -81,19 +83,22 @@ def select_base(regressor: Array, names: Sequence[str]) -> BaseParameters:
     Args:
         regressor: rows for states that excite everything, shape (rows, s).
         names: standard names, shape (s,).
+        units: their units: only columns of one unit can be compared in length, shape (s,).
     """
     reduced = np.linalg.qr(regressor, mode="r")
     lengths = np.linalg.norm(reduced, axis=0)
-    felt = lengths > _ROUNDING * max(float(lengths.max()), 1e-300)
-    scaled = np.where(felt, reduced / np.where(felt, lengths, 1.0), 0.0)
+    longest = {unit: lengths[np.array(units) == unit].max() for unit in units}
+    scale = np.array([longest[unit] or 1.0 for unit in units])
+    scaled = reduced / scale
     kept, shares = _first_independent(scaled)
     dropped = np.setdiff1d(np.arange(len(names)), kept)
     largest_dropped = float(shares[dropped].max(initial=0.0))
 
     relation, *_ = np.linalg.lstsq(scaled[:, kept], scaled, rcond=None)
-    # What is no larger than the remainder of the dropped columns is rounding, not grouping.
-    relation[np.abs(relation) < max(_ROUNDING, 10.0 * largest_dropped)] = 0.0
-    grouping = np.round(relation * lengths / lengths[kept, None], 12)
+    # What is no larger than what stays unexplained is rounding, not grouping.
+    unexplained = np.linalg.norm(scaled - scaled[:, kept] @ relation, axis=0).max(initial=0.0)
+    relation[np.abs(relation) < max(_ROUNDING, 10.0 * float(unexplained))] = 0.0
+    grouping = relation * scale / scale[kept, None]
     grouping[:, kept] = np.eye(len(kept))
     return BaseParameters(
         names=tuple(names[k] for k in kept),
@@ -105,8 +110,16 @@ def select_base(regressor: Array, names: Sequence[str]) -> BaseParameters:
     )
 
 
+def share_left(columns: Array, basis: Array) -> Array:
+    """Return per column (rows, k) the share that the columns of `basis` (rows, b) leave of it."""
+    orthonormal, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))
+    rest = columns - orthonormal @ (orthonormal.T @ columns)
+    share: Array = np.linalg.norm(rest, axis=0) / np.linalg.norm(columns, axis=0)
+    return share
+
+
 def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return the kept indices, and per unit column the share that earlier kept ones leave."""
+    """Return the kept indices, and per column the length that earlier kept ones leave of it."""
     basis = np.zeros_like(columns)
     kept: list[int] = []
     shares = np.zeros(columns.shape[1])

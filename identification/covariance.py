@@ -92,6 +92,12 @@ class PhaseFactor:
             samples[: len(one.samples)] += one.samples
         return PhaseFactor(gram, samples, self.parameter_names)
 
+    def weighted(self, weights: Array) -> Array:
+        """Gram matrices of the blocks (B, p + 1, p + 1) with one weight per joint (n,)."""
+        blocks, joints, width, _ = self.gram.shape
+        flat = self.gram.reshape(blocks, joints, width * width)
+        return np.asarray(weights @ flat).reshape(blocks, width, width)
+
     @property
     def total(self) -> Factor:
         """Factor of all blocks."""
@@ -107,7 +113,7 @@ def with_block_covariance(estimate: Estimate, phase: PhaseFactor, weights: Array
         weights: per joint (n,).
     """
     solution = solve(phase.total.weighted(weights))
-    weighted = np.tensordot(weights, phase.gram, axes=(0, 1))  # (B, p + 1, p + 1)
+    weighted = phase.weighted(weights)
     information, moments = weighted[:, :-1, :-1], weighted[:, :-1, -1]
     used = phase.samples.any(axis=1)
     information, moments = information[used], moments[used]

@@ -19,7 +19,9 @@ Array = NDArray[np.float64]
 # any torque measurement has; a real rank deficiency shows as 1e8 and more.
 WORST_CONDITION: Final = 1e6
 _PARTICIPATION: Final = 1e-3
-_SMALLEST_NOISE: Final = 1e-12  # of the torque's own RMS: a fit without error keeps finite weights
+# Share of the torque's own RMS: what is smaller is rounding of the Gram matrix, not noise, and
+# would make a joint that happens to fit exactly the only one that counts.
+_SMALLEST_NOISE: Final = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

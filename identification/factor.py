@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError, ShapeError
 from identification.model import RobotModel
 from identification.motion import Motion
-from identification.regressor import check_motion
+from identification.regressor import joint_arrays
 
 Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class Factor:
         Raises:
             ShapeError: an array does not have the shape it should have.
         """
-        q, qd, qdd, torque = check_motion(
+        q, qd, qdd, torque = joint_arrays(
             model.n_joints,
             position=motion.position,
             velocity=motion.velocity,
@@ -118,18 +118,13 @@ class Factor:
         Raises:
             IdentificationError: the two belong to different models.
         """
-        if (
-            self.gram.shape != other.gram.shape
-            or self.parameter_names != other.parameter_names
-        ):
+        if self.gram.shape != other.gram.shape or self.parameter_names != other.parameter_names:
             raise IdentificationError(
                 "two factors with different joints or parameters cannot be added: "
                 f"{self.n_joints} joints and {self.n_parameters} parameters, "
                 f"{other.n_joints} joints and {other.n_parameters} parameters"
             )
-        return Factor(
-            self.gram + other.gram, self.samples + other.samples, self.parameter_names
-        )
+        return Factor(self.gram + other.gram, self.samples + other.samples, self.parameter_names)
 
     def weighted(self, weights: Array) -> NormalEquations:
         """Return the normal equations with one weight per joint, shape (n,): 1/variance."""

@@ -1,6 +1,7 @@
 r"""Joint friction, linear in its coefficients.
 
-.. math:: \tau_f = f_0\,\mathrm{sgn}(\dot q) + f_1 \dot q + f_2\,\mathrm{sgn}(\dot q)\,\dot q^2 + f_o
+.. math:: \tau_f = f_0\,\mathrm{sgn}(\dot q) + f_1 \dot q
+                   + f_2\,\mathrm{sgn}(\dot q)\,\dot q^2 + f_o
 
 The source equation of the paper (after eq. 1: three coefficients per joint) could not be read.
 The quadratic third term is what the same authors' later software uses; the cubic one, ``qd**3``,

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.base_parameters import BaseParameters, select_base
+from identification.base_parameters import TOLERANCE, BaseParameters, select_base, share_left
 from identification.errors import ModelError, ShapeError
 from identification.friction import FrictionLaw
 from identification.kinematics import Chain, chain_from_urdf
-from identification.regressor import Regressor, RegressorPlan, check_motion
+from identification.regressor import Regressor, RegressorPlan, joint_arrays
 from identification.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
@@ -126,7 +126,7 @@ class RobotModel:
         Raises:
             ShapeError: an array does not have that shape.
         """
-        q, qd, qdd = check_motion(self.n_joints, q=q, qd=qd, qdd=qdd)
+        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
         return self.plan.evaluate(q, qd, qdd)
 
     def torque(self, values: Array, q: Array, qd: Array, qdd: Array) -> Array:
@@ -138,7 +138,7 @@ class RobotModel:
         values = np.asarray(values, dtype=np.float64)
         if values.shape != (self.n_parameters,):
             raise ShapeError("values", values.shape, f"({self.n_parameters},)")
-        q, qd, qdd = check_motion(self.n_joints, q=q, qd=qd, qdd=qdd)
+        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
         torque = np.empty(q.shape)
         weights = [values[columns] for columns in self.plan.columns]
         for part, rows in self.plan.chunks(q, qd, qdd):
@@ -148,7 +148,7 @@ class RobotModel:
 
     def moving(self, qd: Array) -> NDArray[np.bool_]:
         """Return where each joint is faster than the friction law's standstill, shape (m, n)."""
-        (qd,) = check_motion(self.n_joints, qd=qd)
+        (qd,) = joint_arrays(self.n_joints, qd=qd)
         return self.friction.moving(qd)
 
 
@@ -207,6 +207,24 @@ def _base_parameters(
     qd = random.uniform(-3.0, 3.0, shape)
     qdd = random.uniform(-10.0, 10.0, shape)
     plan = _plan(chain, gravity, everything, rotor_inertia, None)
-    rows = plan.evaluate(q, qd, qdd).dense(len(names))
-    base = select_base(rows.reshape(-1, len(names)), names)
+    rows = plan.evaluate(q, qd, qdd).dense(len(names)).reshape(-1, len(names))
+    units = [_unit(chain, standard, rotor_inertia) for standard in range(len(names))]
+    base = select_base(rows, names, units)
+    if friction.offset:
+        _refuse_weight_as_offset(chain, rows[:, base.kept])
     return base
+
+
+def _refuse_weight_as_offset(chain: Chain, columns: Array) -> None:
+    """Refuse an offset whose column, constant on one joint, the inertial columns contain."""
+    n = chain.n_joints
+    offsets = np.tile(np.eye(n), (len(columns) // n, 1))
+    for joint, share in enumerate(share_left(offsets, columns)):
+        if share <= TOLERANCE:
+            name = chain.joint_names[joint]
+            raise ModelError(
+                f"joint {name!r} slides along gravity and has a rotor inertia: the offset of its "
+                "friction and the weight it carries cannot be told apart; leave out the offset "
+                "or the rotor inertias",
+                joint=name,
+            )

@@ -8,11 +8,13 @@ a parameter that is merely not known is no offence.
 from __future__ import annotations
 
 import re
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.estimation import Estimate
+from identification.factor import Factor
 from identification.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -24,40 +26,79 @@ _SEARCHED = 2.0
 _NEVER_NEGATIVE = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 
 
+class Implausible(NamedTuple):
+    """What is wrong with the signs of an estimate, in words.
+
+    Attributes:
+        impossible: a wrong sign that the predictions rest on.
+        doubtful: a wrong sign whose whole torque is less than the error of the prediction.
+    """
+
+    impossible: tuple[str, ...]
+    doubtful: tuple[str, ...]
+
+
+class _Offence(NamedTuple):
+    words: str
+    torque: Array  # (n,) RMS torque of the offending terms
+
+
 def implausibilities(
-    model: RobotModel, estimate: Estimate, position: Array, speed: Array, sigmas: float = 3.0
-) -> tuple[str, ...]:
+    model: RobotModel,
+    estimate: Estimate,
+    motion: Factor,
+    error_rms: Array,
+    *,
+    position: Array,
+    speed: Array,
+    sigmas: float = 3.0,
+) -> Implausible:
     """Say in words what about an estimate is physically impossible.
 
     Args:
         model: the robot.
         estimate: of the model's parameters.
+        motion: on which the model predicts, to weigh offences by their torque.
+        error_rms: of those predictions (n,).
         position: postures to look at the inertia matrix in (k, n).
         speed: highest measured speed per joint (n,): friction is looked at up to there.
-        sigmas: standard deviations beyond which the wrong sign counts.
+        sigmas: standard deviations beyond which a wrong sign counts.
     """
-    return (
-        *_friction(model, estimate, speed, sigmas),
-        *_inertial(model, estimate, sigmas),
-        *_inertia_matrix(model, estimate, position, sigmas),
+    offences = [
+        *_friction(model, estimate, motion, speed, sigmas),
+        *_inertial(model, estimate, motion, sigmas),
+    ]
+    matters = [bool(np.any(offence.torque > error_rms)) for offence in offences]
+    return Implausible(
+        impossible=(
+            *(o.words for o, serious in zip(offences, matters, strict=True) if serious),
+            *_inertia_matrix(model, estimate, position, sigmas),
+        ),
+        doubtful=tuple(
+            o.words for o, serious in zip(offences, matters, strict=True) if not serious
+        ),
     )
 
 
-def _variance(estimate: Estimate, direction: Array) -> float:
-    """Variance of direction · parameters, infinite where an undetermined one takes part."""
+def _is_negative(estimate: Estimate, direction: Array, sigmas: float) -> bool:
+    """Whether direction · parameters is below zero beyond doubt."""
     known = np.isfinite(np.diag(estimate.covariance))
     if np.any(direction[~known]):
-        return np.inf
+        return False
     part = direction[known]
-    return float(part @ estimate.covariance[np.ix_(known, known)] @ part)
+    variance = float(part @ estimate.covariance[np.ix_(known, known)] @ part)
+    return float(direction @ estimate.values) < -sigmas * float(np.sqrt(variance))
 
 
-def _is_negative(estimate: Estimate, direction: Array, sigmas: float) -> bool:
-    value = float(direction @ estimate.values)
-    return value < -sigmas * float(np.sqrt(_variance(estimate, direction)))
+def _torque_rms(motion: Factor, values: Array) -> Array:
+    """RMS torque (n,) that parameter values (p,) make on a motion."""
+    squares = np.einsum("i,jik,k->j", values, motion.gram[:, :-1, :-1], values)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1)))
 
 
-def _friction(model: RobotModel, estimate: Estimate, speed: Array, sigmas: float) -> list[str]:
+def _friction(
+    model: RobotModel, estimate: Estimate, motion: Factor, speed: Array, sigmas: float
+) -> list[_Offence]:
     """Coulomb friction below zero, and friction at top speed below half of Coulomb's.
 
     Friction may fall with speed (Stribeck) before it rises, by a quarter perhaps; at top speed
@@ -68,42 +109,47 @@ def _friction(model: RobotModel, estimate: Estimate, speed: Array, sigmas: float
     at_speed = np.zeros((len(symbols), model.n_joints))
     model.friction.columns(speed, at_speed)
     for joint, name in enumerate(model.joint_names):
-        top = np.zeros(len(estimate.values))
-        coulomb = np.zeros(len(estimate.values))
+        top, coulomb = np.zeros((2, len(estimate.values)))
         for symbol, column in zip(symbols, at_speed[:, joint], strict=True):
             index = estimate.names.index(f"{symbol}_{joint + 1}")
             if symbol != "fo":
                 top[index] = column
             if symbol == "f0":
                 coulomb[index] = 1.0
+        torque = _torque_rms(motion, np.where(top != 0.0, estimate.values, 0.0))
         if _is_negative(estimate, coulomb, sigmas):
-            found.append(
+            words = (
                 f"Coulomb friction of {name} is negative ({coulomb @ estimate.values:.3g}): a"
                 " torque or a direction has the wrong sign"
             )
+            found.append(_Offence(words, torque))
         elif _is_negative(estimate, top - 0.5 * coulomb, sigmas):
-            found.append(
-                f"friction of {name} is {top @ estimate.values:.3g} at {speed[joint]:.3g} rad/s,"
-                f" less than half of its Coulomb friction {coulomb @ estimate.values:.3g}"
+            words = (
+                f"friction of {name} is {top @ estimate.values:.3g} at its top speed of"
+                f" {speed[joint]:.3g}, less than half of its Coulomb friction"
+                f" {coulomb @ estimate.values:.3g}"
             )
+            found.append(_Offence(words, torque))
     return found
 
 
-def _inertial(model: RobotModel, estimate: Estimate, sigmas: float) -> list[str]:
+def _inertial(
+    model: RobotModel, estimate: Estimate, motion: Factor, sigmas: float
+) -> list[_Offence]:
     """Base parameters that stand for one standard parameter alone and have its wrong sign."""
     found = []
     for index, row in enumerate(model.base.grouping):
-        alone = np.count_nonzero(row) == 1
         name = model.base.names[index]
-        if not alone or not _NEVER_NEGATIVE.fullmatch(name):
+        if np.count_nonzero(row) > 1 or not _NEVER_NEGATIVE.fullmatch(name):
             continue
         direction = np.zeros(len(estimate.values))
         direction[index] = 1.0
         if _is_negative(estimate, direction, sigmas):
-            found.append(
+            words = (
                 f"{name} is negative: {estimate.values[index]:.3g} ± {estimate.std[index]:.2g}"
                 f" {estimate.units[index]}"
             )
+            found.append(_Offence(words, _torque_rms(motion, direction * estimate.values)))
     return found
 
 
@@ -123,7 +169,7 @@ def _inertia_matrix(
     joint = model.joint_names[int(np.argmax(np.abs(along)))]
     return [
         f"the inertia seen by {joint} is negative ({eigenvalues[worst, 0]:.3g}) in a posture of"
-        " the validation motion: a torque or a direction has the wrong sign"
+        " the unseen motion: a torque or a direction has the wrong sign"
     ]
 
 

@@ -136,6 +136,22 @@ class Recording:
             **self._each_channel(lambda array: array[start:stop]),
         )
 
+    @property
+    def motion_start(self) -> float:
+        """Time at which the commanded position begins to move [s]; the first sample's without.
+
+        The first sample commanded otherwise than the first command: the same instant of a plan
+        in every repetition of it.
+        """
+        if self.commanded_position is None:
+            return float(self.time[0])
+        known = np.isfinite(self.commanded_position).all(axis=1)
+        if not known.any():
+            return float(self.time[0])
+        first = self.commanded_position[int(np.argmax(known))]
+        moved = known & (self.commanded_position != first).any(axis=1)
+        return float(self.time[int(np.argmax(moved))])
+
     def segments(self) -> list[slice]:
         """Stretches without a gap, in order.
 

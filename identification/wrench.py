@@ -7,9 +7,9 @@ acceleration; a: acceleration of the origin minus gravity):
           f = m a + \alpha\times mc + \omega\times(\omega\times mc)
 
 Every entry is a sum, with signs, of twelve quantities per sample, the *primitives*: the three
-components of alpha, of a, the squares :math:`\omega_x^2, \omega_y^2, \omega_z^2`, and the products
-:math:`\omega_y\omega_z, \omega_z\omega_x, \omega_x\omega_y`. So the wrenches are one constant matrix
-times the primitives.
+components of a, of alpha, of the squares :math:`\omega_x^2, \omega_y^2, \omega_z^2`, and of the
+products :math:`\omega_y\omega_z, \omega_z\omega_x, \omega_x\omega_y`. So the wrenches are one
+constant matrix times the primitives.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ LINK_SYMBOLS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "
 N_INERTIA = 6
 N_PRIMITIVES = 12
 
-_ALPHA, _ACCELERATION, _SQUARE, _PRODUCT = 0, 3, 6, 9
+# Accelerations stand first: moments of inertia do without them.
+_ACCELERATION, _ALPHA, _SQUARE, _PRODUCT = 0, 3, 6, 9
+ROTATIONAL = slice(_ALPHA, N_PRIMITIVES)
 _TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 

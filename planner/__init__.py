@@ -27,9 +27,11 @@ from planner.piecewise_cubic import Extrema, PiecewiseCubic
 from planner.plan import plan
 from planner.player import TrajectoryPlayer
 from planner.trajectory import Trajectory
+from planner.verify import check_limits
 
 __all__ = [
     "plan",
+    "check_limits",
     "JointLimits",
     "Trajectory",
     "PiecewiseCubic",

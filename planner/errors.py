@@ -20,6 +20,8 @@
 Every error carries the numbers that caused it; joints are counted from 0, as arrays are.
 """
 
+# ruff: noqa: N818  the leaves are named for what is wrong; their root ends in Error
+
 from __future__ import annotations
 
 

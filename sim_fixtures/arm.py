@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.effects import FrictionDrift, TorqueRipple, UnmodelledEffects
 from sim_fixtures.elastic_plant import ElasticPlant
+from sim_fixtures.noise import NoiseSource
 from sim_fixtures.plant import Plant
 from sim_fixtures.servo import CurrentLoop
 from sim_fixtures.settings import ControllerSettings
@@ -54,25 +55,27 @@ class SimulatedArm:
             self.plant = Plant(
                 urdf, truth, gravity=gravity, position=position, brake_torque=holding
             )
+        n = drive.n_axes
+        current_rng, encoder_rng, ripple_rng = rng.spawn(3)
+        self._current_noise = NoiseSource(settings.current_noise, n, current_rng)
+        self._encoder_noise = NoiseSource(settings.encoder_noise, n, encoder_rng)
         self._loop = CurrentLoop(
-            drive.n_axes,
-            settings.servo.current_lag,
-            settings.current_noise,
-            self._substep,
-            round(effects.delay / self._substep),
-            rng,
+            n,
+            lag=settings.servo.current_lag,
+            substep=self._substep,
+            delay_substeps=round(effects.delay / self._substep),
         )
-        self.currents = [0.0] * drive.n_axes
+        self.currents = [0.0] * n
         self._ripple: TorqueRipple | None = None
         if effects.torque_ripple > 0.0:
-            self._ripple = TorqueRipple(effects.torque_ripple * truth.coulomb, rng)
+            self._ripple = TorqueRipple(effects.torque_ripple * truth.coulomb, ripple_rng)
         self._drift: FrictionDrift | None = None
         if effects.friction_drift > 0.0:
-            self._drift = FrictionDrift(effects.friction_drift, drive.n_axes)
+            self._drift = FrictionDrift(effects.friction_drift, n)
 
     def encoders(self) -> list[float]:
         """Return the motor positions [rev] in whole encoder counts."""
-        return self._drive.encoder(self._motors())
+        return self._drive.encoder(self._motors(), self._encoder_noise.draw())
 
     def run_cycle(self, target_currents: Sequence[float] | None, *, braked: bool) -> None:
         """Let one period pass under target currents (n,) [A]; None for a drive that is off."""
@@ -80,13 +83,13 @@ class SimulatedArm:
         plant.close_brakes(braked)
         if self._drift is not None:
             plant.scale_friction(self._drift.scale(plant.velocity, self._period))
-        self._loop.new_cycle()
+        noise = self._current_noise.draw()
         for _ in range(self._substeps):
             if target_currents is None:
                 self._loop.cut()
                 self.currents = [0.0] * len(self.currents)
             else:
-                self.currents = self._loop.substep(target_currents)
+                self.currents = self._loop.substep(target_currents, noise)
             torque = np.array(self._drive.joint_torques(self.currents))
             if self._ripple is not None:
                 torque += self._ripple.torque(self._motors())

@@ -221,11 +221,12 @@ class SimulatedController:
     def _watch_following_error(self) -> None:
         """Switch the drive off where an axis does not follow."""
         thresholds = self._drive.following_error
-        for i, error in enumerate(self._servo.following_error()):
-            if abs(error) > thresholds[i]:
+        errors = self._servo.following_error()
+        for axis, (error, threshold) in enumerate(zip(errors, thresholds, strict=True), start=1):
+            if abs(error) > threshold:
                 self._program.trip(
-                    f"following error of axis {i + 1}: {error:.3f} motor revolutions, "
-                    f"threshold {thresholds[i]:g}"
+                    f"following error of axis {axis}: {error:.3f} motor revolutions, "
+                    f"threshold {threshold:g}"
                 )
 
     def _read(self, reply: bytes) -> tuple[Answer, tuple[list[float], list[float]] | None]:

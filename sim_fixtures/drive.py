@@ -167,7 +167,7 @@ class SimulatedDrive:
             motor[3] += (kr[4] * self.k54 * motor[4] - kr[5] * self._k46 * motor[5]) / kr[3]
         return [m / kt for m, kt in zip(motor, self.torque_constant, strict=True)]
 
-    def encoder(self, revolutions: Sequence[float]) -> list[float]:
-        """Return motor positions rounded to whole encoder counts."""
+    def encoder(self, revolutions: Sequence[float], noise: Sequence[float]) -> list[float]:
+        """Return motor positions as encoders read them: whole counts, `noise` in counts."""
         counts = self.encoder_counts
-        return [round(p * counts) / counts for p in revolutions]
+        return [round(p * counts + e) / counts for p, e in zip(revolutions, noise, strict=True)]

@@ -42,11 +42,11 @@ class ElasticPlant(Plant):
         """Put the arm at rest, the springs loaded by gravity.
 
         Args:
-            urdf: as for `Plant`, like truth, gravity, position and brake_torque.
-            truth: "
-            gravity: "
-            position: "
-            brake_torque: "
+            urdf: URDF text.
+            truth: rotor inertias and friction.
+            gravity: m/s2 in the base frame.
+            position: joint angles [rad]; the URDF's zero if not given.
+            brake_torque: dry friction of each joint's closed brake [N m].
             elasticity: compliance of each gear (n,) [rad/(N m)]; 0 is rigid.
             step: the step that will be used [s].
 
@@ -79,7 +79,7 @@ class ElasticPlant(Plant):
         gravity_torque = pin.computeGeneralizedGravity(self.model, self.data, self.position)
         self._motor: Array = self.position + compliance * gravity_torque
         self._motor_velocity: Array = np.zeros(self.n_joints)
-        self._motor_acceleration: Array = np.zeros(self.n_joints)
+        self._motor_trend: Array = np.zeros(self.n_joints)
 
     @property
     def motor_position(self) -> Array:
@@ -99,9 +99,9 @@ class ElasticPlant(Plant):
         self.time += step
         half = 0.5 * step
         middle = self.position + half * self.velocity
-        predicted = self.velocity + half * self.acceleration
+        predicted = self.velocity + half * self._trend
         motor_middle = self._motor + half * self._motor_velocity
-        motor_predicted = self._motor_velocity + half * self._motor_acceleration
+        motor_predicted = self._motor_velocity + half * self._motor_trend
         spring = self._stiffness * (motor_middle - middle)
         spring += self._damping * (motor_predicted - predicted)
 
@@ -109,7 +109,7 @@ class ElasticPlant(Plant):
         smooth = self._smooth_friction(predicted) * self._rigid
         load = np.where(self._soft, spring, torque - smooth)
         self._advance(load, coulomb * self._rigid, middle, predicted, step)
-        self.friction_torque = np.where(self._soft, rotor_friction, self._dry + smooth)
+        self._smooth = smooth + rotor_friction
         self.position = middle + half * self.velocity
         self._motor = motor_middle + half * self._motor_velocity
 
@@ -118,9 +118,11 @@ class ElasticPlant(Plant):
         smooth = self._smooth_friction(predicted)
         free = self._motor_velocity + step * (torque - smooth) / self._rotor
         # alone on its axis, a rotor is stopped by the friction that takes its free speed away
-        dry = np.clip(free * self._rotor / step, -coulomb, coulomb)
-        after = np.where(np.abs(dry) < coulomb, 0.0, free - step * dry / self._rotor)
-        after = np.where(self._soft, after, 0.0)
-        self._motor_acceleration = (after - self._motor_velocity) / step
+        momentum = self._rotor / step
+        dry = np.minimum(np.maximum(free * momentum, -coulomb), coulomb)
+        after = np.where(np.abs(dry) < coulomb, 0.0, free - dry / momentum) * self._soft
+        # a rotor that has just been stopped does not go on decelerating
+        self._motor_trend = np.where(after == 0.0, 0.0, (after - self._motor_velocity) / step)
         self._motor_velocity = after
-        return smooth + dry
+        friction: Array = (smooth + dry) * self._soft
+        return friction

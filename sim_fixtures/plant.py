@@ -11,6 +11,8 @@ order otherwise, at the price of one evaluation.
 
 from __future__ import annotations
 
+from operator import mul
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
@@ -54,7 +56,6 @@ class Plant:
         model: pinocchio's model; its armature holds the rotor inertias.
         position, velocity, acceleration: state (n,), rad, rad/s, rad/s2. The acceleration is the
             mean over the last step.
-        friction_torque: friction during the last step, (n,) [N m], positive against positive speed.
         time: simulated time [s].
     """
 
@@ -86,19 +87,26 @@ class Plant:
         self.position: Array = start
         self.velocity: Array = np.zeros(n)
         self.acceleration: Array = np.zeros(n)
-        self.friction_torque: Array = np.zeros(n)
         self.time = 0.0
         self._brake: Array = np.broadcast_to(np.asarray(brake_torque, dtype=np.float64), (n,))
         self._braked = False
         self._scale: Array | None = None
         self._coulomb: Array = truth.coulomb
         self._dry: Array = np.zeros(n)
+        self._smooth: Array = np.zeros(n)
+        self._no_friction: Array = np.zeros(n)
+        self._trend: Array = np.zeros(n)
         self._holding: Array | None = None
 
     @property
     def n_joints(self) -> int:
         """Number of joints."""
         return self.truth.n_joints
+
+    @property
+    def friction_torque(self) -> Array:
+        """Friction during the last step, (n,) [N m], positive against positive speed."""
+        return self._dry + self._smooth
 
     @property
     def motor_position(self) -> Array:
@@ -109,7 +117,7 @@ class Plant:
         """Put the arm somewhere, moving: (n,) [rad] and (n,) [rad/s]."""
         self.position = np.array(position, dtype=np.float64)
         self.velocity = np.array(velocity, dtype=np.float64)
-        self.acceleration = np.zeros(self.n_joints)
+        self.acceleration = self._trend = np.zeros(self.n_joints)
         self._holding = None
 
     def close_brakes(self, closed: bool) -> None:
@@ -149,10 +157,10 @@ class Plant:
             return
         half = 0.5 * step
         middle = self.position + half * self.velocity
-        predicted = self.velocity + half * self.acceleration
+        predicted = self.velocity + half * self._trend
         smooth = self._smooth_friction(predicted)
         self._advance(torque - smooth, self._coulomb, middle, predicted, step)
-        self.friction_torque = self._dry + smooth
+        self._smooth = smooth
         self.position = middle + half * self.velocity
 
     def _smooth_friction(self, velocity: Array) -> Array:
@@ -166,7 +174,7 @@ class Plant:
             return False
         friction = torque - self._holding
         if (np.abs(friction) <= self._coulomb).all():
-            self._dry = self.friction_torque = friction
+            self._dry, self._smooth = friction, self._no_friction
             return True
         self._holding = None
         return False
@@ -180,9 +188,10 @@ class Plant:
             sliding = np.copysign(coulomb, self.velocity)
             a = pin.aba(self.model, self.data, middle, predicted, torque - sliding)
             after = self.velocity + step * a
-            if all(v * w > 0.0 for v, w in zip(before, after.tolist(), strict=True)):
+            if min(map(mul, before, after.tolist())) > 0.0:
                 self._dry = sliding
-                self.velocity, self.acceleration = after, a
+                self.velocity = after
+                self.acceleration = self._trend = a
                 return
         self._stop_or_turn(torque, coulomb, middle, predicted, step)
 
@@ -207,5 +216,7 @@ class Plant:
             gravity = pin.computeGeneralizedGravity(self.model, self.data, self.position)
             self._holding = np.array(gravity)
         self.acceleration = (after - self.velocity) / step
+        # a joint that has just been stopped does not go on decelerating
+        self._trend = np.where(after == 0.0, 0.0, self.acceleration)
         self.velocity = after
         self._dry = np.array(result.torque)

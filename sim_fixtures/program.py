@@ -37,7 +37,8 @@ class Phase(IntEnum):
 
 POWERED = frozenset({Phase.DRIVING_ON, Phase.CLOSED, Phase.OPENING, Phase.OPEN, Phase.CLOSING})
 UNBRAKED = POWERED - {Phase.DRIVING_ON}
-AXES_OPEN = frozenset({Phase.OPEN, Phase.CLOSING, Phase.TRIPPED})
+STILL_OPEN = frozenset({Phase.CLOSING, Phase.TRIPPED})
+"""Phases in which an axis keeps for some cycles the mode it had."""
 LISTENING = frozenset({Phase.OPENING, Phase.OPEN})
 
 
@@ -142,9 +143,10 @@ class LoopProgram:
         self.braked = phase not in UNBRAKED
         self.listening = phase in LISTENING
         self._age = 0
-        self.open_axes = [phase in AXES_OPEN] * self._n_axes
         if phase is Phase.OPENING:
             self._open_due_axes()
+        elif phase not in STILL_OPEN:
+            self.open_axes = [phase is Phase.OPEN] * self._n_axes
 
     def _open_due_axes(self) -> None:
         """Open one axis after the other."""

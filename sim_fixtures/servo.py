@@ -166,46 +166,27 @@ class Servo:
 
 
 class CurrentLoop:
-    """The current that flows: target through a first-order lag, plus noise.
+    """The current that flows: the target through a delay and a first-order lag, plus noise.
 
     Currents are means over a sub-step, so that the lag is the stated one whatever the sub-steps.
     """
 
-    def __init__(
-        self, n_axes: int, lag: float, noise: float, substep: float, delay_substeps: int,
-        rng: np.random.Generator,
-    ) -> None:  # fmt: skip
+    def __init__(self, n_axes: int, *, lag: float, substep: float, delay_substeps: int) -> None:
         """Start without current.
 
         Args:
             n_axes: number of axes.
             lag: time constant [s].
-            noise: standard deviation [A], redrawn every cycle.
             substep: duration of a sub-step [s].
             delay_substeps: sub-steps before a target takes effect.
-            rng: source of the noise.
         """
-        decay = exp(-substep / lag) if lag > 0.0 else 0.0
-        self._decay = decay
+        self._decay = exp(-substep / lag) if lag > 0.0 else 0.0
         # mean of exp(-t / lag) over the sub-step
-        self._mean = lag / substep * (1.0 - decay) if lag > 0.0 else 0.0
+        self._mean = lag / substep * (1.0 - self._decay)
         self._state = [0.0] * n_axes
         self._queue: list[Sequence[float]] = [[0.0] * n_axes for _ in range(delay_substeps)]
-        self._noise = noise
-        self._rng = rng
-        self._n_axes = n_axes
-        self._block: list[list[float]] = []
-        self._disturbance = [0.0] * n_axes
 
-    def new_cycle(self) -> None:
-        """Draw the noise of the cycle that begins."""
-        if self._noise > 0.0:
-            if not self._block:
-                draws = self._rng.standard_normal((1024, self._n_axes)) * self._noise
-                self._block = draws.tolist()
-            self._disturbance = self._block.pop()
-
-    def substep(self, target: Sequence[float]) -> list[float]:
+    def substep(self, target: Sequence[float], noise: Sequence[float]) -> list[float]:
         """Return the mean current (n,) [A] of the next sub-step under a target current."""
         if self._queue:
             self._queue.append(target)
@@ -213,9 +194,9 @@ class CurrentLoop:
         decay, mean = self._decay, self._mean
         lag = [s - t for s, t in zip(self._state, target, strict=True)]
         self._state = [t + decay * x for t, x in zip(target, lag, strict=True)]
-        return [t + mean * x + e for t, x, e in zip(target, lag, self._disturbance, strict=True)]
+        return [t + mean * x + e for t, x, e in zip(target, lag, noise, strict=True)]
 
     def cut(self) -> None:
         """Interrupt the current at once, as a drive does that is switched off."""
-        self._state = [0.0] * self._n_axes
+        self._state = [0.0] * len(self._state)
         self._queue = [list(self._state) for _ in self._queue]

@@ -65,12 +65,15 @@ class ControllerSettings:
         current_noise: standard deviation of the current that flows about the target, A; white
             from cycle to cycle, on each axis.
         current_resolution: step of the target current, A; 0 for none.
+        encoder_noise: standard deviation of a reading before it is rounded, encoder counts. Also
+            what makes the servo's current tremble at standstill.
         servo: gains.
         cold_start: begin with nine sync packets, init, two more; otherwise init comes first.
         drive_off_cycles, driving_on_cycles, closed_cycles, closing_cycles: duration of each phase.
             `closed_cycles` passes before every opening.
         opening_stagger: cycles between one axis entering open mode and the next.
-        missed_replies: replies missing in a row that end open mode.
+        missed_replies: replies missing in a row that end open mode. Meanwhile and afterwards the
+            last target is held; at speed that stop is so hard that the drive trips.
         silence_limit: replies missing in a row, in any state, that end the session.
         open_intervals: how often the program opens before it ends by itself; None for endlessly.
         version: major, minor, build in the init packet.
@@ -81,6 +84,7 @@ class ControllerSettings:
     substeps: int = 2
     current_noise: float = 0.0
     current_resolution: float = 0.0
+    encoder_noise: float = 0.5
     servo: ServoSettings = ServoSettings()
     cold_start: bool = True
     drive_off_cycles: int = 20
@@ -97,7 +101,7 @@ class ControllerSettings:
         milliseconds = self.period * 1000.0
         if not (milliseconds >= 0.999 and abs(milliseconds - round(milliseconds)) < 1e-9):
             raise SettingError("period", self.period, "a whole number of milliseconds, in seconds")
-        for name in ("current_noise", "current_resolution", "opening_stagger"):
+        for name in ("current_noise", "current_resolution", "encoder_noise", "opening_stagger"):
             _require(self, name, 0.0)
         for field in fields(self):
             if field.name.endswith("_cycles") or field.name in (

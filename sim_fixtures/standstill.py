@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MAX_SWEEPS = 200
-TOLERANCE = 1e-7
-"""Largest change of a torque in the last sweep, relative to the Coulomb torque."""
+TOLERANCE = 1e-6
+"""Change of a torque that is no longer made, relative to the Coulomb torque."""
 
 
 class DryFriction(NamedTuple):
@@ -49,27 +49,24 @@ def resolve_dry_friction(
         step: h [s].
         guess: torques to start from, (n,) [N m]; those of the step before.
     """
-    n = len(coulomb)
-    rows = (inverse_inertia * step).tolist()
+    coupling = inverse_inertia * step
+    rows: list[list[float]] = coupling.tolist()
     torque = [max(-c, min(c, f)) for f, c in zip(guess, coulomb, strict=True)]
-    velocity = [
-        v - sum(a * f for a, f in zip(row, torque, strict=True))
-        for v, row in zip(free_velocity, rows, strict=True)
-    ]
+    velocity: list[float] = (np.array(free_velocity) - coupling @ torque).tolist()
     for _ in range(MAX_SWEEPS):
         settled = True
-        for i in range(n):
-            limit = coulomb[i]
-            wanted = torque[i] + velocity[i] / rows[i][i]
-            wanted = max(-limit, min(limit, wanted))
-            change = wanted - torque[i]
-            if change != 0.0:
+        for i, limit in enumerate(coulomb):
+            held = torque[i]
+            wanted = max(-limit, min(limit, held + velocity[i] / rows[i][i]))
+            change = wanted - held
+            if abs(change) > TOLERANCE * limit:
                 torque[i] = wanted
                 velocity = [v - a * change for v, a in zip(velocity, rows[i], strict=True)]
-                settled = settled and abs(change) <= TOLERANCE * limit
+                settled = False
         if settled:
             break
-    resting = [abs(f) < c for f, c in zip(torque, coulomb, strict=True)]
-    return DryFriction(
-        [0.0 if rests else v for v, rests in zip(velocity, resting, strict=True)], torque
-    )
+    # a joint stands if friction had enough in hand to take away what is left of its velocity
+    for i, limit in enumerate(coulomb):
+        if abs(torque[i] + velocity[i] / rows[i][i]) < limit:
+            velocity[i] = 0.0
+    return DryFriction(velocity, torque)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -136,6 +137,7 @@ class LayoutBuilder:
         return MessageLayout(dtype, bytes(self._template), np.array(self._constant))
 
 
+@cache
 def fixed_layout(definition: str) -> MessageLayout:
     """Lay out a ros2msg definition of numbers and fixed arrays, with or without a header.
 

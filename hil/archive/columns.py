@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,10 +36,10 @@ class Columns:
 
     Args:
         layout: the messages; their time stamp becomes the column ``stamp`` in nanoseconds.
-        fields: fields wanted, None for all.
+        fields: fields wanted.
     """
 
-    def __init__(self, layout: MessageLayout, fields: Collection[str] | None = None) -> None:
+    def __init__(self, layout: MessageLayout, fields: Collection[str]) -> None:
         self._stamp = layout.dtype[list(_STAMP)]
         self._blocks = _blocks(layout, fields)
         self._places = [(slice(block.start, block.end), block.raw) for block in self._blocks]
@@ -85,12 +85,12 @@ class Columns:
             self._arrays[index] = grown
 
 
-def _blocks(layout: MessageLayout, fields: Collection[str] | None) -> list[_Block]:
+def _blocks(layout: MessageLayout, fields: Collection[str]) -> list[_Block]:
     """Gather the wanted fields into blocks of neighbours."""
     blocks: list[_Block] = []
-    places = layout.dtype.fields or {}
+    places: Mapping[str, Any] = layout.dtype.fields or {}
     for name, (dtype, start, *_) in places.items():
-        if name in _STAMP or (fields is not None and name not in fields):
+        if name in _STAMP or name not in fields:
             continue
         base, shape = dtype.subdtype or (dtype, ())
         last = blocks[-1] if blocks else None

@@ -35,7 +35,7 @@ _FOOTER_SIZE = _RECORD.size + 20
 _NO_CRC = 0
 
 
-class Damage(Exception):
+class Damage(Exception):  # noqa: N818 - handed on as a finding, too
     """Bytes that do not keep the format.
 
     Attributes:

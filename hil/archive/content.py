@@ -21,7 +21,6 @@ from hil.archive.chunk import Bytes, ChunkParser, Messages
 from hil.archive.columns import Columns
 from hil.archive.container import Damage, Record
 from hil.archive.events import ArchivedEvent
-from hil.archive.file_writer import checksum
 from hil.archive.messages import decode_log, joint_state_of
 
 _NEEDED = ("kind", "joint_names", "attachments")
@@ -76,7 +75,7 @@ class Content:
         if name not in (schema.METADATA, schema.OUTCOME):
             return
         claimed = entries.pop("checksum", None)
-        if claimed != checksum(entries):
+        if claimed != schema.checksum(entries):
             raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
         if name == schema.OUTCOME:
             self.outcome = entries
@@ -91,23 +90,28 @@ class Content:
 
     def _take_chunk(self, record: Record) -> None:
         if self.metadata is None:
-            raise Damage(record.offset, f"(chunk) comes before the {schema.METADATA!r} metadata")
+            return  # some other MCAP file, which will be refused as such
         data = container.chunk_data(record, decompressor=self._decompressor)
         found = self._parser.messages(data, record.offset)
         recorded = {channel.topic for channel in self._parser.channels.values()}
         wanted = (
             (schema.CYCLE,) if schema.CYCLE in recorded else (schema.MEASURED, schema.MOTOR_CURRENT)
         )
+        counts = {
+            len(found[topic]) if topic in found else 0 for topic in wanted if topic in recorded
+        }
+        if len(counts) > 1:
+            raise Damage(record.offset, "(chunk) has channels of different length")
         decoded = []
         for topic in wanted:
             if topic in found:
                 channel = self._channel(topic, found[topic], record.offset)
                 decoded.append((channel, channel.verified(found[topic], record.offset)))
         events = self._decoded_events(found.get(schema.EVENTS), record.offset)
-        if len({len(data) for _, data in decoded}) > 1:
-            raise Damage(record.offset, "(chunk) has channels of different length")
-        for channel, data in decoded:
-            channel.append(data, expected=int(_MARGIN * len(data) * self._size / len(record.body)))
+        for channel, messages in decoded:
+            channel.append(
+                messages, expected=int(_MARGIN * len(messages) * self._size / len(record.body))
+            )
         self.events += events
 
     def _channel(self, topic: str, messages: Messages, offset: int) -> _Channel:
@@ -160,8 +164,8 @@ class _Channel:
 
     def __init__(self, layout: MessageLayout, fields: Collection[str] | None) -> None:
         self._layout = layout
-        message_word = {ours: theirs for theirs, ours in _COLUMN_OF.items()}
-        wanted = None if fields is None else {message_word.get(name, name) for name in fields}
+        names = layout.dtype.names or ()
+        wanted = [name for name in names if fields is None or _COLUMN_OF.get(name, name) in fields]
         self._columns = Columns(layout, wanted)
 
     def __len__(self) -> int:

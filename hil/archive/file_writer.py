@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
+from typing import IO, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
@@ -19,6 +19,7 @@ from hil.archive.schema import (
     PROFILE,
     Batch,
     Channel,
+    checksum,
 )
 from hil.errors import ArchiveWriteError
 
@@ -31,12 +32,6 @@ _MEDIA_TYPES = {
     ".csv": "text/csv",
     ".txt": "text/plain",
 }
-
-
-def checksum(entries: Mapping[str, str]) -> str:
-    """CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
-    text = json.dumps(dict(entries), sort_keys=True, separators=(",", ":"))
-    return f"{zlib.crc32(text.encode()):08x}"
 
 
 class _Sink:
@@ -96,8 +91,8 @@ class ArchiveFile:
         self._closed = False
         self._written = 0
         self._events = 0
-        self._writer = Writer(
-            _Sink(self._descriptor, durable=durable),
+        self._writer: Any = Writer(  # its methods are not annotated
+            cast("IO[bytes]", _Sink(self._descriptor, durable=durable)),
             chunk_size=_ONE_CHUNK,
             compression=CompressionType.ZSTD,
         )

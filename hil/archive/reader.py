@@ -77,7 +77,7 @@ class Archive:
 
     @property
     def complete(self) -> bool:
-        """Whether the archive is whole: closed, and every byte as it was written."""
+        """Whether the archive is whole: it was closed, and all its content passed its checks."""
         return self.damage is None
 
     @property
@@ -108,7 +108,7 @@ class Archive:
             ArchiveError: the archive was opened without all fields, or holds no cycles.
         """
         dtype = cycle_dtype(len(self.joint_names))
-        names = [name for name in dtype.names or () if name != "reserved"]
+        names = dtype.names or ()
         absent = [name for name in names if name not in self.columns]
         if absent:
             raise ArchiveError(self.path, f"has no column {absent[0]}", field=CYCLE)
@@ -168,15 +168,18 @@ def _checked_metadata(
                 remedy="install a newer hil",
             )
         return content.metadata
+    remedy = "record it again"
     if size == 0:
         problem = "is empty: the recording ended before anything was written"
     elif damage is None:
         problem = f"is an MCAP file, but not an archive: it has no {METADATA!r} metadata record"
+        remedy = "name a file that hil recorded or imported"
     elif damage.offset == 0:
         problem = "is not an MCAP file"
+        remedy = "name a file that hil recorded, or import this one first"
     else:
         problem = f"is torn before its first data: the record at byte {damage.offset} {damage}"
-    raise NotAnArchiveError(path, problem, remedy="record again, or bring it in with `hil import`")
+    raise NotAnArchiveError(path, problem, remedy=remedy)
 
 
 def _damage(damage: Damage, size: int, content: Content, stamp: NDArray[np.int64]) -> ArchiveDamage:

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -137,6 +139,12 @@ class SampleEncoder:
         current = _stamped(self._current, stamp)
         current["motor_current"] = motor_current
         return Batch(stamp, (state, current))
+
+
+def checksum(entries: Mapping[str, str]) -> str:
+    """CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
+    text = json.dumps(dict(entries), sort_keys=True, separators=(",", ":"))
+    return f"{zlib.crc32(text.encode()):08x}"
 
 
 def _stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:

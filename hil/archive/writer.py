@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -203,7 +204,7 @@ class ArchiveWriter:
         cuts = [0, *(np.flatnonzero(np.diff(slots)) + 1).tolist(), len(records)]
         if not everything and not self._ends_slot(int(records["cycle"][-1])):
             cuts.pop()
-        for start, stop in zip(cuts, cuts[1:], strict=False):
+        for start, stop in pairwise(cuts):
             self._file.add(self._encoder.encode(records[start:stop], torque[start:stop]))
             self._last = int(records["cycle"][stop - 1])
             self._file.flush()

@@ -15,13 +15,12 @@ from hil.archive import ArchiveWriter
 from hil.cell import Cell
 from hil.progress import Reporter
 from hil.version import software
-from identification.excitation import CollisionChecker, CurrentModel, MotionCheck, check_motion
 from planner import PiecewiseCubic, TrajectoryPlayer, plan
 
 from .errors import CampaignFolderError, MotionFailedError, MotionRefusedError
 from .folder import CampaignFolder
 from .link import Link, Stop
-from .plan import CampaignPlan, current_model
+from .plan import CampaignPlan, MotionChecks
 
 Array = NDArray[np.float64]
 
@@ -105,15 +104,24 @@ class Campaign:
             ControllerFault: the controller did not come up.
         """
         intervals = self._missing(link.connect())
-        checks = _Checks(self.cell)
-        for interval in intervals:
-            checks.check(interval)
+        self._check(intervals)
         total = sum(interval.trajectory.duration for interval in intervals)
         with reporter.task("running the campaign (s of motion)", total) as task:
             for interval in intervals:
                 self._run_one(interval, link, stop, provenance, durable=durable)
                 task.advance(interval.trajectory.duration, str(interval))
         link.close()
+
+    def _check(self, intervals: list[Interval]) -> None:
+        """Refuse the campaign if one of its motions must not be sent; each is checked once."""
+        checks = MotionChecks.of(self.cell)
+        distinct = {id(interval.trajectory): interval for interval in intervals}
+        for interval in distinct.values():
+            problem = checks.refusal(interval.trajectory)
+            if problem is not None:
+                raise MotionRefusedError(
+                    str(interval), problem, "jog the arm or design another motion"
+                )
 
     def _missing(self, where: Array) -> list[Interval]:
         """What is still to be run with the arm at `where` (n,), there and back."""
@@ -190,31 +198,6 @@ class Campaign:
             "cell": self.cell.name,
             **{f"software.{name}": version for name, version in software().items()},
         }
-
-
-class _Checks:
-    """Limits, current and collision check of every motion, made once per trajectory."""
-
-    def __init__(self, cell: Cell) -> None:
-        self._limits = cell.joint_limits
-        self._checker = CollisionChecker(cell.urdf, cell.workspace)
-        self._currents: CurrentModel = current_model(cell)
-        self._passed: set[int] = set()
-
-    def check(self, interval: Interval) -> None:
-        """Raise MotionRefusedError unless `interval` may be sent."""
-        if id(interval.trajectory) in self._passed:
-            return
-        result: MotionCheck = check_motion(
-            interval.trajectory, self._limits, checker=self._checker, currents=self._currents
-        )
-        if result.violations:
-            raise MotionRefusedError(
-                str(interval),
-                str(result.violations[0]),
-                "jog the arm or design another motion",
-            )
-        self._passed.add(id(interval.trajectory))
 
 
 def hold(position: Array, duration: float) -> PiecewiseCubic:

@@ -14,10 +14,12 @@ from identification.excitation import (
     CollisionChecker,
     CurrentModel,
     Excitation,
+    check_motion,
     random_search,
     random_validation_motions,
 )
-from planner import PiecewiseCubic
+from planner import JointLimits, NotSmooth, PiecewiseCubic
+from planner.verify import check_smooth
 
 from .folder import write_atomically
 
@@ -64,46 +66,76 @@ def design(cell: Cell, reporter: Reporter) -> CampaignPlan:
 
     Until a real search exists the excitation is the best of `candidates` random via-point sets
     by the paper's eq. 7.
+
+    Raises:
+        NoFeasibleMotion: says which constraint forbids every motion.
     """
     settings = cell.campaign
-    model, limits = cell.model, cell.joint_limits
-    checker = CollisionChecker(cell.urdf, cell.workspace)
-    currents = current_model(cell)
-    with reporter.task("designing the excitation", settings.candidates) as task:
+    checks = MotionChecks.of(cell)
+    with reporter.task("designing the excitation (candidates)", settings.candidates) as task:
         excitation = random_search(
-            model,
-            limits,
+            cell.model,
+            cell.joint_limits,
             home=cell.home,
+            seed=settings.seed,
             n_via=settings.n_via,
             fly=settings.fly,
             candidates=settings.candidates,
-            seed=settings.seed,
-            checker=checker,
-            currents=currents,
+            checker=checks.checker,
+            currents=checks.currents,
             progress=lambda note: task.advance(1, note),
         )
     validation = random_validation_motions(
-        limits,
+        cell.joint_limits,
         home=cell.home,
+        seed=settings.seed,
+        count=settings.validation_runs,
         n_via=settings.n_via,
         fly=settings.fly,
-        count=settings.validation_runs,
-        seed=settings.seed + 1,
-        model=model,
-        checker=checker,
-        currents=currents,
+        checker=checks.checker,
+        currents=checks.currents,
     )
-    return CampaignPlan(excitation, tuple(validation))
+    return CampaignPlan(excitation, validation)
 
 
-def current_model(cell: Cell) -> CurrentModel:
-    """Predicts motor currents of a motion from the nominal model."""
-    drives = cell.drive_train
-    return CurrentModel(
-        model=cell.model,
-        values=cell.nominal_values(),
-        motor_from_joint=drives.motor_from_joint,
-        torque_constant=drives.torque_constant,
-        current_limit=drives.current_limit,
-        uncertainty=cell.nominal.uncertainty,
-    )
+@dataclass(frozen=True, eq=False)
+class MotionChecks:
+    """What every motion of a cell is checked against before it is sent.
+
+    Attributes:
+        limits: joint limits.
+        checker: floor, walls and the arm itself.
+        currents: motor currents by the nominal model, with its uncertainty.
+    """
+
+    limits: JointLimits
+    checker: CollisionChecker
+    currents: CurrentModel
+
+    @classmethod
+    def of(cls, cell: Cell) -> MotionChecks:
+        """The checks of a cell."""
+        drives = cell.drive_train
+        return cls(
+            limits=cell.joint_limits,
+            checker=CollisionChecker(cell.urdf, cell.workspace),
+            currents=CurrentModel(
+                model=cell.model,
+                values=cell.nominal_values(),
+                motor_from_joint=drives.motor_from_joint,
+                torque_constant=drives.torque_constant,
+                current_limit=drives.current_limit,
+                uncertainty=cell.nominal.uncertainty,
+            ),
+        )
+
+    def refusal(self, trajectory: PiecewiseCubic) -> str | None:
+        """Why a motion must not be sent, or None if it may be."""
+        try:
+            check_smooth(trajectory, self.limits)
+        except NotSmooth as error:
+            return str(error)
+        result = check_motion(
+            trajectory, self.limits, checker=self.checker, currents=self.currents
+        )
+        return None if result.ok else str(result.violations[0])

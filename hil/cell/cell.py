@@ -18,8 +18,7 @@ from drivers.guard import GuardLimits
 from identification.errors import ModelError
 from identification.friction import FrictionLaw
 from identification.model import RobotModel
-from identification.excitation import Workspace
-from identification.excitation.constraints import Box
+from identification.excitation import Box, Workspace
 from planner import JointLimits
 
 from .errors import CellError, first_error

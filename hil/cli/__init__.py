@@ -13,7 +13,7 @@ from rich.console import Console
 
 from hil.errors import HilError
 from identification import IdentificationError
-from planner import PlanningError
+from planner import PlannerError
 
 from . import demo, identify, imports
 
@@ -35,13 +35,15 @@ app.command("identify")(identify.identify)
 app.add_typer(imports.app, name="import")
 
 
+
+
 def main() -> None:
     """Run the command line; known errors become one sentence and an exit status."""
     try:
         app(standalone_mode=True)
     except HilError as error:
         _fail(str(error), error.exit_code)
-    except (IdentificationError, PlanningError) as error:
+    except (IdentificationError, PlannerError) as error:
         _fail(str(error), 2)
     except KeyboardInterrupt:
         _fail("interrupted", 130)

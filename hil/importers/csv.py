@@ -55,7 +55,7 @@ def import_csv(
     stamp, origin = log.stamps(lengths["position"])
     return write_imported(
         output,
-        _joint_side(values, columns, log.matrix, stamp),
+        Samples(stamp, **_joint_side(values, columns, log)),
         source=log.files,
         robot=robot,
         metadata={"importer": "csv", "clock_origin_ns": str(origin)},
@@ -65,14 +65,20 @@ def import_csv(
 
 
 class _Log:
-    """The files of a log, and the map that says where things stand in them."""
+    """The files of a log, and the map that says where things stand in them.
+
+    Attributes:
+        path: the log itself.
+        order: the log's column of each joint of the robot.
+        matrix: motor angles per joint angle (n, n), in the log's order.
+    """
 
     def __init__(self, path: Path, columns: ColumnMap, robot: Robot) -> None:
         self.path = path
         self._map = columns
         self._robot = robot
         self._tables: dict[Path, Table] = {}
-        self._order = self._joint_order()
+        self.order = self._joint_order()
         self.matrix = self._motor_from_joint()
 
     @property
@@ -89,8 +95,7 @@ class _Log:
         scale = np.asarray(quantity.scale, np.float64)
         if scale.ndim:
             self._check_length(scale, f"{name}.scale")
-        scaled = values * (factor * scale)
-        return np.asarray(scaled[:, self._order])
+        return np.asarray(values * (factor * scale))
 
     def stamps(self, count: int) -> tuple[NDArray[np.int64], int]:
         """The samples' stamps [ns], and what was taken off them to make them positive."""
@@ -138,7 +143,7 @@ class _Log:
         return [given.index(name) for name in wanted]
 
     def _motor_from_joint(self) -> Array:
-        """Motor angles per joint angle (n, n), in the robot's order."""
+        """Motor angles per joint angle (n, n), in the log's order."""
         drive, n = self._map.drive, len(self._robot.joint_names)
         for name in ("gear_ratio", "joint_offset", "torque_constant"):
             values = getattr(drive, name)
@@ -157,7 +162,7 @@ class _Log:
             raise SourceError(
                 self.path, "a joint would not be moved by any motor", field="drive.gear_ratio"
             )
-        return matrix[np.ix_(self._order, self._order)]
+        return matrix
 
     def _check_length(self, values: Sequence[object] | Array, field: str) -> None:
         names = self._robot.joint_names
@@ -170,29 +175,23 @@ class _Log:
             )
 
 
-def _joint_side(
-    values: dict[str, Array], columns: ColumnMap, matrix: Array, stamp: NDArray[np.int64]
-) -> Samples:
-    """Bring the quantities of the motor side to the joint side; power stays the same.
+def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict[str, Array]:
+    """Bring the quantities to the joint side and into the robot's order; power stays the same.
 
     With motor angles M q, joint torques are M^T times the motors'.
     """
+    matrix = log.matrix
     sides = {name: quantity.side for name, quantity in columns.quantities().items()}
     joint = dict(values)
     for name in ("position", "velocity"):
         if sides.get(name) == "motor":
-            joint[name] = np.linalg.solve(matrix, values[name].T).T
+            joint[name] = np.asarray(np.linalg.solve(matrix, values[name].T).T, np.float64)
     if sides.get("torque") == "motor":
         joint["torque"] = values["torque"] @ matrix
     drive = columns.drive
     if drive.joint_offset is not None:
         joint["position"] = joint["position"] + np.asarray(drive.joint_offset)
     if "torque" not in joint and "motor_current" in joint and drive.torque_constant is not None:
-        joint["torque"] = (joint["motor_current"] * np.asarray(drive.torque_constant)) @ matrix
-    return Samples(
-        stamp,
-        joint["position"],
-        joint.get("velocity"),
-        joint.get("torque"),
-        joint.get("motor_current"),
-    )
+        motor_torque = joint["motor_current"] * np.asarray(drive.torque_constant, np.float64)
+        joint["torque"] = motor_torque @ matrix
+    return {name: array[:, log.order] for name, array in joint.items()}

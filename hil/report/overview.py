@@ -92,9 +92,9 @@ def criteria(results: Results) -> list[Criterion]:
 
 
 def _criterion(criteria: CriteriaResult | None, field: str, decimals: int) -> str:
-    if criteria is None:
+    value = None if criteria is None else getattr(criteria, field)
+    if value is None:
         return numbers.MISSING
-    value = float(getattr(criteria, field))
     return numbers.fixed(value, decimals) if abs(value) < 1e7 else numbers.significant(value)
 
 
@@ -102,9 +102,10 @@ def _change(
     planned: CriteriaResult | None, executed: CriteriaResult, field: str, decimals: int
 ) -> str:
     """Executed minus planned; a log has no meaningful percentage, the others get one."""
-    if planned is None:
+    before = None if planned is None else getattr(planned, field)
+    after = getattr(executed, field)
+    if before is None or after is None:
         return numbers.MISSING
-    before, after = float(getattr(planned, field)), float(getattr(executed, field))
     if field in {"log10_det", "fitness"} or before == 0.0:
         return numbers.fixed(after - before, decimals, sign=True)
     return numbers.fixed(100.0 * (after / before - 1.0), 1, sign=True) + " %"

@@ -14,7 +14,6 @@ from hil.results import ParameterResult, Results
 
 Array = NDArray[np.float64]
 
-INTERVAL_95 = 1.959964
 """Half-width of the 95 % interval in standard deviations (normal distribution)."""
 
 # Shares of a normal distribution outside 2 and 3 standard deviations.
@@ -109,9 +108,9 @@ def deviation(parameter: ParameterResult) -> float | None:
     return z if math.isfinite(z) else None
 
 
-def is_significant(parameter: ParameterResult) -> bool:
+def is_significant(parameter: ParameterResult, factor: float) -> bool:
     """Whether the 95 % interval leaves zero out."""
-    return abs(parameter.estimate) > INTERVAL_95 * parameter.std
+    return abs(parameter.estimate) > factor * parameter.std
 
 
 def short_label(parameter: ParameterResult) -> str:
@@ -122,13 +121,14 @@ def short_label(parameter: ParameterResult) -> str:
 
 def table_rows(results: Results) -> tuple[list[ParameterRow], list[ParameterRow]]:
     """Rows of the base parameters and rows of the friction."""
-    rows = [_row(parameter) for parameter in results.parameters]
+    factor = results.uncertainty.interval_factor
+    rows = [_row(parameter, factor) for parameter in results.parameters]
     return rows[: results.n_base], rows[results.n_base :]
 
 
-def _row(p: ParameterResult) -> ParameterRow:
+def _row(p: ParameterResult, factor: float) -> ParameterRow:
     z = deviation(p)
-    half = INTERVAL_95 * p.std
+    half = factor * p.std
     return ParameterRow(
         label=short_label(p),
         table2_id="" if p.table2_id is None else str(p.table2_id),
@@ -145,7 +145,7 @@ def _row(p: ParameterResult) -> ParameterRow:
         repetition_mean=numbers.beside(p.repetition_mean, p.std),
         repetition_std=numbers.significant(p.repetition_std, 2),
         mark=_mark(z),
-        significant=is_significant(p),
+        significant=is_significant(p, factor),
     )
 
 
@@ -174,7 +174,11 @@ def tally(results: Results) -> Tally:
         outside_3=[short_label(p) for p, z in compared if abs(z) > 3.0],
         expected_2=numbers.fixed(_OUTSIDE_2 * len(compared), 1),
         expected_3=numbers.fixed(_OUTSIDE_3 * len(compared), 1),
-        not_significant=[short_label(p) for p in results.parameters if not is_significant(p)],
+        not_significant=[
+            short_label(p)
+            for p in results.parameters
+            if not is_significant(p, results.uncertainty.interval_factor)
+        ],
         total=len(results.parameters),
     )
 

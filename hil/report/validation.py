@@ -87,12 +87,14 @@ def _rows(
 
 
 def _signed_rows(runs: Sequence[ValidationResult]) -> list[list[str]]:
+    # One number of decimals per joint, so that a column can be read down.
+    usual = np.median([run.rms_error for run in runs], axis=0)
     return [
         [
             *_head(run),
             *(
                 numbers.beside(mean, rms / 10.0)
-                for mean, rms in zip(run.mean_error, run.rms_error, strict=True)
+                for mean, rms in zip(run.mean_error, usual.tolist(), strict=True)
             ),
         ]
         for run in runs

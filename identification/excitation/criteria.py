@@ -71,9 +71,7 @@ def coupling_index_max(p: int) -> float:
     return p * (p - 1) / 2.0
 
 
-def fitness_eq7(
-    gram: Array, n_samples: int, *, weights: tuple[float, float] = (0.7, 0.3)
-) -> float:
+def fitness_eq7(gram: Array, n_samples: int, *, weights: tuple[float, float] = (0.7, 0.3)) -> float:
     r"""Return :math:`\lambda_1 \log_{10}|\det/N^{N_\pi}| + \lambda_2 I_{c,max}/I_c`, as printed.
 
     The two terms differ in size by an order of magnitude, so the first one rules; it is the
@@ -93,10 +91,10 @@ def condition_number(gram: Array, *, scaled: bool) -> float:
     For information: the raw one depends on units. inf for a singular matrix.
     """
     matrix = np.asarray(gram, dtype=np.float64)
+    scale = np.sqrt(np.diag(matrix))
+    if not np.all(np.isfinite(scale) & (scale > 0.0)):
+        return np.inf
     if scaled:
-        scale = np.sqrt(np.diag(matrix))
-        if not np.all(scale > 0.0):
-            return np.inf
         matrix = matrix / scale[:, None] / scale
     values = np.linalg.eigvalsh(matrix)
     if values[0] <= _smallest_pivot(len(matrix)) * values[-1]:

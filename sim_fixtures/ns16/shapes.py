@@ -60,13 +60,16 @@ SHAPES: dict[str, tuple[Shape, ...]] = {
         Cylinder("x", 0.0, 0.30, 0.09),
         Cylinder("z", -0.13, 0.13, 0.11, offset=(0.300, 0.0, 0.0)),
     ),
+    # The upper arm stands beside the plane of the forearm, which folds past it.
     "link_2": (
-        Cylinder("x", 0.0, 0.70, 0.075),
-        Cylinder("z", -0.10, 0.10, 0.09, offset=(0.700, 0.0, 0.0)),
+        Cylinder("z", 0.12, 0.26, 0.10),
+        Cylinder("x", 0.0, 0.70, 0.07, offset=(0.0, 0.0, 0.19)),
+        Cylinder("z", 0.09, 0.26, 0.09, offset=(0.700, 0.0, 0.0)),
     ),
     # The forearm leaves the elbow along -z3; its motors stand behind the elbow.
     "link_3": (
-        Cylinder("x", 0.0, 0.185, 0.08),
+        Cylinder("y", -0.09, 0.08, 0.08),
+        Cylinder("x", 0.0, 0.185, 0.07),
         Cylinder("z", -0.22, 0.16, 0.085, offset=(0.185, 0.0, 0.0)),
     ),
     "link_4": (

@@ -27,8 +27,7 @@ from hil.results import Results
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 
 JOINTS = [f"joint_{j}" for j in range(1, 7)]
-# An idea of what 60 s of motion tell: heavy joints with noise of newton metres, light ones less.
-TORQUE = np.array([496.0, 643.0, 158.0, 17.0, 23.0, 20.0])
+TORQUE = np.array([496.0, 643.0, 158.0, 17.0, 23.0, 20.0])  # RMS of a fast motion, N·m
 
 
 # fmt: off
@@ -57,6 +56,7 @@ def make_results(**changes: Any) -> Results:
         "n_base": N_ESSENTIAL,
         "uncertainty": {
             "reported": "phase_clustered", "phase_clustered": std,
+            "method": "weighted least squares", "interval_factor": 2.05,
             "least_squares": std * rng.uniform(0.15, 0.4, size),
             "independent_repetitions": std * rng.uniform(0.5, 1.1, size),
             "scatter_of_mean": values.std(axis=0, ddof=1) / np.sqrt(30.0),
@@ -70,6 +70,7 @@ def make_results(**changes: Any) -> Results:
             "good": True, "line": "The model predicts unseen motion to 1.5 % of the torque.",
             "reasons": ["Held-out error is 1.3 times the residual of the fit (allowed: 2).",
                         "52 of 58 parameters lie within two standard deviations of the truth."],
+            "doubts": ["f2_1 is not distinct from zero."],
         },
     }
     plain = json.loads(json.dumps(fields | changes, default=lambda a: np.asarray(a).tolist()))
@@ -140,7 +141,7 @@ class Page(HTMLParser):
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.tables: list[list[list[str]]] = []
         self.words: list[str] = []
-        self._cell: list[str] | None = None
+        self._in_cell = False
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -150,18 +151,17 @@ class Page(HTMLParser):
         elif tag == "tr":
             self.tables[-1].append([])
         elif tag in {"td", "th"}:
-            self._cell = []
+            self.tables[-1][-1].append("")
+            self._in_cell = True
 
     def handle_endtag(self, tag: str) -> None:
-        if tag in {"td", "th"} and self._cell is not None:
-            self.tables[-1][-1].append("".join(self._cell))
-            self._cell = None
+        self._in_cell = self._in_cell and tag not in {"td", "th"}
 
     def handle_data(self, data: str) -> None:
         if not self.tags or self.tags[-1][0] != "style":
             self.words.append(data)
-        if self._cell is not None:
-            self._cell.append(data)
+        if self._in_cell:
+            self.tables[-1][-1][-1] += data
 
     @property
     def text(self) -> str:
@@ -202,24 +202,20 @@ def test_a_simulation_says_so_and_what_the_plant_did_besides(page: Page) -> None
     assert all(effect in page.text for effect in make_results().effects)
     assert "best case" not in page.text
     ideal = Page(render_report(make_results(effects=[]), make_series()))
-    assert "switched off" in ideal.text
     assert "best case" in ideal.text
 
 
 def test_a_real_recording_is_not_called_simulated_and_has_no_truth() -> None:
     page = Page(render_report(real_recording(), make_series()))
-    assert "simulated" not in page.text.lower()
-    assert "Truth" not in page.text
-    assert "Planned" not in page.text
+    assert not {"simulated", "truth:", "planned"} & set(page.text.lower().split())
+    assert not any("Truth" in rows[0] for rows in page.tables)
     assert len(page.table("Estimate")) == 58
 
 
 def test_the_file_needs_nothing_from_outside(page: Page, html: str) -> None:
     assert not {"script", "link", "iframe", "object", "embed"} & {tag for tag, _ in page.tags}
-    for _, attributes in page.tags:
-        for name in ("src", "href", "xlink:href", "srcset", "data"):
-            value = attributes.get(name)
-            assert value is None or value.startswith(("#", "data:image/png;base64,"))
+    links = [a[key] for _, a in page.tags for key in a if key in {"src", "href", "xlink:href"}]
+    assert all((link or "").startswith(("#", "data:image/png;base64,")) for link in links)
     assert "@import" not in html
     assert all(target.startswith("#") for target in re.findall(r"url\(([^)]*)\)", html))
     policy = next(a["content"] for t, a in page.tags if t == "meta" and "http-equiv" in a)
@@ -229,15 +225,14 @@ def test_the_file_needs_nothing_from_outside(page: Page, html: str) -> None:
 def test_every_id_is_the_only_one_and_every_reference_finds_its_own(page: Page, html: str) -> None:
     ids = [a["id"] for _, a in page.tags if "id" in a]
     assert len(ids) == len(set(ids))
-    wanted = {a["href"][1:] for _, a in page.tags if (a.get("href") or "").startswith("#")}
-    wanted |= {target[1:] for target in re.findall(r"url\(([^)]*)\)", html)}
-    assert wanted
+    wanted = set(re.findall(r'(?:href="|url\()#([^")]*)', html))
+    assert len(wanted) > 50
     assert wanted <= set(ids)
 
 
 def test_the_same_input_gives_the_same_bytes_whoever_draws(tmp_path: Path, html: str) -> None:
     paths = [tmp_path / f"{k}.html" for k in range(2)]
-    settings = {"font.size": 30.0, "svg.fonttype": "path", "axes.facecolor": "red"}
+    settings = {"lines.linestyle": ":", "svg.fonttype": "path", "text.usetex": True}
     with mpl.rc_context(settings), ThreadPoolExecutor(2) as pool:
         list(pool.map(lambda path: write_report(path, make_results(), make_series()), paths))
         assert {key: mpl.rcParams[key] for key in settings} == settings
@@ -250,7 +245,7 @@ def test_a_full_campaign_stays_small() -> None:
     assert len(text.encode()) < 1_500_000
 
 
-HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>--></svg>{{7*7}}$\\frac_\x07'
+HOSTILE = '$\\frac$\x07"><script>alert(1)</script><img src=x onerror=alert(2)>--></svg>{{7*7}}'
 
 
 def test_names_from_archives_are_inert() -> None:
@@ -279,8 +274,8 @@ def test_the_parameter_table_holds_the_numbers(page: Page) -> None:
         assert float(row["Estimate"]) == pytest.approx(p.estimate, abs=half)
         assert float(row["Truth"]) == pytest.approx(p.truth, abs=half)
         assert float(row["± std"]) == pytest.approx(p.std, rel=0.06)
-        assert float(row["95 % from"]) == pytest.approx(p.estimate - 1.96 * p.std, abs=half)
-        assert float(row["95 % to"]) == pytest.approx(p.estimate + 1.96 * p.std, abs=half)
+        assert float(row["95 % from"]) == pytest.approx(p.estimate - 2.05 * p.std, abs=half)
+        assert float(row["95 % to"]) == pytest.approx(p.estimate + 2.05 * p.std, abs=half)
         z = (p.estimate - p.truth) / p.std
         assert float(row["(est. − truth) / std"]) == pytest.approx(z, abs=0.0051)
         assert float(row["Std over rep."]) == pytest.approx(p.repetition_std, rel=0.06)
@@ -295,14 +290,13 @@ def test_estimates_that_are_off_or_not_significant_are_marked() -> None:
     for parameter, (estimate, truth, _) in zip(parameters, cases, strict=False):
         parameter |= {"estimate": estimate, "truth": truth, "std": 1.0}
     page = Page(render_report(make_results(parameters=parameters), make_series()))
-    remarks = [row["Remark"] for row in page.table("Estimate")]
+    remarks = [row["Remark"].replace("\xa0", " ") for row in page.table("Estimate")]
     assert remarks[: len(cases)] == [remark for *_, remark in cases]
 
 
 def test_the_page_says_which_route_is_reported_and_what_each_would_have_covered(page: Page) -> None:
     rows, results = {row["Route"]: row for row in page.table("Route")}, make_results()
-    assert [name for name in rows if "reported" in name] == ["Phase-clustered (reported)"]
-    assert len(rows) == 4
+    assert [name.endswith("(reported)") for name in rows] == [False, False, True, False]
     pairs = zip(results.parameters, results.uncertainty.least_squares, strict=True)
     inside = sum(abs(p.estimate - p.truth) <= 2.0 * std for p, std in pairs)
     assert rows["Least squares"]["Truth within 2σ"] == f"{inside} of 58"
@@ -320,17 +314,11 @@ def test_the_correlation_matrix_is_shaded_from_white_to_black_without_friction()
 def test_errors_over_runs_are_those_of_all_their_samples() -> None:
     rng = np.random.default_rng(1)
     errors = [scale * rng.standard_normal((size, 6)) for scale, size in ((1.0, 400), (3.0, 100))]
-    runs = [
-        {
-            "duration": 0.01 * len(e),
-            "rms_error": (e**2).mean(axis=0) ** 0.5,
-            "mean_error": e.mean(0),
-        }
-        for e in errors
-    ]
-    results = make_results(validation=[_validation(rng, 1) | run for run in runs])
+    keys = ("duration", "rms_error", "mean_error")
+    found = [(0.01 * len(e), (e**2).mean(axis=0) ** 0.5, e.mean(axis=0)) for e in errors]
+    runs = [_validation(rng, 1) | dict(zip(keys, values, strict=True)) for values in found]
     every = np.concatenate(errors)
-    for j, row in enumerate(validation.joint_errors(results)):
+    for j, row in enumerate(validation.joint_errors(make_results(validation=runs))):
         assert float(row.rms) == pytest.approx(math.sqrt((every[:, j] ** 2).mean()), rel=0.006)
         assert float(row.mean) == pytest.approx(every[:, j].mean(), abs=0.006)
 
@@ -342,7 +330,7 @@ def test_every_run_and_joint_stands_in_the_tables_with_names_whole(page: Page) -
     for rows in tables:
         assert [row[0] for row in rows[1:]] == [run.archive for run in results.validation]
     third, fifth = results.validation[2], results.validation[4]
-    assert float(tables[2][3][2 + 4]) == pytest.approx(third.mean_error[4], rel=0.06)
+    assert float(tables[2][3][2 + 4]) == pytest.approx(third.mean_error[4], abs=6e-4)
     assert float(tables[3][5][-1]) == pytest.approx(100.0 * fifth.overall_relative_error, rel=0.006)
 
 
@@ -359,8 +347,7 @@ def test_a_reader_who_cannot_see_is_told_what_each_figure_shows(page: Page, html
 
 def test_figures_take_every_colour_from_the_style_sheet(html: str) -> None:
     drawn = html[html.index("<main>") :]
-    colours = set(re.findall(r"(?:fill|stroke): *(#[0-9a-f]{3,6})", drawn))
-    assert colours <= {"#000000"}, colours
+    assert not re.findall(r"(?:fill|stroke): *#[0-9a-f]{3,6}", drawn)
     declared = set(re.findall(r"(--[a-z0-9-]+):", html))
     assert set(re.findall(r"var\((--[a-z0-9-]+)\)", html)) <= declared
 

@@ -181,3 +181,17 @@ def test_arrays_that_do_not_fit_each_other_are_refused() -> None:
         replace(recording, torque=recording.torque[:-1])
     with pytest.raises(ShapeError, match="gap_before"):
         replace(recording, gap_before=np.zeros(3, dtype=bool))
+
+
+def test_a_motion_starts_where_the_command_begins_to_move() -> None:
+    recording = a_recording()
+    assert recording.commanded_position is not None
+    command = recording.commanded_position.copy()
+    command[:40] = command[40]
+    assert replace(recording, commanded_position=command).motion_start == recording.time[41]
+    command[:10] = np.nan
+    assert replace(recording, commanded_position=command).motion_start == recording.time[41]
+
+
+def test_without_a_command_a_motion_starts_with_the_recording() -> None:
+    assert a_recording(commanded=False).motion_start == 0.0

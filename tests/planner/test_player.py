@@ -106,6 +106,9 @@ def test_a_stop_at_any_instant_stays_on_the_path_and_within_the_stop_bounds(
     ):
         assert np.all(np.abs(np.diff(seen, order, axis=0)) / period**order <= bound * slack)
     assert np.all(np.abs(velocities) <= limits.velocity * slack)
+    # What is sent as velocity is the slope of what is sent as position.
+    slope = (positions[2:] - positions[:-2]) / (2.0 * period)
+    assert np.all(np.abs(slope - velocities[1:-1]) <= 3.0 * limits.jerk * period**2 / 6.0 + 1e-9)
 
     # At rest in the end, and for as long as anyone asks.
     assert player.finished
@@ -154,16 +157,22 @@ def test_a_stop_keeps_its_bounds_between_the_set_points_too(motions, six_axis_li
     assert abs(law.ends()[0][-1, 1]) < 1e-12
 
 
-def test_the_worst_conceivable_path_just_keeps_the_stop_bounds():
+rates = st.floats(-1.0, 2.0).map(lambda exponent: 10.0**exponent)
+
+
+@given(st.lists(st.tuples(rates, rates, rates), min_size=1, max_size=4), rates, rates)
+def test_the_worst_conceivable_path_just_keeps_the_stop_bounds(joints, more, much_more):
     # All of velocity, acceleration and jerk at their limits at once, signs chosen against us.
-    limits = JointLimits([-1.0, -1.0], [1.0, 1.0], [2.0, 1.0], [8.0, 1.0], [90.0, 4.0])
-    bounds = slowing_bounds(limits, 2.0, 3.0)
-    a = limits.acceleration + limits.velocity * bounds.rate
-    j = limits.jerk + 3 * limits.acceleration * bounds.rate + limits.velocity * bounds.change
-    assert np.all(a <= 2.0 * limits.acceleration * (1 + 1e-12))
-    assert np.all(j <= 3.0 * limits.jerk * (1 + 1e-12))
-    # and at least one joint uses all that it may
-    assert np.isclose(np.max(j / limits.jerk), 3.0)
+    velocity, acceleration, jerk = np.array(joints).T
+    limits = JointLimits(-np.ones(len(jerk)), np.ones(len(jerk)), velocity, acceleration, jerk)
+    bounds = slowing_bounds(limits, 1.0 + more, 1.0 + much_more)
+    assert bounds.rate > 0.0
+    assert bounds.change > 0.0
+    used_acceleration = (acceleration + velocity * bounds.rate) / acceleration
+    used_jerk = (jerk + 3 * acceleration * bounds.rate + velocity * bounds.change) / jerk
+    assert np.all(used_acceleration <= (1.0 + more) * (1 + 1e-9))
+    # At least one joint uses all the jerk that it may, or there would be a faster stop.
+    assert np.max(used_jerk) == pytest.approx(1.0 + much_more)
 
 
 def test_a_six_axis_arm_stops_within_half_a_second(motions, six_axis_limits):

@@ -1,0 +1,91 @@
+"""`hil identify`: from archives to a model, a verdict and a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hil.cli.verdict import finish
+from hil.errors import InputError
+from hil.identify import Options, identify_archives, identify_campaign
+from hil.progress import reporter as make_reporter
+from hil.report import write_report
+
+
+def identify(
+    archives: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Archives (*.mcap), or one campaign folder.", show_default=False, metavar="ARCHIVE..."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for results.json and report.html. If left out: the campaign folder, or "
+            "none for loose archives.",
+            show_default=False,
+        ),
+    ] = None,
+    paper: Annotated[
+        bool,
+        typer.Option(
+            "--paper",
+            help="As the paper does it: smooth positions and torques, filter the regressor alike.",
+        ),
+    ] = False,
+    split: Annotated[
+        float,
+        typer.Option(
+            min=0.1,
+            max=0.9,
+            help="Where there is no validation run: share of the recording that is fitted; the "
+            "rest is predicted.",
+        ),
+    ] = 0.7,
+    delay: Annotated[
+        float | None,
+        typer.Option(help="Time in s by which the torque lags the position; the cell's if left out."),
+    ] = None,
+    torque_bandwidth: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3,
+            help="Bandwidth in Hz of a low-pass the torque came through before it was recorded; "
+            "the model is then filtered alike.",
+        ),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
+) -> None:
+    """Estimate the dynamic parameters from archives, and say whether the result is good.
+
+    Excitations and imported recordings are fitted; validation runs are predicted and never
+    fitted. Everything needed (URDF, friction law, drive train) travels inside the archives.
+    Exit status 0 if the model is good, 5 if it is not.
+    """
+    reporter = make_reporter(quiet=quiet or json)
+    options = Options(
+        method="paper" if paper else "default",
+        split=split,
+        delay=delay,
+        torque_bandwidth=torque_bandwidth,
+    )
+    if len(archives) == 1 and archives[0].is_dir():
+        found = identify_campaign(archives[0], reporter, options)
+        output = output or archives[0]
+    else:
+        folder = next((path for path in archives if path.is_dir()), None)
+        if folder is not None:
+            raise InputError(
+                folder, "is a folder among archives", remedy="name one campaign folder, or files"
+            )
+        found = identify_archives(archives, reporter, options)
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        found.results.save(output / "results.json")
+        write_report(output / "report.html", found.results, found.series)
+        reporter.say(f"report: {output / 'report.html'}")
+    finish(found.results, json=json)

@@ -1,0 +1,137 @@
+"""Estimate, validate, judge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.campaign.folder import CampaignFolder
+from hil.errors import InputError
+from hil.progress import Reporter
+from hil.report import ReportSeries
+from hil.results import Results
+from identification.preprocessing import Preprocessing, Samples, prepare
+from identification.repetitions import RepeatedEstimate, estimate_repetitions
+from identification.validation import for_figure
+from identification.evidence import gather
+from identification.verdict import Verdict, judge
+
+from .options import Options
+from .sources import Source, Sources, gather_sources
+from .summary import summarise
+
+Array = NDArray[np.float64]
+
+FIGURE_SAMPLES = 4000
+"""Rows of a time series that a figure is drawn from, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What an identification found, and the series its figures need."""
+
+    estimate: RepeatedEstimate
+    verdict: Verdict
+    results: Results
+    series: ReportSeries
+
+
+def identify_campaign(
+    root: Path, reporter: Reporter, options: Options = Options()
+) -> Identification:
+    """Identify from the whole archives of a campaign folder.
+
+    Raises:
+        InputError: no whole excitation is in the folder.
+    """
+    folder = CampaignFolder(root)
+    kinds = ("excitation", "validation")
+    paths = [path for kind in kinds for path in folder.completed(kind)]
+    if not paths:
+        raise InputError(
+            root, "holds no completed excitation", remedy="name a campaign folder that was run"
+        )
+    return identify_archives(
+        [*paths, *folder.completed("standstill")], reporter, options, name=root.name
+    )
+
+
+def identify_archives(
+    paths: Sequence[Path], reporter: Reporter, options: Options = Options(), *, name: str = ""
+) -> Identification:
+    """Identify from archives.
+
+    Raises:
+        InputError: the archives cannot be used together.
+        RecordingError: a recording is not fit to be identified from.
+    """
+    sources = gather_sources(paths, options.split)
+    model = sources.cell.model
+    total = len(sources.training) + len(sources.held_out)
+    with reporter.task("smoothing recordings", total) as task:
+
+        def ready(source: Source) -> Samples:
+            samples = _samples(source, sources, options)
+            task.advance(1, source.name)
+            return samples
+
+        training = [ready(source) for source in sources.training]
+        held_out = [ready(source) for source in sources.held_out]
+    with reporter.task("estimating", 2) as task:
+        estimate = estimate_repetitions(model, training)
+        task.advance(1, "validating")
+        nominal = sources.cell.nominal_values() if sources.cell.file.nominal else None
+        evidence = gather(model, estimate, training, held_out, nominal=nominal)
+        verdict = judge(model.joint_names, evidence)
+        task.advance(1)
+    results = summarise(
+        name or paths[0].stem, sources, estimate, verdict, training=training, held_out=held_out
+    )
+    return Identification(
+        estimate, verdict, results, _series(sources, estimate, training[0], held_out[0])
+    )
+
+
+def _samples(source: Source, sources: Sources, options: Options) -> Samples:
+    cell = sources.cell
+    delay = options.delay
+    if delay is None:
+        controller = cell.file.controller
+        delay = controller.current_delay_cycles * cell.period if controller else 0.0
+    return prepare(
+        source.recording,
+        cell.model,
+        noise_variance=sources.noise_variance,
+        options=Preprocessing(
+            smooth_torque=options.method == "paper",
+            torque_bandwidth=options.torque_bandwidth,
+            torque_delay=delay,
+        ),
+        origin=source.origin,
+    )
+
+
+def _series(
+    sources: Sources, estimate: RepeatedEstimate, excitation: Samples, example: Samples
+) -> ReportSeries:
+    model = sources.cell.model
+    motion = excitation.motion
+    every = max(1, motion.n_samples // FIGURE_SAMPLES)
+    time = example.motion.time
+    thin = max(1, len(time) // FIGURE_SAMPLES)
+    predicted = example.predicted_torque(model, estimate.pooled.values)
+    return ReportSeries(
+        excitation_time=motion.time[::every] - excitation.origin,
+        excitation_position=motion.position[::every],
+        excitation_velocity=motion.velocity[::every],
+        example_archive=sources.held_out[0].name,
+        example_time=time[::thin] - example.origin,
+        example_measured=for_figure(time, example.torque)[::thin],
+        example_predicted=for_figure(time, predicted)[::thin],
+    )
+
+

@@ -1,0 +1,199 @@
+"""An identification as plain numbers: `results.json`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.results import (
+    CoverageResult,
+    CriteriaResult,
+    ExcitationResult,
+    ParameterResult,
+    Results,
+    UncertaintyResult,
+    ValidationResult,
+    VerdictResult,
+)
+from hil.simulation import planted_values
+from hil.version import software
+from identification.excitation import (
+    condition_number,
+    correlation,
+    coupling_index,
+    coupling_index_max,
+    fitness_eq7,
+    information,
+    log10_det,
+)
+from identification.preprocessing import Samples
+from identification.repetitions import RepeatedEstimate
+from identification.validation import prediction_error
+from identification.verdict import Verdict
+
+from sim_fixtures.ns16 import TABLE2, urdf_text
+
+from .sources import Sources
+
+Array = NDArray[np.float64]
+
+
+def summarise(
+    name: str,
+    sources: Sources,
+    estimate: RepeatedEstimate,
+    verdict: Verdict,
+    *,
+    training: Sequence[Samples],
+    held_out: Sequence[Samples],
+) -> Results:
+    """Everything that was found, as it goes into `results.json`."""
+    cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
+    gram = information(estimate.factor)
+    simulated = sources.metadata.get("simulated") == "yes"
+    truth = planted_values(cell) if simulated and cell.file.simulation else None
+    many = len(training) > 1
+    return Results(
+        name=name,
+        cell=cell.name,
+        simulated=simulated,
+        effects=json.loads(sources.metadata.get("effects", "[]")),
+        joint_names=list(model.joint_names),
+        period=_period(training[0]),
+        software=software(),
+        excitation=_excitation(sources, gram, training),
+        parameters=_parameters(cell, estimate, truth),
+        n_base=len(model.base.names),
+        uncertainty=UncertaintyResult(
+            reported="phase_clustered",
+            method=pooled.method,
+            interval_factor=pooled.interval_factor,
+            least_squares=estimate.classical_std.tolist(),
+            independent_repetitions=estimate.independent_std.tolist() if many else None,
+            phase_clustered=pooled.std.tolist(),
+            scatter_of_mean=estimate.scatter_std.tolist() if many else None,
+        ),
+        repetitions=[source.name for source in sources.training],
+        repetition_values=[one.values.tolist() for one in estimate.repetitions],
+        noise_std=pooled.noise_std.tolist(),
+        correlation=correlation(gram).tolist(),
+        validation=_validation(sources, estimate, held_out),
+        coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
+        verdict=VerdictResult(
+            good=verdict.good,
+            line=verdict.line,
+            reasons=[*verdict.reasons],
+            doubts=[*verdict.doubts, *sources.doubts],
+        ),
+    )
+
+
+def _period(samples: Samples) -> float:
+    return float(np.median(np.diff(samples.motion.time)))
+
+
+def _excitation(sources: Sources, gram: Array, training: Sequence[Samples]) -> ExcitationResult:
+    """Criteria of what was executed (all repetitions), and of the plan where one was attached."""
+    lengths = [_moving_rows(samples) for samples in training]
+    executed = _criteria(gram, sum(lengths))
+    planned = (sources.plan or {}).get("excitation")
+    if planned is None:
+        return ExcitationResult(
+            duration=lengths[0] * _period(training[0]),
+            n_via=None,
+            fly=None,
+            planned=None,
+            executed=executed,
+        )
+    criteria = planned["criteria"]
+    return ExcitationResult(
+        duration=max(knots[-1] for knots in planned["trajectory"]["knots"]),
+        n_via=len(planned["via_points"]) - 2,
+        fly=planned["fly"],
+        planned=CriteriaResult(
+            **criteria,
+            coupling_index_max=coupling_index_max(len(gram)),
+            condition=None,
+            scaled_condition=None,
+        ),
+        executed=executed,
+    )
+
+
+def _moving_rows(samples: Samples) -> int:
+    """Time samples from the first to the last in which some joint moves."""
+    moving = np.flatnonzero(samples.usable.any(axis=1))
+    return int(moving[-1] - moving[0] + 1) if moving.size else 0
+
+
+def _criteria(gram: Array, n_samples: int) -> CriteriaResult:
+    return CriteriaResult(
+        log10_det=log10_det(gram, n_samples),
+        coupling_index=coupling_index(gram),
+        coupling_index_max=coupling_index_max(len(gram)),
+        fitness=fitness_eq7(gram, n_samples),
+        n_samples=n_samples,
+        condition=condition_number(gram, scaled=False),
+        scaled_condition=condition_number(gram, scaled=True),
+    )
+
+
+def _parameters(
+    cell: Cell, estimate: RepeatedEstimate, truth: Array | None
+) -> list[ParameterResult]:
+    model, pooled = cell.model, estimate.pooled
+    expressions = [*model.base.expressions(), *model.parameter_names[len(model.base.names) :]]
+    std = estimate.std if len(estimate.repetitions) > 1 else None
+    printed = _table2_ids() if cell.urdf == urdf_text() else {}
+    return [
+        ParameterResult(
+            name=parameter,
+            expression=expressions[i],
+            unit=model.units[i],
+            table2_id=printed.get(parameter),
+            estimate=float(pooled.values[i]),
+            std=float(pooled.std[i]),
+            repetition_mean=float(estimate.mean[i]),
+            repetition_std=None if std is None else float(std[i]),
+            truth=None if truth is None else float(truth[i]),
+        )
+        for i, parameter in enumerate(model.parameter_names)
+    ]
+
+
+def _table2_ids() -> dict[str, int]:
+    """Row of the paper's Table 2 by our parameter name (rows 29 and 31 have the other sign)."""
+    return {row.parameter: row.id for row in TABLE2}
+
+
+def _validation(
+    sources: Sources, estimate: RepeatedEstimate, held_out: Sequence[Samples]
+) -> list[ValidationResult]:
+    errors = prediction_error(sources.cell.model, estimate.pooled.values, held_out)
+    return [
+        ValidationResult(
+            archive=source.name,
+            duration=float(source.recording.time[-1] - source.recording.time[0]),
+            mean_abs_error=error.mean_absolute.tolist(),
+            rms_error=error.rms.tolist(),
+            mean_error=error.mean.tolist(),
+            relative_error=error.relative.tolist(),
+            overall_relative_error=error.overall,
+        )
+        for source, error in zip(sources.held_out, errors, strict=True)
+    ]
+
+
+def _coverage(values: Array, std: Array, truth: Array) -> CoverageResult:
+    distance = np.abs(values - truth)
+    return CoverageResult(
+        within_2=int((distance <= 2.0 * std).sum()),
+        within_3=int((distance <= 3.0 * std).sum()),
+        total=len(values),
+    )
+
+

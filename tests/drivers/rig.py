@@ -1,0 +1,286 @@
+"""A session on a bench: a controller that sends what the test says, and motions to ask for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from drivers import (
+    CycleRing,
+    CyclicPacket,
+    DriveTrain,
+    Guard,
+    GuardLimits,
+    InitPacket,
+    Mode,
+    MotionEnded,
+    Session,
+    StateChanged,
+)
+from drivers.packets import DRIVE_ON, cyclic_length, next_number
+
+N = 6
+PERIOD_MS = 2
+PERIOD = 0.002
+START = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
+NOT_SET_POINTS = (Mode.DRIVE_OFF_REQUEST, Mode.FOLLOWING_ERROR)
+
+
+def drive_train() -> DriveTrain:
+    return DriveTrain(
+        gear_ratio=np.array([-120.0, 150.0, -110.0, 90.0, 80.0, -60.0]),
+        calibration=np.array([0.5, -1.25, 2.0, 0.0, 0.25, -0.75]),
+        joint_sign=np.array([-1.0, 1.0, -1.0, -1.0, 1.0, -1.0]),
+        joint_offset=np.array([0.0, 0.0, -1.5, 0.0, 1.5, 0.0]),
+        torque_constant=np.full(N, 0.5),
+        current_limit=np.full(N, 20.0),
+        k54=0.01,
+        k64=0.002,
+        k65=0.03,
+    )
+
+
+def limits(**changes) -> GuardLimits:
+    standard = GuardLimits(
+        lower=np.full(N, -2.0),
+        upper=np.full(N, 2.0),
+        velocity=np.full(N, 2.0),
+        acceleration=np.full(N, 8.0),
+        jerk=np.full(N, 100.0),
+        following_error=np.full(N, 2.0),
+        current=np.full(N, 20.0),
+    )
+    return replace(standard, **changes)
+
+
+def init_packet(**changes) -> InitPacket:
+    arm_1 = {
+        "gear_ratio": drive_train().gear_ratio,
+        "calibration": drive_train().calibration,
+        "following_error": np.full(N, 2.0),
+        "current_limit": np.full(N, 20.0),
+        **changes.pop("arm_1", {}),
+    }
+    n_axes = changes.pop("n_axes", N)
+    return InitPacket.build(n_axes, changes.pop("sample_time", PERIOD_MS), arm_1, **changes)
+
+
+class Cruise:
+    """Joint 1 gathers speed, cruises for ever, and stops when told to; the others stand."""
+
+    RAMP = 0.4
+    SPEED = 0.3
+
+    def __init__(self, start=START):
+        self.start = np.array(start)
+        self.finished = False
+        self.bounds = "plan"
+        self.begun_at = None
+        self.advances = 0
+        self.stops = 0
+        self._velocity = self._time = 0.0
+        self._target = self.SPEED
+        self._from = 0.0
+        self._origin = 0.0
+
+    def begin(self, position):
+        self.begun_at = np.array(position)
+        self._position = np.array(position)
+
+    def advance(self):
+        self.advances += 1
+        self._time = min(self._time + PERIOD, self.RAMP) if self._ramping else self._time
+        if self._ramping or self._velocity:
+            self._move()
+        return self._position, np.array([self._velocity, 0, 0, 0, 0, 0])
+
+    @property
+    def _ramping(self):
+        return self._time < self.RAMP
+
+    def _move(self):
+        share = 0.5 * (1.0 - np.cos(np.pi * self._time / self.RAMP))
+        velocity = self._from + (self._target - self._from) * share
+        self._position = self._position + PERIOD * 0.5 * (
+            np.array([self._velocity + velocity, 0, 0, 0, 0, 0])
+        )
+        self._velocity = velocity
+        self.finished = self.stops > 0 and not self._ramping
+
+    def stop(self):
+        self.stops += 1
+        self.bounds = "stop"
+        self._from, self._target, self._time = self._velocity, 0.0, 0.0
+
+
+class Table:
+    """Plays rows of positions (m, n); the velocity is their step unless it is given."""
+
+    def __init__(self, positions, velocities=None, bounds="plan"):
+        self.positions = np.asarray(positions, dtype=float)
+        steps = np.diff(self.positions, axis=0, prepend=self.positions[:1]) / PERIOD
+        self.velocities = steps if velocities is None else np.asarray(velocities, dtype=float)
+        self.start = self.positions[0]
+        self.bounds = bounds
+        self.index = 0
+
+    @property
+    def finished(self):
+        return self.index + 1 >= len(self.positions)
+
+    def begin(self, position):
+        # The wire rounds to float32; a jump by that much would be a jerk.
+        self.positions = self.positions + (position - self.start)
+
+    def advance(self):
+        self.index += 1
+        return self.positions[self.index], self.velocities[self.index]
+
+    def stop(self):
+        self.positions = self.positions[: self.index + 1]
+
+
+def still(rows: int, position=START) -> Table:
+    return Table(np.tile(position, (rows, 1)))
+
+
+def smooth_move(distance, cycles: int, start=START) -> Table:
+    """From start by `distance` (n,) along a polynomial with zero jerk at both ends."""
+    s = np.linspace(0.0, 1.0, cycles + 1)[:, None]
+    share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
+    return Table(np.asarray(start) + share * np.asarray(distance))
+
+
+class Rig:
+    """Session and controller. The arm is where the last answer told it to be."""
+
+    def __init__(self, *, guard_limits=None, init=None, slots=None, ring_capacity=4096, **options):
+        self.train = drive_train()
+        self.ring = CycleRing(N, ring_capacity)
+        self.guard = Guard(guard_limits or limits(), PERIOD)
+        options = {"settle_cycles": 5, **options}
+        self.session = Session(self.train, self.guard, self.ring, **options)
+        self.init = init or init_packet()
+        self.now = 0.0
+        self.number = 0
+        self.status = DRIVE_ON
+        self.axes = CyclicPacket.zeros(1, self.init.n_axes).axes
+        self.slots = np.arange(min(N, self.init.n_axes)) if slots is None else slots
+        self.put_arm_at(START)
+        self.events = []
+        self.transcript = []
+        self.exits_asked = 0
+
+    def put_arm_at(self, q) -> None:
+        motor = self.train.motor_revolutions(q)[: len(self.slots)]
+        self.axes["d"][self.slots, 0] = self.axes["d"][self.slots, 2] = motor
+
+    @property
+    def state(self):
+        return self.session.state
+
+    @property
+    def modes(self):
+        return self.axes["mode"]
+
+    @modes.setter
+    def modes(self, mode):
+        self.axes["mode"] = mode
+
+    def send(self, packet: bytes) -> bytes | None:
+        """Any bytes, one cycle later."""
+        self.now += PERIOD
+        reply = self.session.reply(packet, self.now)
+        self.events += self.session.events()
+        self.transcript.append((packet, reply))
+        return reply
+
+    def start(self, *, cold: bool = False) -> None:
+        """The hand-shake."""
+        if cold:
+            for number in range(1, 10):
+                self.sync(number)
+        self.send(self.init.encode())
+        self.number = 10
+        if cold:
+            self.number = 12
+            for number in (11, 12):
+                self.sync(number)
+
+    def sync(self, number: int, length: int = 732) -> bytes | None:
+        return self.send(number.to_bytes(4, "little") + bytes(length - 4))
+
+    def packet(self) -> bytes:
+        """The next packet of the controller."""
+        self.number = next_number(self.number)
+        status = bytes([self.status, 0, 0, 0])
+        return CyclicPacket(self.number, status, bytes(4), self.axes.copy()).encode()
+
+    def miss(self, cycles: int) -> None:
+        """Packets that never arrive."""
+        for _ in range(cycles):
+            self.packet()
+            self.now += PERIOD
+
+    def cycle(self, count: int = 1) -> CyclicPacket | None:
+        """Whole cycles; the answer to the last of them."""
+        answer = None
+        for _ in range(count):
+            reply = self.send(self.packet())
+            answer = None
+            if reply is not None:
+                assert len(reply) == cyclic_length(self.init.n_axes)
+                answer = CyclicPacket.decode(reply, self.init.n_axes)
+                assert answer.number == next_number(self.number)
+                self._obey(answer)
+        return answer
+
+    def _obey(self, answer: CyclicPacket) -> None:
+        self.exits_asked += answer.status[0] == 1
+        told = answer.axes
+        if np.isin(told["mode"], NOT_SET_POINTS).any():
+            return
+        moved = told["mode"] == Mode.POSITION
+        for target, field in ((0, 0), (2, 0), (1, 1), (3, 1)):
+            self.axes["d"][moved, target] = told["d"][moved, field]
+
+    def close(self) -> CyclicPacket | None:
+        """To closed axes, drive on."""
+        if self.number < 10:
+            self.start()
+        self.modes = Mode.CLOSED
+        return self.cycle()
+
+    def open(self) -> CyclicPacket | None:
+        """Through closed into open mode, all axes at once."""
+        self.close()
+        self.modes = Mode.POSITION
+        return self.cycle()
+
+    def run(self, cycles: int = 2000) -> None:
+        """Obey until the session asks for the end of open mode, then leave it."""
+        for _ in range(cycles):
+            self.cycle()
+            if self.exits_asked:
+                self.modes = Mode.CLOSED
+                self.cycle()
+                return
+        raise AssertionError(f"no end of open mode asked for in {cycles} cycles")
+
+    def seen(self, kind):
+        return [event for event in self.events if isinstance(event, kind)]
+
+    @property
+    def ended(self) -> MotionEnded | None:
+        ends = self.seen(MotionEnded)
+        return ends[-1] if ends else None
+
+    @property
+    def path(self):
+        """States walked through so far."""
+        return [event.after for event in self.seen(StateChanged)]
+
+    @property
+    def records(self):
+        return self.ring.last(self.ring.capacity)

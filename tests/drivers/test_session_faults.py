@@ -1,0 +1,428 @@
+"""What goes wrong while the arm moves, and that it always ends in a stop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rig import N, START, Cruise, Rig, Table, init_packet, limits, smooth_move, still
+
+from drivers import (
+    AccelerationLimit,
+    AxisLeft,
+    CurrentLimit,
+    CyclicPacket,
+    FollowingError,
+    InitReceived,
+    JerkLimit,
+    Mode,
+    NotFinite,
+    PositionLimit,
+    Refused,
+    RequestError,
+    SourceFailed,
+    State,
+    VelocityLimit,
+    VelocityMismatch,
+)
+from drivers.session import FLIGHT_RECORDER
+
+
+def moving(cycles: int = 300, **options) -> tuple[Rig, Cruise]:
+    rig = Rig(**options)
+    source = Cruise()
+    rig.session.request(source)
+    rig.open()
+    rig.cycle(cycles)
+    assert rig.state is State.OPEN
+    return rig, source
+
+
+def all_drive_off(answer: CyclicPacket) -> bool:
+    return bool((answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all())
+
+
+def assert_refused(rig: Rig, answer: CyclicPacket, kind: type) -> Exception:
+    assert all_drive_off(answer)
+    assert answer.status == bytes(4)
+    assert rig.state is State.FAULTED
+    assert rig.ended.outcome == "refused"
+    assert np.isnan(rig.records[-1]["commanded_position"]).all()
+    error = rig.seen(Refused)[-1].error
+    assert type(error) is kind
+    assert error.cycle == rig.records[-1]["cycle"]
+    return error
+
+
+def play(rows, velocities=None, bounds="plan", **options) -> tuple[Rig, CyclicPacket]:
+    """Run a table of positions to its end; the last answer."""
+    rig = Rig(**options)
+    rig.session.request(Table(rows, velocities, bounds))
+    rig.open()
+    return rig, rig.cycle(len(rows) - 1)
+
+
+def constant_acceleration(acceleration: float, cycles: int = 40) -> np.ndarray:
+    """Joint 2 leaves with a jump in acceleration; limits on jerk have to be wide."""
+    t = np.arange(cycles)[:, None] * 0.002
+    direction = np.array([0, 1, 0, 0, 0, 0])
+    return START + 0.5 * acceleration * t**2 * direction
+
+
+class TestRefusedSetPoints:
+    WIDE = {"jerk": np.full(N, 1e9)}
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    @pytest.mark.parametrize("part", ["position", "velocity"])
+    def test_not_finite(self, value, part):
+        rows = np.tile(START, (5, 1))
+        velocities = np.zeros((5, N))
+        (rows if part == "position" else velocities)[4, 3] = value
+        rig, answer = play(rows, velocities)
+        assert assert_refused(rig, answer, NotFinite).joint == 3
+        assert np.isfinite(answer.axes["d"]).all()
+
+    def test_position(self):
+        speed_limits = limits(lower=START - 0.1, upper=START + 0.1, **self.WIDE)
+        rows = constant_acceleration(8.0, 90)
+        first = int(np.argmax(rows[:, 1] > START[1] + 0.1))
+        rig, answer = play(rows[: first + 1], guard_limits=speed_limits)
+        error = assert_refused(rig, answer, PositionLimit)
+        assert error.joint == 1
+        assert error.bound == pytest.approx(START[1] + 0.1)
+        assert error.value == pytest.approx(rows[first, 1], abs=1e-6)
+
+    def test_velocity(self):
+        rows = constant_acceleration(7.9, 200)
+        speed = np.diff(rows[:, 1]) / 0.002
+        first = int(np.argmax(speed > 1.0)) + 1
+        slow = limits(velocity=np.full(N, 1.0), **self.WIDE)
+        rig, answer = play(rows[: first + 1], guard_limits=slow)
+        error = assert_refused(rig, answer, VelocityLimit)
+        assert error.value == pytest.approx(speed[first - 1], rel=1e-6)
+
+    def test_stated_velocity(self):
+        rows = np.tile(START, (5, 1))
+        velocities = np.zeros((5, N))
+        velocities[4, 2] = 2.5
+        rig, answer = play(rows, velocities)
+        assert assert_refused(rig, answer, VelocityLimit).joint == 2
+
+    def test_velocity_that_is_not_the_derivative_of_the_positions(self):
+        rows = np.tile(START, (5, 1))
+        velocities = np.zeros((5, N))
+        velocities[4, 2] = 0.1
+        rig, answer = play(rows, velocities)
+        assert assert_refused(rig, answer, VelocityMismatch).joint == 2
+
+    def test_acceleration(self):
+        rig, _ = play(constant_acceleration(7.99), guard_limits=limits(**self.WIDE))
+        assert rig.state is State.OPEN
+        rig, answer = play(constant_acceleration(8.01)[:3], guard_limits=limits(**self.WIDE))
+        # The first step from rest shows half of it, the second all.
+        error = assert_refused(rig, answer, AccelerationLimit)
+        assert error.value == pytest.approx(8.01, rel=1e-4)
+
+    def test_jerk(self):
+        rig, answer = play(constant_acceleration(0.5)[:2])
+        error = assert_refused(rig, answer, JerkLimit)
+        assert (error.joint, error.bound) == (1, pytest.approx(100.0, rel=1e-5))
+
+    @pytest.mark.parametrize(("bounds", "factor"), [("plan", 1), ("override", 1.3), ("stop", 2)])
+    def test_each_set_of_bounds_has_its_acceleration(self, bounds, factor):
+        wide = limits(**self.WIDE)
+        inside = constant_acceleration(8.0 * factor * 0.999)
+        assert play(inside, None, bounds, guard_limits=wide)[0].state is State.OPEN
+        outside = constant_acceleration(8.0 * factor * 1.001)[:3]
+        rig, answer = play(outside, None, bounds, guard_limits=wide)
+        assert_refused(rig, answer, AccelerationLimit)
+
+    def test_a_source_that_raises(self):
+        class Broken(Cruise):
+            def advance(self):
+                raise ZeroDivisionError("no row 17")
+
+        rig = Rig()
+        rig.session.request(Broken())
+        rig.open()
+        error = assert_refused(rig, rig.cycle(), SourceFailed)
+        assert isinstance(error.__cause__, ZeroDivisionError)
+
+    @pytest.mark.parametrize(
+        "answer",
+        [(START[:5], np.zeros(6)), (START, 0.0), (None, None), ("x", "y"), START],
+    )
+    def test_a_source_that_gives_something_else(self, answer):
+        class Odd(Cruise):
+            def advance(self):
+                return answer
+
+        rig = Rig()
+        rig.session.request(Odd())
+        rig.open()
+        assert_refused(rig, rig.cycle(), SourceFailed)
+
+    def test_a_source_that_names_no_set_of_bounds(self):
+        source = Cruise()
+        source.bounds = "whatever"
+        rig = Rig()
+        rig.session.request(source)
+        rig.open()
+        assert_refused(rig, rig.cycle(), SourceFailed)
+
+    def test_a_source_that_fails_to_stop(self):
+        rig, source = moving()
+        source.stop = None
+        rig.session.stop()
+        assert_refused(rig, rig.cycle(), SourceFailed)
+
+
+class TestArmThatDoesNotFollow:
+    def test_following_error_is_reported_as_508_in_the_offending_slot(self):
+        rig, _ = moving()
+        target = rig.axes["d"][:, 0].copy()
+        rig.axes["d"][3, 2] = target[3] + 2.01
+        answer = rig.cycle()
+        assert answer.axes["mode"].tolist() == [4, 4, 4, 508, 4, 4]
+        np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
+        assert not answer.axes["d"][:, 1].any()
+        error = rig.seen(Refused)[-1].error
+        assert type(error) is FollowingError
+        assert (error.joint, error.bound) == (3, pytest.approx(2.0, rel=1e-5))
+        assert rig.ended.outcome == "refused"
+        assert rig.state is State.FAULTED
+
+    def test_it_is_held_against_the_set_point_sent_as_well_as_the_target_received(self):
+        """The controller may have missed our answers; the arm counts, not its target."""
+        rig, _ = moving()
+        rig.axes["d"][0, [0, 2]] -= 2.01
+        assert rig.cycle().axes["mode"].tolist() == [508, 4, 4, 4, 4, 4]
+
+    def test_it_goes_on_being_reported_while_the_axes_stay_open(self):
+        rig, _ = moving()
+        rig.axes["d"][3, 2] += 2.01
+        rig.cycle()
+        rig.axes["d"][3, 2] -= 2.01
+        for _ in range(5):
+            assert rig.cycle().axes["mode"].tolist() == [4, 4, 4, 508, 4, 4]
+        assert rig.session.counters.refused == 1
+
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_current_beyond_the_narrower_limit_asks_for_drive_off(self, sign):
+        rig, _ = moving(init=init_packet(arm_1={"current_limit": [20, 20, 20, 20, 20, 7.5]}))
+        rig.axes["d"][:, 4] = sign * 7.5
+        rig.cycle()
+        assert rig.state is State.OPEN
+        rig.axes["d"][5, 4] = sign * 7.51
+        error = assert_refused(rig, rig.cycle(), CurrentLimit)
+        assert (error.joint, error.bound) == (5, pytest.approx(7.5, rel=1e-5))
+
+    @pytest.mark.parametrize("field", [0, 2, 4])
+    def test_feedback_that_is_no_number_is_a_refusal(self, field):
+        rig, _ = moving()
+        rig.axes["d"][2, field] = np.nan
+        assert rig.cycle().axes["mode"].max() == Mode.DRIVE_OFF_REQUEST
+        assert type(rig.seen(Refused)[-1].error) is NotFinite
+
+    def test_limits_the_controller_does_not_know_are_the_cells(self):
+        unknown = {"following_error": np.full(N, np.nan), "current_limit": np.full(N, np.nan)}
+        rig, _ = moving(init=init_packet(arm_1=unknown))
+        rig.axes["d"][0, 4] = 20.1
+        assert_refused(rig, rig.cycle(), CurrentLimit)
+
+
+class TestAfterARefusal:
+    def refuse(self) -> tuple[Rig, Cruise]:
+        rig, source = moving()
+        rig.axes["d"][0, 4] = 99.0
+        rig.cycle()
+        rig.axes["d"][0, 4] = 0.0
+        return rig, source
+
+    def test_nothing_moves_however_long_the_axes_stay_open(self):
+        rig, source = self.refuse()
+        advances = source.advances
+        for _ in range(100):
+            assert all_drive_off(rig.cycle())
+        assert source.advances == advances
+        assert rig.session.counters.refused == 1
+
+    def test_a_new_motion_cannot_be_requested_before_the_axes_are_closed(self):
+        rig, _ = self.refuse()
+        with pytest.raises(RequestError, match="closed"):
+            rig.session.request(still(3))
+
+    @pytest.mark.parametrize("status", [0, 5])
+    def test_open_mode_again_without_closing_is_not_accepted(self, status):
+        rig, _ = self.refuse()
+        rig.status = 0
+        rig.cycle(3)
+        rig.status = 5
+        assert all_drive_off(rig.cycle())
+
+    def test_after_closing_nothing_moves_by_itself(self):
+        rig, source = self.refuse()
+        advances = source.advances
+        rig.status = 0
+        rig.modes = Mode.CLOSED
+        rig.cycle(3)
+        rig.status = 5
+        rig.open()
+        target = rig.axes["d"][:, 0].copy()
+        answer = rig.cycle(20)
+        np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
+        assert source.advances == advances
+
+    def test_after_closing_a_new_motion_runs_from_a_first_set_point(self):
+        rig, _ = self.refuse()
+        rig.modes = Mode.CLOSED
+        rig.cycle(2)
+        here = rig.train.joint_position(rig.axes["d"][:, 0].astype(np.float64))
+        rig.axes["d"][:, [1, 3]] = 0.0
+        rig.session.request(smooth_move(np.full(N, 0.05), 300, start=here))
+        rig.open()
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    def test_the_flight_recorder_holds_the_last_cycles_up_to_the_refused_one(self):
+        rig, _ = self.refuse()
+        event = rig.seen(Refused)[-1]
+        recorder = event.flight_recorder
+        assert len(recorder) == FLIGHT_RECORDER
+        assert recorder["cycle"][-1] == event.error.cycle
+        assert recorder["target_current"][-1, 0] == 99.0
+        assert np.isfinite(recorder["commanded_position"][:-1]).all()
+        assert np.isnan(recorder["commanded_position"][-1]).all()
+        assert recorder["state"][-1] == State.FAULTED
+
+
+class TestLostMotion:
+    def test_the_drive_going_off_in_open_mode_ends_the_motion(self):
+        rig, source = moving()
+        rig.status = 0
+        packet = rig.packet()
+        answer = CyclicPacket.decode(rig.send(packet), N)
+        assert rig.state is State.DRIVE_OFF
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the drive went off")
+        np.testing.assert_array_equal(answer.axes, CyclicPacket.decode(packet, N).axes)
+        advances = source.advances
+        rig.cycle(5)
+        assert source.advances == advances
+
+    def test_a_drive_that_comes_back_in_open_mode_is_switched_off_again(self):
+        rig, _ = moving()
+        rig.status = 0
+        rig.cycle()
+        rig.status = 5
+        assert all_drive_off(rig.cycle())
+        assert rig.state is State.FAULTED
+
+    @pytest.mark.parametrize(
+        ("mode", "state"),
+        [
+            (Mode.CLOSED, State.CLOSED),
+            (Mode.DRIVING_ON, State.DRIVING_ON),
+            (Mode.PAUSE_BY_CONTROLLER, State.FREEZING),
+            (Mode.FOLLOWING_ERROR, State.FAULTED),
+            (Mode.END_OF_SESSION, State.ENDED),
+        ],
+    )
+    def test_open_mode_going_away_ends_the_motion(self, mode, state):
+        rig, _ = moving()
+        rig.modes = mode
+        rig.cycle()
+        assert rig.state is state
+        assert rig.ended.outcome == "lost"
+
+    def test_one_axis_leaving_open_mode_while_moving_asks_for_drive_off(self):
+        rig, _ = moving()
+        rig.axes["mode"][2] = Mode.CLOSED
+        error = assert_refused(rig, rig.cycle(), AxisLeft)
+        assert (error.joint, error.mode, error.wanted) == (2, 0, 4)
+
+    def test_one_axis_leaving_open_mode_while_held_lets_the_others_be_held(self):
+        rig = Rig()
+        rig.open()
+        rig.cycle(3)
+        rig.axes["mode"][2] = Mode.CLOSED
+        answer = rig.cycle()
+        assert rig.state is State.EXITING
+        np.testing.assert_array_equal(answer.axes["mode"], rig.axes["mode"])
+
+    def test_silence_ends_the_motion(self):
+        rig, source = moving()
+        rig.session.tick(rig.now + 1.0)
+        rig.events += rig.session.events()
+        assert rig.ended.outcome == "lost"
+        assert rig.state is State.FAULTED
+        advances = source.advances
+        assert all_drive_off(rig.cycle())
+        assert source.advances == advances
+
+    def test_an_init_in_a_running_session_aborts_the_motion_and_starts_over(self):
+        rig, source = moving()
+        reply = rig.send(rig.init.encode())
+        assert reply[:4] == bytes([11, 0, 0, 0])
+        assert rig.state is State.INIT
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the controller started over")
+        assert len(rig.seen(InitReceived)) == 2
+        rig.number = 10
+        advances = source.advances
+        assert all_drive_off(rig.cycle()), "open axes right after init are not believed"
+        rig.modes = Mode.CLOSED
+        rig.cycle()
+        assert rig.state is State.CLOSED
+        assert source.advances == advances
+
+    def test_the_first_set_point_rule_holds_again_after_a_pause(self):
+        rig, _ = moving()
+        rig.modes = Mode.PAUSE_BY_CONTROLLER
+        rig.cycle()
+        rig.axes["d"][0, 2] += 0.5
+        rig.modes = Mode.POSITION
+        assert all_drive_off(rig.cycle())
+        assert "received target" in str(rig.seen(Refused)[-1].error)
+
+    def test_a_waiting_motion_is_lost_when_the_controller_starts_over(self):
+        rig = Rig()
+        rig.close()
+        rig.session.request(still(3))
+        rig.send(rig.init.encode())
+        assert rig.ended.outcome == "lost"
+        assert rig.ended.interval == -1
+
+    def test_a_waiting_motion_survives_a_drive_off_with_closed_axes(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.close()
+        rig.status = 0
+        rig.cycle()
+        rig.status = 5
+        rig.open()
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+
+def test_bounds_that_become_narrower_do_so_when_no_difference_reaches_back():
+    """Full jerk of the stop bounds up to one cycle, none after: the guard must not trip."""
+    class Switch(Table):
+        @property
+        def bounds(self):
+            return "stop" if self.index < 20 else "plan"
+
+        @bounds.setter
+        def bounds(self, value):
+            pass
+
+    k = np.arange(60)[:, None] * 0.002
+    ramp = np.where(k <= 0.038, 290.0 * k**3 / 6.0, np.nan)
+    knee = 0.038
+    a, v, p = 290 * knee, 290 * knee**2 / 2, 290 * knee**3 / 6
+    ramp = np.where(k <= knee, ramp, p + v * (k - knee) + a * (k - knee) ** 2 / 2)
+    rows = START + ramp * np.array([1, 0, 0, 0, 0, 0])
+    wide = limits(acceleration=np.full(N, 12.0))
+    source = Switch(rows)
+    rig = Rig(guard_limits=wide)
+    rig.session.request(source)
+    rig.open()
+    rig.cycle(59)
+    assert rig.state is State.OPEN, rig.ended

@@ -1,0 +1,331 @@
+"""From the first datagram to closed axes, and every answer on the way."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from rig import N, Rig, init_packet, still
+
+from drivers import CyclicPacket, InitReceived, LinkLost, Mode, PacketRejected, RequestError, State
+from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
+
+WORDS = 9
+
+
+def words(packet: CyclicPacket) -> np.ndarray:
+    return packet.axes.view(np.int32).reshape(-1, WORDS)
+
+
+class TestHandShake:
+    def test_cold_start_echoes_nine_sync_init_and_two_sync(self):
+        rig = Rig()
+        rig.start(cold=True)
+        assert len(rig.transcript) == 12
+        for packet, reply in rig.transcript:
+            number = struct.unpack_from("<i", packet)[0]
+            assert reply == struct.pack("<i", number + 1) + packet[4:]
+        assert rig.path == [State.INIT]
+
+    @pytest.mark.parametrize("length", [12, 228, 732, 1199])
+    def test_sync_of_any_length_below_init_gets_its_own_length_back(self, length):
+        assert len(Rig().sync(1, length)) == length
+
+    def test_init_is_answered_by_itself_with_number_11(self):
+        rig = Rig()
+        rig.start()
+        packet, reply = rig.transcript[0]
+        assert len(reply) == INIT_LENGTH
+        assert reply == struct.pack("<i", 11) + packet[4:]
+        assert rig.session.init.n_axes == N
+        assert rig.session.period == 0.002
+
+    def test_a_warm_start_begins_with_init_and_goes_straight_to_cyclic_packets(self):
+        rig = Rig()
+        rig.start()
+        rig.status = 0
+        rig.cycle()
+        assert rig.number == 11
+        assert rig.path == [State.INIT, State.DRIVE_OFF]
+
+    def test_cyclic_packets_follow_the_cold_start_at_13(self):
+        rig = Rig()
+        rig.start(cold=True)
+        rig.status = 0
+        rig.cycle()
+        assert rig.number == 13
+        assert rig.state is State.DRIVE_OFF
+        assert rig.records["cycle"].tolist() == [3]
+
+    def test_a_second_copy_of_init_gets_the_same_bytes_and_starts_nothing(self):
+        rig = Rig()
+        rig.start()
+        again = rig.send(rig.init.encode())
+        assert again == rig.transcript[0][1]
+        assert len(rig.seen(InitReceived)) == 1
+        assert rig.session.counters.duplicates == 1
+
+    def test_an_init_with_an_impossible_number_of_axes_is_malformed(self):
+        rig = Rig()
+        bad = bytearray(rig.init.encode())
+        bad[12:16] = struct.pack("<i", 21)
+        assert rig.send(bytes(bad)) is None
+        assert rig.state is State.SYNC
+        assert rig.session.counters.malformed == 1
+
+
+class TestSafeAnswers:
+    """What is answered where nothing moves: field by field."""
+
+    def filled(self, mode, status=DRIVE_ON) -> tuple[Rig, CyclicPacket, CyclicPacket]:
+        rig = Rig()
+        rig.start()
+        rig.modes = mode
+        rig.status = status
+        rng = np.random.default_rng(3)
+        rig.axes["d"] = rng.uniform(-1, 1, (N, 5))
+        rig.axes["d"][:, 2] = rig.axes["d"][:, 0]
+        rig.axes["extra"] = rng.uniform(-1, 1, (N, 3))
+        packet = rig.packet()
+        answer = CyclicPacket.decode(rig.send(packet), N)
+        assert answer.functionality == bytes(4)
+        return rig, CyclicPacket.decode(packet, N), answer
+
+    def test_drive_off_is_echoed_whole(self):
+        rig, packet, answer = self.filled(Mode.CLOSED, status=3)
+        np.testing.assert_array_equal(words(answer), words(packet))
+        assert answer.status == bytes([3, 0, 0, 0])
+        assert rig.state is State.DRIVE_OFF
+
+    @pytest.mark.parametrize(
+        ("mode", "state"),
+        [(Mode.DRIVING_ON, State.DRIVING_ON), (Mode.CLOSED, State.CLOSED)],
+    )
+    def test_target_position_and_velocity_are_given_back(self, mode, state):
+        rig, packet, answer = self.filled(mode)
+        assert rig.state is state
+        assert answer.status == bytes(4)
+        np.testing.assert_array_equal(words(answer)[:, :3], words(packet)[:, :3])
+        assert not words(answer)[:, 3:].any()
+
+    def test_mode_10_gets_all_five_data_back_and_no_extras(self):
+        rig, packet, answer = self.filled(Mode.CLOSED_MIRRORED)
+        assert rig.state is State.CLOSED
+        np.testing.assert_array_equal(words(answer)[:, :6], words(packet)[:, :6])
+        assert not words(answer)[:, 6:].any()
+
+    @pytest.mark.parametrize("mode", [3, 6, 500, 502, 506, 507, 508, -1, 162])
+    def test_a_mode_that_is_not_available_is_answered_by_mode_0_and_zeros(self, mode):
+        _, _, answer = self.filled(mode)
+        assert not words(answer).any()
+        assert answer.status == bytes(4)
+
+    @pytest.mark.parametrize("mode", [500, 502])
+    def test_a_pause_is_a_state_of_its_own_with_a_patient_deadline(self, mode):
+        rig, _, _ = self.filled(mode)
+        assert rig.state is State.FREEZING
+        assert rig.session.deadline == pytest.approx(rig.now + 300.0)
+
+    def test_mode_504_is_answered_once_by_a_zero_frame_then_there_is_silence(self):
+        rig, _, answer = self.filled(Mode.END_OF_SESSION)
+        assert not words(answer).any()
+        assert rig.state is State.ENDED
+        last_packet = rig.transcript[-1][0]
+        assert rig.cycle() is None
+        assert rig.send(last_packet) is None
+        assert rig.send(rig.init.encode()) is None
+        assert rig.session.counters.ended == 3
+        assert rig.session.deadline == np.inf
+
+    def test_mode_504_with_the_drive_off_is_echoed(self):
+        rig, packet, answer = self.filled(Mode.END_OF_SESSION, status=0)
+        np.testing.assert_array_equal(words(answer), words(packet))
+        assert rig.state is State.ENDED
+
+    def test_a_longer_packet_gets_an_answer_of_the_documented_length(self):
+        rig = Rig()
+        rig.start()
+        packet = rig.packet()
+        reply = rig.send(packet + b"\xa5" * (732 - len(packet)))
+        assert len(reply) == 228
+        assert b"\xa5\xa5\xa5\xa5" not in reply
+
+    def test_nan_in_a_field_that_is_given_back_goes_back_bit_for_bit(self):
+        rig = Rig()
+        rig.start()
+        rig.axes["d"].view(np.uint32)[2, 1] = 0x7F8ABCDE
+        answer = CyclicPacket.decode(rig.send(rig.packet()), N)
+        assert answer.axes["d"].view(np.uint32)[2, 1] == 0x7F8ABCDE
+
+    def test_each_arm_is_answered_by_its_own_drive(self):
+        axes_map = np.full((4, 10), NO_SLOT)
+        axes_map[0, :N] = range(N)
+        axes_map[1, 0] = N
+        rig = Rig(init=init_packet(n_axes=7, open_axes_map=axes_map))
+        rig.start()
+        rig.axes["d"][6] = [9, 8, 7, 6, 5]
+        answer = rig.cycle()
+        assert rig.state is State.CLOSED
+        np.testing.assert_array_equal(answer.axes["d"][6], [9, 8, 7, 6, 5])
+        np.testing.assert_array_equal(answer.axes["d"][0, 2:], 0.0)
+
+
+class TestWhoGetsAnAnswer:
+    def test_a_duplicate_gets_the_same_bytes_and_no_record(self):
+        rig = Rig()
+        rig.close()
+        packet, reply = rig.transcript[-1]
+        records = len(rig.records)
+        for _ in range(3):
+            assert rig.send(packet) == reply
+        assert rig.session.counters.duplicates == 3
+        assert len(rig.records) == records
+
+    def test_a_stale_packet_gets_none_and_is_counted(self):
+        rig = Rig()
+        rig.close()
+        old = rig.transcript[-1][0]
+        rig.cycle(3)
+        assert rig.send(old) is None
+        assert rig.session.counters.stale == 1
+        assert rig.seen(PacketRejected) == [PacketRejected("stale", 1)]
+
+    def test_a_number_further_ahead_than_silence_allows_is_stale(self):
+        rig = Rig()
+        rig.close()
+        answered = rig.number
+        rig.number = answered + 500
+        assert rig.cycle() is None, "1 s is 500 cycles; this one is 501 ahead"
+        rig.number = answered + 499
+        assert rig.cycle() is not None
+        assert rig.session.counters.missed == 499
+
+    @pytest.mark.parametrize(
+        "packet",
+        [b"", b"\x0b", struct.pack("<i", 11), struct.pack("<i", 11) + bytes(223), bytes(228)],
+    )
+    def test_malformed_packets_get_none_and_change_nothing(self, packet):
+        rig = Rig()
+        rig.start()
+        assert rig.send(packet) is None
+        assert rig.state is State.INIT
+        assert rig.session.counters.malformed == 1
+
+    def test_numbers_go_on_with_1_after_0x7fff(self):
+        rig = Rig()
+        rig.close()
+        rig.cycle(0x7FFF - rig.number)
+        assert rig.number == 0x7FFF
+        before = rig.records["cycle"][-1]
+        rig.cycle(12)
+        assert rig.number == 12
+        assert rig.records["cycle"][-1] == before + 12
+        assert rig.session.counters.missed == 0
+        assert rig.state is State.CLOSED
+
+    def test_a_cyclic_packet_with_number_10_is_no_init(self):
+        rig = Rig()
+        rig.close()
+        rig.cycle(0x7FFF - rig.number + 10)
+        assert rig.number == 10
+        assert len(rig.seen(InitReceived)) == 1
+
+
+class TestSilence:
+    def test_the_deadline_is_long_before_init_and_short_after(self):
+        rig = Rig()
+        assert rig.session.deadline == np.inf
+        rig.session.tick(5.0)
+        assert rig.session.deadline == 305.0
+        rig.now = 6.0
+        rig.close()
+        assert rig.session.deadline == pytest.approx(rig.now + 1.0)
+
+    def test_duplicates_and_rejected_packets_do_not_move_the_deadline(self):
+        rig = Rig()
+        rig.close()
+        deadline = rig.session.deadline
+        rig.send(rig.transcript[-1][0])
+        rig.send(b"nonsense")
+        assert rig.session.deadline == deadline
+
+    def test_silence_is_a_fault_reported_once(self):
+        rig = Rig()
+        rig.close()
+        rig.session.tick(rig.now + 0.999)
+        assert rig.state is State.CLOSED
+        rig.session.tick(rig.now + 1.0)
+        rig.session.tick(rig.now + 9.0)
+        rig.events += rig.session.events()
+        assert rig.state is State.FAULTED
+        assert rig.seen(LinkLost) == [LinkLost(pytest.approx(1.0), State.CLOSED)]
+
+    def test_nobody_has_to_tick_for_silence_to_be_noticed(self):
+        rig = Rig()
+        rig.close()
+        rig.now += 5.0
+        rig.cycle()
+        assert rig.path[-2:] == [State.FAULTED, State.CLOSED]
+
+    def test_after_silence_a_controller_that_goes_on_is_answered_whatever_its_number(self):
+        rig = Rig()
+        rig.close()
+        rig.now += 5.0
+        rig.number += 9000
+        assert rig.cycle() is not None
+        assert rig.state is State.CLOSED
+
+    def test_after_silence_a_cold_start_is_followed(self):
+        rig = Rig()
+        rig.close()
+        rig.now += 60.0
+        rig.start(cold=True)
+        rig.cycle()
+        assert rig.path[-4:] == [State.FAULTED, State.SYNC, State.INIT, State.CLOSED]
+
+    def test_silence_before_init_leaves_the_session_waiting(self):
+        rig = Rig()
+        rig.session.tick(0.0)
+        rig.session.tick(300.0)
+        assert rig.state is State.SYNC
+        rig.now = 400.0
+        rig.close()
+        assert rig.state is State.CLOSED
+
+
+class TestInitThatDoesNotFit:
+    @pytest.mark.parametrize(
+        "init",
+        [
+            init_packet(sample_time=1),
+            init_packet(sample_time=1500),
+            init_packet(n_axes=5),
+            init_packet(open_axes_map=np.full((4, 10), 1)),
+        ],
+        ids=["cycle", "cycle in microseconds", "axis missing", "no map"],
+    )
+    def test_it_is_answered_but_nothing_can_be_moved(self, init):
+        rig = Rig(init=init)
+        rig.start()
+        assert rig.seen(InitReceived)[0].unusable
+        rig.modes = Mode.CLOSED
+        assert rig.cycle() is not None
+        with pytest.raises(RequestError):
+            rig.session.request(still(3))
+        rig.modes = Mode.POSITION
+        assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        assert np.isnan(rig.records["position"]).all()
+
+
+class TestConstruction:
+    def test_parts_for_different_numbers_of_joints_are_refused(self):
+        rig = Rig()
+        with pytest.raises(ValueError, match="joints"):
+            type(rig.session)(rig.train, rig.guard, type(rig.ring)(5))
+
+    @pytest.mark.parametrize("mode", [0, 1, 7, 8, 501])
+    def test_modes_whose_set_point_is_not_d1_and_d2_are_refused(self, mode):
+        with pytest.raises(ValueError, match="mode"):
+            Rig(mode=mode)

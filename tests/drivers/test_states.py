@@ -1,0 +1,149 @@
+"""The state table: complete, and safe by construction."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from drivers import Mode, State
+from drivers.states import (
+    HAS_SET_POINTS,
+    TRANSITIONS,
+    Input,
+    keeps_request,
+    read_input,
+)
+
+FROM_PACKETS = [
+    Input.OFF,
+    Input.DRIVING_ON,
+    Input.CLOSED,
+    Input.PARTLY_OPEN,
+    Input.OPEN,
+    Input.PAUSE,
+    Input.UNAVAILABLE,
+    Input.END,
+]
+RUNNING = [state for state in State if state not in (State.SYNC, State.ENDED)]
+
+
+def test_every_running_state_knows_what_follows_every_packet_and_every_fault():
+    for state, what in itertools.product(RUNNING, [*FROM_PACKETS, Input.INIT, Input.SILENCE]):
+        assert what in TRANSITIONS[state], f"{state.name} does not know {what.name}"
+    for state in RUNNING:
+        assert TRANSITIONS[state][Input.REFUSAL] is State.FAULTED
+
+
+def test_every_state_can_be_reached():
+    reached = {State.SYNC}
+    while True:
+        more = {after for state in reached for after in TRANSITIONS[state].values()} - reached
+        if not more:
+            break
+        reached |= more
+    assert reached == set(State)
+
+
+def test_nothing_leads_out_of_the_end():
+    assert not TRANSITIONS[State.ENDED]
+
+
+def test_an_init_packet_always_starts_over():
+    for state in [State.SYNC, *RUNNING]:
+        assert TRANSITIONS[state][Input.INIT] is State.INIT
+
+
+def test_drive_off_always_leads_out_of_open_mode():
+    for state in RUNNING:
+        assert TRANSITIONS[state][Input.OFF] is State.DRIVE_OFF
+
+
+def test_open_mode_is_entered_only_from_where_axes_were_closed_with_the_drive_on():
+    entered_from = {
+        state
+        for state, row in TRANSITIONS.items()
+        for after in row.values()
+        if after is State.OPEN
+    }
+    allowed = {State.DRIVING_ON, State.CLOSED, State.OPENING, State.FREEZING, State.OPEN}
+    assert entered_from == allowed
+
+
+@pytest.mark.parametrize("state", [State.INIT, State.DRIVE_OFF, State.FAULTED])
+@pytest.mark.parametrize("what", [Input.OPEN, Input.PARTLY_OPEN])
+def test_open_axes_are_not_believed_before_closed_ones(state, what):
+    assert TRANSITIONS[state][what] is State.FAULTED
+
+
+def test_a_fault_is_left_only_by_what_cannot_move():
+    moving = {after for after in TRANSITIONS[State.FAULTED].values() if after in HAS_SET_POINTS}
+    assert not moving
+
+
+def test_only_open_mode_can_be_left_on_request():
+    asking = [state for state, row in TRANSITIONS.items() if Input.EXIT in row]
+    assert asking == [State.OPEN, State.EXITING]
+
+
+class TestReading:
+    CLOSED, OPEN = [Mode.CLOSED] * 3, [Mode.POSITION] * 3
+
+    def read(self, modes, *, drive_on=True, wanted=slice(None)):
+        return read_input(drive_on, modes, modes[wanted], Mode.POSITION)
+
+    @pytest.mark.parametrize(
+        ("modes", "meaning"),
+        [
+            ([0, 0, 0], Input.CLOSED),
+            ([0, 10, 0], Input.CLOSED),
+            ([501, 501, 501], Input.DRIVING_ON),
+            ([0, 501, 0], Input.DRIVING_ON),
+            ([4, 4, 4], Input.OPEN),
+            ([4, 0, 4], Input.PARTLY_OPEN),
+            ([4, 5, 4], Input.PARTLY_OPEN),
+            ([5, 5, 5], Input.PARTLY_OPEN),
+            ([4, 501, 4], Input.PARTLY_OPEN),
+            ([4, 504, 4], Input.PARTLY_OPEN),
+            ([4, 999, 4], Input.PARTLY_OPEN),
+            ([502, 502, 502], Input.PAUSE),
+            ([4, 500, 4], Input.PAUSE),
+            ([504, 504, 504], Input.END),
+            ([504, 0, 504], Input.UNAVAILABLE),
+            ([508, 0, 0], Input.UNAVAILABLE),
+            ([3, 3, 3], Input.UNAVAILABLE),
+            ([-1, -1, -1], Input.UNAVAILABLE),
+        ],
+    )
+    def test_modes(self, modes, meaning):
+        assert self.read(modes) is meaning
+
+    @pytest.mark.parametrize("modes", [[0, 0, 0], [4, 4, 4], [501, 501, 501], [502] * 3])
+    def test_without_the_drive_modes_do_not_matter(self, modes):
+        assert self.read(modes, drive_on=False) is Input.OFF
+
+    def test_axes_that_are_not_wanted_do_not_matter(self):
+        assert self.read([4, 4, 0], wanted=slice(0, 2)) is Input.OPEN
+        assert self.read([0, 0, 4], wanted=slice(0, 2)) is Input.CLOSED
+
+
+class TestWaitingRequests:
+    @pytest.mark.parametrize(
+        "before", [State.DRIVE_OFF, State.DRIVING_ON, State.CLOSED, State.FREEZING]
+    )
+    def test_wait_for_the_drive_and_for_open_mode(self, before):
+        for after in (State.DRIVE_OFF, State.DRIVING_ON, State.CLOSED, State.OPENING, State.OPEN):
+            assert keeps_request(before, after)
+
+    @pytest.mark.parametrize("before", RUNNING)
+    def test_never_survive_a_fault_or_the_end(self, before):
+        assert not keeps_request(before, State.FAULTED)
+        assert not keeps_request(before, State.ENDED)
+
+    def test_survive_axes_closing_again_but_not_the_drive_going_off_while_opening(self):
+        assert keeps_request(State.OPENING, State.CLOSED)
+        assert not keeps_request(State.OPENING, State.DRIVE_OFF)
+
+    def test_survive_the_first_init_but_no_later_one(self):
+        assert keeps_request(State.SYNC, State.INIT)
+        assert not keeps_request(State.CLOSED, State.INIT)

@@ -1,0 +1,88 @@
+"""What every transport has to do; a test of one subclasses this and builds a link.
+
+The controller's end is driven by the test: `far.send` lets the controller send a packet, and
+`far.replies` is what reached it, in order. `far.wait` gives real links the time they need.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import pytest
+
+from drivers import TransportClosed
+from drivers.transports.base import Transport
+
+PATIENCE = 0.5
+
+
+class FarEnd(Protocol):
+    replies: list[bytes]
+
+    def send(self, packet: bytes) -> None: ...
+
+    def wait(self) -> None: ...
+
+
+class TransportContract:
+    @pytest.fixture
+    def link(self) -> tuple[Transport, FarEnd]:
+        raise NotImplementedError("a subclass builds a transport and its far end")
+
+    def test_a_packet_arrives_unchanged(self, link):
+        near, far = link
+        packet = bytes(range(228))
+        far.send(packet)
+        assert near.receive(PATIENCE) == packet
+
+    @pytest.mark.parametrize("length", [12, 48, 228, 732, 1200])
+    def test_packets_of_every_length_of_the_protocol_stay_whole(self, link, length):
+        near, far = link
+        far.send(bytes(length))
+        assert near.receive(PATIENCE) == bytes(length)
+
+    def test_the_answer_reaches_the_controller_unchanged(self, link):
+        near, far = link
+        far.send(b"question" * 8)
+        near.receive(PATIENCE)
+        near.send(b"answer" * 10)
+        far.wait()
+        assert far.replies == [b"answer" * 10]
+
+    def test_packets_arrive_in_order(self, link):
+        near, far = link
+        for number in range(5):
+            far.send(bytes([number]) * 48)
+        assert [near.receive(PATIENCE)[0] for _ in range(5)] == [0, 1, 2, 3, 4]
+
+    def test_nothing_comes_out_of_nothing(self, link):
+        near, _ = link
+        before = near.now
+        assert near.receive(0.05) is None
+        assert near.now - before >= 0.05 * (1.0 - 1e-9)
+
+    def test_no_patience_is_no_wait(self, link):
+        near, _ = link
+        before = near.now
+        assert near.receive(0.0) is None
+        assert near.now - before < 0.05
+
+    def test_time_never_goes_back(self, link):
+        near, far = link
+        times = [near.now]
+        for _ in range(3):
+            far.send(bytes(48))
+            near.receive(PATIENCE)
+            times.append(near.now)
+            near.receive(0.001)
+            times.append(near.now)
+        assert times == sorted(times)
+
+    def test_a_closed_link_says_so(self, link):
+        near, _ = link
+        near.close()
+        near.close()
+        with pytest.raises(TransportClosed):
+            near.receive(0.0)
+        with pytest.raises(TransportClosed):
+            near.send(bytes(48))

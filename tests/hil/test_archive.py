@@ -1,0 +1,391 @@
+"""Archives as they are written and read back: names, content, chunks, determinism."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from numpy.typing import NDArray
+
+from drivers.record import cycle_dtype
+from hil.archive import (
+    KINDS,
+    ArchiveName,
+    ArchiveWriter,
+    Level,
+    Samples,
+    container,
+    definitions,
+    open_archive,
+    schema,
+    write_samples,
+)
+from hil.archive.cdr import fixed_layout
+from hil.archive.definitions import cycle as cycle_definition
+from hil.errors import ArchiveError, ArchiveVersionError, ArchiveWriteError, NotAnArchiveError
+
+JOINTS = ("joint_1", "joint_2", "joint_3")
+PERIOD = 0.001
+ATTACHMENTS = {"cell.toml": b"[cell]\n", "robot.urdf": b"<robot/>" * 50}
+NAME = "excitation_007_a2.mcap"
+
+
+def records(count: int, seed: int = 0, first: int = 12_000) -> NDArray[np.void]:
+    """Cycle records with random content in every field."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros(count, cycle_dtype(len(JOINTS)))
+    for name in rows.dtype.names or ():
+        shape = rows[name].shape
+        if rows[name].dtype.kind == "f":
+            rows[name] = rng.normal(size=shape)
+        else:
+            rows[name] = rng.integers(0, 200, shape)
+    rows["gap"] = 0
+    rows["cycle"] = first + np.arange(count)
+    rows["commanded_position"][:2] = np.nan
+    return rows
+
+
+def same(a: NDArray[np.void], b: NDArray[np.void]) -> bool:
+    """Whether two sets of records are equal to the bit in every field (padding is no field)."""
+    return a.dtype == b.dtype and all(
+        a[name].tobytes() == b[name].tobytes() for name in a.dtype.names or ()
+    )
+
+
+def torques(rows: NDArray[np.void]) -> NDArray[np.float64]:
+    return 60.0 * rows["target_current"]
+
+
+def writer(path: Path, **changes: object) -> ArchiveWriter:
+    settings: dict[str, object] = {
+        "joint_names": JOINTS,
+        "period": PERIOD,
+        "metadata": {"campaign": "c1", "simulated": "yes"},
+        "attachments": ATTACHMENTS,
+        "durable": False,
+    }
+    return ArchiveWriter(path, **{**settings, **changes})  # type: ignore[arg-type]
+
+
+def write(path: Path, rows: NDArray[np.void], *, batch: int = 10_000) -> Path:
+    with writer(path) as archive:
+        for start in range(0, len(rows), batch):
+            part = rows[start : start + batch]
+            archive.write(part, torques(part))
+        archive.close("completed")
+    return path
+
+
+def chunks(path: Path) -> list[bytes]:
+    with path.open("rb") as stream:
+        walked = container.records(stream, path.stat().st_size)
+        return [record.body for record in walked if record.opcode == container.CHUNK]
+
+
+class TestNames:
+    @given(st.sampled_from(KINDS), st.integers(0, 10**6), st.integers(1, 99))
+    def test_a_name_is_parsed_to_what_it_was_made_of(self, kind, index, attempt):
+        name = ArchiveName(kind, index, attempt)
+        assert ArchiveName.parse(Path("somewhere") / name) == name
+
+    def test_looks_as_the_design_says(self):
+        assert ArchiveName("excitation", 7).filename == "excitation_007_a1.mcap"
+
+    @pytest.mark.parametrize(
+        "name", ["excitation.mcap", "dance_001_a1.mcap", "move_1_a1.mcap", "move_001_a0.mcap", "x"]
+    )
+    def test_another_name_is_none_of_ours(self, name):
+        assert ArchiveName.parse(name) is None
+
+    def test_an_unknown_kind_is_refused_with_the_known_ones(self):
+        with pytest.raises(ArchiveError, match=r"'dance' is no kind.*standstill, move"):
+            ArchiveName("dance", 1)
+
+
+class TestRoundTrip:
+    def test_every_field_of_every_record_comes_back(self, tmp_path):
+        rows = records(257)
+        archive = open_archive(write(tmp_path / NAME, rows))
+        back = archive.cycles()
+        assert same(back, rows)
+        assert np.array_equal(archive.columns["torque"], torques(rows))
+
+    def test_the_cycle_message_has_a_place_for_every_field_of_a_record(self):
+        message = fixed_layout(cycle_definition(4)).dtype
+        recorded = cycle_dtype(4)
+        for name in recorded.names or ():
+            assert message[name] == recorded[name], name
+
+    def test_columns_are_contiguous_and_cannot_be_changed(self, tmp_path):
+        archive = open_archive(write(tmp_path / NAME, records(250)))
+        for column in archive.columns.values():
+            assert column.flags.c_contiguous
+            assert not column.flags.writeable
+
+    def test_only_the_wanted_columns_are_read(self, tmp_path):
+        path = write(tmp_path / NAME, records(250))
+        archive = open_archive(path, fields=["position", "torque"])
+        assert set(archive.columns) == {"stamp", "position", "torque"}
+        with pytest.raises(ArchiveError, match="no column"):
+            archive.cycles()
+
+    def test_stamps_count_the_controllers_cycles(self, tmp_path):
+        archive = open_archive(write(tmp_path / NAME, records(150, first=3_000_000_123)))
+        assert archive.columns["stamp"][0] == 3_000_000_123 * 1_000_000
+        assert set(np.diff(archive.columns["stamp"])) == {1_000_000}
+
+    def test_what_describes_the_archive_comes_back(self, tmp_path):
+        archive = open_archive(write(tmp_path / NAME, records(10)))
+        assert archive.complete
+        assert archive.missing is None
+        assert archive.joint_names == JOINTS
+        assert archive.period == PERIOD
+        assert archive.attachments == ATTACHMENTS
+        expected = {"kind": "excitation", "index": "7", "attempt": "2", "campaign": "c1"}
+        assert expected.items() <= archive.metadata.items()
+
+    def test_the_outcome_counts_what_was_written(self, tmp_path):
+        rows = records(120)
+        rows["gap"][[30, 60]] = 2
+        with writer(tmp_path / NAME) as archive:
+            archive.write(rows, torques(rows))
+            archive.close("stopped", reason="Ctrl-C", details={"operator": "me"})
+        assert open_archive(tmp_path / NAME).outcome == {
+            "outcome": "stopped",
+            "reason": "Ctrl-C",
+            "operator": "me",
+            "samples": "120",
+            "events": "0",
+            "lost_packets": "4",
+            "first_cycle": "12000",
+            "last_cycle": "12119",
+        }
+
+    def test_an_archive_without_a_cycle_is_whole_all_the_same(self, tmp_path):
+        write(tmp_path / NAME, records(0))
+        archive = open_archive(tmp_path / NAME)
+        assert archive.complete
+        assert archive.n_samples == 0
+
+    def test_a_torque_that_is_not_known_is_nan(self, tmp_path):
+        with writer(tmp_path / NAME) as archive:
+            archive.write(records(5))
+            archive.close("completed")
+        assert np.isnan(open_archive(tmp_path / NAME).columns["torque"]).all()
+
+    def test_samples_of_a_foreign_recording_come_back(self, tmp_path):
+        rng = np.random.default_rng(3)
+        stamp = np.cumsum(rng.integers(1, 10**9, 2300)) + 1_700_000_000 * 10**9
+        position, torque, current = rng.normal(size=(3, 2300, 3))
+        path = write_samples(
+            tmp_path / "robot.mcap",
+            Samples(stamp, position, torque=torque, motor_current=current),
+            joint_names=JOINTS,
+            metadata={"importer": "test"},
+        )
+        archive = open_archive(path)
+        assert archive.complete
+        assert archive.kind == "imported"
+        assert archive.period is None
+        assert set(archive.columns) == {"stamp", "position", "torque", "motor_current"}
+        assert np.array_equal(archive.columns["stamp"], stamp)
+        assert np.array_equal(archive.columns["position"], position)
+        assert np.array_equal(archive.columns["torque"], torque)
+        assert np.array_equal(archive.columns["motor_current"], current)
+
+
+class TestEvents:
+    def test_come_back_with_text_and_data(self, tmp_path):
+        with writer(tmp_path / NAME) as archive:
+            archive.event(500, "Refused", "too\nfast", level=Level.ERROR, data={"joint": 3})
+            archive.write(records(250), None)
+            archive.event(None, "MotionEnded", "the end")
+            archive.close("refused")
+        first, last = open_archive(tmp_path / NAME).events
+        assert (first.time, first.name, first.text) == (0.5, "Refused", "too fast")
+        assert (first.level, first.data) == (Level.ERROR, {"joint": 3})
+        assert (last.time, last.text, last.data) == (pytest.approx(12.249), "the end", {})
+
+    def test_data_that_json_cannot_hold_are_written_as_well_as_it_can(self, tmp_path):
+        data = {"value": np.nan, "last": np.arange(3.0), "pair": (1, np.int64(2)), 5: Path("x")}
+        with writer(tmp_path / NAME) as archive:
+            archive.event(0, "Refused", "x", data=data)  # type: ignore[arg-type]
+            archive.close("refused")
+        (event,) = open_archive(tmp_path / NAME).events
+        expected = {"value": None, "last": [0.0, 1.0, 2.0], "pair": [1, 2], "5": "x"}
+        assert event.data == expected
+
+    def test_do_not_disturb_the_cycles_they_stand_between(self, tmp_path):
+        rows = records(1000)
+        with writer(tmp_path / NAME) as archive:
+            for start in range(0, 1000, 70):
+                archive.write(rows[start : start + 70], torques(rows[start : start + 70]))
+                archive.event(start, "tick", f"{'x' * start}")
+            archive.close("completed")
+        back = open_archive(tmp_path / NAME)
+        assert same(back.cycles(), rows)
+        assert [len(event.text) for event in back.events] == list(range(0, 1000, 70))
+
+
+class TestChunks:
+    @given(st.lists(st.integers(1, 260), min_size=1, max_size=12))
+    def test_bytes_do_not_depend_on_how_the_cycles_arrived(self, tmp_path_factory, batches):
+        folder = tmp_path_factory.mktemp("bytes")
+        rows = records(600)
+        whole = write(folder / NAME, rows).read_bytes()
+        (folder / NAME).unlink()
+        edges = [*np.cumsum(batches)[np.cumsum(batches) < 600].tolist(), 600]
+        with writer(folder / NAME) as archive:
+            for start, stop in zip([0, *edges], edges, strict=False):
+                archive.write(rows[start:stop], torques(rows[start:stop]))
+            archive.close("completed")
+        assert (folder / NAME).read_bytes() == whole
+
+    def test_end_every_100_ms_of_the_controllers_time(self, tmp_path):
+        assert len(chunks(write(tmp_path / NAME, records(1001)))) == 11
+
+    def test_lost_cycles_make_a_chunk_shorter_not_later(self, tmp_path):
+        rows = records(300)
+        kept = np.delete(rows, slice(150, 250))
+        path = write(tmp_path / NAME, kept)
+        assert len(chunks(path)) == 3
+        assert same(open_archive(path).cycles(), kept)
+
+    def test_reach_the_file_without_waiting_for_the_end(self, tmp_path):
+        archive = writer(tmp_path / NAME)
+        seen = []
+        for start in range(0, 400, 50):
+            archive.write(records(50, first=start))
+            seen.append(open_archive(tmp_path / NAME).n_samples)
+        archive.close("completed")
+        assert seen == [0, 100, 100, 200, 200, 300, 300, 400]
+
+    def test_a_new_archive_is_on_disk_before_its_first_cycle(self, tmp_path):
+        archive = writer(tmp_path / NAME)
+        opened = open_archive(tmp_path / NAME)
+        archive.close("completed")
+        assert opened.attachments == ATTACHMENTS
+        assert not opened.complete
+
+    def test_flush_writes_what_is_pending(self, tmp_path):
+        archive = writer(tmp_path / NAME)
+        archive.write(records(30))
+        archive.flush()
+        assert open_archive(tmp_path / NAME).n_samples == 30
+        archive.close("completed")
+        assert open_archive(tmp_path / NAME).complete
+
+
+class TestBadInput:
+    def test_an_existing_file_is_never_overwritten(self, tmp_path):
+        (tmp_path / NAME).write_bytes(b"precious")
+        with pytest.raises(ArchiveWriteError, match=r"exists already.*never overwritten"):
+            writer(tmp_path / NAME)
+        assert (tmp_path / NAME).read_bytes() == b"precious"
+
+    def test_a_missing_folder_is_named(self, tmp_path):
+        with pytest.raises(ArchiveWriteError, match=r"nowhere.*cannot be created: No such file"):
+            writer(tmp_path / "nowhere" / NAME)
+
+    @pytest.mark.parametrize(
+        ("metadata", "sentence"),
+        [
+            ({"kind": "validation"}, "kind is 'validation', but the file name says 'excitation'"),
+            ({"period": "2"}, "period is written by the archive itself"),
+        ],
+    )
+    def test_metadata_must_not_contradict(self, tmp_path, metadata, sentence):
+        with pytest.raises(ArchiveWriteError, match=sentence):
+            writer(tmp_path / NAME, metadata=metadata)
+        assert not (tmp_path / NAME).exists()
+
+    def test_a_file_of_another_name_needs_a_kind(self, tmp_path):
+        with pytest.raises(ArchiveWriteError, match="None is no kind of archive; use standstill"):
+            writer(tmp_path / "x.mcap")
+
+    def test_records_of_another_arm_are_refused(self, tmp_path):
+        with writer(tmp_path / NAME) as archive, pytest.raises(ValueError, match="expected"):
+            archive.write(np.zeros(3, cycle_dtype(6)))
+
+    def test_a_closed_archive_takes_nothing_more(self, tmp_path):
+        archive = writer(tmp_path / NAME)
+        archive.close("completed")
+        with pytest.raises(ArchiveWriteError, match="is closed"):
+            archive.write(records(1))
+
+    def test_a_full_disk_is_our_error_and_leaves_what_was_flushed(self, tmp_path, monkeypatch):
+        rows = records(500)
+        archive = writer(tmp_path / NAME)
+        archive.write(rows[:250], torques(rows[:250]))
+
+        def full(descriptor, data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(os, "write", full)
+        with pytest.raises(ArchiveWriteError, match="No space left on device; what was flushed"):
+            archive.write(rows[250:], torques(rows[250:]))
+        monkeypatch.undo()
+        assert archive.closed
+        back = open_archive(tmp_path / NAME)
+        assert same(back.cycles(), rows[:200])
+        assert back.damage is not None
+
+    def test_an_exception_closes_the_archive_and_is_its_outcome(self, tmp_path):
+        with pytest.raises(RuntimeError), writer(tmp_path / NAME) as archive:
+            archive.write(records(30))
+            raise RuntimeError("cable pulled")
+        outcome = open_archive(tmp_path / NAME).outcome
+        assert outcome is not None
+        assert outcome["outcome"] == "interrupted"
+        assert outcome["reason"] == "RuntimeError: cable pulled"
+        assert outcome["samples"] == "30"
+
+    def test_an_outcome_nobody_told_is_unknown(self, tmp_path):
+        with writer(tmp_path / NAME):
+            pass
+        outcome = open_archive(tmp_path / NAME).outcome
+        assert outcome is not None
+        assert outcome["outcome"] == "unknown"
+
+    def test_a_file_that_is_not_there_is_named(self, tmp_path):
+        with pytest.raises(ArchiveError, match=r"gone\.mcap: cannot be read: No such file"):
+            open_archive(tmp_path / "gone.mcap")
+
+    def test_a_file_of_another_kind_is_no_archive(self, tmp_path):
+        (tmp_path / "a.mcap").write_text("time,q1\n0,1\n")
+        with pytest.raises(NotAnArchiveError, match=r"is not an MCAP file; .*import this one"):
+            open_archive(tmp_path / "a.mcap")
+
+    def test_somebody_elses_mcap_is_no_archive(self, tmp_path):
+        with (tmp_path / "a.mcap").open("wb") as stream:
+            foreign = Writer(stream)
+            foreign.start("ros2")
+            channel = foreign.register_channel("/x", "json", 0)
+            foreign.add_message(channel, 1, b"{}", 1)
+            foreign.finish()
+        with pytest.raises(NotAnArchiveError, match="is an MCAP file, but not an archive"):
+            open_archive(tmp_path / "a.mcap")
+
+    def test_an_archive_of_a_newer_profile_is_refused_by_version(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("hil.archive.file_writer.FORMAT_VERSION", 9)
+        write(tmp_path / NAME, records(5))
+        with pytest.raises(ArchiveVersionError, match="version 9; this software reads version 1"):
+            open_archive(tmp_path / NAME)
+
+
+def test_the_documentation_shows_the_messages_as_they_are() -> None:
+    page = Path(__file__).parents[2] / "docs" / "archive-format.md"
+    text = page.read_text(encoding="utf-8")
+    for definition in (definitions.cycle(6), definitions.motor_current(6)):
+        assert definition.partition("=" * 80)[0].strip() in text
+    for topic in (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.EVENTS):
+        assert f"`{topic}`" in text
+    assert f"version {schema.FORMAT_VERSION}" in text.splitlines()[0]
+    assert all(f"`{kind}`" in text for kind in KINDS)

@@ -1,0 +1,216 @@
+"""Other people's readers open our archives and see the same values, to the bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import CompressionType, Writer
+from mcap_ros2.decoder import DecoderFactory
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from drivers.record import cycle_dtype
+from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
+from hil.archive import schema as profile
+from hil.archive.messages import joint_state_of
+
+JOINTS = ("shoulder", "elbow", "a_joint_with_a_long_name", "wrist")
+COUNT = 250
+STATE = {"position": "position", "velocity": "velocity", "effort": "torque"}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rng = np.random.default_rng(5)
+    rows = np.zeros(COUNT, cycle_dtype(len(JOINTS)))
+    for name in rows.dtype.names or ():
+        if rows[name].dtype.kind == "f":
+            rows[name] = rng.normal(size=rows[name].shape)
+        else:
+            rows[name] = rng.integers(0, 250, rows[name].shape)
+    rows["cycle"] = 2_000_000 + np.arange(COUNT)
+    rows["commanded_position"][7] = np.nan
+    file = tmp_path_factory.mktemp("interop") / "dryrun_000_a1.mcap"
+    with ArchiveWriter(
+        file,
+        joint_names=JOINTS,
+        period=0.002,
+        metadata={},
+        attachments={"cell.toml": b"[cell]"},
+        durable=False,
+    ) as archive:
+        archive.event(2_000_000, "MotionStarted", "off we go")
+        archive.write(rows, rng.normal(size=(COUNT, len(JOINTS))))
+        archive.close("completed")
+    return file
+
+
+@pytest.fixture(scope="module")
+def ours(path: Path) -> Archive:
+    archive = open_archive(path)
+    assert archive.complete
+    return archive
+
+
+def stacked(messages: list[Any], field: str) -> NDArray[Any]:
+    return np.array([getattr(message, field) for message in messages])
+
+
+def bits(values: Any, like: NDArray[Any]) -> bytes:
+    return np.asarray(values, like.dtype).tobytes()
+
+
+def assert_same_messages(found: dict[str, list[Any]], ours: Archive) -> None:
+    """Decoded messages by topic hold what our reader reads."""
+    cycles, measured = found[profile.CYCLE], found[profile.MEASURED]
+    for name, column in ours.columns.items():
+        if name != "stamp":
+            assert bits(stacked(cycles, name), column) == column.tobytes(), name
+    for word, column_name in STATE.items():
+        column = ours.columns[column_name]
+        assert bits(stacked(measured, word), column) == column.tobytes()
+    commanded = found[profile.COMMANDED]
+    for word in ("position", "velocity"):
+        column = ours.columns[f"commanded_{word}"]
+        assert bits(stacked(commanded, word), column) == column.tobytes()
+    assert all(len(message.effort) == 0 for message in commanded)
+    assert all(tuple(message.name) == JOINTS for message in [*measured, *commanded])
+    for messages in (cycles, measured, commanded):
+        stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
+        assert stamps == ours.columns["stamp"].tolist()
+        assert {message.header.frame_id for message in messages} == {""}
+    (event,) = found[profile.EVENTS]
+    assert (event.name, event.msg, event.level) == ("MotionStarted", "off we go", 20)
+    assert event.stamp.sec == 4000
+
+
+@pytest.mark.parametrize("reader", [make_reader, NonSeekingReader])
+def test_mcap_with_its_ros2_decoder_reads_the_same_values(
+    path: Path, ours: Archive, reader: Any
+) -> None:
+    found: dict[str, list[Any]] = {}
+    with path.open("rb") as stream:
+        opened = reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        for _, channel, message, decoded in opened.iter_decoded_messages():
+            assert message.log_time == message.publish_time
+            found.setdefault(channel.topic, []).append(decoded)
+    assert_same_messages(found, ours)
+
+
+def test_mcap_finds_index_statistics_metadata_and_attachments(path: Path, ours: Archive) -> None:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 3 * COUNT + 1
+        assert len(summary.chunk_indexes) == 5
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        attachments = {record.name: record.data for record in reader.iter_attachments()}
+    assert attachments == ours.attachments
+    assert ours.metadata.items() <= metadata["hil"].items()
+    assert metadata["hil.outcome"]["outcome"] == "completed"
+
+
+def test_rosbags_reads_the_same_values(path: Path, ours: Archive) -> None:
+    """With nothing but the definitions in the file."""
+    found: dict[str, list[Any]] = {}
+    with AnyReader([path]) as reader:
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            found.setdefault(connection.topic, []).append(message)
+    assert_same_messages(found, ours)
+
+
+def test_an_independent_encoder_makes_the_same_bytes(path: Path, ours: Archive) -> None:
+    """rosbags serialises the decoded values back to our very message."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with path.open("rb") as stream:
+        for schema, _, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            store.register(get_types_from_msg(schema.data.decode(), schema.name))
+            value = store.deserialize_cdr(message.data, schema.name)
+            assert bytes(store.serialize_cdr(value, schema.name)) == message.data
+
+
+def test_our_reader_reads_joint_states_that_another_program_encoded(tmp_path: Path) -> None:
+    """Same bytes as ours for the message, decoded by our constant layout."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    header = types["std_msgs/msg/Header"](
+        stamp=types["builtin_interfaces/msg/Time"](sec=12, nanosec=34), frame_id="base"
+    )
+    position, effort = np.array([1.0, -2.5, 3.25, 0.1]), np.array([9.0, 8.0, 7.0, 6.0])
+    message = types["sensor_msgs/msg/JointState"](
+        header=header, name=list(JOINTS), position=position, velocity=np.zeros(0), effort=effort
+    )
+    data = bytes(store.serialize_cdr(message, "sensor_msgs/msg/JointState"))
+    names, layout = joint_state_of(data)
+    row = np.frombuffer(data, layout.dtype)[0]
+    assert names == JOINTS
+    assert (row["sec"], row["nanosec"]) == (12, 34)
+    assert np.array_equal(row["position"], position)
+    assert np.array_equal(row["effort"], effort)
+    assert "velocity" not in (layout.dtype.names or ())
+
+
+def test_imported_archives_are_read_as_well(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    position, current = rng.normal(size=(2, 1500, len(JOINTS)))
+    stamp = 10**9 + np.arange(1500, dtype=np.int64) * 8_000_000
+    file = write_samples(
+        tmp_path / "x.mcap",
+        Samples(stamp, position, motor_current=current),
+        joint_names=JOINTS,
+        metadata={},
+    )
+    found: dict[str, list[Any]] = {}
+    with AnyReader([file]) as reader:
+        for connection, time, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            found.setdefault(connection.topic, []).append((time, message))
+    states = [message for _, message in found[profile.MEASURED]]
+    assert np.array_equal(stacked(states, "position"), position)
+    assert [time for time, _ in found[profile.MEASURED]] == stamp.tolist()
+    currents = [message for _, message in found[profile.MOTOR_CURRENT]]
+    assert np.array_equal(stacked(currents, "motor_current"), current)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_our_reader_takes_chunks_of_every_compression_and_layout(
+    path: Path, ours: Archive, tmp_path: Path, compression: CompressionType
+) -> None:
+    """The same records written by the library with other chunks, and channels in between."""
+    copy = tmp_path / path.name
+    with path.open("rb") as stream, copy.open("wb") as target:
+        reader = make_reader(stream)
+        writer = Writer(target, chunk_size=40_000, compression=compression)
+        writer.start("ros2")
+        for metadata in reader.iter_metadata():
+            if metadata.name == "hil":
+                writer.add_metadata(metadata.name, metadata.metadata)
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(0, 0, attachment.name, "x/y", attachment.data)
+        channels: dict[str, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.topic not in channels:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", schema_id)
+            times = message.log_time, message.data, message.publish_time, message.sequence
+            writer.add_message(channels[channel.topic], *times)
+        for metadata in reader.iter_metadata():
+            if metadata.name == "hil.outcome":
+                writer.add_metadata(metadata.name, metadata.metadata)
+        writer.finish()
+    again = open_archive(copy)
+    assert again.complete, again.missing
+    for name, column in ours.columns.items():
+        assert again.columns[name].tobytes() == column.tobytes(), name
+    assert again.events == ours.events

@@ -1,0 +1,335 @@
+"""Logs of numbers become archives: columns by name, pattern or index, units, gears, refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hil.archive import open_archive
+from hil.errors import SourceError
+from hil.importers import ColumnMap, Robot, import_csv
+from hil.importers.column_map import UNITS
+from hil.recordings import open_recording
+
+JOINTS = ("hip", "knee", "ankle")
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Robot:
+    parts = ["<robot name='three'><link name='l0'/>"]
+    for number, name in enumerate(JOINTS):
+        parts.append(
+            f"<link name='l{number + 1}'><inertial><mass value='1'/><origin xyz='0 0 0.2'/>"
+            "<inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
+            f"<joint name='{name}' type='revolute'><parent link='l{number}'/>"
+            f"<child link='l{number + 1}'/><axis xyz='0 1 0'/><origin xyz='0 0 0.4'/>"
+            "<limit lower='-3' upper='3' effort='9' velocity='9'/></joint>"
+        )
+    path = tmp_path / "three.urdf"
+    path.write_text("".join([*parts, "</robot>"]))
+    return Robot.from_urdf(path)
+
+
+def log(path: Path, values: NDArray[np.float64], header: str = "", delimiter: str = ",") -> Path:
+    lines = [header] if header else []
+    lines += [delimiter.join(repr(float(value)) for value in row) for row in values]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def column_map(**entries: object) -> ColumnMap:
+    base: dict[str, object] = {"position": {"columns": "q{}"}, "sample_rate": 100.0}
+    return ColumnMap.model_validate({**base, **entries})
+
+
+VALUES = np.random.default_rng(0).normal(size=(20, 7))
+HEADER = "t,q1,q2,q3,tau1,tau2,tau3"
+VALUES[:, 0] = 0.01 * np.arange(20)
+
+
+class TestColumns:
+    @pytest.mark.parametrize("position", ["q{}", ("q1", "q2", "q3"), (1, 2, 3), ("q1", 2, "q3")])
+    def test_by_pattern_name_and_index(self, tmp_path, robot, position):
+        file = log(tmp_path / "a.csv", VALUES, HEADER)
+        columns = column_map(position={"columns": position}, torque={"columns": "tau{}"})
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        recording = open_recording(path)
+        assert recording.joint_names == JOINTS
+        assert np.array_equal(recording.position, VALUES[:, 1:4])
+        assert recording.torque is not None
+        assert np.array_equal(recording.torque, VALUES[:, 4:])
+        assert recording.motor_current is None
+
+    @pytest.mark.parametrize("delimiter", [",", ";", "\t", "|", " ", ", "])
+    def test_the_delimiter_is_found_out(self, tmp_path, robot, delimiter):
+        header = HEADER.replace(",", delimiter)
+        file = log(tmp_path / "a.txt", VALUES, header, delimiter)
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
+
+    def test_a_file_without_header_is_read_by_index(self, tmp_path, robot):
+        file = log(tmp_path / "a.txt", VALUES)
+        columns = column_map(position={"columns": (4, 5, 6)})
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        assert np.array_equal(open_recording(path).position, VALUES[:, 4:])
+
+    def test_comments_and_quotes_before_the_data(self, tmp_path, robot):
+        header = '# made by hand\n% 2020\n\n"t", "q1", "q2", "q3", "a", "b", "c"'
+        file = log(tmp_path / "a.txt", VALUES, header)
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
+
+    def test_a_decimal_comma(self, tmp_path, robot):
+        file = log(tmp_path / "a.csv", VALUES, HEADER.replace(",", ";"), ";")
+        file.write_text(file.read_text().replace(".", ","))
+        columns = column_map(format={"decimal": ","})
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
+
+    def test_joints_in_another_order(self, tmp_path, robot):
+        file = log(tmp_path / "a.csv", VALUES, HEADER)
+        columns = column_map(joints=("ankle", "hip", "knee"))
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        assert np.array_equal(open_recording(path).position, VALUES[:, [2, 3, 1]])
+
+
+class TestTime:
+    def test_a_sample_rate_counts_samples(self, tmp_path, robot):
+        file = log(tmp_path / "a.csv", VALUES, HEADER)
+        columns = column_map(sample_rate=3000.0)
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        assert np.array_equal(open_recording(path).time, np.arange(20) * (1 / 3000.0))
+
+    @pytest.mark.parametrize(
+        ("unit", "times", "expected"),
+        [
+            ("s", ["1700000000.123456789", "1700000000.123556790"], [1e9 * 0 + 0, 100001]),
+            ("ms", ["0", "0.5"], [0, 500_000]),
+            ("us", ["1e6", "1000001"], [0, 1000]),
+            ("ns", ["1700000000123456789", "1700000000123456791"], [0, 2]),
+            ("s", ["-0.25", "0.5"], [0, 750_000_000]),
+        ],
+    )
+    def test_a_time_column_is_exact_to_the_nanosecond(self, tmp_path, robot, unit, times, expected):
+        lines = [f"{time},1,2,{row}" for row, time in enumerate(times)]
+        (tmp_path / "a.csv").write_text("t,q1,q2,q3\n" + "\n".join(lines))
+        columns = column_map(time={"column": "t", "unit": unit}, sample_rate=None)
+        path = import_csv(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
+        stamp = open_archive(path).columns["stamp"]
+        assert (stamp - stamp[0]).tolist() == expected
+        assert open_recording(path).time.tolist() == pytest.approx(
+            [1e-9 * value for value in expected], abs=1e-16
+        )
+
+    def test_irregular_steps_are_kept(self, tmp_path, robot):
+        steps = np.cumsum([0.0, 0.01, 0.013, 0.5, 0.0001])
+        values = VALUES[:5].copy()
+        values[:, 0] = steps
+        file = log(tmp_path / "a.csv", values, HEADER)
+        columns = column_map(time={"column": 0}, sample_rate=None)
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        assert open_recording(path).time == pytest.approx(steps, abs=1e-9)
+
+
+class TestUnitsAndGears:
+    def test_units_are_converted_to_si(self, tmp_path, robot):
+        file = log(tmp_path / "a.csv", VALUES, HEADER)
+        columns = column_map(
+            position={"columns": "q{}", "unit": "deg", "scale": (1, -1, 2)},
+            motor_current={"columns": "tau{}", "unit": "mA"},
+        )
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        recording = open_recording(path)
+        expected = np.radians(VALUES[:, 1:4]) * [1, -1, 2]
+        assert recording.position == pytest.approx(expected, rel=1e-15)
+        assert recording.motor_current == pytest.approx(VALUES[:, 4:] / 1000)
+        assert recording.torque is None
+
+    def test_a_speed_in_rpm(self):
+        assert 3000 * UNITS["velocity"]["rpm"] == pytest.approx(2 * np.pi * 50)
+
+    def test_motor_side_goes_to_joint_side_with_power_preserved(self, tmp_path, robot):
+        """Made from joint values by an independent way: ratio by ratio, coupling by hand."""
+        q, qd, tau_motor = np.random.default_rng(8).normal(size=(3, 30, 3))
+        n1, n2, n3, n32 = 100.0, -80.0, 50.0, 25.0
+        ratios = np.array([n1, n2, n3])
+
+        def motor(x):
+            return np.column_stack([n1 * x[:, 0], n2 * x[:, 1], n3 * x[:, 2] + n32 * x[:, 1]])
+
+        file = log(tmp_path / "m.csv", np.hstack([motor(q), motor(qd), tau_motor]))
+        columns = column_map(
+            position={"columns": (0, 1, 2), "side": "motor"},
+            velocity={"columns": (3, 4, 5), "side": "motor"},
+            torque={"columns": (6, 7, 8), "side": "motor"},
+            drive={
+                "gear_ratio": tuple(ratios),
+                "coupling": ((3, 2, n32),),
+                "joint_offset": (0.5, 0.0, -0.5),
+            },
+        )
+        path = import_csv(file, tmp_path / "m.mcap", robot=robot, columns=columns)
+        back = open_archive(path).columns
+        assert back["position"] == pytest.approx(q + np.array([0.5, 0.0, -0.5]), rel=1e-12)
+        assert back["velocity"] == pytest.approx(qd, rel=1e-12)
+        power_motors = np.sum(tau_motor * motor(qd), axis=1)
+        assert np.sum(back["torque"] * qd, axis=1) == pytest.approx(power_motors, rel=1e-9)
+        assert back["torque"][:, 1] == pytest.approx(n2 * tau_motor[:, 1] + n32 * tau_motor[:, 2])
+
+    def test_torque_constants_make_torques_of_currents(self, tmp_path, robot):
+        file = log(tmp_path / "a.csv", VALUES, HEADER)
+        columns = column_map(
+            motor_current={"columns": "tau{}"},
+            drive={"gear_ratio": (100, -80, 50), "torque_constant": (0.1, 0.2, 0.3)},
+        )
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        recording = open_recording(path)
+        assert recording.motor_current is not None
+        assert np.array_equal(recording.motor_current, VALUES[:, 4:])
+        assert recording.torque == pytest.approx(VALUES[:, 4:] * [10.0, -16.0, 15.0])
+
+    def test_gears_follow_the_joints_of_the_log(self, tmp_path, robot):
+        file = log(tmp_path / "a.csv", VALUES, HEADER)
+        columns = column_map(
+            position={"columns": "q{}", "side": "motor"},
+            joints=("ankle", "hip", "knee"),
+            drive={"gear_ratio": (10, 20, 40), "joint_offset": (1, 2, 3)},
+        )
+        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        expected = (VALUES[:, 1:4] / [10, 20, 40] + [1, 2, 3])[:, [1, 2, 0]]
+        assert open_recording(path).position == pytest.approx(expected)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("entries", "sentence"),
+        [
+            ({"position": {"columns": "pos{}"}}, "no column 'pos1'; its columns are t, q1, q2"),
+            ({"torque": {"columns": (4, 5, 9)}}, r"torque.columns: there is no column 9"),
+            ({"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
+            ({"torque": {"columns": "tau"}}, "no place for the joint's number"),
+            ({"joints": ("a", "b", "c")}, "names the joints a, b, c; the robot's joints are hip"),
+            ({"drive": {"gear_ratio": (1, 2)}}, "drive.gear_ratio: has 2 entries"),
+            ({"drive": {"gear_ratio": (1, 0, 2)}}, "would not be moved by any motor"),
+            ({"time": {"column": "time"}, "sample_rate": None}, "time: there is no column 'time'"),
+            ({"torque": {"columns": "tau{}", "file": "t.csv"}}, r"t\.csv: cannot be read"),
+        ],
+    )
+    def test_a_map_that_does_not_fit_is_refused_with_what_would(
+        self, tmp_path, robot, entries, sentence
+    ):
+        file = log(tmp_path / "a.csv", VALUES, HEADER)
+        with pytest.raises(SourceError, match=sentence):
+            import_csv(file, tmp_path / "a.mcap", robot=robot, columns=column_map(**entries))
+        assert not (tmp_path / "a.mcap").exists()
+
+    @pytest.mark.parametrize(
+        ("line", "sentence"),
+        [
+            ("0.1,1,x,3,4,5,6", "line 12 has 'x' in column q2, not a number"),
+            ("0.1,1", "line 12 has nothing in column q2, not a number"),
+            ("0.1,1,,3,4,5,6", "line 12 has nothing in column q2"),
+            ("0.1,1,nan,3,4,5,6", "position of joint knee is nan in sample 10"),
+            ("0.1,1,inf,3,4,5,6", "position of joint knee is inf in sample 10"),
+        ],
+    )
+    def test_a_cell_that_is_no_number_is_named_by_line_and_column(
+        self, tmp_path, robot, line, sentence
+    ):
+        file = log(tmp_path / "a.csv", VALUES, HEADER)
+        lines = file.read_text().splitlines()
+        file.write_text("\n".join([*lines[:11], line, *lines[12:]]))
+        with pytest.raises(SourceError, match=sentence):
+            import_csv(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+
+    @pytest.mark.parametrize("time", ["", "soon", "nan", "inf"])
+    def test_a_time_that_is_no_number_is_named(self, tmp_path, robot, time):
+        (tmp_path / "a.csv").write_text(f"t,q1,q2,q3\n0,1,2,3\n{time},1,2,3\n")
+        columns = column_map(time={"column": "t"}, sample_rate=None)
+        with pytest.raises(SourceError, match=r"time: line 3 has '.*' for the time"):
+            import_csv(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
+
+    def test_files_of_different_length_are_refused(self, tmp_path, robot):
+        file = log(tmp_path / "q.csv", VALUES, HEADER)
+        log(tmp_path / "tau.csv", VALUES[:-1], HEADER)
+        columns = column_map(torque={"columns": "tau{}", "file": "tau.csv"})
+        with pytest.raises(SourceError, match="differ in length: position 20, torque 19"):
+            import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+
+    def test_a_file_without_numbers_is_refused(self, tmp_path, robot):
+        (tmp_path / "a.csv").write_text("t,q1\n")
+        with pytest.raises(SourceError, match="has no row of numbers"):
+            import_csv(tmp_path / "a.csv", tmp_path / "x.mcap", robot=robot, columns=column_map())
+
+
+class TestMapFile:
+    def test_reads_toml(self, tmp_path):
+        (tmp_path / "map.toml").write_text(
+            'sample_rate = 5000.0\n[position]\ncolumns = "Joint_{}"\nside = "motor"\n'
+            "[drive]\ngear_ratio = [32.0, 45]\ncoupling = [[2, 1, 32.0]]\n"
+        )
+        loaded = ColumnMap.load(tmp_path / "map.toml")
+        assert loaded.drive.coupling == ((2, 1, 32.0),)
+        assert loaded.position.side == "motor"
+
+    @pytest.mark.parametrize(
+        ("text", "sentence"),
+        [
+            ("sample_rate = 5\n", "position: Field required"),
+            ("[position]\ncolumns = 'q{}'\n", "either a time column or sample_rate"),
+            ("sample_rate = 5\n[position]\ncolumns = 'q{}'\nunit = 'inch'\n", "'inch' is no unit"),
+            ("sample_rate = 5\n[position]\ncolumn = 'q{}'\n", "position.column"),
+            ("sample_rate = -5\n[position]\ncolumns = 'q{}'\n", "sample_rate: .*greater than 0"),
+            (
+                "sample_rate = 5\n[position]\ncolumns = 'q{}'\nside = 'motor'\n",
+                "drive.gear_ratio is needed",
+            ),
+            ("sample_rate = \n", "cannot be read"),
+        ],
+    )
+    def test_a_bad_one_is_refused_by_field(self, tmp_path, text, sentence):
+        (tmp_path / "map.toml").write_text(text)
+        with pytest.raises(SourceError, match=sentence) as refused:
+            ColumnMap.load(tmp_path / "map.toml")
+        assert "map.toml" in str(refused.value)
+
+
+def test_tx40_positions_and_torques_in_two_files(tmp_path: Path, shared_data: Path) -> None:
+    """A real arm, motor side, with a mechanical coupling of axes 5 and 6."""
+    folder = shared_data / "tx40"
+    (tmp_path / "map.toml").write_text(
+        """sample_rate = 5000.0
+        [position]
+        columns = "Joint_{}"
+        side = "motor"
+        [torque]
+        file = "curr_data.csv"
+        columns = "Joint_{}"
+        side = "motor"
+        [drive]
+        gear_ratio = [32.0, 32.0, 45.0, -48.0, 45.0, 32.0]
+        coupling = [[6, 5, 32.0]]
+        joint_offset = [0.0, -1.5707963267948966, 1.5707963267948966, 0.0, 0.0, 0.0]
+        """
+    )
+    path = import_csv(
+        folder / "pos_read_data.csv",
+        tmp_path / "tx40.mcap",
+        robot=Robot.from_urdf(folder / "tx40_mdh_modified.urdf"),
+        columns=ColumnMap.load(tmp_path / "map.toml"),
+    )
+    recording = open_recording(path).checked()
+    motor = np.loadtxt(folder / "pos_read_data.csv", delimiter=",", skiprows=1)
+    torque = np.loadtxt(folder / "curr_data.csv", delimiter=",", skiprows=1)
+    assert recording.position.shape == (45000, 6)
+    assert recording.time[-1] == pytest.approx(44999 / 5000)
+    q = motor / [32.0, 32.0, 45.0, -48.0, 45.0, 32.0]
+    q[:, 5] -= q[:, 4]
+    q += [0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0]
+    assert recording.position == pytest.approx(q, abs=1e-12)
+    assert recording.torque is not None
+    assert recording.torque[:, 3] == pytest.approx(-48.0 * torque[:, 3])
+    assert recording.torque[:, 4] == pytest.approx(45.0 * torque[:, 4] + 32.0 * torque[:, 5])

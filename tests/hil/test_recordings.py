@@ -1,0 +1,130 @@
+"""From archives to what identification reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.record import cycle_dtype
+from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
+from hil.errors import ArchiveError
+from hil.recordings import open_recording, recording_of
+from identification.recording import RecordingError
+
+JOINTS = ("a", "b")
+NAME = "excitation_002_a1.mcap"
+
+
+def records(count: int = 400, first: int = 777_000_000) -> NDArray[np.void]:
+    rows = np.zeros(count, cycle_dtype(2))
+    rows["cycle"] = first + np.arange(count)
+    phase = 0.01 * np.arange(count)[:, None] + np.array([0.0, 1.0])
+    rows["position"] = np.sin(phase)
+    rows["commanded_position"] = np.sin(phase + 0.001)
+    rows["commanded_position"][:1] = np.nan
+    rows["target_current"] = np.cos(phase)
+    return rows
+
+
+def archive(path: Path, rows: NDArray[np.void], *, torque: bool = True) -> Path:
+    with ArchiveWriter(
+        path,
+        joint_names=JOINTS,
+        period=0.002,
+        metadata={"campaign": "c9", "simulated": "yes", "seed": "4"},
+        durable=False,
+    ) as writer:
+        writer.write(rows, 50.0 * rows["target_current"] if torque else None)
+        writer.close("completed", reason="")
+    return path
+
+
+def test_holds_what_was_archived(tmp_path: Path) -> None:
+    rows = records()
+    recording = open_recording(archive(tmp_path / NAME, rows))
+    assert recording.checked(JOINTS) is recording
+    assert np.array_equal(recording.position, rows["position"])
+    assert recording.torque is not None
+    assert np.array_equal(recording.torque, 50.0 * rows["target_current"])
+    assert recording.motor_current is not None
+    assert np.array_equal(recording.motor_current, rows["target_current"])
+    assert recording.commanded_position is not None
+    assert np.array_equal(recording.commanded_position, rows["commanded_position"], equal_nan=True)
+
+
+def test_time_is_counted_in_cycles_not_in_arrivals(tmp_path: Path) -> None:
+    rows = records()
+    rows["arrival"] = 1e9 + np.random.default_rng(0).normal(size=len(rows))
+    recording = open_recording(archive(tmp_path / NAME, rows))
+    assert np.array_equal(recording.time, np.arange(400) * 0.002)
+
+
+def test_lost_packets_leave_a_gap_where_they_were_lost(tmp_path: Path) -> None:
+    rows = records()
+    rows["gap"][120] = 2
+    rows = np.delete(rows, [118, 119, 300, 301])  # the second hole was never reported
+    recording = open_recording(archive(tmp_path / NAME, rows))
+    assert recording.gap_before is not None
+    assert np.flatnonzero(recording.gap_before).tolist() == [118, 298]
+    assert [(s.start, s.stop) for s in recording.segments()] == [(0, 118), (118, 298), (298, 396)]
+    assert recording.time[118] == pytest.approx(0.240)
+
+
+def test_an_unknown_torque_is_none(tmp_path: Path) -> None:
+    assert open_recording(archive(tmp_path / NAME, records(), torque=False)).torque is None
+
+
+def test_provenance_says_where_it_comes_from_and_how_it_ended(tmp_path: Path) -> None:
+    provenance = open_recording(archive(tmp_path / NAME, records())).provenance
+    expected = {
+        "archive": NAME,
+        "kind": "excitation",
+        "index": "2",
+        "campaign": "c9",
+        "seed": "4",
+        "outcome": "completed",
+    }
+    assert expected.items() <= provenance.items()
+    assert "missing" not in provenance
+
+
+def test_a_torn_archive_gives_what_is_whole_and_says_so(tmp_path: Path) -> None:
+    path = archive(tmp_path / NAME, records())
+    path.write_bytes(path.read_bytes()[:-9000])
+    recording = open_recording(path)
+    kept = recording.n_samples
+    assert 0 < kept < 400
+    assert kept % 50 == 0  # 100 ms of 2 ms cycles
+    assert np.array_equal(recording.position, records()["position"][:kept])
+    assert f"{kept} samples" in recording.provenance["missing"]
+    assert "outcome" not in recording.provenance
+
+
+def test_an_archive_without_a_sample_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArchiveError, match="holds no sample; record it again"):
+        open_recording(archive(tmp_path / NAME, records(0)))
+
+
+def test_a_controller_that_started_over_is_refused_by_the_recording(tmp_path: Path) -> None:
+    rows = np.concatenate([records(100), records(100, first=0)])
+    with pytest.raises(RecordingError, match="the clock falls back at sample 100"):
+        open_recording(archive(tmp_path / NAME, rows)).checked()
+
+
+def test_imported_stamps_become_seconds_from_the_first_on(tmp_path: Path) -> None:
+    stamp = np.array([0, 8_000_001, 15_999_999], np.int64) + 1_700_000_000 * 10**9
+    position = np.arange(6.0).reshape(3, 2)
+    path = write_samples(
+        tmp_path / "x.mcap", Samples(stamp, position), joint_names=JOINTS, metadata={}
+    )
+    recording = open_recording(path)
+    assert recording.time.tolist() == pytest.approx([0.0, 8.000001e-3, 15.999999e-3], abs=1e-15)
+    assert recording.gap_before is None
+
+
+def test_an_opened_archive_serves_as_well(tmp_path: Path) -> None:
+    path = archive(tmp_path / NAME, records())
+    assert np.array_equal(recording_of(open_archive(path)).time, open_recording(path).time)

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from identification import RobotModel
+from identification.base_parameters import TOLERANCE
+from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, standard_parameters, urdf_text
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return RobotModel.from_urdf(urdf_text())
+
+
+def full_regressor(model: RobotModel, samples: int = 50) -> np.ndarray:
+    """Columns of all standard parameters, by torque differences: shape (rows, s)."""
+    random = np.random.default_rng(7)
+    q, qd, qdd = random.uniform(-3.0, 3.0, (3, samples, model.n_joints))
+    rank = model.base.rank
+    rows = model.regressor(q, qd, qdd).dense(model.n_parameters)[:, :, :rank]
+    return rows.reshape(-1, rank)
+
+
+def test_the_ns16_groups_exactly_as_the_papers_table_2(model: RobotModel) -> None:
+    rows = {row.pivot: row for row in TABLE2[:N_ESSENTIAL]}
+    assert set(model.base.names) == set(rows)
+    for name, group in zip(model.base.names, model.base.grouping, strict=True):
+        expected = np.zeros(len(model.standard_names))
+        for standard, factor in rows[name].terms.items():
+            # Rows 29 and 31 are printed for minus the pivot.
+            expected[model.standard_names.index(standard)] = rows[name].sign * factor
+        assert np.abs(group - expected).max() < 1e-10, name
+
+
+def test_only_two_rows_of_table_2_have_the_other_sign() -> None:
+    assert [row.id for row in TABLE2[:N_ESSENTIAL] if row.sign < 0] == [29, 31]
+
+
+def test_the_manufacturers_values_come_out_of_the_planted_truth(model: RobotModel) -> None:
+    truth = standard_parameters()
+    values = model.base.grouping @ np.array([truth[name] for name in model.standard_names])
+    printed = {row.pivot: row.sign * (row.pi_c or 0.0) for row in TABLE2[:N_ESSENTIAL]}
+    for name, value in zip(model.base.names, values, strict=True):
+        assert value == pytest.approx(printed[name], abs=5.1e-4), name
+
+
+def test_what_the_ns16_never_feels_is_what_the_table_leaves_out(model: RobotModel) -> None:
+    assert set(model.base.unobservable) == {
+        "m1", "mc1x", "mc1y", "mc1z", "I1xx", "I1xy", "I1xz", "I1yz", "I1zz", "mc2z",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("gravity", "rotors", "rank"),
+    [
+        ((0.0, 0.0, -9.81), True, 40),
+        ((0.0, 0.0, 9.81), True, 40),
+        ((0.0, 0.0, -9.81), False, 36),
+        ((3.0, 0.0, -9.0), True, 42),
+    ],
+)
+def test_the_rank_of_the_ns16(gravity: tuple[float, ...], rotors: bool, rank: int) -> None:
+    base = RobotModel.from_urdf(urdf_text(), gravity=gravity, rotor_inertia=rotors).base
+    assert base.rank == len(base.names) == rank
+    assert base.gap > 1e10
+    assert base.smallest_kept > 1000 * TOLERANCE
+
+
+def test_hanging_upside_down_groups_alike(model: RobotModel) -> None:
+    hanging = RobotModel.from_urdf(urdf_text(), gravity=(0.0, 0.0, 9.81)).base
+    assert np.allclose(hanging.grouping, model.base.grouping, atol=1e-10)
+
+
+def test_angles_rounded_in_the_file_do_not_split_groups(model: RobotModel) -> None:
+    text = urdf_text()
+    assert "1.5707963267948966" in text
+    rounded = RobotModel.from_urdf(text.replace("1.5707963267948966", "1.5708")).base
+    assert rounded.names == model.base.names
+    assert 1e-8 < rounded.largest_dropped < 1e-5 < rounded.smallest_kept
+    # Their traces are not printed as groups either.
+    assert np.array_equal(rounded.grouping != 0.0, model.base.grouping != 0.0)
+
+
+def test_the_choice_is_the_same_every_time(model: RobotModel) -> None:
+    again = RobotModel.from_urdf(urdf_text()).base
+    assert again.names == model.base.names
+    assert np.array_equal(again.grouping, model.base.grouping)
+
+
+def test_each_kept_parameter_stands_for_itself(model: RobotModel) -> None:
+    base = model.base
+    assert np.array_equal(base.grouping[:, base.kept], np.eye(base.rank))
+    assert tuple(base.standard_names[k] for k in base.kept) == base.names
+    assert np.all(np.diff(base.kept) > 0)
+
+
+def test_the_first_independent_columns_are_kept(model: RobotModel) -> None:
+    # A parameter is only grouped into parameters before it: it was dropped since they explain it.
+    base = model.base
+    for column in set(range(len(base.standard_names))) - set(base.kept.tolist()):
+        groups = base.kept[np.flatnonzero(base.grouping[:, column])]
+        assert np.all(groups < column), base.standard_names[column]
+
+
+def test_kept_columns_are_independent_by_far(model: RobotModel) -> None:
+    columns = full_regressor(model)
+    scaled = columns / np.linalg.norm(columns, axis=0)
+    assert np.linalg.cond(scaled) < 100.0
+
+
+def test_expressions_read_like_the_table(model: RobotModel) -> None:
+    expression = dict(zip(model.base.names, model.base.expressions(3), strict=True))
+    assert expression["I1yy"] == (
+        "I1yy + I1m + I2yy + 0.09 m2 + I3zz + 0.58 m3 + 0.614 m4 + 0.614 m5 + 0.614 m6"
+    )
+    assert expression["mc4z"] == "mc4z - mc5y"
+    assert expression["I3m"] == "I3m"

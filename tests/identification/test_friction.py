@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from identification.errors import ModelError
+from identification.friction import FrictionLaw
+
+SPEED = np.array([-2.0, -1e-9, 0.0, 1e-9, 0.5])
+
+
+def columns(law: FrictionLaw) -> np.ndarray:
+    out = np.full((len(law.symbols), len(SPEED)), np.nan)
+    law.columns(SPEED, out)
+    return out
+
+
+def test_the_default_law_is_coulomb_viscous_and_quadratic() -> None:
+    law = FrictionLaw()
+    assert law.symbols == ("f0", "f1", "f2")
+    assert np.array_equal(columns(law)[0], [-1, -1, 0, 1, 1])
+    assert np.array_equal(columns(law)[1], SPEED)
+    assert np.allclose(columns(law)[2], [-4.0, -1e-18, 0.0, 1e-18, 0.25], rtol=1e-15)
+
+
+def test_the_sign_has_no_dead_zone() -> None:
+    # Standstill is left to the mask; a dead zone here would fit it silently.
+    assert columns(FrictionLaw(standstill=1.0))[0][3] == 1.0
+
+
+def test_the_cubic_third_term_and_the_offset() -> None:
+    law = FrictionLaw(coulomb=False, viscous=False, third="cubic", offset=True)
+    assert law.symbols == ("f2", "fo")
+    assert np.allclose(columns(law)[0], SPEED**3, rtol=1e-15)
+    assert np.array_equal(columns(law)[1], np.ones(5))
+
+
+def test_a_law_without_any_term_has_no_columns() -> None:
+    law = FrictionLaw(coulomb=False, viscous=False, third=None)
+    assert law.symbols == ()
+    assert law.names(6) == ()
+
+
+def test_names_go_term_by_term() -> None:
+    assert FrictionLaw(third=None, offset=True).names(2) == (
+        "f0_1", "f0_2", "f1_1", "f1_2", "fo_1", "fo_2",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("third", "revolute", "unit"),
+    [
+        ("quadratic", True, "N·m·s²/rad²"),
+        ("cubic", True, "N·m·s³/rad³"),
+        ("quadratic", False, "N·s²/m²"),
+    ],
+)
+def test_units_follow_the_term_and_the_joint(third: str, revolute: bool, unit: str) -> None:
+    law = FrictionLaw(third=third)  # type: ignore[arg-type]
+    assert law.unit("f2", revolute=revolute) == unit
+
+
+def test_a_joint_moves_above_the_standstill_speed_in_either_direction() -> None:
+    law = FrictionLaw(standstill=0.01)
+    speeds = np.array([[0.0, 0.01], [0.011, -0.02]])
+    assert law.moving(speeds).tolist() == [[False, False], [True, True]]
+
+
+@pytest.mark.parametrize("speed", [-1.0, np.nan, np.inf])
+def test_a_senseless_standstill_speed_is_refused(speed: float) -> None:
+    with pytest.raises(ModelError, match="standstill"):
+        FrictionLaw(standstill=speed)
+
+
+def test_an_unknown_third_term_is_refused_with_what_is_known() -> None:
+    with pytest.raises(ModelError, match=r"quadratic.*cubic"):
+        FrictionLaw(third="stribeck")  # type: ignore[arg-type]

@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import pickle
+import time
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from identification import FrictionLaw, ModelError, RobotModel, ShapeError
+from sim_fixtures.ns16 import urdf_text
+
+TILTED = (2.0, -3.0, -9.0)
+
+
+def robot_text(path: str) -> str:
+    try:
+        package = distribution("example-robot-data")
+    except PackageNotFoundError:
+        pytest.skip("the example-robot-data package is not installed")
+    root = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
+    return (root / path).read_text(encoding="utf-8")
+
+
+def random_urdf(seed: int, n_joints: int = 7) -> str:
+    """A random tree: any axis, any placement, all four kinds of joint that are allowed."""
+    random = np.random.default_rng(seed)
+    parts = ['<robot name="random"><link name="l0"/>']
+
+    def numbers(*values: float) -> str:
+        return " ".join(f"{value:.6f}" for value in values)
+
+    for i in range(1, n_joints + 1):
+        kind = random.choice(
+            ["revolute", "prismatic", "continuous", "fixed"], p=[0.4, 0.3, 0.2, 0.1]
+        )
+        if i == 1:
+            kind = "revolute"
+        parent = int(random.integers(max(0, i - 3), i))  # branches now and then
+        half = random.normal(size=(3, 3))
+        inertia = half @ half.T + np.eye(3)
+        axis = np.eye(3)[random.integers(3)] if random.random() < 0.5 else random.normal(size=3)
+        parts.append(
+            f'<link name="l{i}"><inertial><origin xyz="{numbers(*random.normal(size=3))}"/>'
+            f'<mass value="{random.uniform(1, 5):.6f}"/><inertia ixx="{inertia[0, 0]}" '
+            f'ixy="{inertia[0, 1]}" ixz="{inertia[0, 2]}" iyy="{inertia[1, 1]}" '
+            f'iyz="{inertia[1, 2]}" izz="{inertia[2, 2]}"/></inertial></link>'
+            f'<joint name="j{i}" type="{kind}"><parent link="l{parent}"/><child link="l{i}"/>'
+            f'<origin xyz="{numbers(*random.normal(size=3))}" '
+            f'rpy="{numbers(*random.normal(size=3))}"/>'
+            f'<axis xyz="{numbers(*axis)}"/>'
+            '<limit lower="-9" upper="9" effort="9" velocity="9"/></joint>'
+        )
+    return "".join(parts) + "</robot>"
+
+
+def inverse_dynamics(
+    urdf: str, gravity: tuple[float, ...], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> np.ndarray:
+    """Pinocchio's recursive Newton-Euler torques, rigid bodies alone."""
+    model = pin.buildModelFromXML(urdf)
+    model.gravity.linear = np.array(gravity)
+    data = model.createData()
+    torque = np.empty(q.shape)
+    for sample in range(len(q)):
+        configuration: list[float] = []
+        for joint, angle in zip(list(model.joints)[1:], q[sample], strict=True):
+            # pinocchio writes a continuous joint as a point on the circle
+            configuration += [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
+        torque[sample] = pin.rnea(model, data, np.array(configuration), qd[sample], qdd[sample])
+    return torque
+
+
+CASES = {
+    "ns16": (urdf_text, (0.0, 0.0, -9.81)),
+    "ns16 tilted": (urdf_text, TILTED),
+    "ur10": (lambda: robot_text("ur_description/urdf/ur10_robot.urdf"), (0.0, 0.0, -9.81)),
+    "panda with its fingers": (lambda: robot_text("panda_description/urdf/panda.urdf"), TILTED),
+    **{f"random tree {seed}": ((lambda s=seed: random_urdf(s)), TILTED) for seed in range(8)},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_torque_is_pinocchios_plus_rotors_plus_friction(case: str) -> None:
+    make, gravity = CASES[case]
+    urdf = make()
+    law = FrictionLaw(third="cubic", offset="random" not in case)
+    model = RobotModel.from_urdf(urdf, gravity=gravity, friction=law)
+    n = model.n_joints
+    random = np.random.default_rng(5)
+    q, qd, qdd = random.uniform(-3.0, 3.0, (3, 40, n))
+    rotors = random.uniform(0.1, 5.0, n)
+    f0, f1, f2, fo = random.uniform(-3.0, 3.0, (4, n))
+    fo *= law.offset
+
+    standard = model.nominal.reshape(n, 11)
+    standard[:, 10] = rotors
+    friction = [f0, f1, f2, fo] if law.offset else [f0, f1, f2]
+    values = np.concatenate([model.base.grouping @ standard.reshape(-1), *friction])
+
+    expected = inverse_dynamics(urdf, gravity, q, qd, qdd)
+    expected += rotors * qdd + f0 * np.sign(qd) + f1 * qd + f2 * qd**3 + fo
+    assert np.abs(model.torque(values, q, qd, qdd) - expected).max() < 1e-10
+
+
+def test_random_trees_cover_every_kind_of_joint_and_branches() -> None:
+    chains = [RobotModel.from_urdf(random_urdf(seed)).chain for seed in range(8)]
+    assert any((~chain.revolute).any() for chain in chains)
+    assert any(len(set(chain.parents.tolist())) < chain.n_joints for chain in chains)
+    assert any('type="continuous"' in random_urdf(seed) for seed in range(8))
+    assert any('type="fixed"' in random_urdf(seed) for seed in range(8))
+
+
+def test_the_ns16_has_40_base_and_18_friction_parameters_in_this_order() -> None:
+    model = RobotModel.from_urdf(urdf_text())
+    assert model.joint_names == tuple(f"joint_{i}" for i in range(1, 7))
+    assert model.n_parameters == len(model.units) == 58
+    assert model.parameter_names[:40] == model.base.names
+    assert model.parameter_names[40:42] == ("f0_1", "f0_2")
+    assert model.parameter_names[46] == "f1_1"
+    assert model.parameter_names[57] == "f2_6"
+    unit = dict(zip(model.parameter_names, model.units, strict=True))
+    assert unit["I1yy"] == unit["I3m"] == "kg m²"
+    assert unit["mc2x"] == "kg m"
+    assert unit["f0_1"] == "N·m"
+    assert unit["f1_6"] == "N·m·s/rad"
+
+
+def test_a_sliding_joint_has_linear_units() -> None:
+    model = RobotModel.from_urdf(slider("1 0 0"))
+    assert model.parameter_names == ("m1", "f0_1", "f1_1", "f2_1")
+    assert model.units == ("kg", "N", "N·s/m", "N·s²/m²")
+    assert model.base.expressions() == ("m1 + I1m",)
+
+
+def test_standard_names_carry_the_joint_number_where_the_field_writes_it() -> None:
+    model = RobotModel.from_urdf(urdf_text())
+    assert model.standard_names[:11] == (
+        "I1xx", "I1xy", "I1xz", "I1yy", "I1yz", "I1zz", "mc1x", "mc1y", "mc1z", "m1", "I1m",
+    )  # fmt: skip
+    assert model.standard_names[-1] == "I6m"
+
+
+def test_a_new_arm_is_ready_in_a_third_of_a_second() -> None:
+    urdf = urdf_text()
+    start = time.perf_counter()
+    RobotModel.from_urdf(urdf)
+    assert time.perf_counter() - start < 0.3
+
+
+def test_moving_tells_rows_from_standstill() -> None:
+    model = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(standstill=0.1))
+    speed = np.zeros((2, 6))
+    speed[1, 3] = -0.2
+    assert np.argwhere(model.moving(speed)).tolist() == [[1, 3]]
+
+
+def test_a_model_survives_the_way_to_another_process() -> None:
+    model = RobotModel.from_urdf(urdf_text())
+    q, qd, qdd = np.random.default_rng(0).normal(size=(3, 10, 6))
+    values = np.arange(58.0)
+    before = model.torque(values, q, qd, qdd)
+    again = pickle.loads(pickle.dumps(model))
+    assert np.array_equal(again.torque(values, q, qd, qdd), before)
+
+
+def joint(kind: str, axis: str = "0 0 1") -> str:
+    return (
+        '<robot name="r"><link name="a"/><link name="b"><inertial><mass value="2"/>'
+        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+        f'<joint name="strange" type="{kind}"><parent link="a"/><child link="b"/>'
+        f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+
+
+def slider(axis: str) -> str:
+    return joint("prismatic", axis)
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_other_joints_are_refused_by_name(kind: str) -> None:
+    with pytest.raises(ModelError, match="'strange'") as caught:
+        RobotModel.from_urdf(joint(kind))
+    assert caught.value.joint == "strange"
+
+
+@pytest.mark.parametrize("text", ["", "no xml", "<robot name='r'/>", joint("fixed")])
+def test_a_text_without_a_robot_that_moves_is_refused(text: str) -> None:
+    with pytest.raises(ModelError, match="robot description"):
+        RobotModel.from_urdf(text)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, -9.81), (0.0, 0.0, np.nan)])
+def test_gravity_is_three_finite_numbers(gravity: tuple[float, ...]) -> None:
+    with pytest.raises(ModelError, match="gravity"):
+        RobotModel.from_urdf(urdf_text(), gravity=gravity)
+
+
+def test_an_offset_that_is_a_weight_is_refused_by_joint() -> None:
+    law = FrictionLaw(offset=True)
+    with pytest.raises(ModelError, match=r"'strange'.*offset"):
+        RobotModel.from_urdf(slider("0 0 1"), friction=law)
+    # Without a rotor the weight is known from the inertia, and across gravity there is none.
+    assert (
+        RobotModel.from_urdf(slider("0 0 1"), friction=law, rotor_inertia=False).n_parameters == 5
+    )
+    assert RobotModel.from_urdf(slider("1 0 0"), friction=law).n_parameters == 5
+
+
+def test_arrays_of_the_wrong_shape_are_refused_by_name() -> None:
+    model = RobotModel.from_urdf(urdf_text())
+    good, short = np.zeros((5, 6)), np.zeros((4, 6))
+    with pytest.raises(ShapeError, match=r"qd has shape \(4, 6\), expected \(5, 6\)"):
+        model.regressor(good, short, good)
+    with pytest.raises(ShapeError, match=r"q has shape \(6,\), expected \(m, 6\)"):
+        model.regressor(good[0], good, good)
+    with pytest.raises(ShapeError, match=r"values has shape \(57,\), expected \(58,\)"):
+        model.torque(np.zeros(57), good, good, good)

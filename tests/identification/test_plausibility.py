@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from identification.estimation import Estimate
+from identification.factor import Factor
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.plausibility import Implausible, _inertia_columns, implausibilities
+
+Array = NDArray[np.float64]
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return RobotModel.from_urdf(URDF)
+
+
+@pytest.fixture(scope="module")
+def estimate(model: RobotModel) -> Estimate:
+    standard = model.nominal.copy()
+    standard[[10, 21]] = 0.4, 0.1  # rotors
+    values = np.concatenate([model.base.grouping @ standard, [4, 2, 1.5, 0.8, 0, 0]])
+    return Estimate(
+        names=model.parameter_names,
+        units=model.units,
+        values=values,
+        covariance=np.diag((0.01 * np.maximum(np.abs(values), 0.1)) ** 2),
+        noise_std=np.ones(2),
+        samples=np.full(2, 1000),
+        method="",
+        condition=10.0,
+    )
+
+
+def a_motion() -> Motion:
+    time = np.arange(2000) * 2e-3
+    amplitude, rate = np.array([0.9, 1.2]), np.array([2.1, 3.7])
+    angle = rate * time[:, None] + np.array([0.3, 1.1])
+    return Motion(
+        time,
+        amplitude * np.sin(angle),
+        amplitude * rate * np.cos(angle),
+        -amplitude * rate**2 * np.sin(angle),
+    )
+
+
+def found(model: RobotModel, estimate: Estimate, *, error: float = 0.1) -> Implausible:
+    motion = a_motion()
+    return implausibilities(
+        model,
+        estimate,
+        Factor.from_samples(model, motion, np.zeros((2000, 2))),
+        np.full(2, error),
+        position=motion.position[::100],
+        speed=np.abs(motion.velocity).max(axis=0),
+    )
+
+
+def with_value(estimate: Estimate, name: str, value: float) -> Estimate:
+    values = estimate.values.copy()
+    values[estimate.names.index(name)] = value
+    return replace(estimate, values=values)
+
+
+def test_a_real_arm_is_plausible(model: RobotModel, estimate: Estimate) -> None:
+    assert found(model, estimate) == Implausible((), ())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("f0_1", -4.0, "Coulomb friction of shoulder is negative"),
+        ("f1_2", -1.0, "friction of elbow is"),
+        ("I2m", -0.1, "I2m is negative"),
+    ],
+)
+def test_signs_that_nature_does_not_make_are_named(
+    model: RobotModel, estimate: Estimate, name: str, value: float, words: str
+) -> None:
+    impossible = found(model, with_value(estimate, name, value)).impossible
+    assert any(words in offence for offence in impossible)
+
+
+def test_friction_that_falls_a_little_with_speed_is_possible(
+    model: RobotModel, estimate: Estimate
+) -> None:
+    # 2 N·m at rest, 1.3 at top speed.
+    assert found(model, with_value(estimate, "f1_2", -0.15)).impossible == ()
+
+
+def test_an_inertia_that_gives_energy_is_named(model: RobotModel, estimate: Estimate) -> None:
+    # The shoulder's whole inertia, a group that no sign rule on single parameters covers.
+    impossible = found(model, with_value(estimate, "I1yy", -3.0)).impossible
+    assert any("inertia seen by shoulder is negative" in offence for offence in impossible)
+
+
+def test_a_wrong_sign_within_its_uncertainty_is_no_offence(
+    model: RobotModel, estimate: Estimate
+) -> None:
+    vague = replace(estimate, covariance=1e4 * estimate.covariance)
+    assert found(model, with_value(vague, "I2m", -0.1)) == Implausible((), ())
+
+
+def test_a_wrong_sign_smaller_than_the_prediction_error_is_only_doubtful(
+    model: RobotModel, estimate: Estimate
+) -> None:
+    offences = found(model, with_value(estimate, "I2m", -0.01), error=5.0)
+    assert offences.impossible == ()
+    assert any("I2m is negative" in doubt for doubt in offences.doubtful)
+
+
+def test_nothing_is_said_about_parameters_the_data_do_not_determine(
+    model: RobotModel, estimate: Estimate
+) -> None:
+    covariance = estimate.covariance.copy()
+    index = estimate.names.index("I2m")
+    covariance[index, index] = np.inf
+    unknown = replace(with_value(estimate, "I2m", -0.1), covariance=covariance)
+    assert found(model, unknown) == Implausible((), ())
+
+
+def test_the_inertia_matrix_is_pinocchios(model: RobotModel, estimate: Estimate) -> None:
+    reference = pin.buildModelFromXML(URDF)
+    reference.armature = np.array([0.4, 0.1])
+    data = reference.createData()
+    position = a_motion().position[::200]
+    matrices = _inertia_columns(model, position) @ estimate.values
+    for q, matrix in zip(position, matrices, strict=True):
+        upper = np.triu(pin.crba(reference, data, q))
+        expected = upper + np.triu(upper, 1).T
+        np.testing.assert_allclose(matrix, expected, atol=1e-12)

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from identification import FrictionLaw, RobotModel
+from identification.kinematics import FROM_PINOCCHIO
+from identification.regressor import CHUNK, joint_arrays
+from identification.wrench import LINK_SYMBOLS
+from sim_fixtures.ns16 import urdf_text
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return RobotModel.from_urdf(urdf_text())
+
+
+def states(m: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, m, 6))
+    return q, qd, qdd
+
+
+def test_inertial_columns_are_pinocchios(model: RobotModel) -> None:
+    q, qd, qdd = states(30)
+    reference = pin.buildModelFromXML(urdf_text())
+    data = reference.createData()
+    dense = model.regressor(q, qd, qdd).dense(model.n_parameters)
+    for column, standard in enumerate(model.base.kept):
+        joint, symbol = divmod(int(standard), 11)
+        if symbol == 10:
+            continue
+        theirs = 10 * joint + FROM_PINOCCHIO[symbol]
+        for t in range(len(q)):
+            expected = pin.computeJointTorqueRegressor(reference, data, q[t], qd[t], qdd[t])
+            assert np.abs(dense[t, :, column] - expected[:, theirs]).max() < 1e-12
+
+
+def test_rotor_and_friction_columns_act_on_their_joint_alone(model: RobotModel) -> None:
+    q, qd, qdd = states(20)
+    dense = model.regressor(q, qd, qdd).dense(58)
+    own = {"I3m": qdd[:, 2], "f0_2": np.sign(qd[:, 1]), "f1_5": qd[:, 4], "f2_1": abs(qd) * qd}
+    own["f2_1"] = own["f2_1"][:, 0]
+    for name, expected in own.items():
+        column = dense[:, :, model.parameter_names.index(name)]
+        joint = int(name[-1]) - 1 if "_" in name else int(name[1]) - 1
+        assert np.array_equal(column[:, joint], expected), name
+        assert not np.delete(column, joint, axis=1).any(), name
+
+
+def test_blocks_hold_what_acts_on_a_joint_and_nothing_else(model: RobotModel) -> None:
+    regressor = model.regressor(*states(50))
+    for joint, (block, columns) in enumerate(
+        zip(regressor.blocks, regressor.columns, strict=True), start=1
+    ):
+        names = [model.parameter_names[c] for c in columns]
+        assert block.shape == (50, len(names))
+        assert len(set(names)) == len(names)
+        link = [int("".join(filter(str.isdigit, n.split("_")[-1]))) for n in names]
+        assert min(link) >= joint, "a link that the joint does not move"
+        alone = [n for n in names if "_" in n or (n.endswith("m") and n[0] == "I")]
+        assert all(str(joint) in n for n in alone)
+    # The last joint: its link, its rotor, its friction.
+    assert len(regressor.columns[5]) == 8 + 3
+
+
+def test_a_sliding_joint_has_no_inertia_columns() -> None:
+    urdf = (
+        '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>'
+        '<joint name="s" type="prismatic"><parent link="a"/><child link="b"/>'
+        '<axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        '<joint name="t" type="continuous"><parent link="b"/><child link="c"/>'
+        '<axis xyz="0 1 0"/></joint></robot>'
+    )
+    model = RobotModel.from_urdf(urdf)
+    random = np.random.default_rng(0).normal(size=(3, 4, 2))
+    regressor = model.regressor(*random)
+    names = [{model.parameter_names[c] for c in columns} for columns in regressor.columns]
+    assert names[0] == {"m1", "mc2x", "mc2z", "f0_1", "f1_1", "f2_1"}
+    assert names[1] == {"I2yy", "mc2x", "mc2z", "f0_2", "f1_2", "f2_2"}
+
+
+@pytest.mark.parametrize("m", [1, 2, 63, 65, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 77])
+def test_a_sample_does_not_feel_its_neighbours(model: RobotModel, m: int) -> None:
+    q, qd, qdd = states(m)
+    whole = model.regressor(q, qd, qdd)
+    for t in {0, m // 2, m - 1}:
+        alone = model.regressor(q[t : t + 1], qd[t : t + 1], qdd[t : t + 1])
+        for long, short in zip(whole.blocks, alone.blocks, strict=True):
+            assert np.allclose(long[t], short[0], rtol=1e-13, atol=1e-13)
+
+
+def test_no_samples_give_no_rows(model: RobotModel) -> None:
+    empty = np.empty((0, 6))
+    regressor = model.regressor(empty, empty, empty)
+    assert [len(block) for block in regressor.blocks] == [0] * 6
+    assert model.torque(np.zeros(58), empty, empty, empty).shape == (0, 6)
+
+
+def test_two_users_of_one_model_do_not_share_working_memory(model: RobotModel) -> None:
+    first, second = states(300, seed=1), states(300, seed=2)
+    alone = [np.concatenate([b.copy() for b in rows]) for _, rows in model.plan.chunks(*first)]
+    together = []
+    for (_, rows), _ in zip(model.plan.chunks(*first), model.plan.chunks(*second), strict=True):
+        together.append(np.concatenate([b.copy() for b in rows]))
+    assert np.array_equal(np.hstack(alone), np.hstack(together))
+
+
+def test_rows_and_columns_of_a_full_turn_repeat(model: RobotModel) -> None:
+    q, qd, qdd = states(20)
+    here, turned = model.regressor(q, qd, qdd), model.regressor(q + 2.0 * np.pi, qd, qdd)
+    for a, b in zip(here.blocks, turned.blocks, strict=True):
+        assert np.allclose(a, b, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, -np.pi, 1e4])
+def test_no_angle_is_special(model: RobotModel, angle: float) -> None:
+    # The rotation is made from the tangent of half the angle, which has a pole at pi.
+    q, qd, qdd = states(3)
+    q[:] = angle
+    nearby = model.regressor(q + 1e-9, qd, qdd)
+    for at, near in zip(model.regressor(q, qd, qdd).blocks, nearby.blocks, strict=True):
+        assert np.all(np.isfinite(at))
+        assert np.allclose(at, near, atol=1e-6)
+
+
+def test_a_model_without_friction_or_rotors_has_inertial_columns_only() -> None:
+    law = FrictionLaw(coulomb=False, viscous=False, third=None)
+    model = RobotModel.from_urdf(urdf_text(), rotor_inertia=False, friction=law)
+    assert model.n_parameters == model.base.rank == 36
+    assert [len(c) for c in model.regressor(*states(2)).columns] == [36, 35, 28, 21, 14, 7]
+
+
+def test_standard_symbols_are_the_ten_of_a_rigid_body() -> None:
+    assert len(LINK_SYMBOLS) == len(set(LINK_SYMBOLS)) == 10
+
+
+def test_lists_are_taken_as_arrays() -> None:
+    (array,) = joint_arrays(2, q=[[0, 1], [2, 3]])  # type: ignore[arg-type]
+    assert array.dtype == np.float64

@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError, ShapeError
+from identification.friction import FrictionLaw
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.preprocessing import Samples
+from identification.repeatability import repeatability
+from identification.validation import (
+    PredictionError,
+    for_figure,
+    over_all,
+    prediction_error,
+    residual,
+)
+
+Array = NDArray[np.float64]
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+
+torques = arrays(np.float64, (20, 2), elements=st.floats(-100, 100, width=32))
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
+
+
+def samples_with(model: RobotModel, error: Array, *, origin: float = 0.0) -> Samples:
+    """A motion whose torque is that of parameters 1, 1, 1, ... plus an error (m, 2)."""
+    time = np.arange(len(error)) * 2e-3
+    amplitude, rate = np.array([0.9, 1.2]), np.array([2.1, 3.7])
+    angle = rate * time[:, None] + np.array([0.3, 1.1])
+    motion = Motion(
+        time + origin,
+        amplitude * np.sin(angle),
+        amplitude * rate * np.cos(angle),
+        -amplitude * rate**2 * np.sin(angle),
+    )
+    return Samples(
+        motion=motion,
+        torque=model.torque(np.ones(model.n_parameters), *motion[1:]) + error,
+        usable=model.moving(motion.velocity),
+        segments=(slice(0, len(time)),),
+        origin=origin,
+        position_bandwidth=np.full(2, np.inf),
+    )
+
+
+def test_the_measures_are_those_of_their_definitions() -> None:
+    measured = np.array([[3.0, 1.0], [-4.0, 2.0]])
+    error = PredictionError.between(measured, np.array([[2.0, 1.0], [-2.0, 2.0]]))
+    np.testing.assert_allclose(error.mean_absolute, [1.5, 0.0])
+    np.testing.assert_allclose(error.mean, [-0.5, 0.0])
+    np.testing.assert_allclose(error.rms, [np.sqrt(2.5), 0.0])
+    np.testing.assert_allclose(error.relative, [np.sqrt(5.0) / 5.0, 0.0])
+    assert error.overall == pytest.approx(np.sqrt(5.0 / 30.0))
+
+
+@given(torques, torques, arrays(np.bool_, (20, 2)))
+def test_rows_that_do_not_count_change_nothing(
+    measured: Array, predicted: Array, usable: NDArray[np.bool_]
+) -> None:
+    spoilt = np.where(usable, measured, np.nan)
+    one = PredictionError.between(measured, predicted, usable)
+    two = PredictionError.between(spoilt, predicted, usable)
+    np.testing.assert_array_equal(one.squared, two.squared)
+    np.testing.assert_array_equal(one.torque_squared, two.torque_squared)
+    assert (one.rows == usable.sum(axis=0)).all()
+
+
+@given(torques, torques, torques, torques)
+def test_the_error_over_two_runs_is_that_of_the_runs_put_together(
+    m1: Array, p1: Array, m2: Array, p2: Array
+) -> None:
+    both = over_all([PredictionError.between(m1, p1), PredictionError.between(m2, p2)])
+    joined = PredictionError.between(np.concatenate([m1, m2]), np.concatenate([p1, p2]))
+    np.testing.assert_allclose(both.rms, joined.rms, rtol=1e-12)
+    assert both.overall == pytest.approx(joined.overall, rel=1e-12)
+
+
+@given(torques, torques)
+def test_the_mean_absolute_error_lies_between_mean_and_rms(m: Array, p: Array) -> None:
+    error = PredictionError.between(m, p)
+    assert (np.abs(error.mean) <= error.mean_absolute * (1 + 1e-12)).all()
+    assert (error.mean_absolute <= error.rms * (1 + 1e-12)).all()
+
+
+def test_zero_for_everything_predicts_with_an_error_of_one() -> None:
+    measured = np.random.default_rng(0).standard_normal((50, 3))
+    assert PredictionError.between(measured, np.zeros((50, 3))).overall == pytest.approx(1.0)
+
+
+def test_prediction_error_is_of_the_usable_rows_unless_all_are_asked_for(
+    model: RobotModel,
+) -> None:
+    values = np.ones(model.n_parameters)
+    samples = samples_with(model, np.zeros((2000, 2)))
+    torque = samples.torque.copy()
+    torque[~samples.usable] += 50.0  # stiction
+    stuck = Samples(**{**samples.__dict__, "torque": torque})
+    (error,) = prediction_error(model, values, [stuck])
+    assert error.overall < 1e-12
+    (error,) = prediction_error(model, values, [stuck], all_rows=True)
+    assert error.overall > 0.05
+
+
+def test_a_low_pass_on_the_error_takes_noise_away_and_leaves_slow_errors(
+    model: RobotModel,
+) -> None:
+    values = np.ones(model.n_parameters)
+    rng = np.random.default_rng(1)
+    time = np.arange(5000) * 2e-3
+    slow = 0.3 * np.sin(2.0 * np.pi * 1.0 * time)[:, None] * np.ones(2)
+    samples = samples_with(model, slow + rng.standard_normal((5000, 2)))
+    (error,) = prediction_error(model, values, [samples], bandwidth=10.0)
+    noise_left = np.sqrt(2 * 10.0 * 2e-3)  # of white noise of 1, in 10 Hz of 250
+    expected = np.sqrt(0.3**2 / 2 + noise_left**2)
+    np.testing.assert_allclose(error.rms, expected, rtol=0.15)
+    raw = residual(model, values, samples)
+    np.testing.assert_array_equal(raw[~samples.usable], 0.0)
+
+
+def test_no_runs_is_an_error() -> None:
+    with pytest.raises(IdentificationError, match="no run"):
+        over_all([])
+    with pytest.raises(ShapeError):
+        PredictionError.between(np.zeros((5, 2)), np.zeros((5, 3)))
+
+
+def test_the_figures_low_pass_keeps_10_hz_and_drops_100_hz() -> None:
+    time = np.arange(4000) * 1e-3
+    tones = np.sin(2.0 * np.pi * np.array([10.0, 100.0]) * time[:, None])
+    drawn = for_figure(time, tones)[500:-500]
+    np.testing.assert_allclose(drawn[:, 0], tones[500:-500, 0], atol=0.01)
+    assert np.abs(drawn[:, 1]).max() < 0.01
+
+
+def test_what_repeats_is_told_from_what_does_not(model: RobotModel) -> None:
+    values = np.ones(model.n_parameters)
+    rng = np.random.default_rng(2)
+    systematic = np.array([0.5, 0.4]) * rng.standard_normal((3000, 2))
+    runs = [
+        # Recordings whose clocks stand differently, as recordings' clocks do.
+        samples_with(
+            model, systematic + np.array([1.0, 2.0]) * rng.standard_normal((3000, 2)), origin=k
+        )
+        for k in range(12)
+    ]
+    split = repeatability(model, values, runs)
+    np.testing.assert_allclose(split.noise, [1.0, 2.0], rtol=0.05)
+    np.testing.assert_allclose(split.systematic, [0.5, 0.4], rtol=0.1)
+    assert split.repetitions == 12
+
+
+def test_noise_alone_has_no_systematic_part(model: RobotModel) -> None:
+    rng = np.random.default_rng(3)
+    runs = [samples_with(model, rng.standard_normal((3000, 2))) for _ in range(5)]
+    split = repeatability(model, np.ones(model.n_parameters), runs)
+    assert (split.systematic < 0.1).all()
+
+
+def test_one_repetition_does_not_tell_noise_from_error(model: RobotModel) -> None:
+    with pytest.raises(IdentificationError, match="two repetitions"):
+        repeatability(model, np.ones(model.n_parameters), [samples_with(model, np.zeros((300, 2)))])

@@ -1,0 +1,200 @@
+"""A cell, a smooth motion and the smallest PC that can play it, shared by the tests of the cell."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import pi, radians
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.packets import CyclicPacket, Mode, echo, is_init, next_number
+from sim_fixtures import (
+    ControllerSettings,
+    PlantTruth,
+    SimulatedController,
+    SimulatedDrive,
+    UnmodelledEffects,
+    ns16,
+)
+
+Array = NDArray[np.float64]
+PERIOD = 0.001
+
+
+@pytest.fixture(scope="session")
+def cell() -> dict[str, Any]:
+    with ns16.CELL_PATH.open("rb") as stream:
+        return tomllib.load(stream)
+
+
+@pytest.fixture(scope="session")
+def make_drive(cell: dict[str, Any]) -> Callable[..., SimulatedDrive]:
+    table = cell["drive_train"]
+
+    def make(**changes: Any) -> SimulatedDrive:
+        figures = {
+            "gear_ratio": table["gear_ratio"],
+            "calibration": table["calibration"],
+            "joint_sign": table["joint_sign"],
+            "joint_offset": [radians(a) for a in table["joint_offset_deg"]],
+            "torque_constant": table["torque_constant"],
+            "current_limit": table["current_limit"],
+            "following_error": table["following_error"],
+            "encoder_counts": table["encoder_counts_per_revolution"],
+            "k54": table["k54"],
+            "k64": table["k64"],
+            "k65": table["k65"],
+        }
+        return SimulatedDrive(**(figures | changes))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def drive(make_drive: Callable[..., SimulatedDrive]) -> SimulatedDrive:
+    return make_drive()
+
+
+@pytest.fixture(scope="session")
+def truth(cell: dict[str, Any]) -> PlantTruth:
+    planted = cell["simulation"]
+    names = ("rotor_inertia", "coulomb", "viscous", "third")
+    return PlantTruth(*(np.array(planted[name]) for name in names))
+
+
+@pytest.fixture(scope="session")
+def frictionless(truth: PlantTruth) -> PlantTruth:
+    return PlantTruth.frictionless(truth.rotor_inertia)
+
+
+@pytest.fixture(scope="session")
+def motor_matrix() -> Callable[[SimulatedDrive], Array]:
+    """Motor revolutions per radian of *controller* angle as a matrix, written from the formulas."""
+
+    def matrix(drive: SimulatedDrive) -> Array:
+        rows = np.eye(6)
+        rows[4, 3] = -drive.k54
+        rows[5, 3] = drive.k65 * drive.k54 - drive.k64
+        rows[5, 4] = -drive.k65
+        return np.diag(drive.gear_ratio) @ rows / (2.0 * pi)
+
+    return matrix
+
+
+@dataclass
+class SmoothMotion:
+    """Sinusoids with a soft start and end, all axes at once, DH angles."""
+
+    time: Array
+    q: Array
+    qd: Array
+    qdd: Array
+
+
+@pytest.fixture(scope="session")
+def smooth_motion() -> SmoothMotion:
+    """Three seconds within the NS 16's limits at up to about a third of its speeds."""
+    duration, n = 3.0, int(3.0 / PERIOD)
+    t = np.arange(n + 1) * PERIOD
+    s = t / duration
+    window = 30 * s**2 * (1 - s) ** 2 / duration  # dx/dt of the quintic from 0 to 1
+    phase = 10 * s**3 - 15 * s**4 + 6 * s**5
+    rate = 60 * s * (1 - s) * (1 - 2 * s) / duration**2
+    centre = np.radians([10.0, -100.0, 170.0, -30.0, 60.0, 20.0])
+    swing = np.radians([40.0, 25.0, 30.0, 70.0, 40.0, 90.0])
+    turns = np.array([2, 2, 2, 2, 3, 2]) * pi
+    angle = phase[:, None] * turns
+    q = centre + swing * np.sin(angle)
+    qd = swing * turns * np.cos(angle) * window[:, None]
+    qdd = (
+        swing
+        * turns
+        * (np.cos(angle) * rate[:, None] - turns * np.sin(angle) * window[:, None] ** 2)
+    )
+    return SmoothMotion(t, q, qd, qdd)
+
+
+@dataclass
+class Log:
+    """What a run left behind; index k of each array is the packet in which target k was sent."""
+
+    axes: NDArray[np.void]
+    q: Array
+    qd: Array
+    raw: list[bytes] = field(default_factory=list)
+
+
+class MinimalPC:
+    """Answers packets: echoes until every axis is open, then plays targets, then leaves."""
+
+    def __init__(self, controller: SimulatedController, targets: Array, deltas: Array) -> None:
+        self.controller = controller
+        self.targets = targets
+        self.deltas = deltas
+
+    def run(self, settle: int = 100) -> Log:
+        controller, n = self.controller, self.targets.shape[1]
+        axes, q, qd, raw = [], [], [], []
+        k = -settle
+        while (packet := controller.next_packet()) is not None:
+            raw.append(packet)
+            if is_init(packet) or len(packet) == 732:
+                controller.accept(echo(packet))
+                continue
+            received = CyclicPacket.decode(packet, n)
+            reply = CyclicPacket.zeros(next_number(received.number), n)
+            status = bytes(4)
+            reply.axes["mode"] = received.axes["mode"]
+            reply.axes["d"][:, 0] = received.axes["d"][:, 0]
+            if (received.axes["mode"] == Mode.POSITION).all() and received.status[0] == 5:
+                if 0 <= k < len(self.targets):
+                    reply.axes["d"][:, 0] = self.targets[k]
+                    reply.axes["d"][:, 1] = self.deltas[k]
+                    axes.append(received.axes.copy())
+                    q.append(controller.plant.position.copy())
+                    qd.append(controller.plant.velocity.copy())
+                elif k == len(self.targets) + settle:
+                    status = bytes((1, 0, 0, 0))
+                    controller.finish()
+                k += 1
+            controller.accept(CyclicPacket(reply.number, status, bytes(4), reply.axes).encode())
+        return Log(np.array(axes), np.array(q), np.array(qd), raw)
+
+
+@pytest.fixture(scope="session")
+def play(
+    truth: PlantTruth, smooth_motion: SmoothMotion, motor_matrix: Callable[..., Array]
+) -> Callable[..., tuple[SimulatedController, Log]]:
+    """Play the smooth motion on a fresh NS 16 and return the controller and the log."""
+
+    def run(
+        drive: SimulatedDrive,
+        settings: ControllerSettings,
+        *,
+        seed: int = 7,
+        effects: UnmodelledEffects | None = None,
+        motion: SmoothMotion = smooth_motion,
+        **options: Any,
+    ) -> tuple[SimulatedController, Log]:
+        controller = SimulatedController(
+            ns16.urdf_text(),
+            drive,
+            truth,
+            settings,
+            seed=seed,
+            effects=effects or UnmodelledEffects(),
+            initial_position=motion.q[0],
+            **options,
+        )
+        turn = motor_matrix(drive)
+        angles = motion.q * drive.joint_sign + drive.joint_offset
+        targets = angles @ turn.T + drive.calibration
+        deltas = (motion.qd * drive.joint_sign) @ turn.T * PERIOD
+        return controller, MinimalPC(controller, targets, deltas).run()
+
+    return run

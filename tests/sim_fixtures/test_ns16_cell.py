@@ -1,0 +1,75 @@
+"""cell.toml of the NS 16 agrees with the truth, the geometry and itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sim_fixtures import ControllerSettings, ns16
+from sim_fixtures.ns16 import geometry
+
+
+def test_the_planted_figures_are_those_of_the_truth(cell: dict[str, Any]) -> None:
+    planted, truth = cell["simulation"], ns16.load_truth()
+    for name in ("rotor_inertia", "coulomb", "viscous", "third"):
+        assert tuple(planted[name]) == getattr(truth, name), name
+
+
+def test_the_limits_and_signs_are_those_of_the_geometry(cell: dict[str, Any]) -> None:
+    limits, train = cell["limits"], cell["drive_train"]
+    assert limits["frame"] == "controller"
+    assert tuple(limits["lower_deg"]) == geometry.LOWER_DEG
+    assert tuple(limits["upper_deg"]) == geometry.UPPER_DEG
+    assert tuple(limits["velocity_deg"]) == geometry.VELOCITY_DEG
+    assert tuple(train["joint_sign"]) == geometry.JOINT_SIGN
+    assert tuple(train["joint_offset_deg"]) == geometry.JOINT_OFFSET_DEG
+    assert tuple(cell["campaign"]["home_deg"]) == geometry.HOME_DEG
+
+
+def test_accelerations_take_0_3_s_to_full_speed_and_0_1_s_to_build_up(
+    cell: dict[str, Any],
+) -> None:
+    limits = {k: np.array(v) for k, v in cell["limits"].items() if k != "frame"}
+    np.testing.assert_allclose(limits["acceleration_deg"], limits["velocity_deg"] / 0.3, rtol=1e-5)
+    np.testing.assert_allclose(limits["jerk_deg"], limits["acceleration_deg"] / 0.1, rtol=1e-5)
+
+
+def test_motors_turn_at_about_3000_rpm_at_full_speed(cell: dict[str, Any]) -> None:
+    rpm = np.abs(cell["drive_train"]["gear_ratio"]) * cell["limits"]["velocity_deg"] / 6.0
+    assert np.all((rpm > 2900.0) & (rpm < 3100.0))
+
+
+def test_nothing_of_the_drive_train_is_trivial(cell: dict[str, Any]) -> None:
+    """Zeros would hide mistakes in coupling and calibration."""
+    train = cell["drive_train"]
+    assert all(train[k] for k in ("k54", "k64", "k65"))
+    assert all(train["calibration"])
+    assert len({np.sign(ratio) for ratio in train["gear_ratio"]}) == 2
+
+
+def test_every_assumed_field_exists(cell: dict[str, Any]) -> None:
+    for path in cell["cell"]["assumed"]:
+        section, name = path.split(".")
+        assert name in cell[section], path
+
+
+def test_everything_unpublished_about_the_drives_is_marked_assumed(cell: dict[str, Any]) -> None:
+    assumed = set(cell["cell"]["assumed"])
+    published = {"joint_sign", "joint_offset_deg"}
+    for name in set(cell["drive_train"]) - published:
+        assert f"drive_train.{name}" in assumed
+
+
+def test_the_start_and_home_lie_within_the_limits(cell: dict[str, Any]) -> None:
+    limits = cell["limits"]
+    for posture in (cell["campaign"]["home_deg"], cell["simulation"]["initial_deg"]):
+        assert np.all(np.array(posture) > limits["lower_deg"])
+        assert np.all(np.array(posture) < limits["upper_deg"])
+
+
+def test_the_stated_current_delay_is_that_of_the_default_servo(cell: dict[str, Any]) -> None:
+    settings = ControllerSettings()
+    assert cell["controller"]["cycle_ms"] == 1000.0 * settings.period
+    delay = 0.5 - settings.servo.current_lag / settings.period
+    assert cell["controller"]["current_delay_cycles"] == delay

@@ -1,0 +1,211 @@
+"""The simulated arm: energy, equations of motion, friction and rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from sim_fixtures import Plant, PlantDiverged, PlantTruth, SettingError, ns16
+
+Array = NDArray[np.float64]
+START = np.array([0.2, -1.2, 2.5, 0.3, 1.0, 0.2])
+STEP = 5e-4
+
+
+def full_inertia(plant: Plant) -> Array:
+    upper = np.triu(pin.crba(plant.model, plant.model.createData(), plant.position))
+    return upper + np.triu(upper, 1).T
+
+
+def gravity_torque(plant: Plant) -> Array:
+    return np.array(
+        pin.computeGeneralizedGravity(plant.model, plant.model.createData(), plant.position)
+    )
+
+
+def swing(truth: PlantTruth, step: float, duration: float = 1.0) -> tuple[Plant, float]:
+    """Let the arm fall freely; return it and the largest error of its energy [J]."""
+    plant = Plant(ns16.urdf_text(), truth, position=START)
+    before, worst = plant.energy(), 0.0
+    for _ in range(round(duration / step)):
+        plant.step(np.zeros(6), step)
+        worst = max(worst, abs(plant.energy() - before))
+    return plant, worst
+
+
+def test_energy_is_kept_to_second_order_in_the_step(frictionless: PlantTruth) -> None:
+    plant, worst = swing(frictionless, STEP)
+    kinetic = 0.5 * plant.velocity @ full_inertia(plant) @ plant.velocity
+    assert kinetic > 100.0  # the fall is a real one
+    assert worst < 2e-5 * kinetic
+    _, coarse = swing(frictionless, 2.0 * STEP)
+    assert coarse / worst == pytest.approx(4.0, rel=0.2)
+
+
+def test_energy_is_what_the_falling_arm_has(frictionless: PlantTruth) -> None:
+    """Independent of the integrator: work of gravity from the bodies' heights."""
+    plant, _ = swing(frictionless, STEP)
+    start = Plant(ns16.urdf_text(), frictionless, position=START)
+    heights = []
+    for arm in (start, plant):
+        data = arm.model.createData()
+        pin.centerOfMass(arm.model, data, arm.position)
+        heights.append(data.com[0][2])
+    mass = sum(i.mass for i in list(plant.model.inertias)[1:])
+    fallen = 9.81 * mass * (heights[0] - heights[1])
+    kinetic = 0.5 * plant.velocity @ full_inertia(plant) @ plant.velocity
+    assert kinetic == pytest.approx(fallen, rel=1e-4)
+
+
+def test_simulated_accelerations_need_the_torques_that_made_them(truth: PlantTruth) -> None:
+    """Inverse dynamics at the middle of a step: applied torque = rigid bodies + friction."""
+    plant = Plant(ns16.urdf_text(), truth, position=START)
+    rng = np.random.default_rng(3)
+    plant.set_state(START, rng.uniform(0.3, 1.5, 6) * rng.choice([-1.0, 1.0], 6))
+    torque = rng.uniform(-1.0, 1.0, 6) * [400.0, 600.0, 200.0, 30.0, 40.0, 30.0]
+    data = plant.model.createData()
+    smooth_steps = 0
+    settled = np.zeros(6, dtype=bool)  # no kink in this joint's motion since the last step
+    for _ in range(400):
+        q, v = plant.position.copy(), plant.velocity.copy()
+        plant.step(torque, STEP)
+        middle = 0.5 * (q + plant.position), 0.5 * (v + plant.velocity)
+        rigid = pin.rnea(plant.model, data, *middle, plant.acceleration)
+        straight = v * plant.velocity > 0.0
+        error = np.abs(rigid + plant.friction_torque - torque)
+        if straight.all() and settled.all():
+            smooth_steps += 1
+            assert error.max() < 2e-3  # N m, of some hundred
+            np.testing.assert_allclose(
+                plant.friction_torque, truth.friction(middle[1]), rtol=1e-3, atol=0.0
+            )
+        assert error.max() < 0.5  # also where a joint stops, turns or starts
+        settled = straight
+    assert smooth_steps > 50
+
+
+def test_rotors_count_as_armature(truth: PlantTruth, frictionless: PlantTruth) -> None:
+    with_rotors = Plant(ns16.urdf_text(), frictionless, position=START)
+    without = Plant(ns16.urdf_text(), PlantTruth.frictionless(np.zeros(6)), position=START)
+    difference = full_inertia(with_rotors) - full_inertia(without)
+    np.testing.assert_allclose(difference, np.diag(truth.rotor_inertia), atol=1e-12)
+    torque = gravity_torque(with_rotors) + 10.0
+    for plant in (with_rotors, without):
+        plant.step(torque, 1e-6)
+        np.testing.assert_allclose(
+            plant.acceleration, np.linalg.solve(full_inertia(plant), np.full(6, 10.0)), rtol=1e-4
+        )
+
+
+def test_stiction_holds_a_resting_arm_for_good(truth: PlantTruth) -> None:
+    plant = Plant(ns16.urdf_text(), truth, position=START)
+    push = 0.95 * truth.coulomb * [1.0, -1.0, 1.0, -1.0, 1.0, -1.0]
+    torque = gravity_torque(plant) + push
+    for _ in range(4000):
+        plant.step(torque, STEP)
+    np.testing.assert_array_equal(plant.position, START)
+    np.testing.assert_array_equal(plant.velocity, 0.0)
+    np.testing.assert_allclose(plant.friction_torque, push, rtol=1e-9)
+
+
+def test_with_the_servo_off_light_axes_stay_and_heavy_ones_fall(truth: PlantTruth) -> None:
+    plant = Plant(ns16.urdf_text(), truth, position=START)
+    held = np.abs(gravity_torque(plant)) < truth.coulomb
+    assert held.any()
+    assert not held.all()
+    for _ in range(20):
+        plant.step(np.zeros(6), STEP)
+    assert np.all(plant.velocity[held] == 0.0)
+    assert np.all(plant.velocity[~held] != 0.0)
+
+
+def test_an_axis_breaks_loose_just_above_its_coulomb_torque(truth: PlantTruth) -> None:
+    for joint in range(6):
+        for factor, moves in ((0.999, False), (1.02, True)):
+            plant = Plant(ns16.urdf_text(), truth, position=START)
+            torque = gravity_torque(plant)
+            torque[joint] += factor * truth.coulomb[joint]
+            for _ in range(10):
+                plant.step(torque, STEP)
+            assert bool(plant.velocity[joint] > 0.0) is moves, (joint, factor)
+
+
+def test_a_pushed_arm_comes_to_rest_and_stays_there(truth: PlantTruth) -> None:
+    plant = Plant(ns16.urdf_text(), truth, position=START)
+    plant.set_state(START, [0.4, -0.3, 0.5, 1.0, -1.0, 2.0])
+    crossings = np.zeros(6)
+    for _ in range(4000):
+        before = np.sign(plant.velocity)
+        plant.step(gravity_torque(plant), STEP)
+        crossings += before * np.sign(plant.velocity) < 0.0
+    np.testing.assert_array_equal(plant.velocity, 0.0)
+    assert crossings.max() <= 1  # no chatter about zero
+    at_rest = plant.position.copy()
+    for _ in range(100):
+        plant.step(gravity_torque(plant), STEP)
+    np.testing.assert_array_equal(plant.position, at_rest)
+
+
+def test_friction_only_takes_power(truth: PlantTruth) -> None:
+    plant = Plant(ns16.urdf_text(), truth, position=START)
+    rng = np.random.default_rng(5)
+    for k in range(2000):
+        if k % 50 == 0:
+            torque = gravity_torque(plant) + rng.normal(size=6) * 2.0 * truth.coulomb
+        before, trend = plant.velocity.copy(), plant.acceleration.copy()
+        plant.step(torque, STEP)
+        mean = 0.5 * (before + plant.velocity)
+        # (a joint that stops or turns has friction of both signs within the step)
+        straight = (before * plant.velocity > 0.0) | (before == 0.0)
+        # viscous friction acts at a predicted velocity, wrong by less than one step's change
+        change = STEP * np.maximum(np.abs(trend), np.abs(plant.acceleration))
+        allowance = truth.viscous * change**2
+        assert np.all((plant.friction_torque * mean + allowance)[straight] >= 0.0)
+
+
+@pytest.mark.parametrize("law", ["quadratic", "cubic"])
+def test_the_third_term_bends_friction_as_stated(truth: PlantTruth, law: str) -> None:
+    third = np.full(6, -0.5)
+    bent = PlantTruth(truth.rotor_inertia, truth.coulomb, truth.viscous, third, law)
+    v = np.array([2.0, -2.0, 1.0, -1.0, 0.5, 0.0])
+    shape = np.sign(v) * v**2 if law == "quadratic" else v**3
+    np.testing.assert_allclose(bent.friction(v), truth.friction(v) + third * shape)
+
+
+def test_closed_brakes_stop_and_hold_the_arm(truth: PlantTruth) -> None:
+    plant = Plant(ns16.urdf_text(), truth, position=START, brake_torque=2000.0)
+    plant.set_state(START, np.full(6, 2.0))
+    plant.close_brakes(True)
+    for _ in range(1000):
+        plant.step(np.zeros(6), STEP)
+    np.testing.assert_array_equal(plant.velocity, 0.0)
+    plant.close_brakes(False)
+    for _ in range(20):
+        plant.step(np.zeros(6), STEP)
+    assert plant.velocity.any()
+
+
+def test_warm_friction_is_scaled(truth: PlantTruth) -> None:
+    plant = Plant(ns16.urdf_text(), truth, position=START)
+    plant.set_state(START, np.ones(6))
+    plant.scale_friction(np.full(6, 0.5))
+    plant.step(gravity_torque(plant), 1e-6)
+    np.testing.assert_allclose(plant.friction_torque, 0.5 * truth.friction(np.ones(6)), rtol=1e-6)
+
+
+def test_a_run_that_leaves_the_numbers_is_an_error(truth: PlantTruth) -> None:
+    plant = Plant(ns16.urdf_text(), truth, position=START)
+    with pytest.raises(PlantDiverged):
+        for _ in range(10):
+            plant.step(np.full(6, np.nan), STEP)
+
+
+def test_a_truth_of_the_wrong_size_is_refused(truth: PlantTruth) -> None:
+    with pytest.raises(SettingError, match="6 degrees of freedom"):
+        Plant(ns16.urdf_text(), PlantTruth.frictionless(np.ones(5)))
+    with pytest.raises(SettingError, match="coulomb"):
+        PlantTruth(truth.rotor_inertia, -truth.coulomb, truth.viscous, truth.third)
+    with pytest.raises(SettingError, match="position"):
+        Plant(ns16.urdf_text(), truth, position=np.zeros(5))

@@ -1,0 +1,206 @@
+"""The controller's loop program: phases and what moves it on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from sim_fixtures import ControllerSettings, Phase, SettingError
+from sim_fixtures.program import MISSING, Answer, LoopProgram, StartStep
+
+FINE = Answer(valid=True)
+QUICK: dict[str, Any] = {
+    "drive_off_cycles": 2,
+    "driving_on_cycles": 3,
+    "closed_cycles": 2,
+    "closing_cycles": 2,
+    "opening_stagger": 2,
+}
+
+
+def program(**changes: Any) -> LoopProgram:
+    return LoopProgram(3, ControllerSettings(**(QUICK | changes)))
+
+
+def advance(loop: LoopProgram, cycles: int = 1, answer: Answer = FINE) -> None:
+    for _ in range(cycles):
+        loop.advance(answer, standing=True)
+
+
+def advance_to(loop: LoopProgram, phase: Phase) -> None:
+    for _ in range(100):
+        if loop.phase is phase:
+            return
+        advance(loop)
+    raise AssertionError(f"{phase!r} never came; stuck in {loop.phase!r}")
+
+
+def test_a_cold_start_is_nine_sync_packets_init_and_two_more() -> None:
+    loop = program()
+    steps = []
+    while loop.phase is Phase.START:
+        steps.append(loop.start_step)
+        advance(loop)
+    assert steps == [StartStep.SYNC] * 9 + [StartStep.INIT] + [StartStep.SYNC] * 2
+
+
+def test_a_warm_start_begins_with_init() -> None:
+    loop = program(cold_start=False)
+    assert loop.start_step is StartStep.INIT
+    advance(loop)
+    assert loop.phase is Phase.DRIVE_OFF
+
+
+def test_an_init_packet_that_nobody_answers_ends_the_session() -> None:
+    loop = program(cold_start=False)
+    advance(loop, answer=MISSING)
+    assert loop.phase is Phase.ENDED
+    assert "init" in loop.reason
+
+
+def test_phases_last_as_long_as_set() -> None:
+    loop = program()
+    advance_to(loop, Phase.DRIVE_OFF)
+    phases = []
+    while loop.phase is not Phase.OPENING:
+        phases.append(loop.phase)
+        advance(loop)
+    assert phases == [Phase.DRIVE_OFF] * 2 + [Phase.DRIVING_ON] * 3 + [Phase.CLOSED] * 2
+
+
+def test_axes_open_one_after_the_other() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPENING)
+    seen = []
+    while loop.phase is Phase.OPENING:
+        seen.append(loop.open_axes)
+        advance(loop)
+    assert seen == [
+        [True, False, False],
+        [True, False, False],
+        [True, True, False],
+        [True, True, False],
+        [True, True, True],
+    ]
+    assert loop.phase is Phase.OPEN
+    assert loop.intervals == 1
+
+
+def test_exit_closes_for_some_cycles_and_the_loop_opens_again() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPEN)
+    advance(loop, answer=Answer(valid=True, exit=True))
+    assert loop.phase is Phase.CLOSING
+    assert all(loop.open_axes)
+    assert not loop.listening
+    advance(loop, 2)
+    assert loop.phase is Phase.CLOSED
+    advance_to(loop, Phase.OPEN)
+    assert loop.intervals == 2
+
+
+def test_505_switches_off_until_somebody_switches_on() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPEN)
+    advance(loop, answer=Answer(valid=True, drive_off=True))
+    advance(loop, 50)
+    assert loop.phase is Phase.DRIVE_OFF
+    assert "505" in loop.reason
+    loop.drive_on()
+    advance_to(loop, Phase.OPEN)
+
+
+def test_508_goes_to_closed_with_the_drive_on() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPEN)
+    advance(loop, answer=Answer(valid=True, following_error=True))
+    assert loop.phase is Phase.CLOSED
+    assert loop.powered
+
+
+def test_missing_replies_end_open_mode_and_only_open_mode() -> None:
+    loop = program(missed_replies=2)
+    advance_to(loop, Phase.CLOSED)
+    advance(loop, answer=MISSING)
+    assert loop.phase is Phase.CLOSED
+    advance_to(loop, Phase.OPEN)
+    advance(loop, answer=MISSING)
+    advance(loop)
+    advance(loop, answer=MISSING)
+    assert loop.phase is Phase.OPEN
+    advance(loop, answer=MISSING)
+    assert loop.phase is Phase.CLOSED
+
+
+def test_long_silence_ends_the_session() -> None:
+    loop = program(silence_limit=20)
+    advance_to(loop, Phase.CLOSED)
+    for _ in range(30):
+        advance(loop, answer=MISSING)
+    assert loop.phase is Phase.ENDED
+
+
+def test_a_trip_in_open_mode_drops_the_drive_before_the_modes() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPEN)
+    loop.trip("test")
+    assert not loop.powered
+    assert loop.braked
+    assert all(loop.open_axes)
+    advance(loop, 2)
+    assert loop.phase is Phase.DRIVE_OFF
+    assert not any(loop.open_axes)
+
+
+def test_leaving_while_axes_are_opening_opens_no_further_axis() -> None:
+    for leave in ("trip", "exit"):
+        loop = program()
+        advance_to(loop, Phase.OPENING)
+        if leave == "trip":
+            loop.trip("test")
+        else:
+            advance(loop, answer=Answer(valid=True, exit=True))
+        assert loop.open_axes == [True, False, False]
+        advance(loop, 2)
+        assert not any(loop.open_axes)
+
+
+def test_finish_waits_until_the_arm_stands() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPEN)
+    loop.finish()
+    loop.advance(FINE, standing=False)
+    assert loop.phase is Phase.OPEN
+    loop.advance(FINE, standing=True)
+    assert loop.phase is Phase.CLOSING
+    phases = []
+    while loop.phase is not Phase.ENDED:
+        phases.append(loop.phase)
+        advance(loop)
+    assert phases[-3:] == [Phase.SHUTDOWN, Phase.SHUTDOWN, Phase.ENDING]
+
+
+def test_the_program_ends_by_itself_after_its_intervals() -> None:
+    loop = program(open_intervals=1)
+    advance_to(loop, Phase.OPEN)
+    advance(loop, answer=Answer(valid=True, exit=True))
+    advance_to(loop, Phase.ENDED)
+    assert loop.intervals == 1
+
+
+def test_finish_in_drive_off_ends_without_driving_on() -> None:
+    loop = program()
+    advance_to(loop, Phase.DRIVE_OFF)
+    loop.finish()
+    advance(loop, 3)
+    assert loop.phase is Phase.ENDED
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"period": 0.0005}, {"substeps": 0}, {"missed_replies": 0}, {"open_mode": 7}],
+)
+def test_impossible_settings_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(SettingError):
+        ControllerSettings(**change)
