@@ -17,6 +17,9 @@ from identification.smoothing_spline import fit_smoothing_spline, low_pass
 
 Array = NDArray[np.float64]
 
+# Planned motion has next to nothing above 10 Hz, and the first resonance of a large arm lies at
+# 10 to 30 Hz. On the simulated NS 16 everything from 20 to 60 Hz is as good as noise allows.
+RIGID_BANDWIDTH: Final = 40.0  # Hz
 # A smoothed signal is worse near the ends of its segment, where it is known from one side only.
 # Measured on sines with noise: the error of the acceleration has come down to its usual size two
 # periods of the smoother's bandwidth from the end. A joint that hardly moves is smoothed to
@@ -38,24 +41,31 @@ class Preprocessing:
     """How a recording is turned into samples.
 
     Attributes:
-        smooth_torque: the paper's way. The torque is smoothed until its mean squared residual
-            is its noise variance, and the regressor goes through the same linear smoother. By
-            default the torque is left as measured: least squares averages it better.
-        torque_bandwidth: the recorded torque has come through a low-pass of this bandwidth [Hz]
-            before it was logged (many controllers do that); the regressor then goes through the
-            same low-pass and the torque is left alone. None: it has not.
+        rigid_bandwidth: widest bandwidth of the smoothed positions [Hz], however little noise
+            they have. A rigid model has nothing to say above the first resonance of the arm,
+            where motors accelerate without their links; and a wide one lets ripple that has
+            found a resonance pass for inertia.
+        smooth_torque: the paper's way. The torque is smoothed, and the regressor goes through the
+            same linear smoother. By default the torque is left as measured: least squares
+            averages it better.
+        torque_bandwidth: with `smooth_torque` the bandwidth of that smoother [Hz]; None smooths
+            until the mean squared residual is the torque's noise variance. Without, the bandwidth
+            of a low-pass that the torque has come through before it was logged, as many
+            controllers do it: the regressor then goes through the same low-pass and the torque
+            is left alone. None: it has come through none.
         torque_delay: time by which the recorded torque lags the recorded position [s].
     """
 
+    rigid_bandwidth: float = RIGID_BANDWIDTH
     smooth_torque: bool = False
     torque_bandwidth: float | None = None
     torque_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.smooth_torque and self.torque_bandwidth is not None:
-            raise ValueError("either smooth the torque or name its bandwidth, not both")
-        if self.torque_bandwidth is not None and not self.torque_bandwidth > 0.0:
-            raise ValueError(f"torque_bandwidth is {self.torque_bandwidth} Hz, must be positive")
+        for name in ("rigid_bandwidth", "torque_bandwidth"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{name} is {value} Hz, must be positive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +96,8 @@ class Samples:
         """Columns (m, c) of a joint's row as the torque channel would have recorded them."""
         if self.torque_bandwidth is None:
             return columns
-        filtered = np.zeros_like(columns)
-        for segment in self.segments:
-            if segment.stop - segment.start >= _SHORTEST_SEGMENT:
-                filtered[segment] = low_pass(
-                    self.motion.time[segment], columns[segment], self.torque_bandwidth[joint]
-                )
-        return filtered
+        bandwidth = np.full(columns.shape[1], self.torque_bandwidth[joint])
+        return _low_passed(self.motion.time, columns, bandwidth, self.segments)
 
     def regressor(self, model: RobotModel) -> Regressor:
         """Regressor of every row, usable or not, as the torque channel would record it."""
@@ -191,7 +196,11 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
 
 
 def smooth(
-    recording: Recording, noise_variance: Array | None = None, *, delay: float = 0.0
+    recording: Recording,
+    noise_variance: Array | None = None,
+    *,
+    delay: float = 0.0,
+    widest: float = RIGID_BANDWIDTH,
 ) -> Motion:
     """Smoothed motion in the rows of the recording, at each instant less the delay.
 
@@ -203,8 +212,9 @@ def smooth(
         noise_variance: of the measured positions (n,) [rad² or m²], from standstill and at least
             resolution²/12. None: estimated from the differences of the positions.
         delay: time by which what the motion is to be compared with lags it [s].
+        widest: see `Preprocessing.rigid_bandwidth` [Hz].
     """
-    return _smooth(recording, noise_variance, delay)[0]
+    return _smooth(recording, noise_variance, delay, widest)[0]
 
 
 def prepare(
@@ -233,13 +243,17 @@ def prepare(
     recording.checked(model.joint_names)
     if recording.torque is None:
         raise RecordingError("torque", "the recording has no joint torque to fit")
-    motion, bandwidth, clear = _smooth(recording, noise_variance, options.torque_delay)
+    motion, bandwidth, clear = _smooth(
+        recording, noise_variance, options.torque_delay, options.rigid_bandwidth
+    )
     segments = tuple(recording.segments())
     torque, torque_bandwidth = recording.torque, None
     if options.torque_bandwidth is not None:
         torque_bandwidth = np.full(recording.n_joints, options.torque_bandwidth)
-    elif options.smooth_torque:
-        torque, torque_bandwidth = _smooth_torque(recording, torque_variance, segments)
+    if options.smooth_torque:
+        if torque_bandwidth is None:
+            torque_bandwidth = _noise_bandwidth(recording, torque_variance, segments)
+        torque = _low_passed(recording.time, torque, torque_bandwidth, segments)
     if torque_bandwidth is not None:
         ends = min(LONGEST_END, END_PERIODS / float(torque_bandwidth.min()))
         clear &= _away_from_ends(recording.time, segments, ends)
@@ -256,7 +270,7 @@ def prepare(
 
 
 def _smooth(
-    recording: Recording, noise_variance: Array | None, delay: float
+    recording: Recording, noise_variance: Array | None, delay: float, widest: float
 ) -> tuple[Motion, Array, NDArray[np.bool_]]:
     """Motion, bandwidth (n,) of the longest segment, and rows (m,) that are away from ends."""
     position = recording.position.copy()
@@ -269,10 +283,8 @@ def _smooth(
         if len(time) < 2 * _SHORTEST_SEGMENT:
             continue
         variance = difference_variance(time, measured) if noise_variance is None else noise_variance
-        # A reading without noise is interpolated as closely as its own rounding allows.
-        rounding = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2
         spline = fit_smoothing_spline(
-            time, measured, np.maximum(variance, np.maximum(rounding, 1e-40))
+            time, measured, _attainable(variance, measured), widest=widest
         )
         at = time - delay
         position[segment], velocity[segment] = spline(at), spline(at, 1)
@@ -286,10 +298,10 @@ def _smooth(
     return Motion(recording.time, position, velocity, acceleration), bandwidth, clear
 
 
-def _smooth_torque(
+def _noise_bandwidth(
     recording: Recording, variance: Array | None, segments: tuple[slice, ...]
-) -> tuple[Array, Array]:
-    """Smoothed torque, and the bandwidth per joint at which it and the regressor are smoothed.
+) -> Array:
+    """Bandwidth per joint (n,) [Hz] that takes the noise variance (n,) out of the torque.
 
     One bandwidth per joint, from the longest segment, so that the smoother is one and the same
     linear filter everywhere.
@@ -299,19 +311,29 @@ def _smooth_torque(
     time, measured = recording.time[longest], recording.torque[longest]
     if variance is None:
         variance = difference_variance(time, measured)
-    tiny = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2
-    bandwidth = fit_smoothing_spline(
-        time, measured, np.maximum(variance, np.maximum(tiny, 1e-40))
-    ).bandwidth
-    smoothed = recording.torque.copy()
+    return fit_smoothing_spline(time, measured, _attainable(variance, measured)).bandwidth
+
+
+def _attainable(variance: Array, measured: Array) -> Array:
+    """Noise variance (c,), at least that of rounding: closer a spline cannot follow (m, c)."""
+    rounding = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2
+    return np.asarray(np.maximum(variance, np.maximum(rounding, 1e-40)))
+
+
+def _low_passed(
+    time: Array, columns: Array, bandwidth: Array, segments: tuple[slice, ...]
+) -> Array:
+    """Columns (m, c), each through a low-pass of its own (c,), segment by segment."""
+    filtered = np.zeros_like(columns)
     for segment in segments:
-        if segment.stop - segment.start >= _SHORTEST_SEGMENT:
-            for joint in range(recording.n_joints):
-                column = recording.torque[segment, joint : joint + 1]
-                smoothed[segment, joint] = low_pass(
-                    recording.time[segment], column, float(bandwidth[joint])
-                )[:, 0]
-    return smoothed, bandwidth
+        if segment.stop - segment.start < _SHORTEST_SEGMENT:
+            continue
+        for value in np.unique(bandwidth):
+            alike = bandwidth == value
+            filtered[segment, alike] = low_pass(
+                time[segment], columns[segment][:, alike], float(value)
+            )
+    return filtered
 
 
 def _near_reversal(motion: Motion, bandwidth: Array) -> NDArray[np.bool_]:

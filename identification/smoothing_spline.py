@@ -36,6 +36,8 @@ SAMPLES_PER_KNOT: Final = 4
 # can show (lower end) and where the normal equations still have digits left (upper end).
 _LIGHTEST: Final = 1e-9
 _HEAVIEST: Final = 1e11
+# Radians of a cutoff frequency per knot: the knots then follow far more than the smoother passes.
+_KNOT_OF_CUTOFF: Final = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +69,12 @@ class SmoothingSpline:
 
 
 def fit_smoothing_spline(
-    time: Array, values: Array, tolerance: Array, *, samples_per_knot: int = SAMPLES_PER_KNOT
+    time: Array,
+    values: Array,
+    tolerance: Array,
+    *,
+    widest: float = np.inf,
+    samples_per_knot: int = SAMPLES_PER_KNOT,
 ) -> SmoothingSpline:
     """Smooth each channel until its mean squared residual equals its tolerance.
 
@@ -79,6 +86,7 @@ def fit_smoothing_spline(
         time: strictly increasing (m,) [s], uniform or not.
         values: (m, c).
         tolerance: wanted mean squared residual (c,), positive.
+        widest: bandwidth [Hz] that is never exceeded, whatever the tolerance.
         samples_per_knot: knot spacing in median sampling intervals, to begin with.
 
     Raises:
@@ -91,11 +99,14 @@ def fit_smoothing_spline(
         raise ValueError(f"the tolerance must be positive in every channel, got {tolerance}")
     while True:
         problem = _Problem.build(time, values, samples_per_knot * _median_step(time))
-        if samples_per_knot == 1 or np.all(problem.closest_residual_variance <= tolerance):
+        fine = problem.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
+        close = bool(np.all(problem.closest_residual_variance <= tolerance))
+        if fine or close or samples_per_knot == 1:
             break
         samples_per_knot = max(1, samples_per_knot // 2)
+    channels = range(values.shape[1])
     return problem.solve(
-        np.array([problem.penalty_for(c, tolerance[c]) for c in range(values.shape[1])])
+        np.array([problem.penalty_for(c, float(tolerance[c]), widest) for c in channels])
     )
 
 
@@ -105,12 +116,9 @@ def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
     What is applied to a measured torque and to every column of its regressor alike leaves their
     linear relation as it is.
     """
-    cutoff = 2.0 * np.pi * bandwidth
-    # Half a radian of the cutoff per knot: the knots then follow far more than the filter passes.
-    problem = _Problem.build(time, values, max(_median_step(time), 0.5 / cutoff))
-    penalty = problem.density / (cutoff * problem.spacing) ** 6
-    lightest, heaviest = problem.density * np.array([_LIGHTEST, _HEAVIEST])
-    correction = problem.correction(slice(None), float(np.clip(penalty, lightest, heaviest)))
+    spacing = max(_median_step(time), _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth))
+    problem = _Problem.build(time, values, spacing)
+    correction = problem.correction(slice(None), problem.penalty_at(bandwidth))
     return np.asarray(problem.rows @ (problem.closest + correction))
 
 
@@ -162,8 +170,17 @@ class _Problem:
         excess = penalty - _LIGHTEST * self.density
         return np.asarray(cho_solve_banded((factor, True), -excess * self.roughness[:, channel]))
 
-    def penalty_for(self, channel: int, tolerance: float) -> float:
-        """Penalty at which the channel's mean squared residual equals the tolerance."""
+    def penalty_at(self, bandwidth: float) -> float:
+        """Penalty that gives a bandwidth [Hz], within what the knots can show."""
+        cutoff = 2.0 * np.pi * bandwidth * self.spacing  # rad per knot
+        share = np.clip(1.0 / max(cutoff, 1e-3) ** 6, _LIGHTEST, _HEAVIEST)
+        return float(self.density * share)
+
+    def penalty_for(self, channel: int, tolerance: float, widest: float) -> float:
+        """Penalty at which the channel's mean squared residual equals the tolerance.
+
+        Never less than gives the widest bandwidth [Hz].
+        """
 
         def excess(log_penalty: float) -> float:
             residual = self.closest_residual[:, channel] - self.rows @ self.correction(
@@ -172,8 +189,9 @@ class _Problem:
             variance = float(np.mean(residual**2))
             return float(np.log(max(variance / tolerance, np.finfo(np.float64).tiny)))
 
-        lightest, heaviest = np.log(self.density * np.array([_LIGHTEST, _HEAVIEST]))
-        if self.closest_residual_variance[channel] >= tolerance:
+        lightest = np.log(self.penalty_at(widest))
+        heaviest = np.log(self.penalty_at(0.0))
+        if excess(lightest) >= 0.0:
             return float(np.exp(lightest))
         if excess(heaviest) <= 0.0:
             return float(np.exp(heaviest))

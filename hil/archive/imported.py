@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive.file_writer import ArchiveFile
-from hil.archive.schema import SampleEncoder
+from hil.archive.schema import Batch, SampleEncoder
 from hil.archive.writer import checked_metadata
 from hil.errors import ArchiveWriteError
 
@@ -57,8 +57,7 @@ def write_samples(
         joint_names: joints in the order of the columns.
         metadata: entries of the ``hil`` metadata record, such as where the recording comes from.
         attachments: content by file name.
-        period: time from sample to sample [s] where the recording was taken at a fixed rate;
-            its time is then counted in samples, free of the stamps' rounding.
+        period: step [s] of a recording at a fixed rate; its time is then counted in samples.
         durable: wait until the disk has the data.
 
     Raises:
@@ -86,12 +85,20 @@ def write_samples(
         durable=durable,
     )
     for start in range(0, len(samples.stamp), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        columns = (samples.position, samples.velocity, samples.torque, samples.motor_current)
-        cut = [None if column is None else column[part] for column in columns]
-        assert cut[0] is not None
-        file.add(encoder.encode(samples.stamp[part], cut[0], *cut[1:]))
+        file.add(_encode(encoder, samples, slice(start, start + _CHUNK)))
         file.flush()
-    count = str(len(samples.stamp))
-    file.finish({"outcome": "completed", "samples": count, "events": "0"})
+    file.finish({"outcome": "completed", "samples": str(len(samples.stamp)), "events": "0"})
     return path
+
+
+def _encode(encoder: SampleEncoder, samples: Samples, part: slice) -> Batch:
+    def cut(values: Array | None) -> Array | None:
+        return None if values is None else values[part]
+
+    return encoder.encode(
+        samples.stamp[part],
+        samples.position[part],
+        cut(samples.velocity),
+        cut(samples.torque),
+        cut(samples.motor_current),
+    )

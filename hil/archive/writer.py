@@ -97,7 +97,8 @@ class ArchiveWriter:
         """Append cycle records.
 
         Args:
-            records: shape (k,), structure of `drivers.cycle_dtype`.
+            records: shape (k,), structure of `drivers.cycle_dtype`; kept until their chunk is
+                written, so hand over a copy. Batches of some 100 cycles cost least.
             torque: joint torque of each record, shape (k, n) [N·m]; None when it is not known.
 
         Raises:

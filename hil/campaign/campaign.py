@@ -75,7 +75,9 @@ class Campaign:
         """
         folder = CampaignFolder(root)
         if not folder.plan.exists():
-            raise CampaignFolderError(root, "is not a campaign folder", "name one that has plan.json")
+            raise CampaignFolderError(
+                root, "is not a campaign folder", "name one that has plan.json"
+            )
         return cls(folder, Cell.load(folder.cell), CampaignPlan.load(folder.plan))
 
     def run(
@@ -166,7 +168,7 @@ class Campaign:
             self.folder.archives / name.filename,
             joint_names=cell.joint_names,
             attachments=self._attachments(interval),
-            metadata=name.metadata() | self._metadata() | dict(provenance),
+            metadata=self._metadata() | dict(provenance),
             period=cell.period,
             durable=durable,
         )

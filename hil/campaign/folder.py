@@ -119,7 +119,7 @@ class CampaignFolder:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replace `path` by `text` so that a crash leaves the old or the new file, never half of one."""
+    """Replace `path` by `text`: a crash leaves the old or the new file, never half of one."""
     temporary = path.with_suffix(path.suffix + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
         file.write(text)

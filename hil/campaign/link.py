@@ -125,9 +125,7 @@ class Link:
             )
         return last
 
-    def run(
-        self, source: MotionSource, writer: ArchiveWriter, stop: Stop
-    ) -> MotionEnded:
+    def run(self, source: MotionSource, writer: ArchiveWriter, stop: Stop) -> MotionEnded:
         """Run one motion and archive every cycle of it; say how it ended."""
         recorder = _Recorder(self, writer)
         self.ring.drain()

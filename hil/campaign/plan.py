@@ -135,7 +135,5 @@ class MotionChecks:
             check_smooth(trajectory, self.limits)
         except NotSmooth as error:
             return str(error)
-        result = check_motion(
-            trajectory, self.limits, checker=self.checker, currents=self.currents
-        )
+        result = check_motion(trajectory, self.limits, checker=self.checker, currents=self.currents)
         return None if result.ok else str(result.violations[0])

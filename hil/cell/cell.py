@@ -16,9 +16,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from drivers.drive_train import DriveTrain
 from drivers.guard import GuardLimits
 from identification.errors import ModelError
+from identification.excitation import Box, Workspace
 from identification.friction import FrictionLaw
 from identification.model import RobotModel
-from identification.excitation import Box, Workspace
 from planner import JointLimits
 
 from .errors import CellError, first_error
@@ -80,7 +80,9 @@ class Cell:
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise CellError(path, "", None, f"cannot be read ({error})", "name a TOML file") from error
+            raise CellError(
+                path, "", None, f"cannot be read ({error})", "name a TOML file"
+            ) from error
         file = _parse(path, text)
         urdf_path = path.parent / file.cell.urdf
         try:
@@ -199,8 +201,8 @@ class Cell:
         """Floor, walls and clearance."""
         table = self.file.workspace
         return Workspace(
-            floor=table.floor,
-            boxes=tuple(Box(lower=tuple(b.lower), upper=tuple(b.upper)) for b in table.walls),
+            floor=None if table.floor == "none" else table.floor,
+            boxes=tuple(Box(lower=b.lower, upper=b.upper) for b in table.walls),
             margin=table.margin,
         )
 

@@ -15,6 +15,7 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Vector = list[FiniteFloat]
 PositiveVector = list[Positive]
+Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class _Table(BaseModel):
@@ -25,7 +26,7 @@ class CellTable(_Table):
     """`[cell]`: what this cell is called and which of its figures are assumptions."""
 
     name: str = Field(min_length=1, max_length=80, description="a short name of the cell")
-    description: str = Field("", description="one or two sentences for the reader")
+    description: str = Field(default="", description="one or two sentences for the reader")
     urdf: str = Field(description="the URDF file, relative to this cell file")
     assumed: list[str] = Field(
         default_factory=list,
@@ -36,14 +37,14 @@ class CellTable(_Table):
 class FrictionTable(_Table):
     """`[robot] friction`: which friction columns each joint gets."""
 
-    coulomb: bool = Field(True, description="true or false: f0 sgn(qd)")
-    viscous: bool = Field(True, description="true or false: f1 qd")
+    coulomb: bool = Field(default=True, description="true or false: f0 sgn(qd)")
+    viscous: bool = Field(default=True, description="true or false: f1 qd")
     third: Literal["quadratic", "cubic", "none"] = Field(
-        "quadratic", description='"quadratic" (sgn(qd) qd²), "cubic" (qd³) or "none"'
+        default="quadratic", description='"quadratic" (sgn(qd) qd²), "cubic" (qd³) or "none"'
     )
-    offset: bool = Field(False, description="true or false: a constant torque per joint")
+    offset: bool = Field(default=False, description="true or false: a constant torque per joint")
     standstill: NonNegative = Field(
-        0.02, description="speed in rad/s below which a joint's row is not used for fitting"
+        default=0.02, description="speed in rad/s below which a joint's row is not used for fitting"
     )
 
 
@@ -51,10 +52,14 @@ class RobotTable(_Table):
     """`[robot]`: how the rigid body model is built from the URDF."""
 
     gravity: Annotated[Vector, Field(min_length=3, max_length=3)] = Field(
-        [0.0, 0.0, -9.81], description="gravity in the base frame, three figures in m/s²"
+        default=[0.0, 0.0, -9.81], description="gravity in the base frame, three figures in m/s²"
     )
-    rotor_inertia: bool = Field(True, description="true or false: one rotor inertia per joint")
-    friction: FrictionTable = Field(FrictionTable(), description="a table of friction columns")
+    rotor_inertia: bool = Field(
+        default=True, description="true or false: one rotor inertia per joint"
+    )
+    friction: FrictionTable = Field(
+        default=FrictionTable(), description="a table of friction columns"
+    )
 
 
 class NominalTable(_Table):
@@ -65,7 +70,7 @@ class NominalTable(_Table):
     viscous: list[NonNegative] = Field(description="viscous friction in N·m·s/rad, one per joint")
     third: Vector = Field(description="third friction coefficient, one per joint; 0 if unknown")
     uncertainty: NonNegative = Field(
-        0.1, description="relative uncertainty of the nominal torque, e.g. 0.1 for 10 %"
+        default=0.1, description="relative uncertainty of the nominal torque, e.g. 0.1 for 10 %"
     )
 
 
@@ -87,7 +92,9 @@ class LimitsTable(_Table):
     def _ordered(self) -> LimitsTable:
         for joint, (low, high) in enumerate(zip(self.lower_deg, self.upper_deg, strict=False), 1):
             if low >= high:
-                raise ValueError(f"joint {joint}: lower_deg {low:g} is not below upper_deg {high:g}")
+                raise ValueError(
+                    f"joint {joint}: lower_deg {low:g} is not below upper_deg {high:g}"
+                )
         return self
 
 
@@ -102,10 +109,10 @@ class BoundsTable(_Table):
     """`[bounds]`: plan < override < stop."""
 
     override: FactorsTable = Field(
-        FactorsTable(acceleration=1.3, jerk=1.7), description="a table {acceleration, jerk}"
+        default=FactorsTable(acceleration=1.3, jerk=1.7), description="a table {acceleration, jerk}"
     )
     stop: FactorsTable = Field(
-        FactorsTable(acceleration=2.0, jerk=3.0), description="a table {acceleration, jerk}"
+        default=FactorsTable(acceleration=2.0, jerk=3.0), description="a table {acceleration, jerk}"
     )
 
 
@@ -116,9 +123,9 @@ class DriveTrainTable(_Table):
         description="signed motor revolutions per joint revolution, none of them 0"
     )
     calibration: Vector = Field(description="motor revolutions at controller angle 0")
-    k54: FiniteFloat = Field(0.0, description="wrist coupling of axis 4 into motor 5")
-    k64: FiniteFloat = Field(0.0, description="wrist coupling of axis 4 into motor 6")
-    k65: FiniteFloat = Field(0.0, description="wrist coupling of axis 5 into motor 6")
+    k54: FiniteFloat = Field(default=0.0, description="wrist coupling of axis 4 into motor 5")
+    k64: FiniteFloat = Field(default=0.0, description="wrist coupling of axis 4 into motor 6")
+    k65: FiniteFloat = Field(default=0.0, description="wrist coupling of axis 5 into motor 6")
     joint_sign: list[Literal[-1, 1]] = Field(
         description="1 or -1: sense of the controller's angle against the URDF's"
     )
@@ -128,7 +135,7 @@ class DriveTrainTable(_Table):
     torque_constant: PositiveVector = Field(description="N·m/A at the motor, all above 0")
     current_limit: PositiveVector = Field(description="A at the motor, one per joint")
     following_error: PositiveVector = Field(description="threshold in motor revolutions")
-    encoder_counts_per_revolution: Positive = Field(description="encoder counts per motor turn")
+    encoder_counts_per_revolution: int = Field(gt=0, description="encoder counts per motor turn")
 
     @model_validator(mode="after")
     def _nonzero(self) -> DriveTrainTable:
@@ -141,15 +148,15 @@ class DriveTrainTable(_Table):
 class ControllerTable(_Table):
     """`[controller]`: the link to the controller."""
 
-    transport: Literal["simulated", "udp", "can"] = Field(
-        description='"simulated", "udp" or "can"'
-    )
+    transport: Literal["simulated", "udp", "can"] = Field(description='"simulated", "udp" or "can"')
     cycle_ms: Literal[1, 2] = Field(description="the controller's cycle, 1 or 2 ms")
-    mode: Literal[4] = Field(4, description="the open mode of campaigns: 4 (absolute position)")
-    host: str = Field("10.2.12.150", description="address of the controller")
-    port: int = Field(1000, gt=0, lt=65536, description="UDP port, 1 to 65535")
+    mode: Literal[4] = Field(
+        default=4, description="the open mode of campaigns: 4 (absolute position)"
+    )
+    host: str = Field(default="10.2.12.150", description="address of the controller")
+    port: int = Field(default=1000, gt=0, lt=65536, description="UDP port, 1 to 65535")
     current_delay_cycles: FiniteFloat = Field(
-        0.0,
+        default=0.0,
         description="cycles by which the position of a packet is newer than its target current",
     )
 
@@ -157,49 +164,56 @@ class ControllerTable(_Table):
 class BoxTable(_Table):
     """A box-shaped obstacle in the base frame."""
 
-    lower: Annotated[Vector, Field(min_length=3, max_length=3)] = Field(
-        description="its lower corner, three figures in m"
-    )
-    upper: Annotated[Vector, Field(min_length=3, max_length=3)] = Field(
-        description="its upper corner, three figures in m"
-    )
+    lower: Point = Field(description="its lower corner, three figures in m")
+    upper: Point = Field(description="its upper corner, three figures in m")
 
 
 class WorkspaceTable(_Table):
     """`[workspace]`: what the arm must not touch, in the base frame."""
 
-    floor: FiniteFloat | None = Field(0.0, description="height of the floor in m; leave out if none")
+    floor: FiniteFloat | Literal["none"] = Field(
+        default=0.0, description='height of the floor in m, or "none"'
+    )
     walls: list[BoxTable] = Field(
         default_factory=list, description="boxes {lower = [x, y, z], upper = [x, y, z]} in m"
     )
-    margin: NonNegative = Field(0.05, description="clearance to keep, in m")
+    margin: NonNegative = Field(default=0.05, description="clearance to keep, in m")
 
 
 class CampaignTable(_Table):
     """`[campaign]`: how the excitation is designed and executed."""
 
-    repetitions: int = Field(30, ge=1, le=1000, description="repetitions, 1 to 1000")
-    validation_runs: int = Field(10, ge=1, le=1000, description="validation runs, 1 to 1000")
+    repetitions: int = Field(default=30, ge=1, le=1000, description="repetitions, 1 to 1000")
+    validation_runs: int = Field(
+        default=10, ge=1, le=1000, description="validation runs, 1 to 1000"
+    )
     home_deg: Vector = Field(
         description="start posture of every excitation, in degrees, in the frame of [limits]"
     )
     approach_speed: Annotated[FiniteFloat, Field(gt=0, le=1)] = Field(
-        0.1, description="fraction of the joint speeds for moves to the start, above 0, at most 1"
+        default=0.1,
+        description="fraction of the joint speeds for moves to the start, above 0, at most 1",
     )
-    settle_s: NonNegative = Field(0.5, description="seconds of rest recorded after each motion")
-    standstill_s: Positive = Field(5.0, description="seconds of standstill for the noise variance")
-    n_via: int = Field(6, ge=2, le=60, description="via points of the excitation, 2 to 60")
+    settle_s: NonNegative = Field(
+        default=0.5, description="seconds of rest recorded after each motion"
+    )
+    standstill_s: Positive = Field(
+        default=5.0, description="seconds of standstill for the noise variance"
+    )
+    n_via: int = Field(default=6, ge=2, le=60, description="via points of the excitation, 2 to 60")
     fly: Annotated[FiniteFloat, Field(ge=0, le=1)] = Field(
-        0.5, description="fly-by fraction, 0 (stop at every via point) to 1"
+        default=0.5, description="fly-by fraction, 0 (stop at every via point) to 1"
     )
-    candidates: int = Field(300, ge=1, description="random via-point sets to choose from")
-    seed: int = Field(1, ge=0, description="seed of the search and of the validation motions")
+    candidates: int = Field(default=300, ge=1, description="random via-point sets to choose from")
+    seed: int = Field(
+        default=1, ge=0, description="seed of the search and of the validation motions"
+    )
 
 
 class SimulationTable(_Table):
     """`[simulation]`: what the simulated cell really is; ignored on hardware."""
 
-    seed: int = Field(1, ge=0, description="one seed is one bit-identical run")
+    seed: int = Field(default=1, ge=0, description="one seed is one bit-identical run")
     initial_deg: Vector = Field(
         description="where the simulated arm stands at first, degrees, in the frame of [limits]"
     )
@@ -210,15 +224,17 @@ class SimulationTable(_Table):
     current_noise: NonNegative = Field(description="A rms about the target current, each motor")
     current_resolution: NonNegative = Field(description="step of the target current, A")
     torque_ripple: NonNegative = Field(
-        0.0, description="size of an unmodelled effect: share of the Coulomb torque"
+        default=0.0, description="size of an unmodelled effect: share of the Coulomb torque"
     )
     friction_drift: Annotated[FiniteFloat, Field(ge=0, lt=1)] = Field(
-        0.0, description="size of an unmodelled effect: fall of the friction from cold to hot"
+        default=0.0,
+        description="size of an unmodelled effect: fall of the friction from cold to hot",
     )
     elasticity: list[NonNegative] = Field(
         default_factory=list,
         description="size of an unmodelled effect: rad/(N·m) of each gear, or nothing",
     )
     delay: NonNegative = Field(
-        0.0, description="size of an unmodelled effect: later effect of the target current, s"
+        default=0.0,
+        description="size of an unmodelled effect: later effect of the target current, s",
     )

@@ -17,8 +17,6 @@ from planner import PlannerError
 
 from . import demo, identify, imports
 
-
-
 app = typer.Typer(
     name="hil",
     help=(
@@ -35,8 +33,6 @@ app.command("identify")(identify.identify)
 app.add_typer(imports.app, name="import")
 
 
-
-
 def main() -> None:
     """Run the command line; known errors become one sentence and an exit status."""
     try:
@@ -50,7 +46,9 @@ def main() -> None:
 
 
 def _fail(text: str, status: int) -> None:
-    Console(stderr=True).print(f"[bold red]error:[/] {_escaped(text)}", highlight=False, soft_wrap=True)
+    Console(stderr=True).print(
+        f"[bold red]error:[/] {_escaped(text)}", highlight=False, soft_wrap=True
+    )
     sys.exit(status)
 
 

@@ -18,7 +18,9 @@ def identify(
     archives: Annotated[
         list[Path],
         typer.Argument(
-            help="Archives (*.mcap), or one campaign folder.", show_default=False, metavar="ARCHIVE..."
+            help="Archives (*.mcap), or one campaign folder.",
+            show_default=False,
+            metavar="ARCHIVE...",
         ),
     ],
     output: Annotated[
@@ -47,7 +49,9 @@ def identify(
     ] = 0.7,
     delay: Annotated[
         float | None,
-        typer.Option(help="Time in s by which the torque lags the position; the cell's if left out."),
+        typer.Option(
+            help="Time in s by which the torque lags the position; the cell's if left out."
+        ),
     ] = None,
     torque_bandwidth: Annotated[
         float | None,

@@ -22,7 +22,8 @@ Output = Annotated[
 ]
 Urdf = Annotated[Path | None, typer.Option(help="URDF of the robot.", show_default=False)]
 CellFile = Annotated[
-    Path | None, typer.Option(help="A cell file instead of --urdf and --friction.", show_default=False)
+    Path | None,
+    typer.Option(help="A cell file instead of --urdf and --friction.", show_default=False),
 ]
 Friction = Annotated[
     str,
@@ -58,7 +59,9 @@ def rosbag2(
     ] = None,
     effort: Annotated[
         str,
-        typer.Option(help="What the effort field holds: torque (N·m), motor_current (A) or ignore."),
+        typer.Option(
+            help="What the effort field holds: torque (N·m), motor_current (A) or ignore."
+        ),
     ] = "torque",
     fixed: Fixed = None,
     held: Held = None,

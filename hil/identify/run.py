@@ -14,10 +14,10 @@ from hil.errors import InputError
 from hil.progress import Reporter
 from hil.report import ReportSeries
 from hil.results import Results
+from identification.evidence import gather
 from identification.preprocessing import Preprocessing, Samples, prepare
 from identification.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.validation import for_figure
-from identification.evidence import gather
 from identification.verdict import Verdict, judge
 
 from .options import Options
@@ -133,5 +133,3 @@ def _series(
         example_measured=for_figure(time, example.torque)[::thin],
         example_predicted=for_figure(time, predicted)[::thin],
     )
-
-

@@ -124,7 +124,7 @@ def _source(archive: Archive, cell: Cell) -> Source:
     recording = recording_of(archive).checked(cell.joint_names)
     origin = 0.0
     if recording.commanded_position is not None:
-        commanded = np.flatnonzero(~np.isnan(recording.commanded_position[:, 0]))
+        commanded = np.flatnonzero(~np.isnan(recording.commanded_position).any(axis=1))
         origin = float(recording.time[commanded[0]]) if commanded.size else 0.0
     return Source(archive.path.name, recording, origin)
 

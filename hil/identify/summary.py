@@ -34,7 +34,6 @@ from identification.preprocessing import Samples
 from identification.repetitions import RepeatedEstimate
 from identification.validation import prediction_error
 from identification.verdict import Verdict
-
 from sim_fixtures.ns16 import TABLE2, urdf_text
 
 from .sources import Sources
@@ -195,5 +194,3 @@ def _coverage(values: Array, std: Array, truth: Array) -> CoverageResult:
         within_3=int((distance <= 3.0 * std).sum()),
         total=len(values),
     )
-
-

@@ -61,24 +61,15 @@ def import_rosbag2(
     """
     files = _files(Path(source))
     states = _States(files[0], robot.joint_names, joint_names or {})
-    chosen = topic
     for file in files:
         with closing(_connect(file)) as bag:
-            chosen = _choose(bag, file, chosen)
-            for stamp, data in _messages(bag, chosen):
+            topic = _choose(bag, file, topic)
+            for stamp, data in _messages(bag, topic):
                 states.add(stamp, data)
+    samples = states.samples(effort)
+    metadata = {"importer": "rosbag2", "topic": str(topic), "effort": effort, "clock": states.clock}
     return write_imported(
-        output,
-        states.samples(effort),
-        source=files,
-        robot=robot,
-        metadata={
-            "importer": "rosbag2",
-            "topic": str(chosen),
-            "clock": states.clock,
-            "effort": effort,
-        },
-        held_joints=held_joints,
+        output, samples, source=files, robot=robot, metadata=metadata, held_joints=held_joints
     )
 
 

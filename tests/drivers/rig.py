@@ -15,6 +15,7 @@ from drivers import (
     InitPacket,
     Mode,
     MotionEnded,
+    Refused,
     Session,
     StateChanged,
 )
@@ -275,6 +276,11 @@ class Rig:
     def ended(self) -> MotionEnded | None:
         ends = self.seen(MotionEnded)
         return ends[-1] if ends else None
+
+    @property
+    def refusal(self):
+        """Why the last refused set-point was refused."""
+        return self.seen(Refused)[-1].error
 
     @property
     def path(self):

@@ -79,9 +79,7 @@ def test_joint_velocity_is_the_inverse(train, qd, period):
 def test_velocity_on_the_wire_is_the_step_of_the_position(train, q, qd):
     period = 0.002
     step = train.motor_revolutions(q) - train.motor_revolutions(q - qd * period)
-    np.testing.assert_allclose(
-        train.motor_revolutions_per_cycle(qd, period), step, atol=1e-11
-    )
+    np.testing.assert_allclose(train.motor_revolutions_per_cycle(qd, period), step, atol=1e-11)
 
 
 @given(drive_trains(), vectors(20.0), vectors(5.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import N, PERIOD, START, Cruise, Rig, smooth_move
+from rig import PERIOD, START, Cruise, N, Rig, smooth_move
 
 from drivers import (
     Corrupt,
@@ -103,7 +103,9 @@ def test_a_session_from_cold_start_to_its_end():
 
 def test_two_runs_are_the_same_bytes():
     def replies():
-        return run([Lose(60), Lose(80, "to_controller"), Duplicate(90), Corrupt(100, 60)])[1].replies
+        return run([Lose(60), Lose(80, "to_controller"), Duplicate(90), Corrupt(100, 60)])[
+            1
+        ].replies
 
     assert replies() == replies()
 

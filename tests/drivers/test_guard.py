@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rig import N, PERIOD, START, limits
+from rig import PERIOD, START, N, limits
 
 from drivers import Guard, GuardError, JerkLimit
 
@@ -94,13 +94,14 @@ def test_jerk_is_resolved_at_joint_angles_of_many_turns_at_1_ms(offset, turns):
 
 def test_errors_carry_joint_value_bound_and_cycle():
     with pytest.raises(JerkLimit) as caught:
-        feed(begun(), [START + [0, 0, 1e-5, 0, 0, 0]])
+        feed(begun(), [START + np.array([0, 0, 1e-5, 0, 0, 0])])
     error = caught.value
     assert (error.joint, error.cycle) == (2, 1)
     assert error.value == pytest.approx(1e-5 / PERIOD**3)
     assert error.bound == pytest.approx(100.0, rel=1e-5)
     assert str(error) == (
-        f"jerk of joint 3 is {error.value:.9g} rad/s³; allowed is {error.bound:.9g} rad/s³ (cycle 1)"
+        f"jerk of joint 3 is {error.value:.9g} rad/s³; "
+        f"allowed is {error.bound:.9g} rad/s³ (cycle 1)"
     )
 
 

@@ -101,29 +101,30 @@ class TestCyclicPacket:
         assert AXIS_DTYPE.itemsize == 36
 
 
-class TestInitPacket:
-    # Offsets as documented for the wire.
-    OFFSETS = {
-        "number": 0,
-        "fields_per_packet": 4,
-        "fields_per_axis": 8,
-        "n_axes": 12,
-        "open_mode": 16,
-        "header_types": 176,
-        "axis_types": 188,
-        "sample_time": 224,
-        "open_axes_map": 228,
-        "calibration": 388,
-        "current_limit": 548,
-        "version": 708,
-        "kinematic_influence": 720,
-        "gear_ratio": 880,
-        "following_error": 1040,
-    }
+# Offsets as documented for the wire.
+OFFSETS = {
+    "number": 0,
+    "fields_per_packet": 4,
+    "fields_per_axis": 8,
+    "n_axes": 12,
+    "open_mode": 16,
+    "header_types": 176,
+    "axis_types": 188,
+    "sample_time": 224,
+    "open_axes_map": 228,
+    "calibration": 388,
+    "current_limit": 548,
+    "version": 708,
+    "kinematic_influence": 720,
+    "gear_ratio": 880,
+    "following_error": 1040,
+}
 
+
+class TestInitPacket:
     def test_layout(self):
         assert INIT_DTYPE.itemsize == INIT_LENGTH
-        assert {name: INIT_DTYPE.fields[name][1] for name in INIT_DTYPE.names} == self.OFFSETS
+        assert {name: INIT_DTYPE.fields[name][1] for name in INIT_DTYPE.names} == OFFSETS
 
     def test_worked_example(self):
         raw = bytearray(INIT_LENGTH)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import N, START, Cruise, Rig, Table, init_packet, limits, smooth_move, still
+from rig import START, Cruise, N, Rig, Table, init_packet, limits, smooth_move, still
 
 from drivers import (
     AccelerationLimit,
@@ -47,7 +47,7 @@ def assert_refused(rig: Rig, answer: CyclicPacket, kind: type) -> Exception:
     assert rig.state is State.FAULTED
     assert rig.ended.outcome == "refused"
     assert np.isnan(rig.records[-1]["commanded_position"]).all()
-    error = rig.seen(Refused)[-1].error
+    error = rig.refusal
     assert type(error) is kind
     assert error.cycle == rig.records[-1]["cycle"]
     return error
@@ -68,9 +68,10 @@ def constant_acceleration(acceleration: float, cycles: int = 40) -> np.ndarray:
     return START + 0.5 * acceleration * t**2 * direction
 
 
-class TestRefusedSetPoints:
-    WIDE = {"jerk": np.full(N, 1e9)}
+WIDE = {"jerk": np.full(N, 1e9)}
 
+
+class TestRefusedSetPoints:
     @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
     @pytest.mark.parametrize("part", ["position", "velocity"])
     def test_not_finite(self, value, part):
@@ -82,7 +83,7 @@ class TestRefusedSetPoints:
         assert np.isfinite(answer.axes["d"]).all()
 
     def test_position(self):
-        speed_limits = limits(lower=START - 0.1, upper=START + 0.1, **self.WIDE)
+        speed_limits = limits(lower=START - 0.1, upper=START + 0.1, **WIDE)
         rows = constant_acceleration(8.0, 90)
         first = int(np.argmax(rows[:, 1] > START[1] + 0.1))
         rig, answer = play(rows[: first + 1], guard_limits=speed_limits)
@@ -95,7 +96,7 @@ class TestRefusedSetPoints:
         rows = constant_acceleration(7.9, 200)
         speed = np.diff(rows[:, 1]) / 0.002
         first = int(np.argmax(speed > 1.0)) + 1
-        slow = limits(velocity=np.full(N, 1.0), **self.WIDE)
+        slow = limits(velocity=np.full(N, 1.0), **WIDE)
         rig, answer = play(rows[: first + 1], guard_limits=slow)
         error = assert_refused(rig, answer, VelocityLimit)
         assert error.value == pytest.approx(speed[first - 1], rel=1e-6)
@@ -115,9 +116,9 @@ class TestRefusedSetPoints:
         assert assert_refused(rig, answer, VelocityMismatch).joint == 2
 
     def test_acceleration(self):
-        rig, _ = play(constant_acceleration(7.99), guard_limits=limits(**self.WIDE))
+        rig, _ = play(constant_acceleration(7.99), guard_limits=limits(**WIDE))
         assert rig.state is State.OPEN
-        rig, answer = play(constant_acceleration(8.01)[:3], guard_limits=limits(**self.WIDE))
+        rig, answer = play(constant_acceleration(8.01)[:3], guard_limits=limits(**WIDE))
         # The first step from rest shows half of it, the second all.
         error = assert_refused(rig, answer, AccelerationLimit)
         assert error.value == pytest.approx(8.01, rel=1e-4)
@@ -129,7 +130,7 @@ class TestRefusedSetPoints:
 
     @pytest.mark.parametrize(("bounds", "factor"), [("plan", 1), ("override", 1.3), ("stop", 2)])
     def test_each_set_of_bounds_has_its_acceleration(self, bounds, factor):
-        wide = limits(**self.WIDE)
+        wide = limits(**WIDE)
         inside = constant_acceleration(8.0 * factor * 0.999)
         assert play(inside, None, bounds, guard_limits=wide)[0].state is State.OPEN
         outside = constant_acceleration(8.0 * factor * 1.001)[:3]
@@ -185,7 +186,7 @@ class TestArmThatDoesNotFollow:
         assert answer.axes["mode"].tolist() == [4, 4, 4, 508, 4, 4]
         np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
         assert not answer.axes["d"][:, 1].any()
-        error = rig.seen(Refused)[-1].error
+        error = rig.refusal
         assert type(error) is FollowingError
         assert (error.joint, error.bound) == (3, pytest.approx(2.0, rel=1e-5))
         assert rig.ended.outcome == "refused"
@@ -221,7 +222,7 @@ class TestArmThatDoesNotFollow:
         rig, _ = moving()
         rig.axes["d"][2, field] = np.nan
         assert rig.cycle().axes["mode"].max() == Mode.DRIVE_OFF_REQUEST
-        assert type(rig.seen(Refused)[-1].error) is NotFinite
+        assert type(rig.refusal) is NotFinite
 
     def test_limits_the_controller_does_not_know_are_the_cells(self):
         unknown = {"following_error": np.full(N, np.nan), "current_limit": np.full(N, np.nan)}
@@ -380,7 +381,7 @@ class TestLostMotion:
         rig.axes["d"][0, 2] += 0.5
         rig.modes = Mode.POSITION
         assert all_drive_off(rig.cycle())
-        assert "received target" in str(rig.seen(Refused)[-1].error)
+        assert "received target" in str(rig.refusal)
 
     def test_a_waiting_motion_is_lost_when_the_controller_starts_over(self):
         rig = Rig()
@@ -402,27 +403,45 @@ class TestLostMotion:
         assert rig.ended.outcome == "completed"
 
 
-def test_bounds_that_become_narrower_do_so_when_no_difference_reaches_back():
-    """Full jerk of the stop bounds up to one cycle, none after: the guard must not trip."""
-    class Switch(Table):
-        @property
-        def bounds(self):
-            return "stop" if self.index < 20 else "plan"
+class Narrowing(Table):
+    """The bounds of a stop for the first rows, those of a plan afterwards."""
 
-        @bounds.setter
-        def bounds(self, value):
-            pass
+    def __init__(self, positions, wide_rows):
+        super().__init__(positions)
+        self.wide_rows = wide_rows
 
-    k = np.arange(60)[:, None] * 0.002
-    ramp = np.where(k <= 0.038, 290.0 * k**3 / 6.0, np.nan)
-    knee = 0.038
-    a, v, p = 290 * knee, 290 * knee**2 / 2, 290 * knee**3 / 6
-    ramp = np.where(k <= knee, ramp, p + v * (k - knee) + a * (k - knee) ** 2 / 2)
-    rows = START + ramp * np.array([1, 0, 0, 0, 0, 0])
-    wide = limits(acceleration=np.full(N, 12.0))
-    source = Switch(rows)
-    rig = Rig(guard_limits=wide)
-    rig.session.request(source)
-    rig.open()
-    rig.cycle(59)
-    assert rig.state is State.OPEN, rig.ended
+    @property
+    def bounds(self):
+        return "stop" if self.index <= self.wide_rows else "plan"
+
+    @bounds.setter
+    def bounds(self, value):
+        pass
+
+
+def jerk_then_constant_acceleration(jerk: float, rows: int) -> np.ndarray:
+    t = np.arange(60)[:, None] * 0.002
+    knee = rows * 0.002
+    a, v, p = jerk * knee, jerk * knee**2 / 2, jerk * knee**3 / 6
+    after = p + v * (t - knee) + a * (t - knee) ** 2 / 2
+    path = np.where(t <= knee, jerk * t**3 / 6, after)
+    return START + path * np.array([1, 0, 0, 0, 0, 0])
+
+
+class TestNarrowingBounds:
+    """A third difference reaches back over three cycles; so far wider bounds stay in force."""
+
+    def run(self, wide_rows: int) -> Rig:
+        rig = Rig(guard_limits=limits(acceleration=np.full(N, 12.0)))
+        rig.session.request(Narrowing(jerk_then_constant_acceleration(299.0, 19), wide_rows))
+        rig.open()
+        rig.cycle(59)
+        return rig
+
+    def test_jerk_of_a_stop_right_up_to_the_change_is_no_violation_after_it(self):
+        assert self.run(19).state is State.OPEN
+
+    def test_jerk_of_a_stop_after_the_change_is(self):
+        rig = self.run(15)
+        assert type(rig.refusal) is JerkLimit
+        assert rig.refusal.value > 150.0

@@ -7,7 +7,7 @@ import struct
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rig import N, NOT_SET_POINTS, PERIOD, START, Rig, Table, drive_train, limits
+from rig import NOT_SET_POINTS, PERIOD, START, N, Rig, Table, drive_train, limits
 
 from drivers import CyclicPacket, Mode, MotionEnded, State
 from drivers.packets import INIT_LENGTH, LAST_NUMBER, cyclic_length, next_number

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import N, PERIOD, START, Cruise, Rig, init_packet, limits, smooth_move, still
+from rig import PERIOD, START, Cruise, N, Rig, init_packet, limits, smooth_move, still
 
 from drivers import (
     CyclicPacket,
@@ -41,7 +41,9 @@ class TestFromRequestToRest:
         started, ended = rig.seen(MotionStarted), rig.seen(MotionEnded)
         assert [event.interval for event in started] == [0]
         assert [(event.outcome, event.interval) for event in ended] == [("completed", 0)]
-        np.testing.assert_allclose(rig.train.joint_position(rig.axes["d"][:, 0]), START + MOVE, atol=1e-6)
+        np.testing.assert_allclose(
+            rig.train.joint_position(rig.axes["d"][:, 0]), START + MOVE, atol=1e-6
+        )
 
     def test_the_first_set_point_is_the_target_received_bit_for_bit_at_zero_velocity(self):
         rig = Rig()
@@ -226,12 +228,6 @@ class TestFirstSetPoint:
         assert rig.state is State.FAULTED
         return rig.refusal
 
-    @pytest.fixture(autouse=True)
-    def _refusals(self, monkeypatch):
-        from drivers import Refused
-
-        monkeypatch.setattr(Rig, "refusal", property(lambda rig: rig.seen(Refused)[-1].error), False)
-
     @pytest.mark.parametrize("joint", range(N))
     @pytest.mark.parametrize("sign", [-1, 1])
     def test_a_target_away_from_the_arm_is_refused(self, joint, sign):
@@ -253,7 +249,9 @@ class TestFirstSetPoint:
             d[1, 2] += 0.06
 
         cell = limits(following_error=np.full(N, 0.5))
-        assert self.refused(self.opening_with(change, guard_limits=cell)).bound == pytest.approx(0.05)
+        assert self.refused(self.opening_with(change, guard_limits=cell)).bound == pytest.approx(
+            0.05
+        )
         controller = init_packet(arm_1={"following_error": np.full(N, 0.5)})
         assert self.refused(self.opening_with(change, init=controller)).bound == pytest.approx(0.05)
 

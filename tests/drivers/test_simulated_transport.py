@@ -158,5 +158,5 @@ class TestFaults:
         "make", [lambda: Lose(0, count=0), lambda: Corrupt(0, 0, 0), lambda: Corrupt(0, -1)]
     )
     def test_a_fault_that_is_none_is_refused(self, make):
-        with pytest.raises(ValueError, match="Lose|Corrupt"):
+        with pytest.raises(ValueError, match=r"Lose|Corrupt"):
             make()

@@ -61,10 +61,7 @@ def test_drive_off_always_leads_out_of_open_mode():
 
 def test_open_mode_is_entered_only_from_where_axes_were_closed_with_the_drive_on():
     entered_from = {
-        state
-        for state, row in TRANSITIONS.items()
-        for after in row.values()
-        if after is State.OPEN
+        state for state, row in TRANSITIONS.items() for after in row.values() if after is State.OPEN
     }
     allowed = {State.DRIVING_ON, State.CLOSED, State.OPENING, State.FREEZING, State.OPEN}
     assert entered_from == allowed

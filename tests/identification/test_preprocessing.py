@@ -90,7 +90,22 @@ def test_rows_at_standstill_and_near_the_ends_do_not_count(model: RobotModel, tr
     assert not samples.usable[standing].any()
     assert not samples.usable[:10].any()
     assert not samples.usable[-10:].any()
-    assert samples.usable.mean() > 0.95
+    assert samples.usable.mean() > 0.9
+
+
+def test_rows_just_before_and_after_a_reversal_do_not_count_for_the_joint_that_turns(
+    model: RobotModel, truth: Array
+) -> None:
+    recording = a_recording(model, truth)
+    samples = prepare(recording, model, noise_variance=QUANTISATION)
+    exact = motion(recording.time)[1]
+    turns = np.flatnonzero(exact[1:, 0] * exact[:-1, 0] < 0.0)
+    reach = 0.5 / samples.position_bandwidth[0]
+    for row in turns[1:-1]:
+        apart = np.abs(recording.time - recording.time[row])
+        assert not samples.usable[apart < 0.9 * reach, 0].any()
+        assert samples.usable[(apart > 2.0 * reach + 0.01) & (apart < 0.2), 0].all()
+        assert samples.usable[row, 1]
 
 
 def test_no_derivative_is_taken_across_a_gap(model: RobotModel, truth: Array) -> None:
@@ -259,8 +274,17 @@ def test_a_recording_that_fails_its_checks_is_refused(model: RobotModel, truth: 
         prepare(wrong, model)
 
 
-def test_contradicting_options_are_refused() -> None:
-    with pytest.raises(ValueError, match="not both"):
-        Preprocessing(smooth_torque=True, torque_bandwidth=10.0)
+def test_torque_and_regressor_can_be_low_passed_alike_at_a_given_bandwidth(
+    model: RobotModel, truth: Array
+) -> None:
+    recording = a_recording(model, truth, noise=0.5)
+    options = Preprocessing(smooth_torque=True, torque_bandwidth=20.0)
+    samples = prepare(recording, model, noise_variance=QUANTISATION, options=options)
+    error = (samples.torque - samples.predicted_torque(model, truth))[samples.usable]
+    # White noise of 0.5 in 20 Hz of 500.
+    assert np.std(error) == pytest.approx(0.5 * np.sqrt(20.0 / 500.0), rel=0.25)
+
+
+def test_a_bandwidth_that_is_none_is_refused() -> None:
     with pytest.raises(ValueError, match="positive"):
         Preprocessing(torque_bandwidth=0.0)

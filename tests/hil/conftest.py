@@ -1,0 +1,75 @@
+"""A small simulated cell: the NS 16 with a campaign of seconds instead of minutes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hil.campaign import Campaign, CampaignPlan, Stop, design
+from hil.cell import Cell
+from hil.cell.cell import replaced_value
+from hil.progress import Silent
+from hil.simulation import simulated_link, simulated_provenance
+from sim_fixtures import SimulatedDrive
+from sim_fixtures.ns16 import CELL_PATH
+
+SETTINGS = {
+    "repetitions": 3,
+    "validation_runs": 2,
+    "n_via": 4,
+    "candidates": 20,
+    "approach_speed": 1.0,
+    "standstill_s": 1.0,
+    "settle_s": 0.2,
+}
+
+
+def small(**changes: float) -> Cell:
+    """The NS 16 cell with a short campaign."""
+    cell = Cell.load(CELL_PATH)
+    text = cell.text
+    for key, value in (SETTINGS | changes).items():
+        text = replaced_value(text, "campaign", key, value)
+    return Cell.from_texts(text, cell.urdf, cell.path)
+
+
+def run_campaign(
+    folder: Path,
+    cell: Cell,
+    plan: CampaignPlan,
+    *,
+    effects: bool = False,
+    drive: SimulatedDrive | None = None,
+) -> Campaign:
+    """A campaign of `cell`, executed on a simulated robot that may differ in its `drive`."""
+    campaign = Campaign.create(folder, cell, plan)
+    link = simulated_link(cell, effects=effects, drive=drive)
+    provenance = simulated_provenance(cell, effects)
+    campaign.run(link, Stop(), Silent(), provenance=provenance, durable=False)
+    return campaign
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., Campaign]:
+    """`run_campaign`."""
+    return run_campaign
+
+
+@pytest.fixture(scope="session")
+def cell() -> Cell:
+    """The small cell."""
+    return small()
+
+
+@pytest.fixture(scope="session")
+def plan(cell: Cell) -> CampaignPlan:
+    """Its excitation and validation motions."""
+    return design(cell, Silent())
+
+
+@pytest.fixture(scope="session")
+def campaign(tmp_path_factory: pytest.TempPathFactory, cell: Cell, plan: CampaignPlan) -> Campaign:
+    """A finished campaign; tests only read it."""
+    return run_campaign(tmp_path_factory.mktemp("campaign") / "small", cell, plan)

@@ -1,0 +1,198 @@
+"""A campaign: checked before it moves, archived once, deterministic, resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.archive import ArchiveName, open_archive
+from hil.campaign import (
+    Campaign,
+    CampaignFolderError,
+    CampaignPlan,
+    MotionFailedError,
+    MotionRefusedError,
+    Stop,
+)
+from hil.cell import Cell
+from hil.progress import Silent
+from hil.simulation import simulated_link, simulated_provenance
+from planner import PiecewiseCubic
+
+Run = Callable[..., Campaign]
+
+
+def digests(campaign: Campaign) -> dict[str, str]:
+    """Checksum of every archive by name."""
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(campaign.folder.archives.glob("*.mcap"))
+    }
+
+
+def execute(campaign: Campaign, stop: Stop | None = None) -> None:
+    provenance = simulated_provenance(campaign.cell, False)
+    campaign.run(
+        simulated_link(campaign.cell),
+        stop or Stop(),
+        Silent(),
+        provenance=provenance,
+        durable=False,
+    )
+
+
+def one_repetition(cell: Cell, plan: CampaignPlan) -> tuple[Cell, CampaignPlan]:
+    return cell.with_campaign(repetitions=1), replace(plan, validation=plan.validation[:1])
+
+
+def test_every_interval_of_motion_is_one_archive(campaign: Campaign) -> None:
+    names = [ArchiveName.parse(path) for path in campaign.folder.archives.glob("*.mcap")]
+    kinds = sorted((name.kind, name.index) for name in names if name is not None)
+    assert kinds == [
+        *(("excitation", i) for i in range(3)),
+        ("move", 0),
+        ("move", 1),
+        ("standstill", 0),
+        *(("validation", i) for i in range(2)),
+    ]
+
+
+def test_an_archive_is_whole_in_itself(campaign: Campaign) -> None:
+    archive = open_archive(campaign.folder.completed("excitation")[0])
+    assert archive.complete
+    assert set(archive.attachments) == {
+        "cell.toml", "robot.urdf", "drive_train.json", "plan.json"
+    }  # fmt: skip
+    assert archive.metadata["simulated"] == "yes"
+    assert archive.outcome is not None
+    assert archive.outcome["outcome"] == "completed"
+
+
+def test_the_commanded_motion_is_the_planned_one_and_keeps_the_limits(campaign: Campaign) -> None:
+    archive = open_archive(campaign.folder.completed("excitation")[0])
+    commanded = archive.columns["commanded_position"]
+    commanded = commanded[~np.isnan(commanded).any(axis=1)]
+    trajectory, period = campaign.plan.excitation.trajectory, campaign.cell.period
+    planned, _, _ = trajectory.sample(np.arange(len(commanded)) * period)
+    # The first set-point is the controller's own float32 target, and its offset is kept.
+    assert commanded == pytest.approx(planned, abs=2e-6)
+    limits = campaign.cell.joint_limits
+    velocity = np.diff(commanded, axis=0) / period
+    assert np.all(np.abs(velocity) <= limits.velocity * (1 + 1e-6))
+
+
+def test_the_arm_follows_and_returns_to_where_it_was(campaign: Campaign) -> None:
+    first = open_archive(campaign.folder.archives / "move_000_a1.mcap")
+    last = open_archive(campaign.folder.archives / "move_001_a1.mcap")
+    before, after = first.columns["target_position"][0], last.columns["target_position"][-1]
+    assert after == pytest.approx(before, abs=2e-6)
+    # Stiction keeps the arm itself some encoder counts away from the target.
+    assert last.columns["position"][-1] == pytest.approx(after, abs=5e-3)
+
+
+def test_records_are_gap_free(campaign: Campaign) -> None:
+    for path in campaign.folder.archives.glob("*.mcap"):
+        assert np.all(np.diff(open_archive(path).columns["cycle"]) == 1), path.name
+
+
+def test_one_seed_is_one_bit_identical_campaign(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, run: Run
+) -> None:
+    short, motions = one_repetition(cell, plan)
+    runs = [run(tmp_path / name / "same", short, motions) for name in ("a", "b")]
+    assert digests(runs[0]) == digests(runs[1])
+
+
+def test_a_stop_ends_the_motion_on_its_path_and_the_rest_is_resumed(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    short, motions = one_repetition(cell, plan)
+    campaign = Campaign.create(tmp_path / "stopped", short, motions)
+    with pytest.raises(MotionFailedError, match="stopped by the operator"):
+        execute(campaign, Stop(requested=True))
+    stopped = open_archive(campaign.folder.archives / "move_000_a1.mcap")
+    assert stopped.complete
+    assert stopped.outcome is not None
+    assert stopped.outcome["outcome"] == "stopped"
+    assert np.abs(stopped.columns["velocity"][-1]).max() < 0.01  # three encoder counts a cycle
+
+    again = Campaign.open(campaign.folder.root)
+    execute(again)
+    assert len(again.folder.completed("excitation")) == 1
+    assert len(again.folder.completed("validation")) == 1
+
+
+def test_what_is_whole_is_kept_and_what_is_torn_is_done_again(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, run: Run
+) -> None:
+    short, motions = one_repetition(cell, plan)
+    campaign = run(tmp_path / "torn", short, motions)
+    kept = campaign.folder.completed("excitation")[0]
+    before = kept.read_bytes()
+    torn = campaign.folder.completed("validation")[0]
+    torn.write_bytes(torn.read_bytes()[:-100])
+
+    execute(Campaign.open(campaign.folder.root))
+
+    assert kept.read_bytes() == before
+    assert [p.name for p in campaign.folder.completed("validation")] == ["validation_000_a2.mcap"]
+    assert torn.exists(), "nothing is ever overwritten"
+
+
+def test_a_motion_outside_the_limits_is_refused_before_anything_moves(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    good = plan.validation[0]
+    far = tuple(
+        np.column_stack([c[:, 0] + (4.0 if j == 1 else 0.0), c[:, 1:]])
+        for j, c in enumerate(good.coefficients)
+    )
+    bad = replace(plan, validation=(PiecewiseCubic(good.knots, far),))
+    campaign = Campaign.create(tmp_path / "far", cell.with_campaign(validation_runs=1), bad)
+    with pytest.raises(MotionRefusedError, match=r"validation 0 was not sent: .*position of joint"):
+        execute(campaign)
+    assert not list(campaign.folder.archives.iterdir())
+
+
+def test_a_motion_into_the_floor_is_refused_before_anything_moves(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    raised = Cell.from_texts(cell.text.replace("floor = 0.0", "floor = 1.0"), cell.urdf, cell.path)
+    campaign = Campaign.create(tmp_path / "floor", raised, plan)
+    with pytest.raises(MotionRefusedError, match=r"collision of .*floor"):
+        execute(campaign)
+    assert not list(campaign.folder.archives.iterdir())
+
+
+def test_motors_that_are_too_weak_are_named_before_anything_moves(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    weak = Cell.from_texts(
+        cell.text.replace("current_limit = [16.5, 22.0", "current_limit = [16.5, 6.0"),
+        cell.urdf,
+        cell.path,
+    )
+    campaign = Campaign.create(tmp_path / "weak", weak, plan)
+    with pytest.raises(MotionRefusedError, match="current of motor of joint_2"):
+        execute(campaign)
+
+
+def test_a_folder_in_use_is_not_overwritten(campaign: Campaign) -> None:
+    with pytest.raises(CampaignFolderError, match="is not empty"):
+        Campaign.create(campaign.folder.root, campaign.cell, campaign.plan)
+
+
+def test_a_damaged_manifest_and_a_foreign_folder_are_named(tmp_path: Path) -> None:
+    with pytest.raises(CampaignFolderError, match="is not a campaign folder"):
+        Campaign.open(tmp_path)
+
+
+def test_the_plan_is_restored_to_the_bit(campaign: Campaign) -> None:
+    again = CampaignPlan.load(campaign.folder.plan)
+    assert json.dumps(again.excitation.to_dict()) == json.dumps(campaign.plan.excitation.to_dict())

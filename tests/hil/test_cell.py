@@ -1,0 +1,101 @@
+"""A cell file is checked once, and every complaint names file, field, value and remedy."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.cell import Cell, CellError
+from sim_fixtures.ns16 import CELL_PATH, TABLE2, URDF_PATH
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "ns16.urdf").write_bytes(URDF_PATH.read_bytes())
+    (tmp_path / "cell.toml").write_bytes(CELL_PATH.read_bytes())
+    return tmp_path
+
+
+def complaint(folder: Path, old: str, new: str) -> str:
+    """What a cell file gets in which the first match of regex `old` became `new`."""
+    path = folder / "cell.toml"
+    text, count = re.subn(old, new, path.read_text("utf-8"), count=1, flags=re.M)
+    assert count == 1
+    path.write_text(text, "utf-8")
+    with pytest.raises(CellError) as caught:
+        Cell.load(path)
+    assert str(path) in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_ns16_cell_describes_six_joints_and_58_parameters(folder: Path) -> None:
+    cell = Cell.load(folder / "cell.toml")
+    assert cell.joint_names == tuple(f"joint_{i}" for i in range(1, 7))
+    assert cell.model.n_parameters == 58
+
+
+def test_limits_of_the_teach_pendant_become_angles_of_the_urdf(folder: Path) -> None:
+    limits = Cell.load(folder / "cell.toml").joint_limits
+    assert np.degrees(limits.lower) == pytest.approx([-180, -140, -20, -360, -120, -360])
+    assert np.degrees(limits.upper) == pytest.approx([180, 5, 260, 360, 120, 360])
+
+
+def test_angles_go_to_the_teach_pendant_and_back(folder: Path) -> None:
+    cell = Cell.load(folder / "cell.toml")
+    home = cell.home
+    assert np.degrees(cell.controller_angles(home)) == pytest.approx(cell.campaign.home_deg)
+    assert cell.urdf_angles(cell.controller_angles(home)) == pytest.approx(home)
+
+
+def test_nominal_values_are_the_manufacturers_column_of_table_2(folder: Path) -> None:
+    cell = Cell.load(folder / "cell.toml")
+    values = dict(zip(cell.model.parameter_names, cell.nominal_values(), strict=True))
+    for row in TABLE2[:40]:
+        assert row.sign * values[row.pivot] == pytest.approx(row.pi_c, abs=6e-4), row.id
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field", "remedy"),
+    [
+        (r"^cycle_ms = 1", "cycle_ms = 3", "controller.cycle_ms = 3", "1 or 2 ms"),
+        (r"^name = .*", "", "cell.name", "add it"),
+        (r"^mode = 4", "mode = 5", "controller.mode = 5", "absolute position"),
+        (r"^margin = 0.05", "margin = -1", "workspace.margin = -1", "clearance"),
+        (r"^fly = 0.5", "flyby = 0.5", "campaign.flyby", "known are"),
+        (r"^k54 = 0.03", "k54 = nan", "drive_train.k54 = nan", "axis 4 into motor 5"),
+        (
+            r"^gear_ratio = \[-116.0",
+            "gear_ratio = [0.0",
+            "gear_ratio of joint 1 is 0",
+            "drive_train",
+        ),
+        (r"^upper_deg = \[180.0", "upper_deg = [-200.0", "not below upper_deg", "limits"),
+        (r"^velocity_deg = \[155.0, ", "velocity_deg = [", "limits.velocity_deg", "6 joints"),
+        (r"^urdf = .*", 'urdf = "other.urdf"', "cell.urdf", "put a URDF at"),
+        (r"^port = 1000", "port = ", "is not TOML", "correct that line"),
+    ],
+)
+def test_a_bad_field_gets_a_sentence(
+    folder: Path, old: str, new: str, field: str, remedy: str
+) -> None:
+    sentence = complaint(folder, old, new)
+    assert field in sentence
+    assert remedy in sentence
+
+
+def test_a_missing_file_and_a_missing_table_are_named(folder: Path) -> None:
+    with pytest.raises(CellError, match=r"nothing\.toml.*cannot be read"):
+        Cell.load(folder / "nothing.toml")
+    (folder / "cell.toml").write_text('[cell]\nname = "x"\nurdf = "ns16.urdf"\n')
+    bare = Cell.load(folder / "cell.toml")
+    with pytest.raises(CellError, match=r"drive_train: is missing"):
+        _ = bare.drive_train
+
+
+def test_campaign_settings_can_be_replaced_in_the_text_too(folder: Path) -> None:
+    cell = Cell.load(folder / "cell.toml").with_campaign(repetitions=7, simulation_seed=5)
+    again = Cell.from_texts(cell.text, cell.urdf, cell.path)
+    assert (again.campaign.repetitions, again.simulation.seed, again.campaign.seed) == (7, 5, 1)

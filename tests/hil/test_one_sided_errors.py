@@ -1,0 +1,108 @@
+"""The circle is not closed on itself: an error planted on one side only turns the verdict red.
+
+"Physical" errors are in the simulated robot, which then differs from what its controller
+announces and the cell file says; the others are in what the PC makes of honest archives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import hil.identify.sources
+from hil.campaign import Campaign, CampaignPlan
+from hil.cell import Cell
+from hil.identify import identify_campaign
+from hil.progress import Silent
+from hil.recordings import recording_of
+from hil.results import VerdictResult
+from hil.simulation import simulated_drive
+from identification import FrictionLaw
+from sim_fixtures import SimulatedDrive
+
+Run = Callable[..., Campaign]
+
+
+def verdict(campaign: Campaign) -> VerdictResult:
+    return identify_campaign(campaign.folder.root, Silent()).results.verdict
+
+
+def gear_4_turned(drive: SimulatedDrive) -> SimulatedDrive:
+    ratios = list(drive.gear_ratio)
+    ratios[3] = -ratios[3]
+    return replace(drive, gear_ratio=tuple(ratios))
+
+
+def coupling_of_5_into_6_turned(drive: SimulatedDrive) -> SimulatedDrive:
+    return replace(drive, k65=-drive.k65)
+
+
+def torque_constants_of_2_and_3_swapped(drive: SimulatedDrive) -> SimulatedDrive:
+    constants = list(drive.torque_constant)
+    constants[1], constants[2] = constants[2], constants[1]
+    return replace(drive, torque_constant=tuple(constants))
+
+
+def test_the_honest_cell_is_green(campaign: Campaign) -> None:
+    found = verdict(campaign)
+    assert found.good, found.line
+
+
+def test_effects_that_the_model_leaves_out_stay_green_at_their_usual_size(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, run: Run
+) -> None:
+    found = verdict(run(tmp_path / "effects", cell, plan, effects=True))
+    assert found.good, found.line
+
+
+@pytest.mark.parametrize(
+    "error",
+    [gear_4_turned, coupling_of_5_into_6_turned, torque_constants_of_2_and_3_swapped],
+    ids=lambda error: error.__name__,
+)
+def test_a_robot_that_is_not_what_the_cell_says_is_red(
+    tmp_path: Path,
+    cell: Cell,
+    plan: CampaignPlan,
+    run: Run,
+    error: Callable[[SimulatedDrive], SimulatedDrive],
+) -> None:
+    physical = error(simulated_drive(cell))
+    found = verdict(run(tmp_path / "tampered", cell, plan, drive=physical))
+    assert not found.good, found.line
+
+
+@pytest.mark.parametrize("joint", range(6))
+def test_one_torque_constant_of_the_wrong_sign_is_red(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch, joint: int
+) -> None:
+    def turned(archive: hil.identify.sources.Archive) -> object:
+        recording = recording_of(archive)
+        assert recording.torque is not None
+        signs = np.where(np.arange(recording.n_joints) == joint, -1.0, 1.0)
+        return replace(recording, torque=recording.torque * signs)
+
+    monkeypatch.setattr(hil.identify.sources, "recording_of", turned)
+    found = verdict(campaign)
+    assert not found.good, found.line
+
+
+def test_friction_columns_of_the_wrong_sign_are_red(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The prediction stays as good, but friction that drives a joint is impossible."""
+    columns = FrictionLaw.columns
+
+    def turned(law: FrictionLaw, velocity: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        columns(law, velocity, out)
+        out[0] *= -1.0
+
+    monkeypatch.setattr(FrictionLaw, "columns", turned)
+    found = verdict(campaign)
+    assert not found.good, found.line
+    assert any("Coulomb friction of" in reason for reason in found.reasons)
