@@ -66,6 +66,9 @@ class ValidationResult(_Frozen):
     mean_error: list[float]
     relative_error: list[float]
     overall_relative_error: float
+    """||e|| / ||tau|| over all joints, rows in which the joint moves."""
+    all_rows_relative_error: float
+    """The same over every row, standstill and the first and last rows included."""
 
 
 class CoverageResult(_Frozen):

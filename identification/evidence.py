@@ -18,7 +18,7 @@ from identification.plausibility import Implausible, implausibilities
 from identification.preprocessing import Samples
 from identification.repeatability import Repeatability, repeatability
 from identification.repetitions import RepeatedEstimate
-from identification.validation import PredictionError, over_all, prediction_error
+from identification.validation import PredictionError, over_all, prediction_error, slow_error
 
 Array = NDArray[np.float64]
 
@@ -38,8 +38,10 @@ class Evidence:
         estimate: the result.
         held_out: its error on motion that was not used for fitting.
         training: its error on the motion it was fitted to.
-        held_out_slow: as `held_out`, with the error low-passed; None where there are no
-            repetitions to tell noise from error.
+        held_out_slow: as `held_out`, with the error low-passed and apart from a change of
+            friction; None where there are no repetitions to tell noise from error.
+        friction_change: share by which friction was higher on the unseen motion than estimated,
+            per joint (n,); None likewise.
         slow: what repeats and what does not of the low-passed residual; None likewise.
         estimation_noise: standard deviation of the predicted torque on the unseen motion because
             the parameters come from noisy data, from the scatter over the repetitions (n,)
@@ -56,6 +58,7 @@ class Evidence:
     held_out: PredictionError
     training: PredictionError
     held_out_slow: PredictionError | None = None
+    friction_change: Array | None = None
     slow: Repeatability | None = None
     estimation_noise: Array | None = None
     disagreement: Array | None = None
@@ -109,11 +112,13 @@ def gather(
     position = np.concatenate([run.motion.position for run in held_out])
     unseen = total([run.factor(model) for run in held_out])
     error = over_all(prediction_error(model, values, held_out))
+    slow_errors = [slow_error(model, values, run, slow) for run in held_out if repeated]
     return Evidence(
         estimate=result.pooled,
         held_out=error,
         training=over_all(prediction_error(model, values, training)),
-        held_out_slow=over_all(prediction_error(model, values, held_out, bandwidth=slow))
+        held_out_slow=over_all(one.error for one in slow_errors) if repeated else None,
+        friction_change=np.mean([one.friction_change for one in slow_errors], axis=0)
         if repeated
         else None,
         slow=repeatability(model, values, training, slow) if repeated else None,

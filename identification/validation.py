@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from identification.smoothing_spline import low_pass
 
 Array = NDArray[np.float64]
 
+FRICTION_CHANGE: Final = 0.10
 FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
 
 
@@ -109,15 +110,59 @@ def residual(
         samples: one recording.
         bandwidth: of a zero-phase low-pass on the result [Hz]; None for none.
     """
-    error = samples.torque - samples.predicted_torque(model, values)
-    error[~samples.usable] = 0.0
+    return _usable_part(
+        samples, samples.torque - samples.predicted_torque(model, values), bandwidth
+    )
+
+
+def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Array:
+    """Torque (m, n) with zero for the rows that are not usable, then low-passed."""
+    torque = np.where(samples.usable, torque, 0.0)
     if bandwidth is None:
-        return error
-    slow = np.zeros_like(error)
+        return torque
+    slow = np.zeros_like(torque)
     for segment in samples.segments:
         if samples.usable[segment].any():
-            slow[segment] = low_pass(samples.motion.time[segment], error[segment], bandwidth)
+            slow[segment] = low_pass(samples.motion.time[segment], torque[segment], bandwidth)
     return slow
+
+
+class SlowError(NamedTuple):
+    """Slow error of a prediction, and what a change of friction explains of it.
+
+    Attributes:
+        error: what is left.
+        friction_change: share by which each joint's friction torque would have to be larger than
+            predicted (n,), within `FRICTION_CHANGE`.
+    """
+
+    error: PredictionError
+    friction_change: Array
+
+
+def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: float) -> SlowError:
+    """Low-passed error of a prediction, apart from a change of friction since the fit.
+
+    Friction follows the temperature of the gears: between training and validation it may differ
+    by some per cent without anything being wrong with the model. Each joint's whole friction
+    torque may therefore be scaled, by one number, before the error is taken.
+
+    Args:
+        model: the robot.
+        values: parameters (p,).
+        samples: one run.
+        bandwidth: of the low-pass [Hz].
+    """
+    error = residual(model, values, samples, bandwidth)
+    is_friction = [name.startswith(("f0_", "f1_", "f2_")) for name in model.parameter_names]
+    friction = samples.predicted_torque(model, np.where(is_friction, values, 0.0))
+    friction = _usable_part(samples, friction, bandwidth)
+    usable = samples.usable
+    power = (friction**2 * usable).sum(axis=0)
+    change = (friction * error * usable).sum(axis=0) / np.where(power > 0.0, power, 1.0)
+    change = np.clip(change, -FRICTION_CHANGE, FRICTION_CHANGE)
+    left = error - change * friction
+    return SlowError(PredictionError.between(samples.torque, samples.torque - left, usable), change)
 
 
 def prediction_error(

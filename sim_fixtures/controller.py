@@ -99,9 +99,7 @@ class SimulatedController:
         """
         if truth.n_joints != drive.n_axes or drive.n_axes > 10:
             raise SettingError("drive", f"{drive.n_axes} axes", f"{truth.n_joints}, at most 10")
-        model_rng, noise_rng = (
-            np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(2)
-        )
+        model_rng, noise_rng = np.random.default_rng(seed).spawn(2)
         self.truth = truth
         self.settings = settings
         self.period = settings.period
@@ -112,14 +110,10 @@ class SimulatedController:
             urdf, drive, truth, settings,
             effects=effects, gravity=gravity, position=initial_position, rng=noise_rng,
         )  # fmt: skip
+        gains, resolution = settings.servo, settings.current_resolution
+        model = NominalModel(urdf, truth, gravity=gravity, error=gains.model_error, rng=model_rng)
         self._servo = Servo(
-            drive,
-            NominalModel(
-                urdf, truth, gravity=gravity, error=settings.servo.model_error, rng=model_rng
-            ),
-            settings.servo,
-            period=settings.period,
-            current_resolution=settings.current_resolution,
+            drive, model, gains, period=settings.period, current_resolution=resolution
         )
         self._servo.start_at(self._arm.encoders())
         self._program = LoopProgram(drive.n_axes, settings)

@@ -66,20 +66,22 @@ class ElasticPlant(Plant):
         self._rotor: Array = np.where(soft, truth.rotor_inertia, 1.0)
         # the rotors of elastic axes are bodies of their own
         self.model.armature = np.where(soft, 0.0, truth.rotor_inertia)
-        inertia = joint_inertia(self.model, self.data, self.position).diagonal()
-        reduced = 1.0 / (1.0 / self._rotor + 1.0 / inertia)
-        self._damping: Array = 2.0 * DAMPING_RATIO * np.sqrt(self._stiffness * reduced) * soft
-        fastest = float(np.sqrt(self._stiffness / reduced).max())
-        if fastest * step > MAX_STEP_ANGLE:
-            raise SettingError(
-                "elasticity",
-                tuple(elasticity),
-                f"resonances below {MAX_STEP_ANGLE / step:.0f} rad/s; the fastest is {fastest:.0f}",
-            )
+        self._damping: Array = self._damping_within(step)
         gravity_torque = pin.computeGeneralizedGravity(self.model, self.data, self.position)
         self._motor: Array = self.position + compliance * gravity_torque
         self._motor_velocity: Array = np.zeros(self.n_joints)
         self._motor_trend: Array = np.zeros(self.n_joints)
+
+    def _damping_within(self, step: float) -> Array:
+        """Return each spring's damper [N m s/rad]; SettingError if `step` is too long for one."""
+        inertia = joint_inertia(self.model, self.data, self.position).diagonal()
+        reduced = 1.0 / (1.0 / self._rotor + 1.0 / inertia)
+        fastest = float(np.sqrt(self._stiffness / reduced).max())
+        if fastest * step > MAX_STEP_ANGLE:
+            bound = f"resonances below {MAX_STEP_ANGLE / step:.0f} rad/s"
+            raise SettingError("elasticity", f"one with {fastest:.0f} rad/s", bound)
+        damping: Array = 2.0 * DAMPING_RATIO * np.sqrt(self._stiffness * reduced) * self._soft
+        return damping
 
     @property
     def motor_position(self) -> Array:

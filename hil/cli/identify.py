@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -54,13 +54,12 @@ def identify(
         ),
     ] = None,
     torque_bandwidth: Annotated[
-        float | None,
+        str,
         typer.Option(
-            min=1e-3,
             help="Bandwidth in Hz of a low-pass the torque came through before it was recorded; "
-            "the model is then filtered alike.",
+            'the model is then filtered alike. "none", or "auto": looked for in imported torques.',
         ),
-    ] = None,
+    ] = "auto",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
 ) -> None:
@@ -75,7 +74,7 @@ def identify(
         method="paper" if paper else "default",
         split=split,
         delay=delay,
-        torque_bandwidth=torque_bandwidth,
+        torque_bandwidth=_bandwidth(torque_bandwidth),
     )
     if len(archives) == 1 and archives[0].is_dir():
         found = identify_campaign(archives[0], reporter, options)
@@ -93,3 +92,22 @@ def identify(
         write_report(output / "report.html", found.results, found.series)
         reporter.say(f"report: {output / 'report.html'}")
     finish(found.results, json=json)
+
+
+def _bandwidth(text: str) -> float | Literal["auto"] | None:
+    if text == "auto":
+        return "auto"
+    if text == "none":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise InputError(
+            None,
+            f"{text!r} is no bandwidth",
+            field="--torque-bandwidth",
+            remedy='give a frequency above 0 Hz, "none" or "auto"',
+        )
+    return value

@@ -19,10 +19,11 @@ class Options:
             there are no validation runs.
         delay: time by which the torque lags the position [s]; None takes it from the cell.
         torque_bandwidth: low-pass [Hz] the torque has come through before it was recorded; None
-            for none.
+            for none. "auto" looks for one in imported torques; a controller's own currents are
+            known to have come through none.
     """
 
     method: Method = "default"
     split: float = 0.7
     delay: float | None = None
-    torque_bandwidth: float | None = None
+    torque_bandwidth: float | Literal["auto"] | None = "auto"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from hil.results import Results
 from identification.evidence import gather
 from identification.preprocessing import Preprocessing, Samples, prepare
 from identification.repetitions import RepeatedEstimate, estimate_repetitions
+from identification.torque_channel import find_torque_bandwidth
 from identification.validation import for_figure
 from identification.verdict import Verdict, judge
 
@@ -71,11 +72,24 @@ def identify_archives(
     """
     sources = gather_sources(paths, options.split)
     model = sources.cell.model
+    preprocessing = _preprocessing(sources, options)
+    if options.torque_bandwidth == "auto" and preprocessing.torque_bandwidth is not None:
+        sources = sources.with_doubt(
+            "the recorded torque seems to have come through a low-pass of "
+            f"{preprocessing.torque_bandwidth:.3g} Hz before it was recorded (found on what was "
+            "fitted); the model is filtered alike"
+        )
     total = len(sources.training) + len(sources.held_out)
     with reporter.task("smoothing recordings", total) as task:
 
         def ready(source: Source) -> Samples:
-            samples = _samples(source, sources, options)
+            samples = prepare(
+                source.recording,
+                model,
+                noise_variance=sources.noise_variance,
+                options=preprocessing,
+                origin=source.origin,
+            )
             task.advance(1, source.name)
             return samples
 
@@ -96,23 +110,22 @@ def identify_archives(
     )
 
 
-def _samples(source: Source, sources: Sources, options: Options) -> Samples:
+def _preprocessing(sources: Sources, options: Options) -> Preprocessing:
     cell = sources.cell
     delay = options.delay
     if delay is None:
         controller = cell.file.controller
         delay = controller.current_delay_cycles * cell.period if controller else 0.0
-    return prepare(
-        source.recording,
-        cell.model,
-        noise_variance=sources.noise_variance,
-        options=Preprocessing(
-            smooth_torque=options.method == "paper",
-            torque_bandwidth=options.torque_bandwidth,
-            torque_delay=delay,
-        ),
-        origin=source.origin,
-    )
+    plain = Preprocessing(smooth_torque=options.method == "paper", torque_delay=delay)
+    bandwidth = options.torque_bandwidth
+    if bandwidth == "auto":
+        recording = sources.training[0].recording
+        bandwidth = None
+        if not plain.smooth_torque and recording.motor_current is None:
+            bandwidth = find_torque_bandwidth(
+                recording, cell.model, noise_variance=sources.noise_variance, options=plain
+            )
+    return replace(plain, torque_bandwidth=bandwidth)
 
 
 def _series(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,10 @@ class Sources:
     held_out: tuple[Source, ...]
     noise_variance: Array | None
     doubts: tuple[str, ...]
+
+    def with_doubt(self, doubt: str) -> Sources:
+        """These sources with one more thing a reader must know."""
+        return replace(self, doubts=(*self.doubts, doubt))
 
 
 def cell_of(archive: Archive) -> Cell:

@@ -172,7 +172,9 @@ def _table2_ids() -> dict[str, int]:
 def _validation(
     sources: Sources, estimate: RepeatedEstimate, held_out: Sequence[Samples]
 ) -> list[ValidationResult]:
-    errors = prediction_error(sources.cell.model, estimate.pooled.values, held_out)
+    model, values = sources.cell.model, estimate.pooled.values
+    errors = prediction_error(model, values, held_out)
+    everywhere = prediction_error(model, values, held_out, all_rows=True)
     return [
         ValidationResult(
             archive=source.name,
@@ -182,8 +184,9 @@ def _validation(
             mean_error=error.mean.tolist(),
             relative_error=error.relative.tolist(),
             overall_relative_error=error.overall,
+            all_rows_relative_error=all_rows.overall,
         )
-        for source, error in zip(sources.held_out, errors, strict=True)
+        for source, error, all_rows in zip(sources.held_out, errors, everywhere, strict=True)
     ]
 
 

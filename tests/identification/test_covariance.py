@@ -76,7 +76,7 @@ def test_95_percent_intervals_cover_90_to_99_percent_whatever_the_colour_of_the_
 ) -> None:
     motion = a_motion()
     honest, classical = [], []
-    for seed in range(200):
+    for seed in range(120):
         noise = coloured(np.random.default_rng(seed), len(motion.time), 5e-3, correlation)
         result = estimate_repetitions(model, [samples_with(model, truth, noise, motion)])
         error = np.abs(result.pooled.values - truth)

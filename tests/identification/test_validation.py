@@ -21,6 +21,7 @@ from identification.validation import (
     over_all,
     prediction_error,
     residual,
+    slow_error,
 )
 
 Array = NDArray[np.float64]
@@ -128,6 +129,29 @@ def test_a_low_pass_on_the_error_takes_noise_away_and_leaves_slow_errors(
     np.testing.assert_allclose(error.rms, expected, rtol=0.15)
     raw = residual(model, values, samples)
     np.testing.assert_array_equal(raw[~samples.usable], 0.0)
+
+
+def test_a_change_of_friction_is_told_from_other_slow_errors(model: RobotModel) -> None:
+    values = np.ones(model.n_parameters)
+    plain = samples_with(model, np.zeros((5000, 2)))
+    friction_only = np.where([n[0] == "f" for n in model.parameter_names], values, 0.0)
+    friction = model.torque(friction_only, *plain.motion[1:])
+    time = plain.motion.time
+    other = 0.2 * np.sin(2.0 * np.pi * 1.3 * time)[:, None] * np.array([1.0, 0.0])
+    warm = samples_with(model, np.array([0.05, -0.08]) * friction + other)
+    left, change = slow_error(model, values, warm, 10.0)
+    np.testing.assert_allclose(change, [0.05, -0.08], atol=0.01)
+    np.testing.assert_allclose(left.rms, [0.2 / np.sqrt(2.0), 0.0], atol=0.01)
+
+
+def test_only_a_small_change_of_friction_is_taken_for_one(model: RobotModel) -> None:
+    values = np.ones(model.n_parameters)
+    plain = samples_with(model, np.zeros((5000, 2)))
+    friction_only = np.where([n[0] == "f" for n in model.parameter_names], values, 0.0)
+    friction = model.torque(friction_only, *plain.motion[1:])
+    left, change = slow_error(model, values, samples_with(model, 0.5 * friction), 10.0)
+    np.testing.assert_allclose(change, 0.1)
+    assert (left.rms > 0.3 * np.std(friction, axis=0)).all()
 
 
 def test_no_runs_is_an_error() -> None:
