@@ -120,8 +120,9 @@ class Table:
 
     def __init__(self, positions, velocities=None, bounds="plan"):
         self.positions = np.asarray(positions, dtype=float)
-        steps = np.diff(self.positions, axis=0, prepend=self.positions[:1]) / PERIOD
-        self.velocities = steps if velocities is None else np.asarray(velocities, dtype=float)
+        if velocities is None:
+            velocities = np.diff(self.positions, axis=0, prepend=self.positions[:1]) / PERIOD
+        self.velocities = np.asarray(velocities, dtype=float)
         self.start = self.positions[0]
         self.bounds = bounds
         self.index = 0

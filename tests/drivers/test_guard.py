@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rig import PERIOD, START, N, limits
 
-from drivers import Guard, GuardError, JerkLimit
+from drivers import Guard, GuardError, JerkLimit, VelocityLimit
 
 REST = np.zeros(N)
 
@@ -75,21 +75,37 @@ def test_what_is_not_finite_never_passes(joint, value, in_velocity):
     assert caught.value.joint == joint
 
 
-@pytest.mark.parametrize(("offset", "turns"), [(0.0, 0), (1.0, 5), (3.0, 10)])
-def test_jerk_is_resolved_at_joint_angles_of_many_turns_at_1_ms(offset, turns):
-    """Rounding of positions of many turns over T³ is allowed for, not mistaken for jerk."""
+def test_a_planner_that_keeps_its_limits_to_a_millionth_passes():
+    feed(begun(), jerk_profile([100.0 * (1.0 + 8e-7)] * 30))
+
+
+@pytest.mark.parametrize("turns", [0, 1, 10, 30])
+def test_rounding_of_joint_angles_of_many_turns_is_not_mistaken_for_jerk(turns):
+    """At 1 ms the last bit of 200 rad is 2e-5 rad/s³ in a third difference."""
+    T = 0.001
     reach = 2.0 * np.pi * (turns + 1)
-    wide = limits(lower=np.full(N, -reach), upper=np.full(N, reach))
-    guard = Guard(wide, 0.001)
-    start = np.full(N, 2.0 * np.pi * turns + offset)
+    wide = limits(lower=np.full(N, -reach), upper=np.full(N, reach), jerk=np.full(N, 10.0))
+    guard = Guard(wide, T)
+    start = 2.0 * np.pi * turns + np.arange(N) * 0.1
     guard.begin(start, REST, REST, np.zeros((2, N)), 0)
-    t = np.arange(1, 200)[:, None] * 0.001
     before = start
-    for cycle, row in enumerate(start + 99.99 * np.minimum(t, 0.04) ** 3 / 6 * np.ones(N)):
-        if cycle >= 40:
-            break
-        guard.check_set_point(row, (row - before) / 0.001, "plan", cycle)
+    for cycle in range(1, 300):
+        row = start + 10.0 * (cycle * T) ** 3 / 6.0
+        guard.check_set_point(row, (row - before) / T, "plan", cycle)
         before = row
+
+
+def test_speed_is_judged_by_the_step_as_well_as_by_the_stated_velocity():
+    guard = begun(jerk=np.full(N, 1e9), velocity=np.full(N, 0.5))
+    q, speed = START.copy(), 0.0
+    with pytest.raises(VelocityLimit) as caught:
+        for cycle in range(1, 100):
+            speed += 7.9 * PERIOD
+            q = q + np.array([0, speed * PERIOD, 0, 0, 0, 0])
+            stated = np.array([0, min(speed, 0.499), 0, 0, 0, 0])
+            guard.check_set_point(q, stated, "plan", cycle)
+    assert caught.value.value == pytest.approx(speed)
+    assert 0.5 < speed < 0.5 + 7.9 * PERIOD
 
 
 def test_errors_carry_joint_value_bound_and_cycle():

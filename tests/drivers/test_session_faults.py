@@ -207,6 +207,18 @@ class TestArmThatDoesNotFollow:
             assert rig.cycle().axes["mode"].tolist() == [4, 4, 4, 508, 4, 4]
         assert rig.session.counters.refused == 1
 
+    def test_a_later_fault_of_another_kind_is_not_reported_as_508(self):
+        rig, _ = moving()
+        rig.axes["d"][3, 2] += 2.01
+        rig.cycle()
+        rig.axes["d"][3, 2] -= 2.01
+        rig.modes = Mode.CLOSED
+        rig.cycle()
+        rig.status = 0
+        rig.cycle()
+        rig.status, rig.modes = 5, Mode.POSITION
+        assert all_drive_off(rig.cycle())
+
     @pytest.mark.parametrize("sign", [-1, 1])
     def test_current_beyond_the_narrower_limit_asks_for_drive_off(self, sign):
         rig, _ = moving(init=init_packet(arm_1={"current_limit": [20, 20, 20, 20, 20, 7.5]}))
@@ -358,6 +370,7 @@ class TestLostMotion:
         advances = source.advances
         assert all_drive_off(rig.cycle())
         assert source.advances == advances
+        assert rig.records["interval"][-2:].tolist() == [0, -1]
 
     def test_an_init_in_a_running_session_aborts_the_motion_and_starts_over(self):
         rig, source = moving()

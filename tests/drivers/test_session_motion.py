@@ -7,6 +7,7 @@ import pytest
 from rig import PERIOD, START, Cruise, N, Rig, init_packet, limits, smooth_move, still
 
 from drivers import (
+    CurrentLimit,
     CyclicPacket,
     FirstSetPoint,
     GapSeen,
@@ -73,6 +74,25 @@ class TestFromRequestToRest:
         rig.cycle(7)
         assert source.advances == 7
 
+    def test_a_source_may_reuse_its_arrays(self):
+        class Reusing(Cruise):
+            def advance(self):
+                position, velocity = super().advance()
+                self.q[:], self.qd[:] = position, velocity
+                return self.q, self.qd
+
+        def answers(source):
+            rig = Rig()
+            source.q, source.qd = np.zeros(N), np.zeros(N)
+            rig.session.request(source)
+            rig.open()
+            rig.cycle(100)
+            return [reply for _, reply in rig.transcript], rig.records["commanded_velocity"]
+
+        (replies, velocities), (expected, theirs) = answers(Reusing()), answers(Cruise())
+        assert replies == expected
+        np.testing.assert_array_equal(velocities, theirs)
+
     def test_set_points_on_the_wire_are_those_of_the_source(self):
         rig = Rig()
         source = smooth_move(MOVE, 300)
@@ -116,6 +136,15 @@ class TestFromRequestToRest:
         assert rig.exits_asked == 1
         rig.cycle(EXIT_RETRY_CYCLES)
         assert rig.exits_asked == 2
+
+    def test_the_wait_for_closed_axes_begins_anew_each_time(self):
+        rig = Rig()
+        for motion in range(1, 3):
+            rig.open()
+            rig.session.stop()
+            rig.cycle(1 + EXIT_RETRY_CYCLES - 1)
+            assert rig.exits_asked == motion
+            rig.close()
 
     def test_axes_that_close_one_by_one_are_answered_one_by_one(self):
         rig = Rig()
@@ -226,6 +255,7 @@ class TestFirstSetPoint:
         assert rig.ended.outcome == "refused"
         assert rig.seen(MotionStarted) == []
         assert rig.state is State.FAULTED
+        assert np.isnan(rig.records[-1]["commanded_position"]).all()
         return rig.refusal
 
     @pytest.mark.parametrize("joint", range(N))
@@ -280,6 +310,12 @@ class TestFirstSetPoint:
         assert type(error) is NotFinite
         assert error.joint == 4
         assert np.isfinite(rig.answer.axes["d"]).all()
+
+    def test_an_axis_that_already_needs_too_much_current_is_refused(self):
+        def change(d):
+            d[3, 4] = 20.1
+
+        assert type(self.refused(self.opening_with(change))) is CurrentLimit
 
     def test_an_arm_outside_its_range_is_refused(self):
         rig = Rig()

@@ -275,6 +275,9 @@ class TestSilence:
         rig.number += 9000
         assert rig.cycle() is not None
         assert rig.state is State.CLOSED
+        # How long it was, numbers that wrap around cannot tell.
+        assert rig.records["gap"][-1] == 0
+        assert np.diff(rig.records["cycle"][-2:]) == 1
 
     def test_after_silence_a_cold_start_is_followed(self):
         rig = Rig()
