@@ -1,12 +1,13 @@
 """What every set-point has to pass before it leaves.
 
 Rates are differences of the joint-side float64 set-points that were really *sent*, taken before
-encoding: a float32 motor position near 100 revolutions moves in steps of 8e-6, a hundred times
-too coarse for jerk. For a motion q(t) sampled at the cycle, the k-th difference over T^k is a
-mean of the k-th derivative over k cycles, so it never exceeds what the derivative keeps, and a
-motion that runs *at* a limit hits the bound exactly. Hence `RELATIVE_TOLERANCE`, far above the
-rounding of a planner's arithmetic and far below anything a drive could feel, plus the rounding
-of the difference itself, which 1/T³ makes visible at joint angles of many turns.
+encoding: a float32 motor position near 100 revolutions moves in steps of 8e-6, which over T³ look
+like a jerk as large as the limit itself. For a motion q(t) sampled at the cycle, the k-th
+difference over T^k is a mean of the k-th derivative over k cycles: it never exceeds what the
+derivative keeps, and a motion that runs *at* a limit hits the bound exactly. Hence a relative
+tolerance of 1e-6, which is how well planners keep their limits and far below anything a drive
+could feel, plus the rounding of the difference itself, which 1/T³ makes visible at joint angles
+of many turns.
 
 All comparisons are written so that NaN fails them.
 """

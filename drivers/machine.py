@@ -7,7 +7,7 @@ from typing import Final
 from drivers.errors import RequestError
 from drivers.events import Event, MotionEnded, MotionStarted, Outcome, StateChanged
 from drivers.execution import Execution
-from drivers.open_mode import Array
+from drivers.motion_source import Array
 from drivers.states import HAS_SET_POINTS, TRANSITIONS, Input, State, keeps_request
 
 _LOSS: Final = {

@@ -166,7 +166,7 @@ def _parameters(
 
 def _table2_ids() -> dict[str, int]:
     """Row of the paper's Table 2 by our parameter name (rows 29 and 31 have the other sign)."""
-    return {row.parameter: row.id for row in TABLE2}
+    return {row.pivot or row.parameter: row.id for row in TABLE2}
 
 
 def _validation(

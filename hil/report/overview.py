@@ -104,7 +104,7 @@ def _change(
     """Executed minus planned; a log has no meaningful percentage, the others get one."""
     before = None if planned is None else getattr(planned, field)
     after = getattr(executed, field)
-    if before is None or after is None:
+    if before is None or after is None or field == "n_samples":
         return numbers.MISSING
     if field in {"log10_det", "fitness"} or before == 0.0:
         return numbers.fixed(after - before, decimals, sign=True)

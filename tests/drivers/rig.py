@@ -17,6 +17,7 @@ from drivers import (
     MotionEnded,
     Refused,
     Session,
+    State,
     StateChanged,
 )
 from drivers.packets import DRIVE_ON, cyclic_length, next_number
@@ -243,7 +244,7 @@ class Rig:
         told = answer.axes
         if np.isin(told["mode"], NOT_SET_POINTS).any():
             return
-        moved = told["mode"] == Mode.POSITION
+        moved = np.isin(told["mode"], (Mode.POSITION, Mode.POSITION_RELATIVE))
         for target, field in ((0, 0), (2, 0), (1, 1), (3, 1)):
             self.axes["d"][moved, target] = told["d"][moved, field]
 
@@ -291,3 +292,29 @@ class Rig:
     @property
     def records(self):
         return self.ring.last(self.ring.capacity)
+
+
+def moving(cycles: int = 300, **options) -> tuple[Rig, Cruise]:
+    rig = Rig(**options)
+    source = Cruise()
+    rig.session.request(source)
+    rig.open()
+    rig.cycle(cycles)
+    assert rig.state is State.OPEN
+    return rig, source
+
+
+def all_drive_off(answer: CyclicPacket) -> bool:
+    return bool((answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all())
+
+
+def assert_refused(rig: Rig, answer: CyclicPacket, kind: type) -> Exception:
+    assert all_drive_off(answer)
+    assert answer.status == bytes(4)
+    assert rig.state is State.FAULTED
+    assert rig.ended.outcome == "refused"
+    assert np.isnan(rig.records[-1]["commanded_position"]).all()
+    error = rig.refusal
+    assert type(error) is kind
+    assert error.cycle == rig.records[-1]["cycle"]
+    return error

@@ -1,0 +1,217 @@
+"""How open mode begins: the first set-point, and axes that open one after the other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rig import (
+    START,
+    Cruise,
+    N,
+    Rig,
+    init_packet,
+    limits,
+    smooth_move,
+    still,
+)
+
+from drivers import (
+    CurrentLimit,
+    FirstSetPoint,
+    Mode,
+    MotionStarted,
+    NotAtStandstill,
+    NotFinite,
+    PositionLimit,
+    State,
+)
+
+MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
+
+
+class TestFirstSetPoint:
+    """Ten per cent of the axis's following-error threshold, and at rest; refused, never clamped."""
+
+    def opening_with(self, change, **options) -> Rig:
+        rig = Rig(**options)
+        rig.session.request(smooth_move(MOVE, 300))
+        rig.close()
+        change(rig.axes["d"])
+        rig.modes = Mode.POSITION
+        rig.answer = rig.cycle()
+        return rig
+
+    def refused(self, rig: Rig):
+        assert (rig.answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        assert rig.ended.outcome == "refused"
+        assert rig.seen(MotionStarted) == []
+        assert rig.state is State.FAULTED
+        assert np.isnan(rig.records[-1]["commanded_position"]).all()
+        return rig.refusal
+
+    @pytest.mark.parametrize("joint", range(N))
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_a_target_away_from_the_arm_is_refused(self, joint, sign):
+        def change(d):
+            d[joint, 2] = d[joint, 0] + sign * 0.21
+
+        error = self.refused(self.opening_with(change))
+        assert type(error) is FirstSetPoint
+        assert error.joint == joint
+        assert error.value == pytest.approx(0.21, abs=1e-5)
+        assert error.bound == pytest.approx(0.2)
+
+    def test_a_target_within_ten_per_cent_is_taken(self):
+        rig = self.opening_with(lambda d: d[:, 2].__iadd__(0.19))
+        assert rig.state is State.OPEN
+
+    def test_the_narrower_threshold_of_cell_and_controller_counts(self):
+        def change(d):
+            d[1, 2] += 0.06
+
+        cell = limits(following_error=np.full(N, 0.5))
+        assert self.refused(self.opening_with(change, guard_limits=cell)).bound == pytest.approx(
+            0.05
+        )
+        controller = init_packet(arm_1={"following_error": np.full(N, 0.5)})
+        assert self.refused(self.opening_with(change, init=controller)).bound == pytest.approx(0.05)
+
+    @pytest.mark.parametrize("field", [1, 3], ids=["target", "actual"])
+    def test_an_axis_in_motion_is_refused(self, field):
+        def change(d):
+            d[2, field] = -0.001
+
+        error = self.refused(self.opening_with(change))
+        assert type(error) is NotAtStandstill
+        assert error.joint == 2
+
+    def test_encoder_noise_of_an_axis_at_rest_is_not_motion(self):
+        two_increments_of_12_bit = 2.0 / 4096.0
+        rig = self.opening_with(lambda d: d[:, 3].__iadd__(two_increments_of_12_bit))
+        assert rig.state is State.OPEN
+
+    @pytest.mark.parametrize("field", [0, 1, 2, 3])
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    def test_what_is_not_a_number_is_refused(self, field, value):
+        def change(d):
+            d[4, field] = value
+
+        rig = self.opening_with(change)
+        error = self.refused(rig)
+        assert type(error) is NotFinite
+        assert error.joint == 4
+        assert np.isfinite(rig.answer.axes["d"]).all()
+
+    def test_an_axis_that_already_needs_too_much_current_is_refused(self):
+        def change(d):
+            d[3, 4] = 20.1
+
+        assert type(self.refused(self.opening_with(change))) is CurrentLimit
+
+    def test_an_arm_outside_its_range_is_refused(self):
+        rig = Rig()
+        rig.session.request(smooth_move(MOVE, 300))
+        rig.close()
+        outside = START.copy()
+        outside[3] = 2.01
+        rig.put_arm_at(outside)
+        rig.modes = Mode.POSITION
+        rig.answer = rig.cycle()
+        error = self.refused(rig)
+        assert type(error) is PositionLimit
+        assert (error.joint, error.bound) == (3, 2.0)
+        assert error.value == pytest.approx(2.01, abs=1e-5)
+
+    def test_the_rule_holds_without_a_motion_too(self):
+        rig = Rig()
+        rig.close()
+        rig.axes["d"][0, 2] += 1.0
+        rig.modes = Mode.POSITION
+        assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+
+    def test_a_source_that_wants_to_begin_elsewhere_is_refused(self):
+        class Elsewhere(Cruise):
+            def begin(self, position):
+                raise ValueError("start is 3 rad away")
+
+        rig = Rig()
+        rig.session.request(Elsewhere())
+        rig.answer = rig.open()
+        assert "3 rad away" in str(self.refused(rig))
+
+
+class TestStaggeredOpening:
+    def test_nothing_moves_until_the_last_axis_is_open(self):
+        rig = Rig()
+        source = Cruise()
+        rig.session.request(source)
+        rig.close()
+        target = rig.axes["d"][:, 0].copy()
+        for joint in range(N - 1):
+            rig.axes["mode"][joint] = Mode.POSITION
+            for _ in range(3):
+                answer = rig.cycle()
+                assert rig.state is State.OPENING
+                np.testing.assert_array_equal(answer.axes["mode"], rig.axes["mode"])
+                np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
+                assert not answer.axes["d"][:, 1:].any()
+        assert source.begun_at is None
+        rig.modes = Mode.POSITION
+        rig.cycle()
+        assert rig.state is State.OPEN
+        assert source.begun_at is not None
+
+    def test_records_say_which_axes_had_a_set_point(self):
+        rig = Rig()
+        rig.close()
+        rig.axes["mode"][[1, 4]] = Mode.POSITION
+        rig.cycle()
+        record = rig.records[-1]
+        has = np.isfinite(record["commanded_position"])
+        np.testing.assert_array_equal(has, [False, True, False, False, True, False])
+        np.testing.assert_allclose(record["commanded_position"][has], START[has], atol=1e-6)
+        np.testing.assert_array_equal(record["commanded_velocity"][has], 0.0)
+        assert record["interval"] == -1
+
+    def test_an_open_axis_that_is_not_where_its_target_is_gets_508(self):
+        rig = Rig()
+        rig.close()
+        rig.axes["mode"][[1, 4]] = Mode.POSITION
+        rig.axes["d"][4, 2] += 2.1
+        answer = rig.cycle()
+        assert answer.axes["mode"].tolist() == [0, 4, 0, 0, 508, 0]
+
+    def test_axes_that_close_again_leave_the_motion_waiting(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.close()
+        rig.axes["mode"][0] = Mode.POSITION
+        rig.cycle()
+        rig.modes = Mode.CLOSED
+        rig.cycle()
+        assert rig.ended is None
+        rig.open()
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    def test_a_motion_does_not_start_in_a_mode_it_was_not_asked_for(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.close()
+        rig.axes["mode"][2] = Mode.POSITION_RELATIVE
+        answer = rig.cycle()
+        assert (answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        assert rig.ended.outcome == "refused"
+        assert "mode 5" in rig.ended.reason
+
+    def test_without_a_motion_another_open_mode_is_answered_by_holding(self):
+        rig = Rig()
+        rig.close()
+        rig.modes = Mode.POSITION_RELATIVE
+        answer = rig.cycle()
+        assert rig.state is State.OPENING
+        np.testing.assert_array_equal(answer.axes["d"][:, 0], rig.axes["d"][:, 0])
+        rig.modes = Mode.DELTA_POSITION
+        answer = rig.cycle()
+        np.testing.assert_array_equal(answer.axes["mode"], Mode.DELTA_POSITION)
+        assert not answer.axes["d"].any()
