@@ -1,4 +1,8 @@
-"""One connection to a controller, and how an interval of motion is run and recorded on it."""
+"""One connection to a controller, and how an interval of motion is run and recorded on it.
+
+Exchange and archive share one thread here, which is right in virtual time, where the controller
+waits for the PC, and only there: on a real link a slow disk must not delay a reply.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +36,10 @@ from drivers.states import State
 from drivers.transports import Transport
 from hil.archive import ArchiveWriter, Level
 from hil.cell import Cell
-from hil.errors import ControllerFault
+from hil.errors import ArchiveWriteError, ControllerFault
 
 Array = NDArray[np.float64]
+Records = NDArray[np.void]
 DRAIN_CYCLES = 100
 """Records go to the archive this many cycles at a time: 100 ms at 1 kHz, the flush period."""
 
@@ -126,7 +131,13 @@ class Link:
         return last
 
     def run(self, source: MotionSource, writer: ArchiveWriter, stop: Stop) -> MotionEnded:
-        """Run one motion and archive every cycle of it; say how it ended."""
+        """Run one motion and archive every cycle of it; say how it ended.
+
+        Should the archive refuse to take more, the arm is brought to rest on its path first.
+
+        Raises:
+            ArchiveWriteError: the archive could not be written; the motion was stopped.
+        """
         recorder = _Recorder(self, writer)
         self.ring.drain()
         self.session.request(source)
@@ -145,6 +156,8 @@ class Link:
 
         exchange(self.transport, self.session, until=over)
         recorder.take()
+        if recorder.failure is not None:
+            raise recorder.failure
         return recorder.ended or MotionEnded("lost", "the link ended", -1, -1)
 
     def close(self) -> None:
@@ -165,17 +178,29 @@ class _Recorder:
         self._link, self._writer = link, writer
         self._overflow = link.ring.overflow
         self.ended: MotionEnded | None = None
+        self.failure: ArchiveWriteError | None = None
 
     def take(self) -> None:
-        """Archive what has come since the last call."""
+        """Archive what has come since the last call; a failure stops the motion on its path."""
+        events = self._link.session.events()
+        for event in events:
+            if isinstance(event, MotionEnded):
+                self.ended = event
+        records = self._link.ring.drain()
+        if self.failure is not None:
+            return
+        try:
+            self._archive(records, events)
+        except ArchiveWriteError as error:
+            self.failure = error
+            self._link.session.stop("the archive cannot be written")
+
+    def _archive(self, records: Records, events: list[Event]) -> None:
         link, writer = self._link, self._writer
-        records = link.ring.drain()
         if len(records):
             link.cycles += len(records)
             writer.write(records, link.drive_train.joint_torque(records["target_current"]))
-        for event in link.session.events():
-            if isinstance(event, MotionEnded):
-                self.ended = event
+        for event in events:
             cycle = getattr(event, "cycle", None)
             writer.event(cycle, type(event).__name__, describe(event), level=_level(event))
         if link.ring.overflow > self._overflow:

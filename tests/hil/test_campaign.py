@@ -11,18 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.archive import ArchiveName, open_archive
+from drivers.transports import SimulatedTransport
+from hil.archive import ArchiveName, ArchiveWriter, open_archive
 from hil.campaign import (
     Campaign,
     CampaignFolderError,
     CampaignPlan,
+    Link,
     MotionFailedError,
     MotionRefusedError,
     Stop,
 )
 from hil.cell import Cell
+from hil.errors import ArchiveWriteError
 from hil.progress import Silent
-from hil.simulation import simulated_link, simulated_provenance
+from hil.simulation import simulated_controller, simulated_link, simulated_provenance
 from planner import PiecewiseCubic
 
 Run = Callable[..., Campaign]
@@ -143,6 +146,29 @@ def test_what_is_whole_is_kept_and_what_is_torn_is_done_again(
     assert kept.read_bytes() == before
     assert [p.name for p in campaign.folder.completed("validation")] == ["validation_000_a2.mcap"]
     assert torn.exists(), "nothing is ever overwritten"
+
+
+def test_a_disk_that_refuses_brings_the_arm_to_rest_before_anything_else(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = Campaign.create(tmp_path / "full", *one_repetition(cell, plan))
+    controller = simulated_controller(campaign.cell)
+    link = Link.over(SimulatedTransport(controller), campaign.cell)
+    write, calls = ArchiveWriter.write, []
+
+    def refusing(writer: ArchiveWriter, *arguments: object) -> None:
+        calls.append(np.abs(controller.plant.velocity).max())
+        if len(calls) == 20:
+            raise ArchiveWriteError(writer.path, "no space left on device")
+        write(writer, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ArchiveWriter, "write", refusing)
+    with pytest.raises(ArchiveWriteError, match="no space left"):
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+    assert max(calls) > 0.1, "the arm was moving"
+    assert np.abs(controller.plant.velocity).max() < 1e-3
+    assert len(calls) == 20, "nothing was sent to be archived after that"
+    assert campaign.folder.manifest() == []
 
 
 def test_a_motion_outside_the_limits_is_refused_before_anything_moves(

@@ -1,0 +1,144 @@
+"""What a person types, what he gets, and the exit status a script sees."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hil.archive import open_archive
+from hil.campaign import Campaign
+from hil.results import Results
+from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
+
+
+def hil(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "hil", *map(str, arguments)]
+    environment = os.environ | {"COLUMNS": "200", "NO_COLOR": "1"}
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=cwd, env=environment, timeout=300, check=False
+    )
+
+
+def test_help_says_where_to_start() -> None:
+    done = hil("--help")
+    assert done.returncode == 0
+    assert "hil demo" in done.stdout
+    for command in ("demo", "identify", "import"):
+        assert hil(command, "--help").returncode == 0
+
+
+def test_the_demo_leaves_archives_results_and_a_report_and_ends_with_the_verdict(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "runs" / "demo"
+    done = hil("demo", "--output", folder, "--repetitions", 2, "--validation", 1)
+    assert done.returncode == 0, done.stderr
+    last = done.stdout.strip().splitlines()[-1]
+    results = Results.load(folder / "results.json")
+    assert last == results.verdict.line
+    assert "predicts unseen motion well" in last
+    assert "%" in last
+    assert len(list((folder / "archives").glob("excitation_*.mcap"))) == 2
+    assert (folder / "report.html").read_text("utf-8").startswith("<!")
+
+    again = hil("demo", "--output", folder)
+    assert again.returncode == 2
+    assert "--force" in again.stderr
+
+
+def test_identify_works_on_a_campaign_folder_and_on_loose_archives(
+    campaign: Campaign, tmp_path: Path
+) -> None:
+    archives = [*campaign.folder.completed("excitation"), *campaign.folder.completed("validation")]
+    loose = hil("identify", *archives, "--json", "--output", tmp_path)
+    assert loose.returncode == 0, loose.stderr
+    assert json.loads(loose.stdout)["good"] is True
+    assert Results.load(tmp_path / "results.json").verdict.good
+    whole = hil("identify", campaign.folder.root, "--quiet", "--output", tmp_path)
+    assert whole.stdout.strip() == Results.load(tmp_path / "results.json").verdict.line
+
+
+def test_a_bag_becomes_an_archive_and_a_model(shared_data: Path, tmp_path: Path) -> None:
+    """The UR10 recording: as good as the comparators, from the command line alone."""
+    robots = pytest.importorskip("importlib.metadata").files("example-robot-data")
+    urdf = next(Path(str(f.locate())) for f in robots if f.name == "ur10_robot.urdf")
+    bag = shared_data / "ur10_unisa" / "ur10_exciting_trajectory.db3"
+    archive = tmp_path / "ur10.mcap"
+    friction = "coulomb,viscous,offset,quadratic"
+    made = hil("import", "rosbag2", bag, "--urdf", urdf, "--friction", friction, "-o", archive)
+    assert made.returncode == 0, made.stderr
+    done = hil("identify", archive, "--output", tmp_path)
+    assert done.returncode == 0, done.stderr
+    (run,) = Results.load(tmp_path / "results.json").validation
+    assert run.all_rows_relative_error <= 0.068
+
+
+def test_a_log_with_a_column_map_becomes_an_archive(tmp_path: Path) -> None:
+    header = ",".join(["t", *(f"q{i}" for i in range(1, 7)), *(f"u{i}" for i in range(1, 7))])
+    rows = [",".join(f"{0.004 * k + j:.6f}" for j in range(13)) for k in range(100)]
+    (tmp_path / "log.csv").write_text("\n".join([header, *rows]) + "\n")
+    (tmp_path / "map.toml").write_text(
+        'time = { column = "t" }\nposition = { columns = "q{}", unit = "deg" }\n'
+        'torque = { columns = "u{}" }\n'
+    )
+    source, output = tmp_path / "log.csv", tmp_path / "log.mcap"
+    done = hil(
+        "import", "csv", source, "--map", tmp_path / "map.toml", "--urdf", URDF_PATH, "-o", output
+    )
+    assert done.returncode == 0, done.stderr
+    archive = open_archive(output)
+    assert archive.n_samples == 100
+    assert archive.columns["position"][0, 0] == pytest.approx(0.0174532925)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["identify", "nothing.mcap"], "nothing.mcap"),
+        (["identify", str(CELL_PATH)], "cell.toml"),
+        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf or --cell"),
+        (["import", "rosbag2", "x.db3", "-o", "y.mcap", "--urdf", str(URDF_PATH)], "x.db3"),
+        (
+            ["import", "csv", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],
+            "m.toml",
+        ),
+        (["identify", "x.mcap", "--torque-bandwidth", "wide"], "no bandwidth"),
+    ],
+)
+def test_bad_input_gets_one_sentence_and_status_2(
+    tmp_path: Path, arguments: list[str], sentence: str
+) -> None:
+    done = hil(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert sentence in done.stderr.replace("\n", "")
+    assert "Traceback" not in done.stderr
+
+
+def test_ctrl_c_stops_the_arm_on_its_path_and_leaves_whole_archives(tmp_path: Path) -> None:
+    folder = tmp_path / "demo"
+    command = [sys.executable, "-m", "hil", "demo", "--output", str(folder)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        deadline = time.monotonic() + 120.0
+        while not (folder / "archives" / "excitation_000_a1.mcap").exists():
+            assert time.monotonic() < deadline
+            assert run.poll() is None
+            time.sleep(0.05)
+        time.sleep(0.3)
+        run.send_signal(signal.SIGINT)
+        _, said = run.communicate(timeout=60)
+    assert run.returncode == 4, said
+    assert "stopped" in said
+    last = sorted((folder / "archives").iterdir(), key=lambda path: path.stat().st_mtime)[-1]
+    archive = open_archive(last)
+    assert archive.complete
+    assert archive.outcome is not None
+    assert archive.outcome["outcome"] == "stopped"

@@ -1,0 +1,149 @@
+"""From archives to a result: reads archives and nothing else."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.archive import Samples, write_samples
+from hil.campaign import Campaign
+from hil.errors import InputError
+from hil.identify import Identification, Options, identify_archives, identify_campaign
+from hil.importers import Robot
+from hil.progress import Silent
+from hil.results import Results
+from identification import RecordingError
+from sim_fixtures.ns16 import URDF_PATH
+
+PERIOD = 0.004
+
+
+@pytest.fixture(scope="module")
+def found(campaign: Campaign) -> Identification:
+    return identify_campaign(campaign.folder.root, Silent())
+
+
+def paths(campaign: Campaign) -> list[Path]:
+    kinds = ("excitation", "validation", "standstill")
+    return [path for kind in kinds for path in campaign.folder.completed(kind)]
+
+
+def test_58_parameters_are_found_with_their_rows_of_table_2(found: Identification) -> None:
+    ids = sorted(p.table2_id or 0 for p in found.results.parameters)
+    assert ids == list(range(1, 59))
+
+
+def test_nearly_all_planted_values_lie_within_three_standard_deviations(
+    found: Identification,
+) -> None:
+    """Of 58 normal deviates more than 3 outside 3 sigma come once in 10^5 tries."""
+    coverage = found.results.coverage
+    assert coverage is not None
+    assert coverage.within_3 >= 55
+
+
+def test_the_planned_criteria_are_those_of_what_was_executed(found: Identification) -> None:
+    """Rows at standstill are missing from the latter, hence not equal."""
+    planned, executed = found.results.excitation.planned, found.results.excitation.executed
+    assert planned is not None
+    assert executed.log10_det == pytest.approx(planned.log10_det, abs=3.0)
+    assert executed.coupling_index == pytest.approx(planned.coupling_index, rel=0.10)
+
+
+def test_the_result_needs_the_archives_only(
+    campaign: Campaign, found: Identification, tmp_path: Path
+) -> None:
+    """Moved elsewhere, without the folder around them, they give the same numbers."""
+    moved = [Path(shutil.copy(path, tmp_path)) for path in paths(campaign)]
+    again = identify_archives(moved, Silent(), name=found.results.name)
+    assert again.results == found.results
+
+
+def test_the_papers_way_of_filtering_finds_the_same_parameters(
+    campaign: Campaign, found: Identification
+) -> None:
+    paper = identify_campaign(campaign.folder.root, Silent(), Options(method="paper"))
+    assert paper.verdict.good, paper.verdict.line
+    for ours, theirs in zip(found.results.parameters, paper.results.parameters, strict=True):
+        both = np.hypot(ours.std, theirs.std)
+        assert abs(ours.estimate - theirs.estimate) < 5.0 * both, ours.name
+
+
+def test_results_survive_their_file(found: Identification, tmp_path: Path) -> None:
+    found.results.save(tmp_path / "results.json")
+    assert Results.load(tmp_path / "results.json") == found.results
+
+
+def test_a_torn_repetition_is_used_up_to_its_last_whole_chunk_and_named(
+    campaign: Campaign, tmp_path: Path
+) -> None:
+    moved = [Path(shutil.copy(path, tmp_path)) for path in paths(campaign)]
+    moved[2].write_bytes(moved[2].read_bytes()[: moved[2].stat().st_size // 2])
+    found = identify_archives(moved, Silent())
+    doubts = " ".join(found.results.verdict.doubts)
+    assert moved[2].name in doubts
+    assert "could be read" in doubts
+
+
+def test_archives_without_an_excitation_are_refused(campaign: Campaign, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no excitation"):
+        identify_archives(campaign.folder.completed("validation"), Silent())
+    with pytest.raises(InputError, match="holds no completed excitation"):
+        identify_campaign(tmp_path, Silent())
+
+
+def imported(path: Path, names: tuple[str, ...] | None = None, **spoilt: object) -> Path:
+    """An imported recording of smooth sines on six joints, with something wrong."""
+    robot = Robot.from_urdf(URDF_PATH)
+    time = np.arange(2000) * PERIOD
+    position = 0.3 * np.sin(np.outer(time, np.linspace(1.0, 2.0, 6)))
+    torque = np.cos(np.outer(time, np.linspace(1.0, 2.0, 6)))
+    stamp = np.rint(time * 1e9).astype(np.int64)
+    for key, value in spoilt.items():
+        if key == "nan":
+            position[value] = np.nan
+        elif key == "stuck":
+            position[:, value] = 0.25  # type: ignore[call-overload]
+        elif key == "repeat":
+            stamp[value] = stamp[value - 1]  # type: ignore[index, operator]
+        elif key == "fall":
+            stamp[value] -= 10**9  # type: ignore[index]
+    write_samples(
+        path,
+        Samples(stamp, position, None, torque, None),
+        joint_names=names or robot.joint_names,
+        metadata={"kind": "imported"},
+        attachments=robot.attachments(),
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "sentence"),
+    [
+        ({"nan": (700, 2)}, r"position of joint joint_3 is nan at sample 700"),
+        ({"stuck": 4}, r"joint joint_5 is stuck"),
+        ({"repeat": 300}, r"clock repeats at sample 300"),
+        ({"fall": 300}, r"clock falls back at sample 300"),
+    ],
+)
+def test_a_bad_recording_is_refused_by_name(
+    tmp_path: Path, spoilt: dict[str, object], sentence: str
+) -> None:
+    with pytest.raises(RecordingError, match=sentence):
+        identify_archives([imported(tmp_path / "bad.mcap", **spoilt)], Silent())
+
+
+def test_joints_in_another_order_than_the_urdfs_are_refused_by_name(tmp_path: Path) -> None:
+    names = ("joint_2", "joint_1", "joint_3", "joint_4", "joint_5", "joint_6")
+    with pytest.raises(RecordingError, match=r"recorded in the order joint_2, joint_1"):
+        identify_archives([imported(tmp_path / "order.mcap", names)], Silent())
+
+
+def test_a_single_recording_is_split_and_the_split_is_called_what_it_is(tmp_path: Path) -> None:
+    found = identify_archives([imported(tmp_path / "one.mcap")], Silent())
+    assert any("temporal split" in doubt for doubt in found.results.verdict.doubts)
+    assert [run.archive for run in found.results.validation] == ["one.mcap (last part)"]
