@@ -167,6 +167,11 @@ class Session:
         """The controller's cycle, s; before its init packet the one the guard was built for."""
         return self._guard.period if self._answers is None else self._answers.init.period
 
+    @property
+    def requested(self) -> bool:
+        """Whether a motion was requested and has not ended."""
+        return self._machine.execution is not None
+
     def events(self) -> list[Event]:
         """What happened since the last call, in order; rejected packets come last, summed up."""
         events, self._machine.events = self._machine.events, []

@@ -42,6 +42,8 @@ Array = NDArray[np.float64]
 Records = NDArray[np.void]
 DRAIN_CYCLES = 100
 """Records go to the archive this many cycles at a time: 100 ms at 1 kHz, the flush period."""
+AFTERMATH_CYCLES = 500
+"""What the arm does after a motion was refused or lost is recorded for so long."""
 
 
 @dataclass
@@ -141,18 +143,21 @@ class Link:
         recorder = _Recorder(self, writer)
         self.ring.drain()
         self.session.request(source)
-        countdown = DRAIN_CYCLES
+        until_drain, aftermath = DRAIN_CYCLES, AFTERMATH_CYCLES
 
         def over() -> bool:
-            nonlocal countdown
-            countdown -= 1
-            if countdown > 0:
-                return False
-            countdown = DRAIN_CYCLES
-            if stop.requested:
-                self.session.stop("stopped by the operator")
-            recorder.take()
-            return recorder.ended is not None
+            nonlocal until_drain, aftermath
+            if not self.session.requested:
+                aftermath -= 1
+                if aftermath < 0 or self.session.state is State.CLOSED:
+                    return True
+            until_drain -= 1
+            if until_drain == 0:
+                until_drain = DRAIN_CYCLES
+                if stop.requested:
+                    self.session.stop("stopped by the operator")
+                recorder.take()
+            return False
 
         exchange(self.transport, self.session, until=over)
         recorder.take()

@@ -31,9 +31,12 @@ MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 class TestFromRequestToRest:
     def test_states_events_and_outcome_of_a_whole_motion(self):
         rig = Rig()
+        assert not rig.session.requested
         rig.session.request(smooth_move(MOVE, 500))
+        assert rig.session.requested
         rig.open()
         rig.run()
+        assert not rig.session.requested
         assert rig.path == [
             State.INIT,
             State.CLOSED,
