@@ -21,6 +21,8 @@ from sim_fixtures.nominal_model import NominalModel
 from sim_fixtures.settings import ServoSettings
 
 _TURN = 2.0 * pi
+INERTIA_CYCLES = 8
+"""The inertia of the posture, which changes slowly, is computed anew every so many cycles."""
 
 
 class Servo:
@@ -71,6 +73,7 @@ class Servo:
         self.current = [0.0] * n
         self.model_current = [0.0] * n
         self.inertia = [0.0] * n
+        self._tick = 0
         self._integral = [0.0] * n
 
     def measure(self, revolutions: Sequence[float]) -> None:
@@ -113,7 +116,9 @@ class Servo:
         q = np.array(drive.joint_angles(middle))
         qd = np.array(drive.joint_speeds(speed))
         qdd = np.array(drive.joint_speeds(acceleration))
-        self.inertia = self._model.diagonal_inertia(q).tolist()
+        if self._tick % INERTIA_CYCLES == 0:
+            self.inertia = self._model.diagonal_inertia(q).tolist()
+        self._tick += 1
         return drive.currents(self._model.torque(q, qd, qdd).tolist())
 
     def _velocity_gains(self) -> list[float]:
