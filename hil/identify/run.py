@@ -133,16 +133,25 @@ def _series(
 ) -> ReportSeries:
     model = sources.cell.model
     motion = excitation.motion
-    every = max(1, motion.n_samples // FIGURE_SAMPLES)
+    shown = _moving(excitation)
     time = example.motion.time
-    thin = max(1, len(time) // FIGURE_SAMPLES)
     predicted = example.predicted_torque(model, estimate.pooled.values)
+    drawn = _moving(example)
     return ReportSeries(
-        excitation_time=motion.time[::every] - excitation.origin,
-        excitation_position=motion.position[::every],
-        excitation_velocity=motion.velocity[::every],
+        excitation_time=motion.time[shown] - excitation.origin,
+        excitation_position=motion.position[shown],
+        excitation_velocity=motion.velocity[shown],
         example_archive=sources.held_out[0].name,
-        example_time=time[::thin] - example.origin,
-        example_measured=for_figure(time, example.torque)[::thin],
-        example_predicted=for_figure(time, predicted)[::thin],
+        example_time=time[drawn] - example.origin,
+        example_measured=for_figure(time, example.torque)[drawn],
+        example_predicted=for_figure(time, predicted)[drawn],
     )
+
+
+def _moving(samples: Samples) -> slice:
+    """Rows of the motion, thinned for a figure: at rest no model of sliding friction is right."""
+    moving = np.flatnonzero(samples.usable.any(axis=1))
+    if not moving.size:
+        return slice(0, 0)
+    first, last = int(moving[0]), int(moving[-1]) + 1
+    return slice(first, last, max(1, (last - first) // FIGURE_SAMPLES))
