@@ -1,6 +1,7 @@
 """What an identification leaves behind: `results.json`, checked on the way in and out.
 
-Everything is plain numbers in SI units, so that another program can read it without `hil`.
+Everything is plain numbers in SI units, so that another program can read it without `hil`; what
+is infinite or was not measured stands as the string "Infinity" or "NaN".
 Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
 """
 
@@ -15,7 +16,7 @@ SCHEMA_VERSION = 1
 
 
 class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
 
 class CriteriaResult(_Frozen):

@@ -40,8 +40,8 @@ class Evidence:
         training: its error on the motion it was fitted to.
         held_out_slow: as `held_out`, with the error low-passed and apart from a change of
             friction; None where there are no repetitions to tell noise from error.
-        friction_change: share by which friction was higher on the unseen motion than estimated,
-            per joint (n,); None likewise.
+        friction_change: share by which friction was higher on an unseen motion than estimated,
+            of all motions the one with the largest change, per joint (n,); None likewise.
         slow: what repeats and what does not of the low-passed residual; None likewise.
         estimation_noise: standard deviation of the predicted torque on the unseen motion because
             the parameters come from noisy data, from the scatter over the repetitions (n,)
@@ -71,13 +71,16 @@ class Evidence:
         """Slow error on unseen motion that no noise explains, as a share of the torque (n,).
 
         Explained are the torque noise and, up to two standard deviations, what it has done to
-        the parameters.
+        the parameters. NaN for a joint that was not tested.
         """
         if self.held_out_slow is None or self.slow is None or self.estimation_noise is None:
             return None
         explained = self.slow.noise**2 + (2.0 * self.estimation_noise) ** 2
         excess = np.maximum(self.held_out_slow.rms**2 - explained, 0.0)
-        return np.asarray(np.sqrt(excess) / self.held_out.torque_rms)
+        tested = self.held_out.rows > 0
+        return np.where(
+            tested, np.sqrt(excess) / np.where(tested, self.held_out.torque_rms, 1), np.nan
+        )
 
 
 def gather(
@@ -86,6 +89,7 @@ def gather(
     training: Sequence[Samples],
     held_out: Sequence[Samples],
     *,
+    same_motion: bool = True,
     nominal: Array | None = None,
     slow: float = SLOW,
     sigmas: float = SIGMAS,
@@ -95,7 +99,9 @@ def gather(
     Args:
         model: the robot.
         result: from the training recordings.
-        training: repetitions, as many as the result has.
+        training: as many recordings as the result has.
+        same_motion: whether these are repetitions of one motion; only then can what repeats be
+            told from noise.
         held_out: motions that were not used for fitting.
         nominal: parameters (p,) of the nominal model.
         slow: bandwidth in which systematic errors are looked for [Hz].
@@ -107,7 +113,7 @@ def gather(
     if not held_out:
         raise IdentificationError("there is no motion left that was not used for fitting")
     values = result.pooled.values
-    repeated = len(result.repetitions) > 1
+    repeated = same_motion and len(result.repetitions) > 1
     velocity = np.concatenate([run.motion.velocity for run in held_out])
     position = np.concatenate([run.motion.position for run in held_out])
     unseen = total([run.factor(model) for run in held_out])
@@ -118,9 +124,7 @@ def gather(
         held_out=error,
         training=over_all(prediction_error(model, values, training)),
         held_out_slow=over_all(one.error for one in slow_errors) if repeated else None,
-        friction_change=np.mean([one.friction_change for one in slow_errors], axis=0)
-        if repeated
-        else None,
+        friction_change=_largest([one.friction_change for one in slow_errors]),
         slow=repeatability(model, values, training, slow) if repeated else None,
         estimation_noise=_estimation_noise(result, unseen) if repeated else None,
         disagreement=_disagreement(result) if repeated else None,
@@ -136,6 +140,14 @@ def gather(
             sigmas=sigmas,
         ),
     )
+
+
+def _largest(changes: list[Array]) -> Array | None:
+    """Of several vectors (n,), for each entry the one of largest magnitude; None of none."""
+    if not changes:
+        return None
+    stacked = np.array(changes)
+    return np.asarray(stacked[np.abs(stacked).argmax(axis=0), np.arange(stacked.shape[1])])
 
 
 def _disagreement(result: RepeatedEstimate) -> Array:

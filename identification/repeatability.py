@@ -22,7 +22,7 @@ class Repeatability:
 
     Attributes:
         noise: standard deviation between repetitions at equal times (n,) [N·m or N]: no model
-            can predict it.
+            can predict it. NaN for a joint that never moves twice at the same time.
         systematic: root mean square of what all repetitions have in common (n,) [N·m or N]: what
             the model gets wrong. Zero where noise can explain it.
         repetitions: R.
@@ -51,7 +51,7 @@ def repeatability(
         bandwidth: of a low-pass on the residual [Hz]; None for none.
 
     Raises:
-        IdentificationError: fewer than two repetitions, or a joint without common usable rows.
+        IdentificationError: fewer than two repetitions, or no row that two of them share.
     """
     moments = _Moments(model.n_joints)
     step = 0.0
@@ -88,13 +88,14 @@ class _Moments:
     def split(self) -> Repeatability:
         shared = self.count >= 2.0
         rows = np.count_nonzero(shared, axis=0)
-        if self.repetitions < 2 or not rows.all():
+        if self.repetitions < 2 or not rows.any():
             raise IdentificationError(
-                "what repeats cannot be told from noise: it takes two repetitions in which every"
-                f" joint moves at the same times, here are {self.repetitions} with"
+                "what repeats cannot be told from noise: it takes two repetitions in which joints"
+                f" move at the same times, here are {self.repetitions} with"
                 f" {rows.tolist()} common rows per joint"
             )
         freedom = np.where(shared, self.count - 1.0, 0.0).sum(axis=0)
+        freedom[rows == 0], rows = np.nan, np.where(rows == 0, np.nan, rows)
         noise = np.where(shared, self.spread, 0.0).sum(axis=0) / freedom
         # The mean over repetitions still holds its share of the noise.
         common = self.mean**2 - noise / np.maximum(self.count, 1.0)

@@ -89,9 +89,10 @@ class PredictionError:
 
     @property
     def relative(self) -> Array:
-        """||e|| / ||tau|| of each joint (n,)."""
+        """||e|| / ||tau|| of each joint (n,); NaN where a joint has no row: not tested."""
         tiny = np.finfo(np.float64).tiny
-        return np.sqrt(self.squared / np.maximum(self.torque_squared, tiny))
+        share = np.sqrt(self.squared / np.maximum(self.torque_squared, tiny))
+        return np.where(self.rows > 0, share, np.nan)
 
     @property
     def overall(self) -> float:

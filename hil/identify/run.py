@@ -67,8 +67,7 @@ def identify_archives(
     """Identify from archives.
 
     Raises:
-        InputError: the archives cannot be used together.
-        RecordingError: a recording is not fit to be identified from.
+        InputError: the archives cannot be used, or not together.
     """
     sources = gather_sources(paths, options.split)
     model = sources.cell.model
@@ -82,24 +81,39 @@ def identify_archives(
     total = len(sources.training) + len(sources.held_out)
     with reporter.task("smoothing recordings", total) as task:
 
-        def ready(source: Source) -> Samples:
+        def ready(source: Source, how: Preprocessing) -> Samples:
             samples = prepare(
                 source.recording,
                 model,
                 noise_variance=sources.noise_variance,
-                options=preprocessing,
+                torque_variance=sources.torque_variance,
+                options=how,
                 origin=source.origin,
             )
             task.advance(1, source.name)
             return samples
 
-        training = [ready(source) for source in sources.training]
-        held_out = [ready(source) for source in sources.held_out]
+        fitted = [ready(source, preprocessing) for source in sources.training]
+        # A verdict on smoothed torque would flatter: what is judged is the torque as recorded.
+        judged = replace(preprocessing, smooth_torque=False)
+        training = (
+            fitted
+            if judged == preprocessing
+            else [ready(source, judged) for source in sources.training]
+        )
+        held_out = [ready(source, judged) for source in sources.held_out]
     with reporter.task("estimating", 2) as task:
-        estimate = estimate_repetitions(model, training)
+        estimate = estimate_repetitions(model, fitted)
         task.advance(1, "validating")
         nominal = sources.cell.nominal_values() if sources.cell.file.nominal else None
-        evidence = gather(model, estimate, training, held_out, nominal=nominal)
+        evidence = gather(
+            model,
+            estimate,
+            training,
+            held_out,
+            same_motion=sources.same_motion,
+            nominal=nominal,
+        )
         verdict = judge(model.joint_names, evidence)
         task.advance(1)
     results = summarise(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.recordings import recording_of
 from identification.preprocessing import standstill_variance
-from identification.recording import Recording
+from identification.recording import Recording, RecordingError
 
 Array = NDArray[np.float64]
 
@@ -47,9 +48,11 @@ class Sources:
         cell: from the attachments of the first archive.
         metadata: of the first archive.
         plan: of the first archive; None where none was attached.
-        training: what is fitted; repetitions of one motion.
+        training: what is fitted.
+        same_motion: whether these are repetitions of one planned motion.
         held_out: what is predicted and never fitted.
         noise_variance: of the positions (n,) [rad²]; None where no standstill was recorded.
+        torque_variance: of the torques at standstill (n,) [N²·m²]; None likewise.
         doubts: what a reader must know about the archives.
     """
 
@@ -57,8 +60,10 @@ class Sources:
     metadata: dict[str, str]
     plan: dict[str, Any] | None
     training: tuple[Source, ...]
+    same_motion: bool
     held_out: tuple[Source, ...]
     noise_variance: Array | None
+    torque_variance: Array | None
     doubts: tuple[str, ...]
 
     def with_doubt(self, doubt: str) -> Sources:
@@ -90,9 +95,10 @@ def gather_sources(paths: Sequence[Path], split: float) -> Sources:
     last part of a single recording, or the last of several, is held out.
 
     Raises:
-        InputError: there is nothing to fit, or nothing left to predict.
-        ArchiveError: an archive cannot be read.
+        InputError: there is nothing to fit, or an archive is named twice.
+        ArchiveError: an archive cannot be read, is not fit, or belongs to another cell.
     """
+    _refuse_duplicates(paths)
     archives = [open_archive(path) for path in paths]
     by_kind: dict[str, list[Archive]] = {}
     for archive in archives:
@@ -105,32 +111,97 @@ def gather_sources(paths: Sequence[Path], split: float) -> Sources:
             remedy="name archives of kind excitation or imported",
         )
     cell = cell_of(fitted[0])
+    _refuse_strangers(archives)
     training = [_source(archive, cell) for archive in fitted]
     held_out = [_source(archive, cell) for archive in by_kind.get("validation", [])]
-    doubts = [archive.missing for archive in archives if archive.missing is not None]
+    doubts = [*_doubts_of(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
+    same_motion = len({archive.attachments.get("plan.json") for archive in fitted}) == 1
     if not held_out:
         training, held_out, doubt = _split(training, split)
         doubts.append(doubt)
-    rest = by_kind.get("standstill", [])
+    rest = [_source(archive, cell) for archive in by_kind.get("standstill", [])]
     plan = fitted[0].attachments.get("plan.json")
     return Sources(
         cell=cell,
         metadata=dict(fitted[0].metadata),
         plan=None if plan is None else json.loads(plan),
         training=tuple(training),
+        same_motion=same_motion and plan is not None,
         held_out=tuple(held_out),
-        noise_variance=_noise_variance(cell, rest[0]) if rest else None,
+        noise_variance=_noise_variance(cell, rest[0].recording) if rest else None,
+        torque_variance=_torque_variance(rest[0].recording) if rest else None,
         doubts=tuple(doubts),
     )
 
 
+def _refuse_duplicates(paths: Sequence[Path]) -> None:
+    """What is fitted must not be predicted as well."""
+    seen: dict[str, Path] = {}
+    for path in paths:
+        if not path.is_file():
+            continue  # opening it will say so
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        if digest in seen:
+            raise InputError(path, f"holds the same as {seen[digest]}", remedy="name it once")
+        seen[digest] = path
+
+
+def _refuse_strangers(archives: Sequence[Archive]) -> None:
+    """All archives belong to one robot, described in the same words."""
+    first = archives[0]
+    for archive in archives[1:]:
+        for name in ("robot.urdf", "cell.toml"):
+            if archive.attachments.get(name) != first.attachments.get(name):
+                raise ArchiveError(
+                    archive.path,
+                    f"carries another {name} than {first.path}",
+                    remedy="identify each cell's archives by themselves",
+                )
+
+
+def _incomplete(archive: Archive) -> str | None:
+    """What a reader must know about an archive that did not end as planned."""
+    if archive.missing is not None:
+        return archive.missing
+    outcome = (archive.outcome or {}).get("outcome", "completed")
+    return None if outcome == "completed" else f"{archive.path.name} ended {outcome}"
+
+
+def _doubts_of(cell: Cell, archive: Archive) -> list[str]:
+    """What is known beforehand to stand between the numbers and the truth."""
+    doubts = []
+    if "drive_train.torque_constant" in cell.file.cell.assumed and (
+        archive.metadata.get("simulated") != "yes"
+    ):
+        doubts.append(
+            "the torque constants are assumed: predictions are as good as they look, but every "
+            "parameter is in their units"
+        )
+    if "friction drift" in archive.metadata.get("effects", ""):
+        doubts.append(
+            "friction drift is switched on: the planted friction is that of a half-warm joint, "
+            "and a short run is colder, so friction estimates differ from it"
+        )
+    return doubts
+
+
 def _source(archive: Archive, cell: Cell) -> Source:
-    recording = recording_of(archive).checked(cell.joint_names)
-    origin = 0.0
+    """The recording of an archive, as far as the PC was commanding the arm.
+
+    Raises:
+        ArchiveError: the recording is not fit to be identified from; names file and reason.
+    """
+    recording = recording_of(archive)
     if recording.commanded_position is not None:
         commanded = np.flatnonzero(~np.isnan(recording.commanded_position).any(axis=1))
-        origin = float(recording.time[commanded[0]]) if commanded.size else 0.0
-    return Source(archive.path.name, recording, origin)
+        if not commanded.size:
+            raise ArchiveError(archive.path, "the arm was never commanded in it")
+        recording = recording.between(int(commanded[0]), int(commanded[-1]) + 1)
+    try:
+        recording.checked(cell.joint_names)
+    except RecordingError as error:
+        raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
+    return Source(archive.path.name, recording, float(recording.time[0]))
 
 
 def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Source], str]:
@@ -156,26 +227,24 @@ def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Sour
     return [first], [last], doubt
 
 
-def _noise_variance(cell: Cell, rest: Archive) -> Array:
+def _noise_variance(cell: Cell, rest: Recording) -> Array:
     """Variance of the measured positions at standstill, at least that of their resolution (n,).
 
     An arm that rests may show the same count for seconds; rounding to a count is noise all the
     same, uniform over the step.
     """
-    recording = recording_of(rest)
-    commanded = recording.commanded_position
-    still = (
-        np.ones(recording.n_samples, dtype=bool)
-        if commanded is None
-        else ~np.isnan(commanded).any(axis=1)
-    )
-    measured = standstill_variance(recording.time[still], recording.position[still])
+    measured = standstill_variance(rest.time, rest.position)
     drives = cell.drive_train
-    revolutions = drives.motor_revolutions(recording.position[still]).reshape(-1, len(measured))
+    revolutions = drives.motor_revolutions(rest.position)
     step = np.maximum(
         1.0 / cell.drive_table.encoder_counts_per_revolution,
         2.0 * FLOAT32_STEP * np.abs(revolutions).max(axis=0),
     )
-    joint_step = np.abs(np.linalg.inv(drives.motor_from_joint)) * (2.0 * np.pi * step)
+    joint_step = np.abs(drives.joint_from_motor) * (2.0 * np.pi * step)
     resolution = (joint_step**2).sum(axis=1) / 12.0
     return np.asarray(np.maximum(measured, resolution))
+
+
+def _torque_variance(rest: Recording) -> Array | None:
+    """Variance of the torques at standstill (n,), None where none were recorded."""
+    return None if rest.torque is None else standstill_variance(rest.time, rest.torque)

@@ -21,6 +21,7 @@ from hil.results import (
 )
 from hil.simulation import planted_values
 from hil.version import software
+from identification import Factor, Motion, RobotModel
 from identification.excitation import (
     condition_number,
     correlation,
@@ -52,7 +53,8 @@ def summarise(
 ) -> Results:
     """Everything that was found, as it goes into `results.json`."""
     cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
-    gram = information(estimate.factor)
+    rows = [_moving_rows(samples) for samples in training]
+    gram = information(_executed(cell.model, training, rows))
     simulated = sources.metadata.get("simulated") == "yes"
     truth = planted_values(cell) if simulated and cell.file.simulation else None
     many = len(training) > 1
@@ -64,7 +66,7 @@ def summarise(
         joint_names=list(model.joint_names),
         period=_period(training[0]),
         software=software(),
-        excitation=_excitation(sources, gram, training),
+        excitation=_excitation(sources, gram, training, rows),
         parameters=_parameters(cell, estimate, truth),
         n_base=len(model.base.names),
         uncertainty=UncertaintyResult(
@@ -95,9 +97,20 @@ def _period(samples: Samples) -> float:
     return float(np.median(np.diff(samples.motion.time)))
 
 
-def _excitation(sources: Sources, gram: Array, training: Sequence[Samples]) -> ExcitationResult:
+def _executed(model: RobotModel, training: Sequence[Samples], rows: Sequence[slice]) -> Factor:
+    """Every sample of the motion, standing joints included, as the criteria of a plan see it."""
+    factor = Factor.zero(model)
+    for samples, part in zip(training, rows, strict=True):
+        motion = Motion(*(series[part] for series in samples.motion))
+        factor = factor + Factor.from_samples(model, motion, samples.torque[part])
+    return factor
+
+
+def _excitation(
+    sources: Sources, gram: Array, training: Sequence[Samples], rows: Sequence[slice]
+) -> ExcitationResult:
     """Criteria of what was executed (all repetitions), and of the plan where one was attached."""
-    lengths = [_moving_rows(samples) for samples in training]
+    lengths = [part.stop - part.start for part in rows]
     executed = _criteria(gram, sum(lengths))
     planned = (sources.plan or {}).get("excitation")
     if planned is None:
@@ -123,10 +136,10 @@ def _excitation(sources: Sources, gram: Array, training: Sequence[Samples]) -> E
     )
 
 
-def _moving_rows(samples: Samples) -> int:
+def _moving_rows(samples: Samples) -> slice:
     """Time samples from the first to the last in which some joint moves."""
     moving = np.flatnonzero(samples.usable.any(axis=1))
-    return int(moving[-1] - moving[0] + 1) if moving.size else 0
+    return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
 
 
 def _criteria(gram: Array, n_samples: int) -> CriteriaResult:
@@ -191,9 +204,12 @@ def _validation(
 
 
 def _coverage(values: Array, std: Array, truth: Array) -> CoverageResult:
-    distance = np.abs(values - truth)
+    """Of the parameters that the data determine."""
+    determined = np.isfinite(std)
+    distance = np.abs(values - truth)[determined]
+    std = std[determined]
     return CoverageResult(
         within_2=int((distance <= 2.0 * std).sum()),
         within_3=int((distance <= 3.0 * std).sum()),
-        total=len(values),
+        total=int(determined.sum()),
     )
