@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 AT_REST_TOLERANCE = 1e-6
 """rad; a move shorter than this is not worth an interval."""
+START_TOLERANCE = 1e-3
+"""rad by which a motion may begin elsewhere than where the arm is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +61,12 @@ class Campaign:
             raise CampaignFolderError(root, "is not empty", "name a new folder")
         folder = CampaignFolder(root)
         folder.archives.mkdir(parents=True)
-        urdf = root / Path(cell.file.cell.urdf).name
-        urdf.write_text(cell.urdf, encoding="utf-8")
-        folder.cell.write_text(cell.text, encoding="utf-8")
+        own = cell.with_urdf_beside_it(folder.cell)
+        (root / own.file.cell.urdf).write_text(own.urdf, encoding="utf-8")
+        folder.cell.write_text(own.text, encoding="utf-8")
         plan.save(folder.plan)
-        return cls(folder, cell, plan)
+        folder.seal()
+        return cls(folder, own, plan)
 
     @classmethod
     def open(cls, root: Path) -> Campaign:
@@ -105,25 +108,38 @@ class Campaign:
             MotionFailedError: a motion ended otherwise than planned; it is archived.
             ControllerFault: the controller did not come up.
         """
-        intervals = self._missing(link.connect())
+        self.folder.require_unchanged()
+        intervals = self._missing(link.connect(stop))
         self._check(intervals)
         total = sum(interval.trajectory.duration for interval in intervals)
         with reporter.task("running the campaign (s of motion)", total) as task:
             for interval in intervals:
+                if stop.requested:
+                    raise MotionFailedError(str(interval), "stopped", "it had not begun")
                 self._run_one(interval, link, stop, provenance, durable=durable)
                 task.advance(interval.trajectory.duration, str(interval))
         link.close()
 
     def _check(self, intervals: list[Interval]) -> None:
-        """Refuse the campaign if one of its motions must not be sent; each is checked once."""
+        """Refuse the campaign if one of its motions must not be sent.
+
+        Each motion is checked once, and that each begins where the one before ends.
+        """
         checks = MotionChecks.of(self.cell)
-        distinct = {id(interval.trajectory): interval for interval in intervals}
-        for interval in distinct.values():
-            problem = checks.refusal(interval.trajectory)
+        checked: set[int] = set()
+        before: Interval | None = None
+        for interval in intervals:
+            problem = None
+            if id(interval.trajectory) not in checked:
+                problem = checks.refusal(interval.trajectory)
+                checked.add(id(interval.trajectory))
+            if problem is None and before is not None:
+                problem = _jump(before, interval)
             if problem is not None:
                 raise MotionRefusedError(
                     str(interval), problem, "jog the arm or design another motion"
                 )
+            before = interval
 
     def _missing(self, where: Array) -> list[Interval]:
         """What is still to be run with the arm at `where` (n,), there and back."""
@@ -162,6 +178,7 @@ class Campaign:
             cell.joint_limits,
             stop_acceleration=bounds.acceleration,
             stop_jerk=bounds.jerk,
+            start_tolerance=START_TOLERANCE,
         )
         name = self.folder.next_name(interval.kind, interval.index)
         writer = ArchiveWriter(
@@ -200,6 +217,20 @@ class Campaign:
             "cell": self.cell.name,
             **{f"software.{name}": version for name, version in software().items()},
         }
+
+
+def _jump(before: Interval, after: Interval) -> str | None:
+    """Why `after` cannot follow `before`, or None if it begins where that ends."""
+    end = before.trajectory.sample(np.array([before.trajectory.duration]))[0][0]
+    start = after.trajectory.sample(np.zeros(1))[0][0]
+    distance = np.abs(start - end)
+    if np.max(distance) <= START_TOLERANCE:
+        return None
+    joint = int(np.argmax(distance))
+    return (
+        f"it begins with joint {joint + 1} at {start[joint]:.6g} rad, but {before} ends at "
+        f"{end[joint]:.6g} rad"
+    )
 
 
 def hold(position: Array, duration: float) -> PiecewiseCubic:

@@ -1,8 +1,9 @@
 """The campaign folder: what lies where, and which archives are whole.
 
-`manifest.json` names every closed archive with its checksum and outcome. It is replaced
-atomically after each archive, so a killed run loses at most the archive being written, and that
-file is recognised as torn because the manifest does not name it.
+`manifest.json` holds the checksums of cell, URDF and plan, and names every closed archive with its
+checksum and outcome. It is replaced atomically after each archive, so a killed run loses at most
+the archive being written, and that file is recognised as torn because the manifest does not name
+it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from hil.archive import ArchiveName
 
@@ -62,28 +64,45 @@ class CampaignFolder:
     def _manifest(self) -> Path:
         return self.root / "manifest.json"
 
+    def seal(self) -> None:
+        """Begin the manifest with the checksums of what the campaign is about."""
+        self._save({"inputs": self._inputs(), "archives": []})
+
+    def require_unchanged(self) -> None:
+        """Refuse to go on if cell, URDF or plan are not those the campaign began with.
+
+        Raises:
+            CampaignFolderError: names the file that changed.
+        """
+        sealed, now = self._content()["inputs"], self._inputs()
+        for name in sorted(sealed.keys() | now.keys()):
+            if sealed.get(name) != now.get(name):
+                raise CampaignFolderError(
+                    self.root,
+                    f"{name} is not the one this campaign began with",
+                    "restore it, or begin a new campaign",
+                )
+
     def manifest(self) -> list[Entry]:
         """Closed archives in the order they were made.
 
         Raises:
             CampaignFolderError: the manifest cannot be read.
         """
-        if not self._manifest.exists():
-            return []
         try:
-            return [Entry(**entry) for entry in json.loads(self._manifest.read_text("utf-8"))]
-        except (ValueError, TypeError) as error:
-            raise CampaignFolderError(
-                self.root, f"manifest.json is damaged ({error})", "restore it or start a new folder"
-            ) from error
+            return [Entry(**entry) for entry in self._content()["archives"]]
+        except (KeyError, TypeError) as error:
+            raise self._damaged(error) from error
 
     def add(self, name: str, outcome: str) -> None:
-        """Enter a closed archive into the manifest."""
-        digest = hashlib.sha256((self.archives / name).read_bytes()).hexdigest()
-        entries = [asdict(entry) for entry in self.manifest()] + [
-            asdict(Entry(name, outcome, digest))
-        ]
-        write_atomically(self._manifest, json.dumps(entries, indent=1) + "\n")
+        """Enter a closed archive into the manifest.
+
+        Raises:
+            CampaignFolderError: the disk refuses.
+        """
+        content = self._content()
+        entry = Entry(name, outcome, _sha256(self.archives / name))
+        self._save(content | {"archives": [*content["archives"], asdict(entry)]})
 
     def whole(self, kind: str, index: int) -> str | None:
         """Name of the whole archive of this interval, if there is one with outcome `completed`."""
@@ -102,7 +121,12 @@ class CampaignFolder:
         latest: dict[int, str] = {}
         for entry in self.manifest():
             name = ArchiveName.parse(entry.name)
-            if name is not None and name.kind == kind and entry.outcome == "completed":
+            if (
+                name is not None
+                and name.kind == kind
+                and entry.outcome == "completed"
+                and self._unchanged(entry)
+            ):
                 latest[name.index] = entry.name
         return [self.archives / latest[index] for index in sorted(latest)]
 
@@ -115,7 +139,38 @@ class CampaignFolder:
 
     def _unchanged(self, entry: Entry) -> bool:
         path = self.archives / entry.name
-        return path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() == entry.sha256
+        return path.exists() and _sha256(path) == entry.sha256
+
+    def _inputs(self) -> dict[str, str]:
+        """Checksums of cell, plan and URDF by file name."""
+        files = [self.cell, self.plan, *self.root.glob("*.urdf")]
+        return {file.name: _sha256(file) for file in files if file.exists()}
+
+    def _content(self) -> dict[str, Any]:
+        if not self._manifest.exists():
+            return {"inputs": {}, "archives": []}
+        try:
+            content = json.loads(self._manifest.read_text("utf-8"))
+            return {"inputs": dict(content["inputs"]), "archives": list(content["archives"])}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise self._damaged(error) from error
+
+    def _save(self, content: dict[str, Any]) -> None:
+        try:
+            write_atomically(self._manifest, json.dumps(content, indent=1) + "\n")
+        except OSError as error:
+            raise CampaignFolderError(
+                self.root, f"manifest.json cannot be written ({error})", "make room and run again"
+            ) from error
+
+    def _damaged(self, error: Exception) -> CampaignFolderError:
+        return CampaignFolderError(
+            self.root, f"manifest.json is damaged ({error})", "restore it or start a new folder"
+        )
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
+from drivers.errors import RequestError
 from drivers.events import (
     Event,
     GapSeen,
@@ -33,10 +34,10 @@ from drivers.motion_source import MotionSource
 from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
-from drivers.transports import Transport
+from drivers.transports import SimulatedTransport
 from hil.archive import ArchiveWriter, Level
 from hil.cell import Cell
-from hil.errors import ArchiveWriteError, ControllerFault
+from hil.errors import ControllerFault
 
 Array = NDArray[np.float64]
 Records = NDArray[np.void]
@@ -55,7 +56,11 @@ class Stop:
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[Stop]:
-    """Turn SIGINT into a request to stop on the path; a second one is the ordinary interrupt."""
+    """Turn SIGINT into a request to stop on the path.
+
+    A second one is the ordinary interrupt: it ends the program at once, and the controller is on
+    its own.
+    """
     stop = Stop()
 
     def request(signum: int, frame: FrameType | None) -> None:
@@ -75,7 +80,7 @@ class Link:
     """Session, transport and recorder of one connection.
 
     Attributes:
-        transport: moves bytes and time.
+        transport: moves bytes and time, virtual time (see above).
         session: answers every packet.
         ring: the session's records, drained here.
         drive_train: turns target currents into joint torques.
@@ -83,7 +88,7 @@ class Link:
         cycles: records archived so far.
     """
 
-    transport: Transport
+    transport: SimulatedTransport
     session: Session
     ring: CycleRing
     drive_train: DriveTrain
@@ -92,9 +97,9 @@ class Link:
 
     @classmethod
     def over(
-        cls, transport: Transport, cell: Cell, finish: Callable[[], None] = lambda: None
+        cls, transport: SimulatedTransport, cell: Cell, finish: Callable[[], None] = lambda: None
     ) -> Link:
-        """A link to the controller of `cell` over `transport`."""
+        """A link to the simulated controller of `cell` over `transport`."""
         ring = CycleRing(len(cell.joint_names), capacity=10 * DRAIN_CYCLES)
         session = Session(
             cell.drive_train,
@@ -105,11 +110,12 @@ class Link:
         )
         return cls(transport, session, ring, cell.drive_train, finish)
 
-    def connect(self, timeout: float = 60.0) -> Array:
+    def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
         """Exchange until the drive is on and the axes are closed; the target position then (n,).
 
         Raises:
-            ControllerFault: the controller did not get there within `timeout` of its own time.
+            ControllerFault: the controller did not get there within `timeout` of its own time,
+                cannot be used, or a stop was asked for.
         """
         deadline = self.transport.now + timeout
         last: Array | None = None
@@ -119,12 +125,15 @@ class Link:
             records = self.ring.drain()
             if len(records):
                 last = records["target_position"][-1]
-            return self.session.state is State.CLOSED or self.transport.now > deadline
+            late = self.transport.now > deadline
+            return self.session.state is State.CLOSED or late or stop.requested
 
         exchange(self.transport, self.session, until=ready)
         for event in self.session.events():
             if isinstance(event, InitReceived) and event.unusable is not None:
                 raise ControllerFault(f"the controller cannot be used: {event.unusable}")
+        if stop.requested:
+            raise ControllerFault("stopped by the operator before anything moved")
         if self.session.state is not State.CLOSED or last is None:
             raise ControllerFault(
                 f"the controller did not reach drive-on within {timeout:g} s "
@@ -135,29 +144,32 @@ class Link:
     def run(self, source: MotionSource, writer: ArchiveWriter, stop: Stop) -> MotionEnded:
         """Run one motion and archive every cycle of it; say how it ended.
 
-        Should the archive refuse to take more, the arm is brought to rest on its path first.
+        Should archiving fail, the arm is brought to rest on its path before the error is raised.
 
         Raises:
-            ArchiveWriteError: the archive could not be written; the motion was stopped.
+            ControllerFault: the session cannot promise the motion; nothing moved.
+            Exception: what archiving failed with; the motion was stopped.
         """
         recorder = _Recorder(self, writer)
         self.ring.drain()
-        self.session.request(source)
+        try:
+            self.session.request(source)
+        except RequestError as error:
+            raise ControllerFault(str(error)) from error
         until_drain, aftermath = DRAIN_CYCLES, AFTERMATH_CYCLES
 
         def over() -> bool:
             nonlocal until_drain, aftermath
-            if not self.session.requested:
-                aftermath -= 1
-                if aftermath < 0 or self.session.state is State.CLOSED:
-                    return True
+            if stop.requested:
+                self.session.stop("stopped by the operator")
             until_drain -= 1
-            if until_drain == 0:
+            if until_drain == 0 or not (self.session.requested or recorder.ended):
                 until_drain = DRAIN_CYCLES
-                if stop.requested:
-                    self.session.stop("stopped by the operator")
                 recorder.take()
-            return False
+            if recorder.ended is None:
+                return False
+            aftermath -= 1
+            return recorder.ended.outcome in ("completed", "stopped") or aftermath < 0
 
         exchange(self.transport, self.session, until=over)
         recorder.take()
@@ -183,7 +195,7 @@ class _Recorder:
         self._link, self._writer = link, writer
         self._overflow = link.ring.overflow
         self.ended: MotionEnded | None = None
-        self.failure: ArchiveWriteError | None = None
+        self.failure: Exception | None = None
 
     def take(self) -> None:
         """Archive what has come since the last call; a failure stops the motion on its path."""
@@ -196,7 +208,7 @@ class _Recorder:
             return
         try:
             self._archive(records, events)
-        except ArchiveWriteError as error:
+        except Exception as error:  # whatever it is, the arm comes to rest first
             self.failure = error
             self._link.session.stop("the archive cannot be written")
 

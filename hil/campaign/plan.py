@@ -131,6 +131,8 @@ class MotionChecks:
 
     def refusal(self, trajectory: PiecewiseCubic) -> str | None:
         """Why a motion must not be sent, or None if it may be."""
+        if trajectory.n_joints != self.limits.n_joints:
+            return f"it is for {trajectory.n_joints} joints, the arm has {self.limits.n_joints}"
         try:
             check_smooth(trajectory, self.limits)
         except NotSmooth as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import json
 import tomllib
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +21,7 @@ from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from planner import JointLimits
 
+from .checks import check_built, check_lengths
 from .errors import CellError, first_error
 from .schema import (
     BoundsTable,
@@ -34,6 +35,7 @@ from .schema import (
     SimulationTable,
     WorkspaceTable,
 )
+from .text import replaced_value
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -98,12 +100,13 @@ class Cell:
         """The cell from its texts (an archive carries both); `path` only names it in errors."""
         cell = cls(path, text, urdf, _parse(path, text))
         try:
-            n_joints = cell.model.n_joints
+            _ = cell.model
         except ModelError as error:
             raise CellError(
                 path, "cell.urdf", cell.file.cell.urdf, str(error), "correct the URDF"
             ) from error
-        _check_lengths(cell, n_joints)
+        check_lengths(cell)
+        check_built(cell)
         return cell
 
     @property
@@ -235,6 +238,11 @@ class Cell:
                 text = replaced_value(text, table, key, value)
         return Cell.from_texts(text, self.urdf, self.path)
 
+    def with_urdf_beside_it(self, path: Path) -> Cell:
+        """This cell as a file `path` that names its URDF without a folder."""
+        name = json.dumps(Path(self.file.cell.urdf).name)  # a JSON string is a TOML string
+        return Cell.from_texts(replaced_value(self.text, "cell", "urdf", name), self.urdf, path)
+
     @property
     def nominal(self) -> NominalTable:
         """`[nominal]`."""
@@ -322,30 +330,3 @@ def _required(cell: Cell, table: T | None, name: str) -> T:
     if table is None:
         raise CellError(cell.path, name, None, "is missing", f"add a table [{name}]")
     return table
-
-
-def replaced_value(text: str, table: str, key: str, value: int) -> str:
-    """The TOML `text` with `key` of `[table]` set to `value`; comments and order stay."""
-    pattern = rf"(?ms)(^\[{table}\]$(?:(?!^\[).)*?^{key} *= *)[^\n#]*"
-    changed, count = re.subn(pattern, rf"\g<1>{value}", text, count=1)
-    if count:
-        return changed
-    return re.sub(rf"(?m)^\[{table}\]$", f"[{table}]\n{key} = {value}", text, count=1)
-
-
-_NOT_PER_JOINT = {"gravity", "assumed", "elasticity"}
-
-
-def _check_lengths(cell: Cell, n_joints: int) -> None:
-    """Every list that has one entry per joint has as many as the URDF has joints."""
-    for table_name in ("nominal", "limits", "drive_train", "campaign", "simulation"):
-        table = getattr(cell.file, table_name)
-        for name, value in table or ():
-            if isinstance(value, list) and name not in _NOT_PER_JOINT and len(value) != n_joints:
-                raise CellError(
-                    cell.path,
-                    f"{table_name}.{name}",
-                    value,
-                    f"has {len(value)} entries but the URDF has {n_joints} joints",
-                    f"give one entry for each of {', '.join(cell.joint_names)}",
-                )

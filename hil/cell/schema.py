@@ -18,6 +18,9 @@ PositiveVector = list[Positive]
 Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
+Factor = Annotated[FiniteFloat, Field(gt=1, le=5)]
+
+
 class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -101,8 +104,8 @@ class LimitsTable(_Table):
 class FactorsTable(_Table):
     """Factors on the plan's acceleration and jerk limits."""
 
-    acceleration: Annotated[FiniteFloat, Field(ge=1)] = Field(description="a factor of at least 1")
-    jerk: Annotated[FiniteFloat, Field(ge=1)] = Field(description="a factor of at least 1")
+    acceleration: Factor = Field(description="a factor above 1, at most 5")
+    jerk: Factor = Field(description="a factor above 1, at most 5")
 
 
 class BoundsTable(_Table):

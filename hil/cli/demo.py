@@ -65,6 +65,8 @@ def demo(
         campaign.run(
             link, stop, reporter, provenance=simulated_provenance(cell, effects), durable=False
         )
+    if stop.requested:
+        raise KeyboardInterrupt
     took = time.perf_counter() - started
     seconds = link.cycles * cell.period
     reporter.say(
@@ -84,7 +86,7 @@ def _make_room(output: Path, *, force: bool) -> None:
         return
     if not force:
         raise CampaignFolderError(output, "is not empty", "name another folder or add --force")
-    if not (output / "plan.json").exists() and not (output / "archives").is_dir():
+    if not ((output / "manifest.json").exists() and (output / "archives").is_dir()):
         raise CampaignFolderError(
             output, "is no campaign, so --force will not remove it", "name another folder"
         )

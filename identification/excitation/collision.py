@@ -19,7 +19,9 @@ from identification.kinematics import Chain, chain_from_urdf
 
 Array = NDArray[np.float64]
 
-# Postures by which pairs that can never come apart are found.
+# Shapes that are closer than the margin, and than this [m], in all of so many postures are built
+# that way; a wider margin must not check less.
+BUILT_IN = 0.05
 _N_POSTURES = 200
 _SEED = 20140901
 
@@ -77,8 +79,8 @@ class CollisionChecker:
 
     Links that share a joint are never checked against each other, nor is the base against what
     it stands among. Shapes two joints apart at most that are too close in every one of 200
-    random postures are taken to be built that way (a wrist, a sunken foot), and are left out
-    too. Any pair farther apart along the arm is checked, even if it always touches.
+    random postures, and closer than 5 cm, are taken to be built that way (a wrist, a sunken foot), and are left
+    out too. Any pair farther apart along the arm is checked, even if it always touches.
 
     Args:
         urdf: text of the robot description; meshes are replaced by their convex hulls.
@@ -196,10 +198,10 @@ class CollisionChecker:
         if self._joints_between(*pair) > 2:
             return False
         paths = self._paths(postures)
-        margin = self.workspace.margin
-        if np.any(self._lower_bound(*pair, paths) >= margin):
+        near = min(self.workspace.margin, BUILT_IN)
+        if np.any(self._lower_bound(*pair, paths) >= near):
             return False
-        return all(self._distance(*pair, paths, k) < margin for k in range(len(postures)))
+        return all(self._distance(*pair, paths, k) < near for k in range(len(postures)))
 
     def _joints_between(self, a: int, b: int) -> int:
         """Count the joints between two bodies."""

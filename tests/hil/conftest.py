@@ -9,7 +9,7 @@ import pytest
 
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
-from hil.cell.cell import replaced_value
+from hil.cell.text import replaced_value
 from hil.progress import Silent
 from hil.simulation import simulated_link, simulated_provenance
 from sim_fixtures import SimulatedDrive

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.states import State
-from drivers.transports import SimulatedTransport
+from drivers.transports import Lose, SimulatedTransport
 from hil.archive import ArchiveName, ArchiveWriter, open_archive
 from hil.campaign import (
     Campaign,
@@ -25,8 +26,8 @@ from hil.campaign import (
     Stop,
 )
 from hil.cell import Cell
-from hil.errors import ArchiveWriteError
-from hil.progress import Silent
+from hil.errors import ArchiveWriteError, ControllerFault
+from hil.progress import Silent, Task
 from hil.simulation import simulated_controller, simulated_link, simulated_provenance
 from planner import PiecewiseCubic
 
@@ -137,8 +138,17 @@ def test_a_stop_ends_the_motion_on_its_path_and_the_rest_is_resumed(
 ) -> None:
     short, motions = one_repetition(cell, plan)
     campaign = Campaign.create(tmp_path / "stopped", short, motions)
+    controller = simulated_controller(short)
+    link, stop = Link.over(SimulatedTransport(controller), short), Stop()
+    advance = controller.accept
+
+    def stop_at_speed(reply: bytes | None) -> None:
+        advance(reply)
+        stop.requested = stop.requested or bool(np.abs(controller.plant.velocity).max() > 1.0)
+
+    controller.accept = stop_at_speed  # type: ignore[method-assign]
     with pytest.raises(MotionFailedError, match="stopped by the operator"):
-        execute(campaign, Stop(requested=True))
+        campaign.run(link, stop, Silent(), provenance={}, durable=False)
     stopped = open_archive(campaign.folder.archives / "move_000_a1.mcap")
     assert stopped.complete
     assert stopped.outcome is not None
@@ -149,6 +159,112 @@ def test_a_stop_ends_the_motion_on_its_path_and_the_rest_is_resumed(
     execute(again)
     assert len(again.folder.completed("excitation")) == 1
     assert len(again.folder.completed("validation")) == 1
+
+
+def test_a_stop_between_motions_begins_none(tmp_path: Path, cell: Cell, plan: CampaignPlan) -> None:
+    campaign = Campaign.create(tmp_path / "between", *one_repetition(cell, plan))
+    controller = simulated_controller(campaign.cell)
+    link, stop = Link.over(SimulatedTransport(controller), campaign.cell), Stop()
+
+    class StopAfterTheFirst(Silent):
+        @contextmanager
+        def task(self, title: str, total: float) -> Iterator[Task]:
+            class Stopping:
+                def advance(self, units: float, note: str = "") -> None:
+                    stop.requested = True
+
+            yield Stopping()
+
+    with pytest.raises(MotionFailedError, match="it had not begun"):
+        campaign.run(link, stop, StopAfterTheFirst(), provenance={}, durable=False)
+    assert [entry.name for entry in campaign.folder.manifest()] == ["move_000_a1.mcap"]
+
+
+def test_a_stop_before_the_connection_moves_nothing(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    campaign = Campaign.create(tmp_path / "before", *one_repetition(cell, plan))
+    with pytest.raises(ControllerFault, match="before anything moved"):
+        execute(campaign, Stop(requested=True))
+    assert not list(campaign.folder.archives.iterdir())
+
+
+def test_what_the_arm_does_after_a_refusal_is_recorded(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    """The controller closes open mode at once; the arm needs longer to come to rest."""
+    campaign = Campaign.create(tmp_path / "lost", *one_repetition(cell, plan))
+    controller = simulated_controller(campaign.cell)
+    lose = Lose(600, "to_controller")
+    link = Link.over(SimulatedTransport(controller, [lose]), campaign.cell)
+    with pytest.raises(MotionFailedError, match="ended lost"):
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+    archive = open_archive(campaign.folder.archives / "move_000_a1.mcap")
+    (ended,) = (event for event in archive.events if event.name == "MotionEnded")
+    last = archive.columns["cycle"][-1] * campaign.cell.period
+    assert last - ended.time == pytest.approx(0.5, abs=0.002)
+    assert np.abs(archive.columns["velocity"][-1]).max() < 0.01
+
+
+def test_whatever_goes_wrong_in_archiving_the_arm_comes_to_rest(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = Campaign.create(tmp_path / "memory", *one_repetition(cell, plan))
+    controller = simulated_controller(campaign.cell)
+    link = Link.over(SimulatedTransport(controller), campaign.cell)
+
+    def failing(writer: ArchiveWriter, *arguments: object) -> None:
+        if np.abs(controller.plant.velocity).max() > 0.5:
+            raise MemoryError("none left")
+
+    monkeypatch.setattr(ArchiveWriter, "write", failing)
+    with pytest.raises(MemoryError):
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+    assert np.abs(controller.plant.velocity).max() < 0.01
+
+
+def test_a_plan_that_changed_since_is_refused(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    campaign = Campaign.create(tmp_path / "changed", *one_repetition(cell, plan))
+    text = campaign.folder.plan.read_text("utf-8")
+    campaign.folder.plan.write_text(text.replace('"seed": 1', '"seed": 2'), "utf-8")
+    with pytest.raises(CampaignFolderError, match=r"plan\.json is not the one"):
+        execute(Campaign.open(campaign.folder.root))
+
+
+def test_motions_that_do_not_join_are_refused_before_anything_moves(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    good = plan.validation[0]
+    shifted = tuple(np.column_stack([c[:, 0] + 0.01, c[:, 1:]]) for c in good.coefficients)
+    bad = replace(plan, validation=(PiecewiseCubic(good.knots, shifted),))
+    campaign = Campaign.create(tmp_path / "jump", cell.with_campaign(validation_runs=1), bad)
+    with pytest.raises(MotionRefusedError, match="validation 0 was not sent: it begins with joint"):
+        execute(campaign)
+    assert not list(campaign.folder.archives.iterdir())
+
+
+def test_a_motion_for_another_arm_is_refused(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    good = plan.validation[0]
+    five = PiecewiseCubic(good.knots[:5], good.coefficients[:5])
+    bad = replace(plan, validation=(five,))
+    campaign = Campaign.create(tmp_path / "five", cell.with_campaign(validation_runs=1), bad)
+    with pytest.raises(MotionRefusedError, match="for 5 joints, the arm has 6"):
+        execute(campaign)
+
+
+def test_a_torn_archive_is_not_among_the_completed(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, run: Run
+) -> None:
+    campaign = run(tmp_path / "flipped", *one_repetition(cell, plan))
+    (path,) = campaign.folder.completed("excitation")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    assert campaign.folder.completed("excitation") == []
 
 
 def test_what_is_whole_is_kept_and_what_is_torn_is_done_again(

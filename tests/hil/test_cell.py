@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hil.cell import Cell, CellError
+from hil.cell.text import replaced_value
 from sim_fixtures.ns16 import CELL_PATH, TABLE2, URDF_PATH
 
 
@@ -76,6 +77,16 @@ def test_nominal_values_are_the_manufacturers_column_of_table_2(folder: Path) ->
         (r"^velocity_deg = \[155.0, ", "velocity_deg = [", "limits.velocity_deg", "6 joints"),
         (r"^urdf = .*", 'urdf = "other.urdf"', "cell.urdf", "put a URDF at"),
         (r"^port = 1000", "port = ", "is not TOML", "correct that line"),
+        (r"^lower_deg = \[-180.0", "lower_deg = [-190.0", "limits.upper_deg", "beyond the URDF's"),
+        (r"^velocity_deg = \[155.0", "velocity_deg = [156.0", "velocity_deg", "beyond the URDF's"),
+        (r"^stop = .*", "stop = { acceleration = 9, jerk = 3 }", "bounds.stop", "at most 5"),
+        (r"^stop = .*", "stop = { acceleration = 1.1, jerk = 3 }", "bounds", "correct that table"),
+        (
+            r"^walls = .*",
+            "walls = [{ lower = [1, 0, 0], upper = [0, 1, 1] }]",
+            "workspace",
+            "correct that table",
+        ),
     ],
 )
 def test_a_bad_field_gets_a_sentence(
@@ -93,6 +104,24 @@ def test_a_missing_file_and_a_missing_table_are_named(folder: Path) -> None:
     bare = Cell.load(folder / "cell.toml")
     with pytest.raises(CellError, match=r"drive_train: is missing"):
         _ = bare.drive_train
+
+
+def test_a_value_is_replaced_in_its_own_table_and_nowhere_else() -> None:
+    text = "[a]\nseed = 1 # one\n[b] # comment\nseed = 2\n"
+    assert replaced_value(text, "b", "seed", 7) == "[a]\nseed = 1 # one\n[b] # comment\nseed = 7\n"
+    assert "other = 3" in replaced_value(text, "a", "other", 3)
+    with pytest.raises(ValueError, match="no table"):
+        replaced_value(text, "c", "seed", 7)
+
+
+def test_a_cell_can_be_moved_beside_its_urdf(folder: Path) -> None:
+    (folder / "models").mkdir()
+    (folder / "ns16.urdf").rename(folder / "models" / "ns16.urdf")
+    path = folder / "cell.toml"
+    path.write_text(path.read_text("utf-8").replace('"ns16.urdf"', '"models/ns16.urdf"'), "utf-8")
+    moved = Cell.load(path).with_urdf_beside_it(folder / "models" / "cell.toml")
+    assert moved.file.cell.urdf == "ns16.urdf"
+    assert moved.urdf == URDF_PATH.read_text("utf-8")
 
 
 def test_campaign_settings_can_be_replaced_in_the_text_too(folder: Path) -> None:

@@ -204,6 +204,11 @@ def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
     assert contact.distance < 0.0
 
 
+def test_a_wider_margin_checks_no_fewer_pairs():
+    pairs = [CollisionChecker(urdf_text(), Workspace(margin=m)).pairs for m in (0.05, 0.2, 0.5)]
+    assert pairs[0] == pairs[1] == pairs[2]
+
+
 def test_a_mesh_counts_as_its_convex_hull(tmp_path):
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 0.2 - 0.1
     facets = [
