@@ -58,6 +58,9 @@ def simulated_controller(
         ControllerSettings(
             period=cell.period,
             open_mode=cell.controller.mode,
+            # Springs and a delay of half a cycle need steps shorter than the cycle; rigid gears,
+            # integrated to second order under a current that is constant over it, do not.
+            substeps=2 if effects else 1,
             current_noise=settings.current_noise,
             current_resolution=settings.current_resolution,
         ),

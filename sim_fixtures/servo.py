@@ -73,6 +73,7 @@ class Servo:
         self.current = [0.0] * n
         self.model_current = [0.0] * n
         self.inertia = [0.0] * n
+        self._gains = [0.0] * n
         self._tick = 0
         self._integral = [0.0] * n
 
@@ -101,7 +102,7 @@ class Servo:
             Target currents of the cycle, (n,) [A].
         """
         self.model_current = self._feed_forward(target, delta)
-        self.current = self._close_loops(self._velocity_gains())
+        self.current = self._close_loops(self._gains)
         self._delta_before = self.delta
         self.target, self.delta = list(target), list(delta)
         return self.current
@@ -118,6 +119,7 @@ class Servo:
         qdd = np.array(drive.joint_speeds(acceleration))
         if self._tick % INERTIA_CYCLES == 0:
             self.inertia = self._model.diagonal_inertia(q).tolist()
+            self._gains = self._velocity_gains()
         self._tick += 1
         return drive.currents(self._model.torque(q, qd, qdd).tolist())
 
