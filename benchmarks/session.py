@@ -105,14 +105,23 @@ def record(cycles: int) -> list[bytes]:
     """Packets of a controller whose arm is where it was told to be."""
     session = new_session(64)
     start = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
+    drives = drive_train()
     init = InitPacket.build(
-        N, PERIOD_MS, {"following_error": np.full(N, 2.0), "current_limit": np.full(N, 20.0)}
+        N,
+        PERIOD_MS,
+        {
+            "following_error": np.full(N, 2.0),
+            "current_limit": np.full(N, 20.0),
+            "gear_ratio": drives.gear_ratio,
+            "calibration": drives.calibration,
+            "kinematic_influence": [0.0, 0.0, 0.0, drives.k54, drives.k64, drives.k65],
+        },
     ).encode()
     packets = [init]
     session.reply(init, 0.0)
     session.request(Sinusoid(start, cycles))
     axes = CyclicPacket.zeros(1, N).axes
-    axes["d"][:, 0] = axes["d"][:, 2] = drive_train().motor_revolutions(start)
+    axes["d"][:, 0] = axes["d"][:, 2] = drives.motor_revolutions(start)
     axes["d"][:, 4] = 1.0
     number = 10
     for cycle in range(cycles):

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.announced import contradiction
 from drivers.arm_wire import ArmWire
 from drivers.drive_train import DriveTrain
 from drivers.errors import FollowingError, PacketError, RefusalError
@@ -33,7 +34,8 @@ class Answers:
     Attributes:
         init: the init packet.
         reader: reads status and modes of its packets.
-        wire: the joints in a packet; None if the packet cannot be matched to them.
+        wire: the joints in a packet; None if the packet cannot be matched to them, or is of an arm
+            with other gears, calibration or coupling.
         unusable: why this arm cannot be moved in this session, or None.
     """
 
@@ -54,9 +56,12 @@ class Answers:
             )
         else:
             try:
-                self.wire = ArmWire(drive_train, init, arm)
+                wire = ArmWire(drive_train, init, arm)
             except PacketError as error:
                 self.unusable = str(error)
+            else:
+                self.unusable = contradiction(drive_train, init, arm)
+                self.wire = wire if self.unusable is None else None
         if self.wire is None:
             self.reader = Reader(np.arange(init.n_axes), (arm,) * init.n_axes, arm, mode)
             return
@@ -129,6 +134,17 @@ class Answers:
             machine.begin_motion(open_mode.held)
         execution.leaving = execution.settled
         return execution.leaving
+
+    def require_carried_on(self, machine: Machine) -> None:
+        """After a long gap: a motion under way goes on only where the controller carried it on.
+
+        Raises:
+            NotFinite, MotionNotCarriedOn, MotionHeld: it did not.
+        """
+        execution = machine.execution
+        under_way = machine.state is State.OPEN and not machine.entering
+        if self._open_mode is not None and under_way and execution is not None:
+            self._open_mode.require_carried_on(machine.cycle)
 
     def refusal(self, offending: int | None, reading: Reading, words: Words) -> bytes:
         """Fill the frame with 508 for the offending joint, or with 505 for all."""

@@ -16,8 +16,10 @@
             ├── VelocityMismatch   velocity is not the derivative of the positions
             ├── FollowingError
             ├── CurrentLimit
-            └── FirstSetPoint      away from the arm
-                └── NotAtStandstill
+            ├── FirstSetPoint      away from the arm
+            │   └── NotAtStandstill
+            └── MotionNotCarriedOn the target is elsewhere after a long gap
+                └── MotionHeld     or has been brought to rest
 """
 
 # ruff: noqa: N818  the leaves are named for what is wrong; their roots end in Error
@@ -203,4 +205,18 @@ class NotAtStandstill(FirstSetPoint):
     """The axis moves in the cycle in which it would get its first set-point."""
 
     check = "velocity at the first set-point"
+    unit = "motor revolutions per cycle"
+
+
+class MotionNotCarriedOn(GuardError):
+    """After a long gap the controller's target is not the set-point sent last."""
+
+    check = "distance, after a gap, between received target and the set-point sent last"
+    unit = "motor revolutions"
+
+
+class MotionHeld(MotionNotCarriedOn):
+    """After a long gap the axis rests, or moves otherwise than the set-point sent last."""
+
+    check = "difference, after a gap, between received velocity and the one sent last"
     unit = "motor revolutions per cycle"

@@ -28,6 +28,8 @@ from drivers.errors import (
     FollowingError,
     GuardError,
     JerkLimit,
+    MotionHeld,
+    MotionNotCarriedOn,
     NotAtStandstill,
     NotFinite,
     PositionLimit,
@@ -40,7 +42,8 @@ Array = NDArray[np.float64]
 
 RELATIVE_TOLERANCE: Final = 1e-6
 FIRST_FRACTION: Final = 0.1
-"""Share of the following-error threshold allowed between target and arm at the first set-point."""
+"""Share of the following-error threshold allowed between target and arm at the first set-point,
+and between the target and the set-point sent last after a long gap."""
 DEFAULT_STANDSTILL: Final = 5e-4
 """Motor revolutions per cycle below which an axis stands still.
 
@@ -276,6 +279,33 @@ class Guard:
         np.abs(found, out=found)
         if not (found <= self._feedback_bounds).all():
             _report(found, found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
+
+    def check_after_gap(
+        self, target: Array, velocity: Array, commanded: Array, step: Array, cycle: int
+    ) -> None:
+        """The first packet after a long gap, before a motion goes on from the set-point sent last.
+
+        A velocity may be off by half the step sent last, or by what counts as standstill. The
+        target's is always held against that; the arm's lags behind, so only where it stands.
+
+        Args:
+            target: (n,) D1, motor revolutions.
+            velocity: (2, n) D2 and D4, motor revolutions per cycle.
+            commanded: (n,) D1 of the answer sent last, motor revolutions.
+            step: (n,) D2 of the answer sent last, motor revolutions per cycle.
+            cycle: for the error.
+
+        Raises:
+            NotFinite, MotionNotCarriedOn, MotionHeld: going on would be a jump.
+        """
+        every = np.ones(len(step), dtype=np.bool_)
+        bound = FIRST_FRACTION * self._threshold
+        _require(every, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
+        standstill = self.limits.standstill
+        bound = np.maximum(0.5 * np.abs(step), standstill)
+        moving = np.abs(velocity[1]) > standstill
+        for where, found in ((every, velocity[0]), (~moving, velocity[1])):
+            _require(where, np.abs(found - step), bound, MotionHeld, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """The next set-point; if it passes, it counts as sent.

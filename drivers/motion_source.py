@@ -31,7 +31,10 @@ class MotionSource(Protocol):
 
     @property
     def bounds(self) -> BoundsName:
-        """Which set of bounds the set-points keep from now on."""
+        """Which set of bounds the set-points keep from now on: "stop" only after `stop`.
+
+        The session grants "override" to nobody as long as none can be asked for.
+        """
         ...
 
     def begin(self, position: Array) -> None:
@@ -43,5 +46,8 @@ class MotionSource(Protocol):
         ...
 
     def stop(self) -> None:
-        """Come to rest on the path; `finished` tells when. Calling it again changes nothing."""
+        """Come to rest on the path; `finished` tells when. Calling it again changes nothing.
+
+        The session asks for drive-off if that takes longer than `session.STOP_TIMEOUT`.
+        """
         ...

@@ -29,6 +29,7 @@ class OpenMode:
         self._still = np.zeros(n)
         self.held = self._still
         self._sent = self._still
+        self._step = self._still
 
     def opening(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
         """Some axes are open: the safe answer gives them their target, if it can be held.
@@ -71,13 +72,22 @@ class OpenMode:
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
-        step = motor - self._sent
+        self._step = step = motor - self._sent
         np.subtract(position, self.held, out=commanded[1])
         commanded[1] /= self._guard.period
         commanded[0] = position
         self._wire.write(self._frame.floats, motor, step)
         self.held = position
         self._sent = motor
+
+    def require_carried_on(self, cycle: int) -> None:
+        """The packet read last, the first after a long gap, against the set-point sent last.
+
+        Raises:
+            NotFinite, MotionNotCarriedOn, MotionHeld: the arm is not where and as fast as it was.
+        """
+        raw = self._wire.raw
+        self._guard.check_after_gap(raw[0], raw[1:4:2], self._sent, self._step, cycle)
 
     def leaving(self, reading: Reading, commanded: Array) -> None:
         """Axes still open keep the last set-point; those that closed have the safe answer."""
@@ -89,6 +99,7 @@ class OpenMode:
         commanded[1] = np.where(ready, 0.0, np.nan)
 
     def _write(self, motor: Array, step: Array, commanded: Array) -> None:
+        self._step = step
         self._wire.write(self._frame.floats, motor, step)
         commanded[0] = self.held
         commanded[1] = 0.0

@@ -3,7 +3,8 @@
 ====================  ======================================  =====================================
 state                 what the controller reports             what it is answered
 ====================  ======================================  =====================================
-sync                  sync packets, before init               the same bytes, number plus one
+sync                  sync packets, before init               the same bytes, number plus one;
+                                                              nothing if a drive is on
 init                  init packet; two more sync after a      the same bytes, number plus one
                       cold start
 drive off             drive not on                            everything echoed
@@ -25,7 +26,13 @@ controller has to report closed axes first, and a new motion has to be requested
 
 Every fresh, well-formed packet gets exactly one answer, a duplicate the same bytes again; stale
 and malformed ones get none and are counted. Motion advances one period per answered packet,
-whatever was missed; more than `max_gap` missed in a row bring it to rest on its path.
+whatever was missed; more than `max_gap` missed in a row bring it to rest on its path, if the
+controller carried it on. Unanswered, a controller may as well have held the last target and so
+stopped the arm; one set-point further at full speed would then be a jump. Hence, after such a gap,
+the motion is refused unless for each axis the target received (D1) is within 10 % of the
+following-error threshold of the set-point sent last, and its velocity (D2) within half the
+velocity sent last or what counts as standstill; an arm that itself stands (D4) is held against
+the latter too.
 
 In open mode the first set-point is the target received in the packet in which the last wanted
 axis opened, at zero velocity, held against actual position and standstill. D2 is the step of the
@@ -60,6 +67,7 @@ from drivers.guard import Guard
 from drivers.machine import Machine
 from drivers.motion_source import MotionSource
 from drivers.packets import (
+    DRIVE_ON,
     INIT_LENGTH,
     INIT_NUMBER,
     N_ARMS,
@@ -78,6 +86,8 @@ from drivers.states import Input, State
 
 FLIGHT_RECORDER: Final = 50
 """Records that go with a refusal."""
+STOP_TIMEOUT: Final = 10.0
+"""s that a motion may take from being told to stop to rest; drive-off is asked for after that."""
 SERVED_MODES: Final = (Mode.POSITION, Mode.POSITION_RELATIVE)
 """Open modes a motion can run in: those whose set-point is D1 and D2."""
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
@@ -185,7 +195,9 @@ class Session:
         Raises:
             RequestError: none can be promised now.
         """
-        execution = Execution(source, self._drive_train.n_joints, self._settle_cycles)
+        stop_cycles = round(STOP_TIMEOUT / self._guard.period)
+        n = self._drive_train.n_joints
+        execution = Execution(source, n, self._settle_cycles, stop_cycles)
         self._machine.request(execution, self._answers.unusable if self._answers else None)
 
     def stop(self, reason: str = "a stop was asked for") -> None:
@@ -222,8 +234,9 @@ class Session:
                 if is_init(packet):
                     return self._start_over(packet, now)
                 number = packet_number(packet)
-                if self._expects_sync(number):
-                    return self._sync(packet, number, now)
+                powered = DRIVE_ON in packet[4 : 4 + N_ARMS]
+                if self._expects_sync(number, powered):
+                    return self._sync(packet, number, now, powered)
                 return self._cyclic(packet, number, now)
         except PacketError:
             self.counters.malformed += 1
@@ -243,16 +256,22 @@ class Session:
         self._machine.events.append(InitReceived(init, self._answers.unusable))
         return self._answered(packet, echo(packet), now)
 
-    def _expects_sync(self, number: int) -> bool:
+    def _expects_sync(self, number: int, powered: bool) -> bool:
         if self.state is State.SYNC:
             return True
+        if powered:
+            return False
         if self.state is State.INIT:
             return self._cold_start and number in _SYNC_AFTER_INIT
         # A controller that was silent and counts from the beginning was started anew.
         sequence = self._sequence
         return sequence.broken and number < INIT_NUMBER and sequence.distance(number) != 1
 
-    def _sync(self, packet: bytes, number: int, now: float) -> bytes:
+    def _sync(self, packet: bytes, number: int, now: float, powered: bool) -> bytes:
+        if powered:
+            # The controller is in mid-session, and an echo would give open axes set-points.
+            # Unanswered, its own watch acts.
+            raise PacketError("status", packet[4 : 4 + N_ARMS].hex(), "no drive on before init")
         if len(packet) >= INIT_LENGTH:
             raise PacketError("length", len(packet), f"less than {INIT_LENGTH} bytes")
         self._machine.take(Input.SYNC)
@@ -282,6 +301,8 @@ class Session:
             self._note_gap(missed)
             self._require_axes(reading)
             machine.take(reading.input)
+            if missed > self._max_gap:
+                answers.require_carried_on(machine)
             measured, commanded = ring.measured[row], ring.commanded[row]
             status = answers.answer(machine, reading, words, measured, commanded)
         except RefusalError as error:

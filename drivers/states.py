@@ -159,17 +159,23 @@ TRANSITIONS: Final[Mapping[State, Mapping[Input, State]]] = {
 HAS_SET_POINTS: Final = frozenset({State.OPENING, State.OPEN, State.EXITING})
 """States in which open axes are given set-points."""
 
-_WAITING: Final = frozenset({State.DRIVE_OFF, State.DRIVING_ON, State.CLOSED, State.FREEZING})
+_BEFORE_THE_DRIVE: Final = frozenset({State.INIT, State.DRIVE_OFF})
+_WAITING: Final = frozenset({State.CLOSED, State.FREEZING})
 
 
 def keeps_request(before: State, after: State) -> bool:
     """Whether a motion that was requested but has not begun survives this step.
 
     It waits for the controller to start, for the drive and for open mode; it does not survive a
-    restart, a fault, or open mode going away by more than closing again.
+    restart, a fault, a drive that was on and goes off (or is switched on again, its going off
+    having been missed), or open mode going away by more than closing again.
     """
     if after in (State.SYNC, State.INIT):
         return before in (State.SYNC, State.INIT)
+    if after is State.DRIVE_OFF:
+        return before in _BEFORE_THE_DRIVE
+    if after is State.DRIVING_ON:
+        return before in _BEFORE_THE_DRIVE or before is State.DRIVING_ON
     if after in _WAITING:
         return before not in HAS_SET_POINTS or after is State.CLOSED
     return after in (State.OPENING, State.OPEN)

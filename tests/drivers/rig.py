@@ -60,6 +60,7 @@ def init_packet(**changes) -> InitPacket:
     arm_1 = {
         "gear_ratio": drive_train().gear_ratio,
         "calibration": drive_train().calibration,
+        "kinematic_influence": [0.0, 0.0, 0.0, 0.01, 0.002, 0.03],
         "following_error": np.full(N, 2.0),
         "current_limit": np.full(N, 20.0),
         **changes.pop("arm_1", {}),
@@ -142,6 +143,13 @@ class Table:
 
     def stop(self):
         self.positions = self.positions[: self.index + 1]
+
+
+class GoesOn(Table):
+    """A table of a stop: has the bounds of one from being told to, and plays on to its end."""
+
+    def stop(self):
+        self.bounds = "stop"
 
 
 def still(rows: int, position=START) -> Table:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rig import PERIOD, START, N, limits
 
-from drivers import Guard, GuardError, JerkLimit, VelocityLimit
+from drivers import AccelerationLimit, Guard, GuardError, JerkLimit, VelocityLimit
 
 REST = np.zeros(N)
 
@@ -63,6 +63,16 @@ def test_whatever_keeps_its_jerk_passes_the_check_on_jerk(shares, factor):
     bounds = {1.0: "plan", 1.7: "override", 3.0: "stop"}[factor]
     rows = jerk_profile([100.0 * factor * share for share in shares])
     feed(begun(**wide, lower=np.full(N, -1e3), upper=np.full(N, 1e3)), rows, bounds)
+
+
+@pytest.mark.parametrize(("bounds", "factor"), [("plan", 1.0), ("override", 1.3), ("stop", 2.0)])
+def test_each_set_of_bounds_has_its_acceleration(bounds, factor):
+    t = PERIOD * np.arange(1, 40)[:, None]
+    path = START + 0.5 * 8.0 * factor * t**2 * np.array([0, 1, 0, 0, 0, 0])
+    wide = {"jerk": np.full(N, 1e9)}
+    feed(begun(**wide), START + 0.999 * (path - START), bounds)
+    with pytest.raises(AccelerationLimit):
+        feed(begun(**wide), START + 1.001 * (path - START), bounds)
 
 
 @given(st.integers(0, N - 1), st.sampled_from([np.nan, np.inf, -np.inf]), st.booleans())

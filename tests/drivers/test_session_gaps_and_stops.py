@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from rig import (
+    PERIOD,
     START,
     Cruise,
     Rig,
+    assert_refused,
+    moving,
     smooth_move,
     still,
 )
@@ -15,7 +19,11 @@ from drivers import (
     GapSeen,
     Mode,
     MotionEnded,
+    MotionHeld,
+    MotionNotCarriedOn,
     MotionStarted,
+    NotFinite,
+    RefusalError,
     State,
 )
 
@@ -82,6 +90,86 @@ class TestGaps:
         rig.run()
         assert rig.ended.outcome == "completed"
         assert rig.session.counters.missed == 0
+
+
+class TestLongGaps:
+    """The arm of `Rig` goes on unanswered as if nothing were missed, unless a test stops it."""
+
+    def after_gap(self, missed, change, cycles=300):
+        rig, source = moving(cycles)
+        change(rig.axes["d"])
+        rig.miss(missed)
+        return rig, source, rig.cycle()
+
+    def refused(self, answer, rig, kind):
+        error = assert_refused(rig, answer, kind)
+        assert error.joint == 0
+        assert isinstance(error, RefusalError)
+        return error
+
+    def held(self, d):
+        d[:, [1, 3]] = 0.0
+
+    def test_a_controller_that_held_the_last_target_is_not_run_away_from(self):
+        rig, source, answer = self.after_gap(3, self.held)
+        step = 0.3 * 120.0 / (2.0 * np.pi) * PERIOD
+        error = self.refused(answer, rig, MotionHeld)
+        assert error.value == pytest.approx(step, rel=1e-3)
+        assert error.bound == pytest.approx(step / 2, rel=1e-3)
+        assert source.advances == 300
+
+    @pytest.mark.parametrize("factor", [0.0, 0.49, 1.51, -1.0, np.nan])
+    def test_nor_one_whose_target_velocity_is_another(self, factor):
+        def change(d):
+            d[0, 1] *= factor
+
+        kind = MotionHeld if np.isfinite(factor) else NotFinite
+        rig, _, answer = self.after_gap(3, change)
+        self.refused(answer, rig, kind)
+
+    def test_nor_one_whose_arm_stands_whatever_its_target_velocity(self):
+        rig, _, answer = self.after_gap(3, lambda d: d[0].__setitem__(3, 0.0))
+        self.refused(answer, rig, MotionHeld)
+
+    def test_an_arm_that_lags_behind_is_not_one_that_stands(self):
+        rig, _, _ = self.after_gap(3, lambda d: d[0].__setitem__(3, 0.3 * d[0, 3]))
+        assert rig.state is State.OPEN
+
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_nor_one_whose_target_went_elsewhere(self, sign):
+        def change(d):
+            d[0, [0, 2]] += sign * 0.201
+
+        rig, _, answer = self.after_gap(3, change)
+        error = self.refused(answer, rig, MotionNotCarriedOn)
+        assert error.value == pytest.approx(0.201, abs=1e-5)
+        assert error.bound == pytest.approx(0.2)
+
+    def test_a_target_carried_on_a_little_further_is_stopped_on_the_path(self):
+        def change(d):
+            d[0, [0, 2]] += 3 * d[0, 1]
+
+        rig, source, _ = self.after_gap(3, change)
+        assert rig.state is State.OPEN
+        assert source.stops == 1
+
+    def test_a_short_gap_is_bridged_even_so(self):
+        rig, source, _ = self.after_gap(2, self.held)
+        assert rig.state is State.OPEN
+        assert (source.advances, source.stops) == (301, 0)
+
+    def test_a_motion_that_creeps_below_standstill_may_be_stopped(self):
+        rig, source, _ = self.after_gap(3, self.held, cycles=5)
+        assert rig.state is State.OPEN
+        assert source.stops == 1
+
+    def test_an_arm_that_is_only_held_stays_held(self):
+        rig = Rig()
+        rig.open()
+        rig.cycle(3)
+        rig.miss(30)
+        rig.cycle()
+        assert rig.state is State.OPEN
 
 
 class TestStop:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rig import (
+    Cruise,
     N,
     Rig,
     all_drive_off,
@@ -118,13 +119,40 @@ class TestLostMotion:
         assert rig.ended.outcome == "lost"
         assert rig.ended.interval == -1
 
-    def test_a_waiting_motion_survives_a_drive_off_with_closed_axes(self):
+    @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.DRIVING_ON, Mode.PAUSE_BY_CONTROLLER])
+    def test_a_waiting_motion_is_lost_when_the_drive_goes_off(self, mode):
+        rig = Rig()
+        source = Cruise()
+        rig.session.request(source)
+        rig.start()
+        rig.modes = mode
+        rig.cycle()
+        assert rig.session.requested
+        rig.status = 0
+        rig.cycle()
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the drive went off")
+        rig.status = 5
+        rig.open()
+        rig.cycle(10)
+        assert source.begun_at is None
+
+    def test_a_waiting_motion_is_lost_when_the_drive_is_switched_on_again(self):
         rig = Rig()
         rig.session.request(still(3))
         rig.close()
+        rig.modes = Mode.DRIVING_ON
+        rig.cycle()
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the drive was switched on again")
+
+    def test_a_motion_requested_while_the_drive_is_off_waits_for_it(self):
+        rig = Rig()
+        rig.close()
         rig.status = 0
         rig.cycle()
-        rig.status = 5
+        rig.session.request(still(3))
+        rig.cycle(3)
+        rig.status, rig.modes = 5, Mode.DRIVING_ON
+        rig.cycle(3)
         rig.open()
         rig.run()
         assert rig.ended.outcome == "completed"

@@ -231,6 +231,9 @@ class TestFromRequestToRest:
         axes_map[0, 0] = 3
         axes_map[1, :N] = [6, 5, 4, 2, 1, 0]
         init = init_packet(n_axes=7, open_axes_map=axes_map)
+        for name in ("gear_ratio", "calibration", "kinematic_influence"):
+            init.record[name][0, 1] = init.record[name][0, 0]
+            init.record[name][0, 0] = np.nan  # of axes that are nothing to us
         init.record["following_error"][0, 1] = 2.0
         init.record["current_limit"][0, 1] = 20.0
         rig = Rig(init=init, slots=np.array([6, 5, 4, 2, 1, 0]), arm=2)

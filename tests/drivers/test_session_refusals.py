@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rig import (
+    PERIOD,
     START,
     Cruise,
+    GoesOn,
     N,
     Rig,
     Table,
@@ -35,7 +37,7 @@ from drivers import (
     VelocityLimit,
     VelocityMismatch,
 )
-from drivers.session import FLIGHT_RECORDER
+from drivers.session import FLIGHT_RECORDER, STOP_TIMEOUT
 
 WIDE = {"jerk": np.full(N, 1e9)}
 
@@ -112,14 +114,31 @@ class TestRefusedSetPoints:
         error = assert_refused(rig, answer, JerkLimit)
         assert (error.joint, error.bound) == (1, pytest.approx(100.0, rel=1e-5))
 
-    @pytest.mark.parametrize(("bounds", "factor"), [("plan", 1), ("override", 1.3), ("stop", 2)])
-    def test_each_set_of_bounds_has_its_acceleration(self, bounds, factor):
-        wide = limits(**WIDE)
-        inside = constant_acceleration(8.0 * factor * 0.999)
-        assert play(inside, None, bounds, guard_limits=wide)[0].state is State.OPEN
-        outside = constant_acceleration(8.0 * factor * 1.001)[:3]
-        rig, answer = play(outside, None, bounds, guard_limits=wide)
+    @pytest.mark.parametrize(("stopping", "factor"), [(False, 1), (True, 2)])
+    def test_a_plan_and_a_stop_have_their_acceleration(self, stopping, factor):
+        def play_on(rows):
+            rig = Rig(guard_limits=limits(**WIDE))
+            rig.session.request(GoesOn(rows))
+            rig.open()
+            if stopping:
+                rig.session.stop()
+            return rig, rig.cycle(len(rows) - 1)
+
+        assert play_on(constant_acceleration(8.0 * factor * 0.999))[0].state is State.OPEN
+        rig, answer = play_on(constant_acceleration(8.0 * factor * 1.001)[:3])
         assert_refused(rig, answer, AccelerationLimit)
+
+    @pytest.mark.parametrize("bounds", ["override", "stop"])
+    def test_a_source_that_takes_wider_bounds_than_it_was_granted(self, bounds):
+        rig, answer = play(np.tile(START, (5, 1))[:2], None, bounds)
+        assert bounds in str(assert_refused(rig, answer, SourceFailed))
+
+    def test_a_source_that_takes_the_bounds_of_an_override_for_its_stop(self):
+        rig, source = moving()
+        rig.session.stop()
+        rig.cycle()
+        source.bounds = "override"
+        assert_refused(rig, rig.cycle(), SourceFailed)
 
     def test_a_source_that_raises(self):
         class Broken(Cruise):
@@ -146,13 +165,58 @@ class TestRefusedSetPoints:
         rig.open()
         assert_refused(rig, rig.cycle(), SourceFailed)
 
-    def test_a_source_that_names_no_set_of_bounds(self):
+    @pytest.mark.parametrize(
+        "bounds", ["whatever", None, 1, np.array(["plan"]), np.full(2, "plan"), ["plan"]]
+    )
+    @pytest.mark.parametrize("finished", [False, True])
+    def test_a_source_that_names_no_set_of_bounds(self, bounds, finished):
         source = Cruise()
-        source.bounds = "whatever"
+        source.bounds, source.finished = bounds, finished
         rig = Rig()
         rig.session.request(source)
         rig.open()
         assert_refused(rig, rig.cycle(), SourceFailed)
+
+    @pytest.mark.parametrize("from_cycle", [0, 1])
+    def test_a_source_that_cannot_say_whether_it_is_over(self, from_cycle):
+        class Unclear(Cruise):
+            @property
+            def finished(self):
+                return self.advances >= from_cycle and np.array([True, False])
+
+            @finished.setter
+            def finished(self, value):
+                pass
+
+        rig = Rig()
+        rig.session.request(Unclear())
+        answer = rig.open()
+        if from_cycle:
+            answer = rig.cycle()
+        assert_refused(rig, answer, SourceFailed)
+
+    def test_a_source_that_ignores_a_stop(self):
+        class Deaf(Cruise):
+            SPEED = 0.1
+
+            def stop(self):
+                pass
+
+        rig = Rig()
+        rig.session.request(Deaf())
+        rig.open()
+        rig.cycle(300)
+        rig.session.stop()
+        rig.cycle(round(STOP_TIMEOUT / PERIOD))
+        assert rig.state is State.OPEN
+        error = assert_refused(rig, rig.cycle(), SourceFailed)
+        assert "did not come to rest" in str(error)
+
+    def test_a_long_hold_of_the_end_of_a_stop_is_no_slow_stop(self):
+        rig, _ = moving(settle_cycles=round(STOP_TIMEOUT / PERIOD) + 10)
+        rig.session.stop()
+        rig.run(12_000)
+        assert rig.ended.outcome == "stopped"
 
     def test_a_source_that_fails_to_stop(self):
         rig, source = moving()
@@ -161,8 +225,8 @@ class TestRefusedSetPoints:
         assert_refused(rig, rig.cycle(), SourceFailed)
 
 
-class Narrowing(Table):
-    """The bounds of a stop for the first rows, those of a plan afterwards."""
+class Narrowing(GoesOn):
+    """Told to stop: the bounds of a stop for the first rows, those of a plan afterwards."""
 
     def __init__(self, positions, wide_rows):
         super().__init__(positions)
@@ -193,6 +257,7 @@ class TestNarrowingBounds:
         rig = Rig(guard_limits=limits(acceleration=np.full(N, 12.0)))
         rig.session.request(Narrowing(jerk_then_constant_acceleration(299.0, 19), wide_rows))
         rig.open()
+        rig.session.stop()
         rig.cycle(59)
         return rig
 

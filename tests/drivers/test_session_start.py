@@ -6,9 +6,9 @@ import struct
 
 import numpy as np
 import pytest
-from rig import N, Rig, init_packet, still
+from rig import N, Rig, init_packet
 
-from drivers import CyclicPacket, InitReceived, LinkLost, Mode, PacketRejected, RequestError, State
+from drivers import CyclicPacket, InitReceived, LinkLost, Mode, PacketRejected, State
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 
 WORDS = 9
@@ -297,29 +297,41 @@ class TestSilence:
         assert rig.state is State.CLOSED
 
 
-class TestInitThatDoesNotFit:
-    @pytest.mark.parametrize(
-        "init",
-        [
-            init_packet(sample_time=1),
-            init_packet(sample_time=1500),
-            init_packet(n_axes=5),
-            init_packet(open_axes_map=np.full((4, 10), 1)),
-        ],
-        ids=["cycle", "cycle in microseconds", "axis missing", "no map"],
-    )
-    def test_it_is_answered_but_nothing_can_be_moved(self, init):
-        rig = Rig(init=init)
+class TestPcThatStartsInMidSession:
+    @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.POSITION, Mode.DELTA_POSITION])
+    @pytest.mark.parametrize("arm", range(4))
+    def test_a_packet_with_a_drive_on_is_no_sync_packet(self, mode, arm):
+        rig = Rig()
+        rig.number = 5000
+        rig.modes = mode
+        for count in range(1, 4):
+            packet = bytearray(rig.packet())
+            packet[4:8] = bytes(4)
+            packet[4 + arm] = DRIVE_ON
+            assert rig.send(bytes(packet)) is None
+            assert rig.session.counters.malformed == count
+        assert rig.state is State.SYNC
         rig.start()
-        assert rig.seen(InitReceived)[0].unusable
-        rig.modes = Mode.CLOSED
         assert rig.cycle() is not None
-        with pytest.raises(RequestError):
-            rig.session.request(still(3))
-        rig.modes = Mode.POSITION
+
+    @pytest.mark.parametrize(("mode", "answered"), [(Mode.CLOSED, 0), (Mode.DELTA_POSITION, 505)])
+    def test_neither_right_after_init(self, mode, answered):
+        rig = Rig()
+        for number in range(1, 10):
+            rig.sync(number)
+        rig.send(rig.init.encode())
+        rig.number = 10
+        rig.modes = mode
+        assert (rig.cycle().axes["mode"] == answered).all()
+
+    def test_nor_after_a_silence(self):
+        rig = Rig()
+        rig.open()
+        rig.now += 60.0
+        rig.number = 2
+        rig.modes = Mode.DELTA_POSITION
+        rig.axes["d"][:, 0] = 0.5
         assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
-        assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
-        assert np.isnan(rig.records["position"]).all()
 
 
 class TestConstruction:

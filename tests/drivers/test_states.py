@@ -128,18 +128,28 @@ class TestWaitingRequests:
     @pytest.mark.parametrize(
         "before", [State.DRIVE_OFF, State.DRIVING_ON, State.CLOSED, State.FREEZING]
     )
-    def test_wait_for_the_drive_and_for_open_mode(self, before):
-        for after in (State.DRIVE_OFF, State.DRIVING_ON, State.CLOSED, State.OPENING, State.OPEN):
+    def test_wait_for_open_mode(self, before):
+        for after in (State.CLOSED, State.OPENING, State.OPEN):
             assert keeps_request(before, after)
+
+    @pytest.mark.parametrize("before", [State.INIT, State.DRIVE_OFF])
+    def test_wait_for_the_drive(self, before):
+        assert keeps_request(before, State.DRIVE_OFF)
+        assert keeps_request(before, State.DRIVING_ON)
+
+    @pytest.mark.parametrize(
+        "before", [s for s in RUNNING if s not in (State.INIT, State.DRIVE_OFF)]
+    )
+    def test_never_survive_the_drive_going_off(self, before):
+        assert not keeps_request(before, State.DRIVE_OFF)
 
     @pytest.mark.parametrize("before", RUNNING)
     def test_never_survive_a_fault_or_the_end(self, before):
         assert not keeps_request(before, State.FAULTED)
         assert not keeps_request(before, State.ENDED)
 
-    def test_survive_axes_closing_again_but_not_the_drive_going_off_while_opening(self):
+    def test_survive_axes_closing_again(self):
         assert keeps_request(State.OPENING, State.CLOSED)
-        assert not keeps_request(State.OPENING, State.DRIVE_OFF)
 
     def test_survive_the_first_init_but_no_later_one(self):
         assert keeps_request(State.SYNC, State.INIT)

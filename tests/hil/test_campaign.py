@@ -180,6 +180,26 @@ def test_a_stop_between_motions_begins_none(tmp_path: Path, cell: Cell, plan: Ca
     assert [entry.name for entry in campaign.folder.manifest()] == ["move_000_a1.mcap"]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("gear_ratio = [-116.0", "gear_ratio = [116.0", "gear ratio"),
+        ("calibration = [0.25", "calibration = [29.25", "calibration"),
+        ("k65 = 0.035", "k65 = -0.035", "k65"),
+    ],
+)
+def test_a_controller_that_announces_another_drive_train_is_refused(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, old: str, new: str, named: str
+) -> None:
+    assert old in cell.text
+    wrong = Cell.from_texts(cell.text.replace(old, new), cell.urdf, cell.path)
+    campaign = Campaign.create(tmp_path / "init", wrong, plan)
+    link = Link.over(SimulatedTransport(simulated_controller(cell)), wrong)
+    with pytest.raises(ControllerFault, match=f"cannot be used: .*{named}"):
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+    assert not list(campaign.folder.archives.iterdir())
+
+
 def test_a_stop_before_the_connection_moves_nothing(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
