@@ -79,8 +79,9 @@ class CollisionChecker:
 
     Links that share a joint are never checked against each other, nor is the base against what
     it stands among. Shapes two joints apart at most that are too close in every one of 200
-    random postures, and closer than 5 cm, are taken to be built that way (a wrist, a sunken foot), and are left
-    out too. Any pair farther apart along the arm is checked, even if it always touches.
+    random postures, and closer than 5 cm, are taken to be built that way (a wrist, a sunken
+    foot), and are left out too. Any pair farther apart along the arm is checked, even if it
+    always touches.
 
     Args:
         urdf: text of the robot description; meshes are replaced by their convex hulls.
