@@ -209,7 +209,8 @@ def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Sour
         return (
             sources[:-1],
             sources[-1:],
-            f"no validation run: the last recording, {sources[-1].name}, was held out instead",
+            f"no validation run: the last recording, {sources[-1].name}, was held out instead; if "
+            "it repeats a motion that was fitted, that is a weak test",
         )
     whole = sources[0]
     cut = round(share * whole.recording.n_samples)

@@ -1,0 +1,47 @@
+"""Long work says how far it is: bars on a terminal, lines elsewhere, nothing when quiet."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from hil.progress import Bar, Plain, Silent, reporter
+
+
+def test_lines_come_every_tenth_of_the_way(capsys: pytest.CaptureFixture[str]) -> None:
+    plain = Plain()
+    with plain.task("smoothing", 40) as task:
+        for k in range(40):
+            task.advance(1, f"file {k}")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "smoothing"
+    assert len(lines) == 11
+    assert lines[1] == "smoothing: 10 %  file 3"
+    assert lines[-1] == "smoothing: 100 %  file 39"
+
+
+def test_a_bar_shows_the_note_and_the_time_left() -> None:
+    screen = io.StringIO()
+    bar = Bar(Console(file=screen, force_terminal=True, width=140))
+    with bar.task("running", 10) as task:
+        task.advance(4, "excitation 3")
+        bar.say("a line [above] the bar")
+    shown = screen.getvalue()
+    assert "a line [above] the bar" in shown
+    assert "running" in shown
+    assert "left" in shown
+
+
+def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    quiet = reporter(quiet=True)
+    assert isinstance(quiet, Silent)
+    quiet.say("nothing")
+    with quiet.task("nothing", 1) as task:
+        task.advance(1)
+    assert capsys.readouterr().out == ""
+
+
+def test_what_is_no_terminal_gets_lines() -> None:
+    assert isinstance(reporter(), Plain)
