@@ -3,12 +3,17 @@
 ```
 HilError                   exit status 1
 ├── UnsafeError            3: a motion was refused before anything was sent
+│   └── MotionRefusedError      limits, current or collision
 ├── ControllerFault        4: the controller, the link or the guard ended a motion
+│   └── MotionFailedError       and what was recorded of it is archived
+├── OperatorStopError         130: a person stopped the work
 └── InputError             2: something the user gave cannot be used: file, field, problem, remedy
     ├── ArchiveError       an archive that cannot be read or written
     │   ├── NotAnArchiveError       not ours: other format, empty, torn at its head
     │   ├── ArchiveVersionError     written by a newer version of the archive profile
     │   └── ArchiveWriteError       the file cannot be created or the disk refuses
+    ├── CellError          the cell file
+    ├── CampaignFolderError     the campaign folder
     └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
 ```
 """
@@ -83,6 +88,12 @@ class UnsafeError(HilError):
     """A motion that was refused before anything was sent."""
 
     exit_code: ClassVar[int] = 3
+
+
+class OperatorStopError(HilError):
+    """A person stopped the work; what was recorded is whole."""
+
+    exit_code: ClassVar[int] = 130
 
 
 class ControllerFault(HilError):  # noqa: N818 - the controller's own word

@@ -12,6 +12,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from hil.errors import InputError
+from hil.files import write_atomically
+
 SCHEMA_VERSION = 1
 
 
@@ -137,13 +140,23 @@ class Results(_Frozen):
 
     def save(self, path: Path) -> None:
         """Write `path` as indented JSON."""
-        path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        write_atomically(path, self.model_dump_json(indent=1) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> Results:
         """Read and check a `results.json`.
 
         Raises:
-            pydantic.ValidationError: the file is not of this schema.
+            InputError: the file is not of this schema.
         """
-        return cls.model_validate_json(path.read_text(encoding="utf-8"))
+        try:
+            results = cls.model_validate_json(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(
+                path, f"is not a result of this version ({error})", remedy="identify again"
+            ) from error
+        if results.schema_version != SCHEMA_VERSION:
+            raise InputError(
+                path, f"is of version {results.schema_version}", remedy="identify again"
+            )
+        return results

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.transports import SimulatedTransport
 from hil.campaign import Link
-from hil.cell import Cell
+from hil.cell import Cell, CellError
 from sim_fixtures import (
     ControllerSettings,
     PlantTruth,
@@ -50,6 +50,14 @@ def simulated_controller(
 ) -> SimulatedController:
     """The controller and arm that `simulated_link` connects to."""
     settings = cell.simulation
+    if cell.controller.transport != "simulated":
+        raise CellError(
+            cell.path,
+            "controller.transport",
+            cell.controller.transport,
+            "a cell of real hardware is not simulated",
+            'write "simulated" to try it without',
+        )
     announced = simulated_drive(cell)
     return SimulatedController(
         cell.urdf,

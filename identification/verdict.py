@@ -76,7 +76,11 @@ class Verdict:
 
 
 def judge(
-    joint_names: Sequence[str], evidence: Evidence, thresholds: Thresholds = Thresholds()
+    joint_names: Sequence[str],
+    evidence: Evidence,
+    thresholds: Thresholds = Thresholds(),
+    *,
+    tested_on: str = "unseen motion",
 ) -> Verdict:
     """Give the verdict.
 
@@ -84,6 +88,7 @@ def judge(
         joint_names: names of the n axes.
         evidence: see :func:`gather`.
         thresholds: what a good result keeps to.
+        tested_on: what the held-out motion was, in words.
     """
     reasons = (
         *_untested(joint_names, evidence, thresholds),
@@ -100,7 +105,7 @@ def judge(
     if reasons:
         line = f"The model must not be relied on: {reasons[0]}; {measure}."
     else:
-        line = f"The model predicts unseen motion well: {measure}."
+        line = f"The model predicts {tested_on} well: {measure}."
     doubts = (
         *evidence.implausible.doubtful,
         *_growth(joint_names, evidence, thresholds, serious=False),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hil.archive import ArchiveWriter
 from hil.cell import Cell
+from hil.files import make_folder
 from hil.progress import Reporter
 from hil.version import software
 from planner import PiecewiseCubic, TrajectoryPlayer, plan
@@ -57,12 +58,13 @@ class Campaign:
         Raises:
             CampaignFolderError: the folder holds something already.
         """
-        if root.exists() and any(root.iterdir()):
+        make_folder(root)
+        if any(root.iterdir()):
             raise CampaignFolderError(root, "is not empty", "name a new folder")
         folder = CampaignFolder(root)
-        folder.archives.mkdir(parents=True)
-        own = cell.with_urdf_beside_it(folder.cell)
-        (root / own.file.cell.urdf).write_text(own.urdf, encoding="utf-8")
+        make_folder(folder.archives)
+        own = cell.with_urdf(folder.cell, folder.urdf.name)
+        folder.urdf.write_text(own.urdf, encoding="utf-8")
         folder.cell.write_text(own.text, encoding="utf-8")
         plan.save(folder.plan)
         folder.seal()
@@ -213,7 +215,7 @@ class Campaign:
 
     def _metadata(self) -> dict[str, str]:
         return {
-            "campaign": self.folder.root.name,
+            "campaign": self.folder.root.resolve().name,
             "cell": self.cell.name,
             **{f"software.{name}": version for name, version in software().items()},
         }

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from hil.archive import ArchiveName
+from hil.files import write_atomically
 
 from .errors import CampaignFolderError
 
@@ -44,6 +44,11 @@ class CampaignFolder:
     def cell(self) -> Path:
         """The campaign's own copy of the cell file."""
         return self.root / "cell.toml"
+
+    @property
+    def urdf(self) -> Path:
+        """The campaign's own copy of the URDF."""
+        return self.root / "robot.urdf"
 
     @property
     def plan(self) -> Path:
@@ -90,7 +95,10 @@ class CampaignFolder:
             CampaignFolderError: the manifest cannot be read.
         """
         try:
-            return [Entry(**entry) for entry in self._content()["archives"]]
+            entries = [Entry(**entry) for entry in self._content()["archives"]]
+            if not all(isinstance(text, str) for e in entries for text in asdict(e).values()):
+                raise TypeError("an entry is not made of words")
+            return entries
         except (KeyError, TypeError) as error:
             raise self._damaged(error) from error
 
@@ -130,6 +138,14 @@ class CampaignFolder:
                 latest[name.index] = entry.name
         return [self.archives / latest[index] for index in sorted(latest)]
 
+    def damaged(self) -> list[str]:
+        """What the manifest names and is missing, or is not what was written, in words."""
+        return [
+            f"{entry.name} is missing or is not what was recorded, and was left out"
+            for entry in self.manifest()
+            if not self._unchanged(entry)
+        ]
+
     def next_name(self, kind: str, index: int) -> ArchiveName:
         """Name of the next attempt at an interval; never that of an existing file."""
         attempt = 1
@@ -139,11 +155,11 @@ class CampaignFolder:
 
     def _unchanged(self, entry: Entry) -> bool:
         path = self.archives / entry.name
-        return path.exists() and _sha256(path) == entry.sha256
+        return path.is_file() and _sha256(path) == entry.sha256
 
     def _inputs(self) -> dict[str, str]:
         """Checksums of cell, plan and URDF by file name."""
-        files = [self.cell, self.plan, *self.root.glob("*.urdf")]
+        files = [self.cell, self.plan, self.urdf]
         return {file.name: _sha256(file) for file in files if file.exists()}
 
     def _content(self) -> dict[str, Any]:
@@ -171,13 +187,3 @@ class CampaignFolder:
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Replace `path` by `text`: a crash leaves the old or the new file, never half of one."""
-    temporary = path.with_suffix(path.suffix + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)

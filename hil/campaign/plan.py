@@ -9,6 +9,7 @@ from typing import Any
 
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.files import write_atomically
 from hil.progress import Reporter
 from identification.excitation import (
     CollisionChecker,
@@ -20,8 +21,6 @@ from identification.excitation import (
 )
 from planner import JointLimits, NotSmooth, PiecewiseCubic
 from planner.verify import check_smooth
-
-from .folder import write_atomically
 
 FORMAT_VERSION = 1
 
@@ -51,6 +50,8 @@ class CampaignPlan:
         """
         try:
             content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+            if content["format_version"] != FORMAT_VERSION:
+                raise ValueError(f"format version {content['format_version']}")
             return cls(
                 Excitation.from_dict(content["excitation"]),
                 tuple(PiecewiseCubic.from_dict(motion) for motion in content["validation"]),

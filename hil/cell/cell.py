@@ -238,10 +238,10 @@ class Cell:
                 text = replaced_value(text, table, key, value)
         return Cell.from_texts(text, self.urdf, self.path)
 
-    def with_urdf_beside_it(self, path: Path) -> Cell:
-        """This cell as a file `path` that names its URDF without a folder."""
-        name = json.dumps(Path(self.file.cell.urdf).name)  # a JSON string is a TOML string
-        return Cell.from_texts(replaced_value(self.text, "cell", "urdf", name), self.urdf, path)
+    def with_urdf(self, path: Path, name: str) -> Cell:
+        """This cell as a file `path` whose URDF is called `name`."""
+        text = replaced_value(self.text, "cell", "urdf", json.dumps(name))  # JSON is TOML here
+        return Cell.from_texts(text, self.urdf, path)
 
     @property
     def nominal(self) -> NominalTable:

@@ -23,6 +23,25 @@ _NOT_PER_JOINT = {"gravity", "assumed", "elasticity"}
 def check_lengths(cell: Cell) -> None:
     """Every list that has one entry per joint has as many as the URDF has joints."""
     n_joints = cell.model.n_joints
+    simulation = cell.file.simulation
+    if simulation is not None and len(simulation.elasticity) not in (0, n_joints):
+        raise CellError(
+            cell.path,
+            "simulation.elasticity",
+            simulation.elasticity,
+            f"has {len(simulation.elasticity)} entries, the URDF {n_joints} joints",
+            "give one for each joint, or none",
+        )
+    for name in cell.file.cell.assumed:
+        table, _, field = name.partition(".")
+        if field not in getattr(type(getattr(cell.file, table, None)), "model_fields", {}):
+            raise CellError(
+                cell.path,
+                "cell.assumed",
+                name,
+                "names no field of this file",
+                'name fields as "table.field"',
+            )
     for table_name in ("nominal", "limits", "drive_train", "campaign", "simulation"):
         table = getattr(cell.file, table_name)
         for name, value in table or ():
@@ -45,6 +64,7 @@ def check_built(cell: Cell) -> None:
     if file.drive_train is not None and file.limits is not None:
         _build(cell, "limits", "joint_limits")
         _check_against_urdf(cell)
+        _check_postures(cell)
         _build(cell, "bounds", "guard_limits")
 
 
@@ -55,6 +75,26 @@ def _build(cell: Cell, table: str, attribute: str) -> None:
         raise
     except (ValueError, DriverError) as error:
         raise CellError(cell.path, table, None, str(error), "correct that table") from error
+
+
+def _check_postures(cell: Cell) -> None:
+    """Postures named in the file lie inside its limits."""
+    limits, file = cell.joint_limits, cell.file
+    postures = {}
+    if file.campaign is not None:
+        postures["campaign.home_deg"] = cell.home
+    if file.simulation is not None:
+        postures["simulation.initial_deg"] = cell.initial
+    for field, posture in postures.items():
+        for joint, name in enumerate(cell.joint_names):
+            if not limits.lower[joint] <= posture[joint] <= limits.upper[joint]:
+                raise CellError(
+                    cell.path,
+                    field,
+                    None,
+                    f"{name} stands outside [limits]",
+                    "name a posture that the arm can take",
+                )
 
 
 def _check_against_urdf(cell: Cell) -> None:

@@ -11,16 +11,15 @@ def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
     Raises:
         ValueError: there is no such table.
     """
-    header = rf"^\[{table}\][ \t]*(?:#[^\n]*)?$"
+    header = rf"^[ \t]*\[[ \t]*{table}[ \t]*\][ \t]*(?:#[^\n]*)?$"
     found = re.search(header, text, re.MULTILINE)
     if found is None:
         raise ValueError(f"there is no table [{table}]")
     start = found.end()
-    following = re.search(r"^\[", text[start:], re.MULTILINE)
+    following = re.search(r"^[ \t]*\[", text[start:], re.MULTILINE)
     end = start + following.start() if following else len(text)
-    body, count = re.subn(
-        rf"(?m)^({key} *= *)(?:\"[^\"\n]*\"|[^\n#]*)", rf"\g<1>{value}", text[start:end], count=1
-    )
+    setting = rf"(?m)^([ \t]*{key}[ \t]*=[ \t]*)(?:\"[^\"\n]*\"|[^\n#]*)"
+    body, count = re.subn(setting, lambda match: f"{match[1]}{value}", text[start:end], count=1)
     if not count:
         body = f"\n{key} = {value}{text[start:end]}"
     return text[:start] + body + text[end:]

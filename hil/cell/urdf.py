@@ -22,8 +22,11 @@ class UrdfLimits(NamedTuple):
 
 
 def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
-    """Limits of these joints, in their order; a speed of 0 counts as not stated."""
-    joints = {joint.get("name"): joint for joint in ElementTree.fromstring(urdf).iter("joint")}
+    """Limits of these joints, in their order; a speed of 0 counts as not stated.
+
+    Only the robot's own joints: a transmission names joints of the same name again.
+    """
+    joints = {joint.get("name"): joint for joint in ElementTree.fromstring(urdf).findall("joint")}
     rows = []
     for name in joint_names:
         limit = joints[name].find("limit")

@@ -1,7 +1,7 @@
 """The command line: a thin shell over the package.
 
 Exit status: 0 done, 1 internal error, 2 bad input, 3 refused as unsafe, 4 controller fault,
-5 done, but the model is not good, 130 interrupted.
+5 done, but the model is not good, 130 stopped by the operator.
 """
 
 from __future__ import annotations

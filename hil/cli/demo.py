@@ -12,7 +12,9 @@ import typer
 from hil.campaign import Campaign, CampaignFolderError, design, stop_on_interrupt
 from hil.cell import Cell
 from hil.cli.verdict import finish
+from hil.errors import ControllerFault, OperatorStopError
 from hil.identify import identify_campaign
+from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.report import write_report
 from hil.simulation import simulated_link, simulated_provenance
@@ -43,6 +45,9 @@ def demo(
     force: Annotated[
         bool, typer.Option("--force", help="Replace an earlier campaign in OUTPUT.")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a campaign in OUTPUT that was stopped.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
 ) -> None:
@@ -53,41 +58,70 @@ def demo(
     Nothing here is hardware: controller, drives and arm are simulated, packet for packet.
     """
     reporter = make_reporter(quiet=quiet or json)
-    cell = Cell.load(CELL_PATH).with_campaign(
-        repetitions=repetitions, validation_runs=validation, simulation_seed=seed
-    )
-    _make_room(output, force=force)
-    plan = design(cell, reporter)
-    campaign = Campaign.create(output, cell, plan)
-    started = time.perf_counter()
+    if resume:
+        campaign = Campaign.open(output)
+    else:
+        _refuse_what_is_not_ours(output, force=force)
+        cell = Cell.load(CELL_PATH).with_campaign(
+            repetitions=repetitions, validation_runs=validation, simulation_seed=seed
+        )
+        plan = design(cell, reporter)
+        _make_room(output)
+        campaign = Campaign.create(output, cell, plan)
+    _run(campaign, reporter, effects=effects)
+    found = identify_campaign(campaign.folder.root, reporter)
+    found.results.save(campaign.folder.results)
+    write_report(campaign.folder.report, found.results, found.series)
+    reporter.say(f"report: {campaign.folder.report}")
+    finish(found.results, json=json)
+
+
+def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
+    """Run what is missing on a simulated controller; Ctrl-C stops the arm, then the program."""
+    cell, started = campaign.cell, time.perf_counter()
     with stop_on_interrupt() as stop:
         link = simulated_link(cell, effects=effects)
-        campaign.run(
-            link, stop, reporter, provenance=simulated_provenance(cell, effects), durable=False
-        )
-    if stop.requested:
-        raise KeyboardInterrupt
+        try:
+            campaign.run(
+                link, stop, reporter, provenance=simulated_provenance(cell, effects), durable=False
+            )
+        except ControllerFault as fault:
+            if stop.requested:
+                raise OperatorStopError(f"{fault} Go on with --resume.") from fault
+            raise
     took = time.perf_counter() - started
     seconds = link.cycles * cell.period
     reporter.say(
         f"recorded {seconds:.0f} s of simulated motion in {took:.1f} s "
         f"({seconds / took:.1f} x real time)"
     )
-    identification = identify_campaign(campaign.folder.root, reporter)
-    identification.results.save(campaign.folder.results)
-    write_report(campaign.folder.report, identification.results, identification.series)
-    reporter.say(f"report: {campaign.folder.report}")
-    finish(identification.results, json=json)
 
 
-def _make_room(output: Path, *, force: bool) -> None:
-    """Remove an earlier campaign, and only a campaign, if asked to."""
-    if not output.exists() or not any(output.iterdir()):
+_OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "results.json"}
+_OURS |= {"report.html", "paper"}
+
+
+def _refuse_what_is_not_ours(output: Path, *, force: bool) -> None:
+    """Only an earlier campaign may be replaced, and only if asked to."""
+    if not output.exists() and not output.is_symlink():
+        return
+    if output.is_symlink() or not output.is_dir():
+        raise CampaignFolderError(output, "is no folder of its own", "name a folder")
+    found = {path.name for path in output.iterdir()}
+    if not found:
         return
     if not force:
-        raise CampaignFolderError(output, "is not empty", "name another folder or add --force")
-    if not ((output / "manifest.json").exists() and (output / "archives").is_dir()):
         raise CampaignFolderError(
-            output, "is no campaign, so --force will not remove it", "name another folder"
+            output, "is not empty", "name another folder, go on with --resume, or add --force"
         )
-    shutil.rmtree(output)
+    foreign = sorted(found - _OURS)
+    if foreign or "manifest.json" not in found:
+        what = f"holds {foreign[0]}" if foreign else "is no campaign"
+        raise CampaignFolderError(
+            output, f"{what}, so --force will not remove it", "name another folder"
+        )
+
+
+def _make_room(output: Path) -> None:
+    if output.exists():
+        shutil.rmtree(output)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +10,7 @@ import typer
 
 from hil.cli.verdict import finish
 from hil.errors import InputError
+from hil.files import make_folder
 from hil.identify import Options, identify_archives, identify_campaign
 from hil.progress import reporter as make_reporter
 from hil.report import write_report
@@ -26,8 +28,8 @@ def identify(
     output: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for results.json and report.html. If left out: the campaign folder, or "
-            "none for loose archives.",
+            help="Folder for results.json and report.html. If left out: the campaign folder (with "
+            "--paper its folder paper), or none for loose archives.",
             show_default=False,
         ),
     ] = None,
@@ -50,7 +52,9 @@ def identify(
     delay: Annotated[
         float | None,
         typer.Option(
-            help="Time in s by which the torque lags the position; the cell's if left out."
+            min=-0.5,
+            max=0.5,
+            help="Time in s by which the torque lags the position; the cell's if left out.",
         ),
     ] = None,
     torque_bandwidth: Annotated[
@@ -70,6 +74,8 @@ def identify(
     Exit status 0 if the model is good, 5 if it is not.
     """
     reporter = make_reporter(quiet=quiet or json)
+    if delay is not None and not math.isfinite(delay):
+        raise InputError(None, f"{delay} is no time", field="--delay", remedy="give seconds")
     options = Options(
         method="paper" if paper else "default",
         split=split,
@@ -77,17 +83,19 @@ def identify(
         torque_bandwidth=_bandwidth(torque_bandwidth),
     )
     if len(archives) == 1 and archives[0].is_dir():
+        output = output or (archives[0] / "paper" if paper else archives[0])
+        make_folder(output)
         found = identify_campaign(archives[0], reporter, options)
-        output = output or archives[0]
     else:
         folder = next((path for path in archives if path.is_dir()), None)
         if folder is not None:
             raise InputError(
                 folder, "is a folder among archives", remedy="name one campaign folder, or files"
             )
+        if output is not None:
+            make_folder(output)
         found = identify_archives(archives, reporter, options)
     if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
         found.results.save(output / "results.json")
         write_report(output / "report.html", found.results, found.series)
         reporter.say(f"report: {output / 'report.html'}")

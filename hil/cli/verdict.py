@@ -10,10 +10,12 @@ NOT_GOOD = 5
 
 
 def finish(results: Results, *, json: bool) -> None:
-    """Print the verdict; exit 5 if the model is not good."""
+    """Print the verdict last, doubts to stderr before it; exit 5 if the model is not good."""
     if json:
         typer.echo(results.verdict.model_dump_json())
     else:
+        for doubt in results.verdict.doubts:
+            typer.echo(f"note: {doubt}", err=True)
         typer.echo(results.verdict.line)
     if not results.verdict.good:
         raise typer.Exit(NOT_GOOD)

@@ -54,22 +54,35 @@ def identify_campaign(
     paths = [path for kind in kinds for path in folder.completed(kind)]
     if not paths:
         raise InputError(
-            root, "holds no completed excitation", remedy="name a campaign folder that was run"
+            root,
+            "its manifest.json names no completed excitation that is still whole",
+            remedy="run the campaign, or name the archives themselves",
         )
     return identify_archives(
-        [*paths, *folder.completed("standstill")], reporter, options, name=root.name
+        [*paths, *folder.completed("standstill")],
+        reporter,
+        options,
+        name=root.resolve().name,
+        doubts=folder.damaged(),
     )
 
 
 def identify_archives(
-    paths: Sequence[Path], reporter: Reporter, options: Options = Options(), *, name: str = ""
+    paths: Sequence[Path],
+    reporter: Reporter,
+    options: Options = Options(),
+    *,
+    name: str = "",
+    doubts: Sequence[str] = (),
 ) -> Identification:
-    """Identify from archives.
+    """Identify from archives; `doubts` is what is known beforehand to be wrong with them.
 
     Raises:
         InputError: the archives cannot be used, or not together.
     """
     sources = gather_sources(paths, options.split)
+    for doubt in doubts:
+        sources = sources.with_doubt(doubt)
     model = sources.cell.model
     preprocessing = _preprocessing(sources, options)
     if options.torque_bandwidth == "auto" and preprocessing.torque_bandwidth is not None:
@@ -114,7 +127,7 @@ def identify_archives(
             same_motion=sources.same_motion,
             nominal=nominal,
         )
-        verdict = judge(model.joint_names, evidence)
+        verdict = judge(model.joint_names, evidence, tested_on=sources.tested_on)
         task.advance(1)
     results = summarise(
         name or paths[0].stem, sources, estimate, verdict, training=training, held_out=held_out

@@ -54,6 +54,7 @@ class Sources:
         noise_variance: of the positions (n,) [rad²]; None where no standstill was recorded.
         torque_variance: of the torques at standstill (n,) [N²·m²]; None likewise.
         doubts: what a reader must know about the archives.
+        tested_on: what is predicted, in words.
     """
 
     cell: Cell
@@ -65,6 +66,7 @@ class Sources:
     noise_variance: Array | None
     torque_variance: Array | None
     doubts: tuple[str, ...]
+    tested_on: str
 
     def with_doubt(self, doubt: str) -> Sources:
         """These sources with one more thing a reader must know."""
@@ -116,7 +118,16 @@ def gather_sources(paths: Sequence[Path], split: float) -> Sources:
     held_out = [_source(archive, cell) for archive in by_kind.get("validation", [])]
     doubts = [*_doubts_of(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
     same_motion = len({archive.attachments.get("plan.json") for archive in fitted}) == 1
+    tested_on = "unseen motion"
     if not held_out:
+        whole = len(training) == 1
+        tested_on = (
+            "the rest of the same motion"
+            if whole
+            else "a repetition of the fitted motion"
+            if same_motion
+            else "another recording"
+        )
         training, held_out, doubt = _split(training, split)
         doubts.append(doubt)
     rest = [_source(archive, cell) for archive in by_kind.get("standstill", [])]
@@ -131,6 +142,7 @@ def gather_sources(paths: Sequence[Path], split: float) -> Sources:
         noise_variance=_noise_variance(cell, rest[0].recording) if rest else None,
         torque_variance=_torque_variance(rest[0].recording) if rest else None,
         doubts=tuple(doubts),
+        tested_on=tested_on,
     )
 
 
@@ -192,6 +204,12 @@ def _source(archive: Archive, cell: Cell) -> Source:
         ArchiveError: the recording is not fit to be identified from; names file and reason.
     """
     recording = recording_of(archive)
+    if recording.torque is None:
+        raise ArchiveError(
+            archive.path,
+            "holds no joint torques to fit",
+            remedy="import torques, or motor currents with gear ratios and torque constants",
+        )
     if recording.commanded_position is not None:
         commanded = np.flatnonzero(~np.isnan(recording.commanded_position).any(axis=1))
         if not commanded.size:
@@ -209,8 +227,7 @@ def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Sour
         return (
             sources[:-1],
             sources[-1:],
-            f"no validation run: the last recording, {sources[-1].name}, was held out instead; if "
-            "it repeats a motion that was fitted, that is a weak test",
+            f"no validation run: the last recording, {sources[-1].name}, was held out instead",
         )
     whole = sources[0]
     cut = round(share * whole.recording.n_samples)

@@ -119,7 +119,7 @@ def _held(urdf: str, joints: Sequence[str], path: Path) -> str:
         root = ElementTree.fromstring(urdf)
     except ElementTree.ParseError as error:
         raise SourceError(path, f"is not a readable URDF: {error}") from error
-    found = {joint.get("name", ""): joint for joint in root.iter("joint")}
+    found = {joint.get("name", ""): joint for joint in root.findall("joint")}
     for name in joints:
         if name not in found:
             raise InputError(

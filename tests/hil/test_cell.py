@@ -81,6 +81,10 @@ def test_nominal_values_are_the_manufacturers_column_of_table_2(folder: Path) ->
         (r"^velocity_deg = \[155.0", "velocity_deg = [156.0", "velocity_deg", "beyond the URDF's"),
         (r"^stop = .*", "stop = { acceleration = 9, jerk = 3 }", "bounds.stop", "at most 5"),
         (r"^stop = .*", "stop = { acceleration = 1.1, jerk = 3 }", "bounds", "correct that table"),
+        (r"^home_deg = \[0.0, 0.0", "home_deg = [0.0, 99.0", "campaign.home_deg", "posture"),
+        (r"^initial_deg = \[10.0", "initial_deg = [900.0", "initial_deg", "posture"),
+        (r"^elasticity = .*", "elasticity = [1e-6]", "simulation.elasticity", "each joint"),
+        (r'"limits.jerk_deg"', '"limits.jrk_deg"', "cell.assumed", "table.field"),
         (
             r"^walls = .*",
             "walls = [{ lower = [1, 0, 0], upper = [0, 1, 1] }]",
@@ -106,10 +110,20 @@ def test_a_missing_file_and_a_missing_table_are_named(folder: Path) -> None:
         _ = bare.drive_train
 
 
+def test_a_transmission_that_names_a_joint_again_does_not_widen_its_limits(folder: Path) -> None:
+    urdf = folder / "ns16.urdf"
+    again = '<transmission name="t"><joint name="joint_2"/></transmission></robot>'
+    urdf.write_text(urdf.read_text("utf-8").replace("</robot>", again), "utf-8")
+    assert "beyond the URDF's" in complaint(
+        folder, r"^upper_deg = \[180.0, 95.0", "upper_deg = [180.0, 165.0"
+    )
+
+
 def test_a_value_is_replaced_in_its_own_table_and_nowhere_else() -> None:
     text = "[a]\nseed = 1 # one\n[b] # comment\nseed = 2\n"
     assert replaced_value(text, "b", "seed", 7) == "[a]\nseed = 1 # one\n[b] # comment\nseed = 7\n"
     assert "other = 3" in replaced_value(text, "a", "other", 3)
+    assert replaced_value("[ a ]\n  x = 1", "a", "x", '"\\u00e1"') == '[ a ]\n  x = "\\u00e1"'
     with pytest.raises(ValueError, match="no table"):
         replaced_value(text, "c", "seed", 7)
 
@@ -119,8 +133,8 @@ def test_a_cell_can_be_moved_beside_its_urdf(folder: Path) -> None:
     (folder / "ns16.urdf").rename(folder / "models" / "ns16.urdf")
     path = folder / "cell.toml"
     path.write_text(path.read_text("utf-8").replace('"ns16.urdf"', '"models/ns16.urdf"'), "utf-8")
-    moved = Cell.load(path).with_urdf_beside_it(folder / "models" / "cell.toml")
-    assert moved.file.cell.urdf == "ns16.urdf"
+    moved = Cell.load(path).with_urdf(folder / "models" / "cell.toml", "robot.urdf")
+    assert moved.file.cell.urdf == "robot.urdf"
     assert moved.urdf == URDF_PATH.read_text("utf-8")
 
 

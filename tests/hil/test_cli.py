@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -110,6 +111,9 @@ def test_a_log_with_a_column_map_becomes_an_archive(tmp_path: Path) -> None:
             "m.toml",
         ),
         (["identify", "x.mcap", "--torque-bandwidth", "wide"], "no bandwidth"),
+        (["identify", "x.mcap", "--output", str(CELL_PATH)], "cannot be made a folder"),
+        (["identify", "x.mcap", "--delay", "nan"], "--delay"),
+        (["demo", "--output", str(CELL_PATH)], "no folder of its own"),
     ],
 )
 def test_bad_input_gets_one_sentence_and_status_2(
@@ -119,6 +123,38 @@ def test_bad_input_gets_one_sentence_and_status_2(
     assert done.returncode == 2
     assert sentence in done.stderr.replace("\n", "")
     assert "Traceback" not in done.stderr
+
+
+def test_a_stopped_demo_goes_on_where_it_was(campaign: Campaign, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(campaign.folder.root, folder)
+    torn = folder / "archives" / "validation_001_a1.mcap"
+    torn.unlink()
+    done = hil("demo", "--output", folder, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert (folder / "archives" / "validation_001_a1.mcap").exists()
+    assert (folder / "report.html").exists()
+
+
+def test_force_removes_nothing_but_a_campaign(campaign: Campaign, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(campaign.folder.root, folder)
+    (folder / "my_notes.txt").write_text("mine")
+    done = hil("demo", "--output", folder, "--force")
+    assert done.returncode == 2
+    assert "my_notes.txt" in done.stderr
+    assert (folder / "my_notes.txt").exists()
+    link = tmp_path / "link"
+    link.symlink_to(folder)
+    assert hil("demo", "--output", link, "--force").returncode == 2
+
+
+def test_an_archive_that_went_missing_is_named(campaign: Campaign, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(campaign.folder.root, folder)
+    (folder / "archives" / "excitation_001_a1.mcap").unlink()
+    done = hil("identify", folder, "--quiet")
+    assert "excitation_001_a1.mcap is missing" in done.stderr
 
 
 def test_ctrl_c_stops_the_arm_on_its_path_and_leaves_whole_archives(tmp_path: Path) -> None:
@@ -135,8 +171,9 @@ def test_ctrl_c_stops_the_arm_on_its_path_and_leaves_whole_archives(tmp_path: Pa
         time.sleep(0.3)
         run.send_signal(signal.SIGINT)
         _, said = run.communicate(timeout=60)
-    assert run.returncode == 4, said
+    assert run.returncode == 130, said
     assert "stopped" in said
+    assert "--resume" in said
     last = sorted((folder / "archives").iterdir(), key=lambda path: path.stat().st_mtime)[-1]
     archive = open_archive(last)
     assert archive.complete

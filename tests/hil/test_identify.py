@@ -89,7 +89,7 @@ def test_a_torn_repetition_is_used_up_to_its_last_whole_chunk_and_named(
 def test_archives_without_an_excitation_are_refused(campaign: Campaign, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no excitation"):
         identify_archives(campaign.folder.completed("validation"), Silent())
-    with pytest.raises(InputError, match="holds no completed excitation"):
+    with pytest.raises(InputError, match="names no completed excitation"):
         identify_campaign(tmp_path, Silent())
 
 
@@ -120,12 +120,14 @@ def test_a_stretch_at_rest_is_no_test_of_a_model(campaign: Campaign) -> None:
     assert "tests nothing" in found.verdict.line
 
 
-def imported(path: Path, names: tuple[str, ...] | None = None, **spoilt: object) -> Path:
+def imported(
+    path: Path, names: tuple[str, ...] | None = None, *, torque: bool = True, **spoilt: object
+) -> Path:
     """An imported recording of smooth sines on six joints, with something wrong."""
     robot = Robot.from_urdf(URDF_PATH)
     time = np.arange(2000) * PERIOD
     position = 0.3 * np.sin(np.outer(time, np.linspace(1.0, 2.0, 6)))
-    torque = np.cos(np.outer(time, np.linspace(1.0, 2.0, 6)))
+    torques = np.cos(np.outer(time, np.linspace(1.0, 2.0, 6)))
     stamp = np.rint(time * 1e9).astype(np.int64)
     for key, value in spoilt.items():
         if key == "nan":
@@ -138,7 +140,7 @@ def imported(path: Path, names: tuple[str, ...] | None = None, **spoilt: object)
             stamp[value] -= 10**9  # type: ignore[index]
     write_samples(
         path,
-        Samples(stamp, position, None, torque, None),
+        Samples(stamp, position, None, torques if torque else None, None),
         joint_names=names or robot.joint_names,
         metadata={"kind": "imported"},
         attachments=robot.attachments(),
@@ -172,3 +174,14 @@ def test_a_single_recording_is_split_and_the_split_is_called_what_it_is(tmp_path
     found = identify_archives([imported(tmp_path / "one.mcap")], Silent())
     assert any("temporal split" in doubt for doubt in found.results.verdict.doubts)
     assert [run.archive for run in found.results.validation] == ["one.mcap (last part)"]
+    assert "unseen" not in found.verdict.line.split(":")[0]
+
+
+def test_a_repetition_of_what_was_fitted_is_not_called_unseen(campaign: Campaign) -> None:
+    found = identify_archives(campaign.folder.completed("excitation"), Silent())
+    assert found.verdict.line.startswith("The model predicts a repetition of the fitted motion")
+
+
+def test_a_recording_without_torque_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArchiveError, match=r"bare\.mcap.*no joint torques"):
+        identify_archives([imported(tmp_path / "bare.mcap", torque=False)], Silent())

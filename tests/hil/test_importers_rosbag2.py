@@ -101,6 +101,12 @@ class TestRobot:
         assert model.gravity.tolist() == [0, 9.81, 0]
         assert not model.rotor_inertia
 
+    def test_a_transmission_of_the_same_name_does_not_hide_a_fixed_joint(self, tmp_path):
+        again = '<transmission name="t"><joint name="ankle"/></transmission></robot>'
+        (tmp_path / "two.urdf").write_text(URDF.replace("</robot>", again))
+        held = Robot.from_urdf(tmp_path / "two.urdf", fixed_joints=["ankle"])
+        assert held.joint_names == ("hip",)
+
     def test_a_fixed_joint_is_no_joint_any_more(self, tmp_path):
         (tmp_path / "two.urdf").write_text(URDF)
         held = Robot.from_urdf(tmp_path / "two.urdf", fixed_joints=["ankle"])
