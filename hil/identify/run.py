@@ -23,7 +23,7 @@ from identification.verdict import Verdict, judge
 
 from .options import Options
 from .sources import Source, Sources, gather_sources
-from .summary import summarise
+from .summary import moving_rows, summarise
 
 Array = NDArray[np.float64]
 
@@ -160,10 +160,10 @@ def _series(
 ) -> ReportSeries:
     model = sources.cell.model
     motion = excitation.motion
-    shown = _moving(excitation)
+    shown = _thinned(moving_rows(excitation))
     time = example.motion.time
     predicted = example.predicted_torque(model, estimate.pooled.values)
-    drawn = _moving(example)
+    drawn = _thinned(moving_rows(example))
     return ReportSeries(
         excitation_time=motion.time[shown] - excitation.origin,
         excitation_position=motion.position[shown],
@@ -175,10 +175,6 @@ def _series(
     )
 
 
-def _moving(samples: Samples) -> slice:
-    """Rows of the motion, thinned for a figure: at rest no model of sliding friction is right."""
-    moving = np.flatnonzero(samples.usable.any(axis=1))
-    if not moving.size:
-        return slice(0, 0)
-    first, last = int(moving[0]), int(moving[-1]) + 1
-    return slice(first, last, max(1, (last - first) // FIGURE_SAMPLES))
+def _thinned(rows: slice) -> slice:
+    """Rows of the motion for a figure: at rest no model of sliding friction is right."""
+    return slice(rows.start, rows.stop, max(1, (rows.stop - rows.start) // FIGURE_SAMPLES))

@@ -53,7 +53,7 @@ def summarise(
 ) -> Results:
     """Everything that was found, as it goes into `results.json`."""
     cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
-    rows = [_moving_rows(samples) for samples in training]
+    rows = [moving_rows(samples) for samples in training]
     gram = information(_executed(cell.model, training, rows))
     simulated = sources.metadata.get("simulated") == "yes"
     truth = planted_values(cell) if simulated and cell.file.simulation else None
@@ -136,7 +136,7 @@ def _excitation(
     )
 
 
-def _moving_rows(samples: Samples) -> slice:
+def moving_rows(samples: Samples) -> slice:
     """Time samples from the first to the last in which some joint moves."""
     moving = np.flatnonzero(samples.usable.any(axis=1))
     return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
