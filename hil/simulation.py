@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,11 +124,14 @@ def unmodelled_effects(cell: Cell) -> UnmodelledEffects:
 def simulated_provenance(cell: Cell, effects: bool) -> dict[str, str]:
     """Metadata that marks an archive as simulated, and with what."""
     sizes = unmodelled_effects(cell) if effects else UnmodelledEffects()
-    switched_on = [
-        f"{effect.name.replace('_', ' ')} {getattr(sizes, effect.name)}"
-        for effect in fields(sizes)
-        if getattr(sizes, effect.name)
-    ]
+    elasticity = ", ".join(f"{compliance:g}" for compliance in sizes.elasticity)
+    described = {
+        f"torque ripple of {sizes.torque_ripple:.0%} of the Coulomb torque": sizes.torque_ripple,
+        f"friction drift of {sizes.friction_drift:.0%} from cold to hot": sizes.friction_drift,
+        f"elasticity of {elasticity} rad/(N·m)": any(sizes.elasticity),
+        f"delay of {1e3 * sizes.delay:g} ms": sizes.delay,
+    }
+    switched_on = [text for text, size in described.items() if size]
     return {
         "simulated": "yes",
         "seed": str(cell.simulation.seed),
