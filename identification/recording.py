@@ -106,27 +106,6 @@ class Recording:
         self._check_stuck()
         return self
 
-    def reordered(self, joint_names: Sequence[str]) -> Recording:
-        """Return the recording with its joints in the given order; others are left out.
-
-        Raises:
-            RecordingError: a joint that was not recorded.
-        """
-        missing = [name for name in joint_names if name not in self.joint_names]
-        if missing:
-            raise RecordingError(
-                "joints",
-                f"joint {missing[0]} was not recorded; recorded are {', '.join(self.joint_names)}",
-                joint=missing[0],
-            )
-        columns = [self.joint_names.index(name) for name in joint_names]
-        return replace(
-            self,
-            joint_names=tuple(joint_names),
-            held_joints=tuple(name for name in self.held_joints if name in joint_names),
-            **self._each_channel(lambda array: array[:, columns]),
-        )
-
     def between(self, start: int, stop: int) -> Recording:
         """Return samples start to stop (exclusive) as a recording of its own."""
         return replace(

@@ -99,7 +99,16 @@ class Link:
     def over(
         cls, transport: SimulatedTransport, cell: Cell, finish: Callable[[], None] = lambda: None
     ) -> Link:
-        """A link to the simulated controller of `cell` over `transport`."""
+        """A link to the simulated controller of `cell` over `transport`.
+
+        Raises:
+            TypeError: the transport is a real one, which this loop is not fit for.
+        """
+        if not isinstance(transport, SimulatedTransport):
+            raise TypeError(
+                f"{type(transport).__name__} is not virtual time: on a real link the exchange "
+                "must not share a thread with the archive"
+            )
         ring = CycleRing(len(cell.joint_names), capacity=10 * DRAIN_CYCLES)
         session = Session(
             cell.drive_train,

@@ -200,7 +200,7 @@ class _States:
                 self.source,
                 f"none of the joints {', '.join(self.joints)} was recorded; {recorded}",
                 field="joints",
-                remedy="give the URDF of this robot, or map the names",
+                remedy="give the URDF of this robot, or one with the recorded names",
             )
         position = self._column("position")
         if position is None:
@@ -240,7 +240,7 @@ class _States:
                     self.source,
                     f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}",
                     field="joints",
-                    remedy="map the names, or fix the joints that were not recorded",
+                    remedy="give a URDF with the recorded names, or hold the others with --fixed",
                 )
             self._orders[names] = [] if missing else [ours.index(joint) for joint in self.joints]
         return self._orders[names]

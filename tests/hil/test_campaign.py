@@ -200,6 +200,14 @@ def test_a_controller_that_announces_another_drive_train_is_refused(
     assert not list(campaign.folder.archives.iterdir())
 
 
+def test_a_real_link_is_not_driven_from_the_archives_thread(cell: Cell) -> None:
+    class Wire:
+        now = 0.0
+
+    with pytest.raises(TypeError, match="Wire is not virtual time"):
+        Link.over(Wire(), cell)  # type: ignore[arg-type]
+
+
 def test_a_stop_before_the_connection_moves_nothing(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:

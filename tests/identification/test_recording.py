@@ -144,17 +144,6 @@ def test_joints_that_are_not_the_models_are_refused_by_name(
     assert (refused.value.check, refused.value.joint) == ("joints", named)
 
 
-def test_joints_can_be_put_in_the_models_order_on_purpose() -> None:
-    recording = a_recording()
-    turned = recording.reordered(("wrist", "shoulder"))
-    np.testing.assert_array_equal(turned.position, recording.position[:, [2, 0]])
-    assert turned.torque is not None and recording.torque is not None
-    np.testing.assert_array_equal(turned.torque, recording.torque[:, [2, 0]])
-    turned.checked(("wrist", "shoulder"))
-    with pytest.raises(RecordingError, match="hand was not recorded"):
-        recording.reordered(("hand",))
-
-
 def test_reported_gaps_and_jumps_of_the_clock_split_a_recording() -> None:
     recording = a_recording()
     gap = np.zeros(200, dtype=bool)
