@@ -35,6 +35,7 @@ test-slow: $(STAMP)  ## the tests that take minutes
 bench: $(STAMP)  ## every benchmark that needs no data beside the project
 	$(BIN)/python -m benchmarks.regressor
 	$(BIN)/python -m benchmarks.session
+	$(BIN)/python -m benchmarks.turnaround --busy
 
 clean:  ## remove .venv, runs and caches
 	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,10 +1,14 @@
 """Cost of one cycle: session, guard and drive train of a six-joint arm in open mode.
 
-A first run records what a controller with a perfect arm sends while a sinusoid runs; the timed
-runs replay these packets, so that only `Session.reply` (with the motion source's table look-up
-inside) stands between the two clock readings. `--warm` cycles at the beginning are left out.
+A first run records what a controller with a perfect arm sends while periodic joint sinusoids run;
+the timed runs replay these packets, period after period with running numbers, so that only
+`Session.reply` (with the motion source's table look-up inside) stands between the two clock
+readings. `--warm` cycles at the beginning are left out.
 
-    python -m benchmarks.session [--json] [--cycles N] [--runs N]
+With enough cycles for it, the cost of the first and of the last `--window` cycles are compared,
+and a further run says what memory was allocated in between and not given back.
+
+    python -m benchmarks.session [--json] [--cycles N] [--runs N] [--window N]
 """
 
 # ruff: noqa: E402  the number of BLAS threads has to stand before numpy is imported
@@ -19,7 +23,11 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import argparse
 import gc
 import json
+import struct
 import time
+import tracemalloc
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,16 +42,22 @@ PERIOD_MS = 2
 N = 6
 AMPLITUDE = np.array([0.8, 0.5, 0.6, 0.9, 0.7, 1.2])
 FREQUENCY = np.array([0.21, 0.17, 0.26, 0.31, 0.37, 0.29])
+FADE = 1_000
+"""Cycles in which the sinusoids fade in."""
+LOOP = 50_000
+"""Cycles after which all of them, being multiples of 0.01 Hz, begin again."""
+START = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
 
 
 class Sinusoid:
-    """Joint sinusoids from rest, faded in over two seconds, as a table."""
+    """Joint sinusoids from rest, faded in over two seconds and going on for ever, as a table."""
 
     bounds: BoundsName = "plan"
+    finished = False
 
-    def __init__(self, start: Array, cycles: int) -> None:
-        t = np.arange(cycles + 1)[:, None] * (PERIOD_MS / 1000.0)
-        s = np.clip(t / 2.0, 0.0, 1.0)
+    def __init__(self, start: Array) -> None:
+        t = np.arange(FADE + LOOP)[:, None] * (PERIOD_MS / 1000.0)
+        s = np.clip(t / (FADE * PERIOD_MS / 1000.0), 0.0, 1.0)
         fade = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
         rate = 0.5 * 140.0 * s**3 * (1.0 - s) ** 3
         phase = 2.0 * np.pi * FREQUENCY * t
@@ -53,11 +67,6 @@ class Sinusoid:
         self.start = start
         self._index = 0
 
-    @property
-    def finished(self) -> bool:
-        """Whether the table is at its end."""
-        return self._index + 1 >= len(self.position)
-
     def begin(self, position: Array) -> None:
         """Shift the table to where the arm is."""
         self.position = self.position + (position - self.start)
@@ -65,6 +74,8 @@ class Sinusoid:
     def advance(self) -> tuple[Array, Array]:
         """The next row."""
         self._index += 1
+        if self._index == FADE + LOOP:
+            self._index = FADE
         return self.position[self._index], self.velocity[self._index]
 
     def stop(self) -> None:
@@ -101,10 +112,17 @@ def new_session(capacity: int) -> Session:
     return Session(drive_train(), Guard(limits, PERIOD_MS / 1000.0), CycleRing(N, capacity))
 
 
-def record(cycles: int) -> list[bytes]:
-    """Packets of a controller whose arm is where it was told to be."""
+CLOSED = 3
+"""Cycles before the axes open."""
+_NUMBER = struct.Struct("<i")
+
+
+def record() -> list[bytes]:
+    """Init and cyclic packets of a controller whose arm is where it was told to be.
+
+    The last `LOOP` of them may be repeated for ever.
+    """
     session = new_session(64)
-    start = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
     drives = drive_train()
     init = InitPacket.build(
         N,
@@ -119,14 +137,14 @@ def record(cycles: int) -> list[bytes]:
     ).encode()
     packets = [init]
     session.reply(init, 0.0)
-    session.request(Sinusoid(start, cycles))
+    session.request(Sinusoid(START))
     axes = CyclicPacket.zeros(1, N).axes
-    axes["d"][:, 0] = axes["d"][:, 2] = drives.motor_revolutions(start)
+    axes["d"][:, 0] = axes["d"][:, 2] = drives.motor_revolutions(START)
     axes["d"][:, 4] = 1.0
     number = 10
-    for cycle in range(cycles):
+    for cycle in range(CLOSED + 2 + FADE + LOOP):
         number = next_number(number)
-        axes["mode"] = Mode.CLOSED if cycle < 3 else Mode.POSITION
+        axes["mode"] = Mode.CLOSED if cycle < CLOSED else Mode.POSITION
         status = bytes([DRIVE_ON, 0, 0, 0])
         packet = CyclicPacket(number, status, bytes(4), axes.copy()).encode()
         packets.append(packet)
@@ -139,21 +157,74 @@ def record(cycles: int) -> list[bytes]:
     return packets
 
 
-def replay(packets: list[bytes]) -> Array:
-    """Duration of each `reply`, s."""
+def stream(packets: list[bytes], cycles: int) -> Iterator[bytes]:
+    """`cycles` cyclic packets with running numbers."""
+    number, index = 10, 0
+    for _ in range(cycles):
+        number, index = next_number(number), index + 1
+        if index == len(packets):
+            index -= LOOP
+        yield _NUMBER.pack(number) + packets[index][4:]
+
+
+def begun(packets: list[bytes]) -> Session:
+    """A session that has had the init packet and a motion requested."""
     session = new_session(4096)
-    session.reply(packets[0], time.perf_counter())
-    session.request(Sinusoid(np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6]), len(packets)))
+    session.reply(packets[0], 0.0)
+    session.request(Sinusoid(START))
+    return session
+
+
+def replay(packets: list[bytes], cycles: int) -> Array:
+    """Duration of each `reply`, s."""
+    session = begun(packets)
     reply, clock = session.reply, time.perf_counter
-    durations = np.empty(len(packets) - 1)
+    durations = np.empty(cycles)
     gc.disable()
-    for index, packet in enumerate(packets[1:]):
+    for index, packet in enumerate(stream(packets, cycles)):
         begin = clock()
-        reply(packet, begin)
+        # The link's own time, because a run is faster than the cycle and may be interrupted.
+        reply(packet, index * PERIOD_MS / 1000.0)
         durations[index] = clock() - begin
     gc.enable()
     assert session.state is State.OPEN, session.events()[-1]
     return durations
+
+
+def allocated(packets: list[bytes], cycles: int, warm: int) -> int:
+    """Bytes allocated after `warm` cycles that are not free again after `cycles`."""
+    session = begun(packets)
+    for index, packet in enumerate(stream(packets, cycles)):
+        if index == warm:
+            tracemalloc.start()
+            gc.collect()
+            before = tracemalloc.get_traced_memory()[0]
+        session.reply(packet, index * PERIOD_MS / 1000.0)
+    gc.collect()
+    growth = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert session.state is State.OPEN, session.events()[-1]
+    return growth
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """All figures."""
+    packets = record()
+    warm, window = options.warm, options.window
+    runs = np.array([replay(packets, options.cycles)[warm:] for _ in range(options.runs)]) * 1e6
+    # Another process can only make a cycle longer: the quietest run is nearest the truth.
+    quietest = runs[np.argmin(np.median(runs, axis=1))]
+    result = {
+        "median_us": round(float(np.median(quietest)), 2),
+        "p99_us": round(float(np.percentile(quietest, 99)), 2),
+        "worst_run_median_us": round(float(np.median(runs, axis=1).max()), 2),
+        "cycles": len(quietest),
+    }
+    if len(quietest) >= 2 * window:
+        result["median_first_us"] = round(float(np.median(quietest[:window])), 2)
+        result["median_last_us"] = round(float(np.median(quietest[-window:])), 2)
+        result["allocated_bytes"] = allocated(packets, options.cycles, warm)
+    return result
 
 
 def main() -> None:
@@ -163,17 +234,11 @@ def main() -> None:
     parser.add_argument("--cycles", type=int, default=20_000)
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--warm", type=int, default=1_000)
+    parser.add_argument("--window", type=int, default=100_000)
     options = parser.parse_args()
-    packets = record(options.cycles)
-    durations = np.array([replay(packets)[options.warm :] for _ in range(options.runs)]) * 1e6
-    # Another process can only make a cycle longer: the quietest run is nearest the truth.
-    quietest = durations[np.argmin(np.median(durations, axis=1))]
-    result = {
-        "median_us": round(float(np.median(quietest)), 2),
-        "p99_us": round(float(np.percentile(quietest, 99)), 2),
-        "worst_run_median_us": round(float(np.median(durations, axis=1).max()), 2),
-        "cycles": len(quietest),
-    }
+    if options.cycles <= options.warm:
+        parser.error(f"--cycles must be more than the {options.warm} of --warm")
+    result = measure(options)
     if not options.json:
         print(f"session + guard + drive train, {N} joints, {PERIOD_MS} ms, open mode")
         for name, value in result.items():

@@ -10,6 +10,8 @@ from drivers.errors import PacketError
 from drivers.packets import InitPacket
 from drivers.replies import D1, Floats
 
+Ages = NDArray[np.uint16]
+
 Array = NDArray[np.float64]
 
 
@@ -19,6 +21,7 @@ class ArmWire:
     Attributes:
         joint_slots: (n,) slot of each joint.
         raw: (8, n) D1..D5, extra1..3 of the packet read last, in wire units.
+        age: (8, n) cycles since each of them was sent; None where all came with this packet.
         n_axes: slots in a packet.
 
     Raises:
@@ -50,10 +53,15 @@ class ArmWire:
         at_zero = -self._motor_offset @ self._to_joint
         self._offset = np.array([at_zero, zero, at_zero, zero])
         self.raw = np.zeros((8, n))
+        self.age: Ages | None = None
 
-    def read(self, received: Floats, measured: Array) -> None:
-        """Take a packet's axis blocks (n_axes, 9) into `raw`, and (8, n) into `measured` in SI."""
+    def read(self, received: Floats, measured: Array, ages: Ages | None = None) -> None:
+        """Take a packet's axis blocks (n_axes, 9) into `raw`, and (8, n) into `measured` in SI.
+
+        `ages` (n_axes, 8) go with the blocks; None if nothing is older than the packet.
+        """
         raw = self.raw
+        self.age = None if ages is None else ages[self._pick].T
         raw[...] = received[self._pick, D1:].T
         kinematics = measured[:4]
         np.matmul(raw[:4], self._to_joint, out=kinematics)
@@ -66,6 +74,15 @@ class ArmWire:
         motor: Array = np.dot(q, self._to_motor)
         motor += self._motor_offset
         return motor
+
+    def motor_difference(self, dq: Array) -> Array:
+        """Differences of joint positions (n,) rad to motor revolutions (n,)."""
+        difference: Array = np.dot(dq, self._to_motor)
+        return difference
+
+    def put(self, frame: Floats, column: int, values: Array) -> None:
+        """Put values (n,) into one column of a frame."""
+        frame[self._pick, column] = values
 
     def write(self, frame: Floats, position: Array, step: Array) -> None:
         """Put set-points (n,) in motor revolutions, per cycle, into a frame's D1 and D2."""

@@ -7,28 +7,52 @@
     ├── DriveTrainError      a drive train that cannot be (zero gear ratio, no wrist to couple)
     ├── RequestError         a motion asked for at a moment when none can be promised
     ├── TransportClosed      the link was closed, or its far end is gone for good
+    ├── TransportError       a link that cannot be opened or has broken (`drivers.transports.base`)
+    ├── ExchangeError        the exchange process does not do as asked (`drivers.exchange.errors`)
     └── RefusalError         a set-point that never left, and why
         ├── SourceFailed     the motion source raised, or gave arrays of the wrong shape
         ├── AxisLeft         an axis is not in the open mode that the motion needs
-        └── GuardError       a number outside its bound: joint, value, bound, cycle
+        ├── ExitNotGranted   the controller does not leave open mode although asked to
+        └── GuardError       a number outside its bound: joint, value, bound, unit, cycle
             ├── NotFinite
             ├── PositionLimit, VelocityLimit, AccelerationLimit, JerkLimit
             ├── VelocityMismatch   velocity is not the derivative of the positions
             ├── FollowingError
             ├── CurrentLimit
+            │   └── CommandedCurrentLimit
+            ├── CorrectionNotEnded a correction, or feed-forward, is over but not back at zero
             ├── FirstSetPoint      away from the arm
-            │   └── NotAtStandstill
+            │   ├── NotAtStandstill
+            │   └── FirstSetPointUnknown  what it is judged by is not of this cycle
             └── MotionNotCarriedOn the target is elsewhere after a long gap
-                └── MotionHeld     or has been brought to rest
+                ├── MotionHeld     or has been brought to rest
+                │   └── MotionUnknown     or what it is judged by is not of this cycle
+                └── CorrectionNotCarriedOn  or nothing tells whether a correction was kept
+
+All of them survive pickling with message and attributes, though without their cause.
 """
 
 # ruff: noqa: N818  the leaves are named for what is wrong; their roots end in Error
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class DriverError(Exception):
     """Root of every error raised on purpose by this package."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # An exception is unpickled by calling its class with `args`, here the message alone.
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(
+    kind: type[DriverError], args: tuple[object, ...], attributes: dict[str, object]
+) -> DriverError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(attributes)
+    return error
 
 
 class PacketError(DriverError):
@@ -64,17 +88,19 @@ class DriveTrainError(DriverError):
 
 
 class RequestError(DriverError):
-    """A motion was requested at a moment when none can be promised.
+    """A motion, or a change of its speed, was requested when none can be promised.
 
     Attributes:
         state: name of the session's state.
         reason: why not, and what has to happen first.
+        what: was requested.
     """
 
-    def __init__(self, state: str, reason: str) -> None:
-        super().__init__(f"no motion can be requested in state '{state}': {reason}")
+    def __init__(self, state: str, reason: str, what: str = "motion") -> None:
+        super().__init__(f"no {what} can be requested in state '{state}': {reason}")
         self.state = state
         self.reason = reason
+        self.what = what
 
 
 class TransportClosed(DriverError):
@@ -113,6 +139,20 @@ class AxisLeft(RefusalError):
         self.wanted = wanted
 
 
+class ExitNotGranted(RefusalError):
+    """The controller keeps axes in open mode although their end of open mode was asked for.
+
+    Attributes:
+        cycles: for so many of the controller's cycles.
+    """
+
+    def __init__(self, cycles: int, cycle: int) -> None:
+        super().__init__(
+            f"open mode was asked to end {cycles} cycles ago and axes are still open", cycle
+        )
+        self.cycles = cycles
+
+
 class GuardError(RefusalError):
     """A number outside its bound.
 
@@ -128,12 +168,16 @@ class GuardError(RefusalError):
     check = "guard"
     unit = ""
 
-    def __init__(self, joint: int, value: float, bound: float, cycle: int) -> None:
+    def __init__(
+        self, joint: int, value: float, bound: float, cycle: int, unit: str | None = None
+    ) -> None:
+        unit = self.unit if unit is None else unit
         super().__init__(
-            f"{self.check} of joint {joint + 1} is {value:.9g} {self.unit}; "
-            f"allowed is {bound:.9g} {self.unit}",
+            f"{self.check} of joint {joint + 1} is {value:.9g} {unit}; "
+            f"allowed is {bound:.9g} {unit}",
             cycle,
         )
+        self.unit = unit
         self.joint = joint
         self.value = value
         self.bound = bound
@@ -194,6 +238,18 @@ class CurrentLimit(GuardError):
     unit = "A"
 
 
+class CommandedCurrentLimit(CurrentLimit):
+    """Fed forward, or together with the servo's own, a current is more than is allowed."""
+
+    check = "commanded current"
+
+
+class CorrectionNotEnded(GuardError):
+    """A source says that it is finished while a correction of its, or feed-forward, is not zero."""
+
+    check = "correction at the end"
+
+
 class FirstSetPoint(GuardError):
     """The first set-point is not where the arm is, or the arm is not at rest."""
 
@@ -208,6 +264,13 @@ class NotAtStandstill(FirstSetPoint):
     unit = "motor revolutions per cycle"
 
 
+class FirstSetPointUnknown(FirstSetPoint):
+    """Target, position or velocity received with it were sent in an earlier cycle."""
+
+    check = "age, at the first set-point, of received target, position or velocity"
+    unit = "cycles"
+
+
 class MotionNotCarriedOn(GuardError):
     """After a long gap the controller's target is not the set-point sent last."""
 
@@ -220,3 +283,16 @@ class MotionHeld(MotionNotCarriedOn):
 
     check = "difference, after a gap, between received velocity and the one sent last"
     unit = "motor revolutions per cycle"
+
+
+class MotionUnknown(MotionHeld):
+    """After a long gap, target or velocity received were sent in an earlier cycle."""
+
+    check = "age, after a gap, of received target or velocity"
+    unit = "cycles"
+
+
+class CorrectionNotCarriedOn(MotionNotCarriedOn):
+    """After a long gap nothing tells whether the controller kept the correction sent last."""
+
+    check = "correction sent last before a gap"

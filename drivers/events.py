@@ -1,4 +1,7 @@
-"""What a session tells whoever runs it. Drained by `Session.events`, in order."""
+"""What a session tells whoever runs it. Drained by `Session.events`, in order.
+
+Every event survives pickling, so that another process may be told.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,14 @@ from drivers.packets import InitPacket
 from drivers.states import State
 
 Outcome = Literal["completed", "stopped", "refused", "lost"]
-Rejection = Literal["malformed", "stale", "ended"]
 
 
 @dataclass
 class Counters:
-    """How many packets had which fate since the session was made; `missed` never arrived."""
+    """How many packets had which fate since the session was made.
+
+    `missed` never arrived; `discarded` were dropped by the link, by kind ("foreign", "torn", ...).
+    """
 
     answered: int = 0
     duplicates: int = 0
@@ -27,6 +32,7 @@ class Counters:
     ended: int = 0
     missed: int = 0
     refused: int = 0
+    discarded: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +42,14 @@ class InitReceived:
     Attributes:
         init: its init packet.
         unusable: why this session cannot move the arm, or None if it can.
+        differences: from what the cell says of the arm, each naming the axis and both values.
+        adopted: the controller's gear ratios, calibration and coupling are in force.
     """
 
     init: InitPacket = field(repr=False)
     unusable: str | None
+    differences: tuple[str, ...] = ()
+    adopted: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,9 +97,14 @@ class MotionEnded:
 
 @dataclass(frozen=True)
 class PacketRejected:
-    """`count` packets since the last drain got no answer."""
+    """`count` packets since the last drain got no answer.
 
-    kind: Rejection
+    Attributes:
+        kind: "malformed", "stale" or "ended", or what the link discarded them for.
+        count: how many.
+    """
+
+    kind: str
     count: int
 
 

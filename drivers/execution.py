@@ -1,32 +1,40 @@
-"""The life of one requested motion, from request to rest."""
+"""The life of one requested motion or correction, from request to rest.
+
+A source is foreign code inside the cycle: whatever it raises, any array that is not (n,) numbers,
+and bounds wider than what it was granted become `SourceFailed`. It is granted the bounds of a
+plan; those of an override from the first change of override on, and those of a stop from `stop`
+on. A stop that takes too long is a failure too.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+from abc import ABC, abstractmethod
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import SourceFailed
 from drivers.events import Outcome
-from drivers.motion_source import BoundsName, MotionSource
+from drivers.motion_source import (
+    BoundsName,
+    CorrectionSource,
+    FeedForwardSource,
+    MotionSource,
+    OverridableSource,
+    is_correction,
+    is_motion,
+)
+from drivers.states import CORRECTION_MODES, POSITION_MODES
 
 Array = NDArray[np.float64]
 
-# No live override can be asked for, so no source has a use for its bounds.
-_MOVING: Final = ("plan",)
-_STOPPING: Final = ("plan", "stop")
 
-
-class Execution:
-    """Asks one motion source for set-points and keeps the answer honest.
-
-    A source is foreign code inside the cycle: whatever it raises, any array that is not (n,)
-    numbers, and bounds wider than what it was asked for become `SourceFailed`: it has those of a
-    plan, from `stop` on those of a stop as well. So does a stop that takes too long.
+class Execution(ABC):
+    """What motions and corrections have in common.
 
     Args:
-        source: the motion.
+        source: the motion or correction.
         n_joints: n.
         settle_cycles: how long its end is held.
         stop_cycles: how many set-points it may give after it was told to stop.
@@ -34,83 +42,89 @@ class Execution:
     Attributes:
         started: the first set-point was taken.
         leaving: the motion came to rest and open mode is being left.
+        finished: the source said so.
         outcome: what it will be called when open mode has been left.
         reason: in words.
     """
 
     def __init__(
-        self, source: MotionSource, n_joints: int, settle_cycles: int, stop_cycles: int
+        self,
+        source: MotionSource | CorrectionSource,
+        n_joints: int,
+        settle_cycles: int,
+        stop_cycles: int,
     ) -> None:
         self._source = source
         self._shape = (n_joints,)
         self._still = np.zeros(n_joints)
         self._settle_cycles = settle_cycles
-        self._granted: tuple[str, ...] = _MOVING
         self._stop_cycles = stop_cycles
+        self._granted: tuple[BoundsName, ...] = ("plan",)
         self._stopping = 0
         self._resting = 0
-        self._finished = False
+        self.finished = False
         self.started = False
         self.leaving = False
         self.outcome: Outcome = "completed"
         self.reason = "the motion came to its end"
-        self.position = self._still
 
     @property
     def settled(self) -> bool:
-        """Whether the arm was held at the end for as long as was asked."""
-        return self._finished and self._resting >= self._settle_cycles
+        """Whether the end was held for as long as was asked."""
+        return self.finished and self._resting >= self._settle_cycles
 
+    @property
+    def granted(self) -> BoundsName:
+        """The widest bounds granted so far."""
+        return self._granted[-1]
+
+    @abstractmethod
     def begin(self, position: Array, cycle: int) -> None:
         """Take the first set-point, (n,) rad.
 
         Raises:
             SourceFailed: the source does not begin there.
         """
-        self.position = position
-        try:
-            self._source.begin(position.copy())
-            self._finished = bool(self._source.finished)
-        except Exception as error:
-            raise SourceFailed(f"the motion cannot begin: {error}", cycle) from error
-        self.started = True
 
-    def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
-        """The next set-point (n,) rad, rad/s, and the bounds it keeps; the end is held.
+    def stop(self, reason: str, cycle: int) -> None:
+        """Come to rest on the path. The first reason stays.
 
         Raises:
-            SourceFailed: the source raised or gave no proper set-point.
+            SourceFailed: the source raised.
         """
+        if self.outcome == "stopped" or self.finished:
+            return
+        self.outcome = "stopped"
+        self.reason = reason
+        self._granted = (*self._granted, "stop")
         try:
-            if self._finished:
-                self._resting += 1
-                return self.position, self._still, self._bounds(cycle)
-            position, velocity = self._source.advance()
-            position = np.asarray(position, dtype=np.float64)
-            velocity = np.asarray(velocity, dtype=np.float64)
-            bounds = self._bounds(cycle)
-            self._finished = bool(self._source.finished)
-        except SourceFailed:
-            raise
+            self._source.stop()
         except Exception as error:
-            raise SourceFailed(f"the motion source failed: {error}", cycle) from error
-        if position.shape != self._shape or velocity.shape != self._shape:
-            raise SourceFailed(
-                f"the motion source gave shapes {position.shape} and {velocity.shape}, "
-                f"not {self._shape}",
-                cycle,
-            )
-        self._count_stopping(cycle)
-        # The source may reuse its arrays.
-        self.position = position.copy()
-        return self.position, velocity, bounds
+            raise _failed("failed to stop", error, cycle) from error
 
-    def _bounds(self, cycle: int) -> BoundsName:
-        bounds = self._source.bounds
-        if not isinstance(bounds, str) or bounds not in self._granted:
-            granted = " or ".join(self._granted)
-            raise SourceFailed(f"the motion source named bounds {bounds!r}, not {granted}", cycle)
-        return bounds
+    def override(self, fraction: float) -> str | None:
+        """Pass a change of override on; says why that cannot be, or None."""
+        if not callable(getattr(self._source, "override", None)):
+            return "this motion knows no override"
+        if self.outcome == "stopped":
+            return "the motion was told to stop"
+        if not 0.0 <= fraction <= 1.0:
+            return f"an override of {fraction!r} is not one of 0..1"
+        try:
+            cast(OverridableSource, self._source).override(float(fraction))
+        except Exception as error:
+            return f"the motion source refused it: {type(error).__name__}: {error}"
+        if "override" not in self._granted:
+            self._granted = (*self._granted, "override")
+        return None
+
+    def _checked(self, values: object, what: str, cycle: int) -> Array:
+        array = np.asarray(values, dtype=np.float64)
+        if array.shape != self._shape:
+            raise SourceFailed(
+                f"the motion source gave a {what} of shape {array.shape}, not {self._shape}", cycle
+            )
+        return array
 
     def _count_stopping(self, cycle: int) -> None:
         if self.outcome != "stopped":
@@ -123,18 +137,143 @@ class Execution:
                 cycle,
             )
 
-    def stop(self, reason: str, cycle: int) -> None:
-        """Come to rest on the path. The first reason stays.
+
+class MotionExecution(Execution):
+    """Asks a `MotionSource` for set-points.
+
+    Attributes:
+        position: (n,) rad, the set-point given last.
+        feeds_forward: the source is a `FeedForwardSource`.
+    """
+
+    _source: MotionSource
+
+    def __init__(
+        self, source: MotionSource, n_joints: int, settle_cycles: int, stop_cycles: int
+    ) -> None:
+        super().__init__(source, n_joints, settle_cycles, stop_cycles)
+        self.position = self._still
+        self.feeds_forward = callable(getattr(source, "feed_forward", None))
+
+    def begin(self, position: Array, cycle: int) -> None:
+        """Take the first set-point, (n,) rad.
 
         Raises:
-            SourceFailed: the source raised.
+            SourceFailed: the source does not begin there.
         """
-        if self.outcome == "stopped" or self._finished:
-            return
-        self.outcome = "stopped"
-        self.reason = reason
-        self._granted = _STOPPING
+        self.position = position
         try:
-            self._source.stop()
+            self._source.begin(position.copy())
+            self.finished = bool(self._source.finished)
         except Exception as error:
-            raise SourceFailed(f"the motion source failed to stop: {error}", cycle) from error
+            raise _failed("cannot begin", error, cycle) from error
+        self.started = True
+
+    def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
+        """The next set-point (n,) rad, rad/s, and the bounds it keeps; the end is held.
+
+        Raises:
+            SourceFailed: the source raised or gave no proper set-point.
+        """
+        try:
+            if self.finished:
+                self._resting += 1
+                return self.position, self._still, self._bounds(cycle)
+            given, speed = self._source.advance()
+            position = self._checked(given, "position", cycle)
+            velocity = self._checked(speed, "velocity", cycle)
+            bounds = self._bounds(cycle)
+            self.finished = bool(self._source.finished)
+        except SourceFailed:
+            raise
+        except Exception as error:
+            raise _failed("failed", error, cycle) from error
+        self._count_stopping(cycle)
+        # The source may reuse its arrays.
+        self.position = position.copy()
+        return self.position, velocity, bounds
+
+    def feed_forward(self, cycle: int) -> tuple[Array, Array]:
+        """Velocity (n,) rad/s and motor current (n,) A of the set-point given last.
+
+        Raises:
+            SourceFailed: the source raised or gave none.
+        """
+        if self._resting:
+            return self._still, self._still
+        try:
+            velocity, current = cast(FeedForwardSource, self._source).feed_forward()
+            return (
+                self._checked(velocity, "feed-forward velocity", cycle).copy(),
+                self._checked(current, "feed-forward current", cycle).copy(),
+            )
+        except SourceFailed:
+            raise
+        except Exception as error:
+            raise _failed("failed to feed forward", error, cycle) from error
+
+    def _bounds(self, cycle: int) -> BoundsName:
+        bounds = self._source.bounds
+        if not isinstance(bounds, str) or bounds not in self._granted:
+            granted = " or ".join(self._granted)
+            raise SourceFailed(f"the motion source named bounds {bounds!r}, not {granted}", cycle)
+        return bounds
+
+
+class CorrectionExecution(Execution):
+    """Asks a `CorrectionSource` for corrections; after its end they stay zero."""
+
+    _source: CorrectionSource
+
+    def begin(self, position: Array, cycle: int) -> None:  # noqa: ARG002  nobody asks where
+        """Every axis is open.
+
+        Raises:
+            SourceFailed: the source does not begin.
+        """
+        try:
+            self._source.begin()
+            self.finished = bool(self._source.finished)
+        except Exception as error:
+            raise _failed("cannot begin", error, cycle) from error
+        self.started = True
+
+    def advance(self, cycle: int) -> tuple[Array, Array]:
+        """The next correction: motion (n,), see `CorrectionSource`, and motor current (n,) A.
+
+        Raises:
+            SourceFailed: the source raised or gave no proper correction.
+        """
+        if self.finished:
+            self._resting += 1
+            return self._still, self._still
+        try:
+            given, amperes = self._source.advance()
+            motion = self._checked(given, "correction", cycle)
+            current = self._checked(amperes, "current", cycle)
+            self.finished = bool(self._source.finished)
+        except SourceFailed:
+            raise
+        except Exception as error:
+            raise _failed("failed", error, cycle) from error
+        self._count_stopping(cycle)
+        return motion.copy(), current.copy()
+
+
+def execution_of(
+    source: MotionSource | CorrectionSource,
+    mode: int,
+    n_joints: int,
+    settle_cycles: int,
+    stop_cycles: int,
+) -> Execution | None:
+    """The execution of a source of the kind that the open mode needs; None for any other."""
+    if mode in CORRECTION_MODES and is_correction(source):
+        return CorrectionExecution(source, n_joints, settle_cycles, stop_cycles)
+    if mode in POSITION_MODES and is_motion(source):
+        return MotionExecution(source, n_joints, settle_cycles, stop_cycles)
+    return None
+
+
+def _failed(what: str, error: Exception, cycle: int) -> SourceFailed:
+    return SourceFailed(f"the motion source {what}: {type(error).__name__}: {error}", cycle)

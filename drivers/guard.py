@@ -14,13 +14,12 @@ All comparisons are written so that NaN fails them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final, NoReturn
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.checks import report, require, require_finite
 from drivers.errors import (
     AccelerationLimit,
     CurrentLimit,
@@ -31,12 +30,14 @@ from drivers.errors import (
     MotionHeld,
     MotionNotCarriedOn,
     NotAtStandstill,
-    NotFinite,
     PositionLimit,
     VelocityLimit,
     VelocityMismatch,
 )
+from drivers.guard_limits import RANK, BoundsInForce, GuardLimits
 from drivers.motion_source import BoundsName
+
+__all__ = ["FIRST_FRACTION", "RELATIVE_TOLERANCE", "Guard", "GuardLimits"]
 
 Array = NDArray[np.float64]
 
@@ -44,83 +45,6 @@ RELATIVE_TOLERANCE: Final = 1e-6
 FIRST_FRACTION: Final = 0.1
 """Share of the following-error threshold allowed between target and arm at the first set-point,
 and between the target and the set-point sent last after a long gap."""
-DEFAULT_STANDSTILL: Final = 5e-4
-"""Motor revolutions per cycle below which an axis stands still.
-
-An encoder at rest toggles between two increments, so a velocity formed over one cycle shows one
-increment per cycle at worst and two with a little servo dither. Two increments of a coarse 12-bit
-encoder are 4.9e-4; at 2 ms this is some 0.5 % of a drive's full speed.
-"""
-
-_RANK: Final[Mapping[BoundsName, int]] = {"plan": 0, "override": 1, "stop": 2}
-_MEMORY: Final = 2
-"""Cycles for which wider bounds stay: a third difference reaches over three cycles."""
-
-
-@dataclass(frozen=True, eq=False)
-class GuardLimits:
-    """What the guard enforces; arrays (n,).
-
-    Attributes:
-        lower: rad, smallest joint position.
-        upper: rad, largest.
-        velocity: rad/s, magnitude, in all three sets of bounds.
-        acceleration: rad/s², of the set "plan".
-        jerk: rad/s³, of the set "plan".
-        following_error: motor revolutions, as the controller states its thresholds.
-        current: A.
-        override_acceleration: factor on acceleration while an override changes.
-        override_jerk: factor on jerk while an override changes.
-        stop_acceleration: factor on acceleration during hold and stop.
-        stop_jerk: factor on jerk during hold and stop.
-        standstill: motor revolutions per cycle, see `DEFAULT_STANDSTILL`.
-
-    Raises:
-        ValueError: a shape, sign or order is wrong; names the field.
-    """
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-    following_error: Array
-    current: Array
-    override_acceleration: float = 1.3
-    override_jerk: float = 1.7
-    stop_acceleration: float = 2.0
-    stop_jerk: float = 3.0
-    standstill: float = DEFAULT_STANDSTILL
-
-    def __post_init__(self) -> None:
-        n = np.size(self.lower)
-        for name in ("lower", "upper", "velocity", "acceleration", "jerk"):
-            self._check(name, n, positive=name not in ("lower", "upper"))
-        self._check("following_error", n, positive=True)
-        self._check("current", n, positive=True)
-        if not np.all(self.lower < self.upper):
-            raise ValueError(f"guard limits: lower {self.lower} is not below upper {self.upper}")
-        for plan, override, stop in (
-            (1.0, self.override_acceleration, self.stop_acceleration),
-            (1.0, self.override_jerk, self.stop_jerk),
-        ):
-            if not plan <= override <= stop:
-                raise ValueError(f"guard limits: factors 1 <= {override} <= {stop} do not hold")
-        if not self.standstill > 0.0:
-            raise ValueError(f"guard limits: standstill {self.standstill} is not positive")
-
-    def _check(self, name: str, n: int, *, positive: bool) -> None:
-        array = np.array(getattr(self, name), dtype=np.float64)
-        if array.shape != (n,) or not np.all(np.isfinite(array)):
-            raise ValueError(f"guard limits: {name} must be {n} finite numbers, got {array}")
-        if positive and not np.all(array > 0.0):
-            raise ValueError(f"guard limits: {name} must be positive, got {array}")
-        object.__setattr__(self, name, array)
-
-    @property
-    def n_joints(self) -> int:
-        """Number of joints n."""
-        return len(self.lower)
 
 
 # Rows of the matrix of checked quantities, in the order in which a violation is reported.
@@ -154,9 +78,9 @@ class Guard:
         self.period = period
         n = limits.n_joints
         self._middle = 0.5 * (limits.lower + limits.upper)
-        self._sets = {rank: self._bounds(rank) for rank in _RANK.values()}
-        self._rank = 0
-        self._age = 0
+        self._every = np.ones(n, dtype=np.bool_)
+        self._sets = {rank: self._bounds(rank) for rank in RANK.values()}
+        self._in_force = BoundsInForce()
         # Three sent set-points (oldest first), the candidate, and its stated velocity.
         self._history = np.zeros((5, n))
         self._quantities = np.zeros((len(_SET_POINT_CHECKS), n))
@@ -178,8 +102,7 @@ class Guard:
     def _bounds(self, rank: int) -> Array:
         """Bounds (6, n) of one set, tolerances included."""
         limits = self.limits
-        factor_a = (1.0, limits.override_acceleration, limits.stop_acceleration)[rank]
-        factor_j = (1.0, limits.override_jerk, limits.stop_jerk)[rank]
+        factor_a, factor_j = limits.factors(rank)
         T = self.period
         acceleration = factor_a * limits.acceleration
         reach = np.maximum(np.abs(limits.lower), np.abs(limits.upper))
@@ -201,6 +124,11 @@ class Guard:
         """Threshold in force, (n,) motor revolutions."""
         return self._threshold
 
+    @property
+    def current(self) -> Array:
+        """Limit in force, (n,) A."""
+        return self._current
+
     def narrow(self, following_error: Array, current: Array) -> None:
         """Take the controller's own limits where they are narrower; NaN means it has none.
 
@@ -211,7 +139,8 @@ class Guard:
         self._threshold = np.fmin(self.limits.following_error, following_error)
         self._feedback_bounds[0] = self._threshold
         self._feedback_bounds[1] = self._threshold
-        self._feedback_bounds[2] = np.fmin(self.limits.current, current)
+        self._current = np.fmin(self.limits.current, current)
+        self._feedback_bounds[2] = self._current
         self._feedback_bounds *= 1.0 + RELATIVE_TOLERANCE
 
     def check_hold(self, target: Array, actual: Array, held: NDArray[np.bool_], cycle: int) -> None:
@@ -226,9 +155,9 @@ class Guard:
         Raises:
             NotFinite, FollowingError: a target that cannot be held.
         """
-        _require_finite(target, held, cycle)
+        require_finite(target, held, cycle)
         error = np.abs(actual - target)
-        _require(held, error, self._threshold * (1.0 + RELATIVE_TOLERANCE), FollowingError, cycle)
+        require(held, error, self._threshold * (1.0 + RELATIVE_TOLERANCE), FollowingError, cycle)
 
     def begin(self, q: Array, target: Array, actual: Array, step: Array, cycle: int) -> None:
         """First set-point: the target received in the packet in which the last axis opened.
@@ -243,19 +172,39 @@ class Guard:
         Raises:
             NotFinite, PositionLimit, FirstSetPoint, NotAtStandstill: it must not be sent.
         """
-        every = np.ones(len(q), dtype=np.bool_)
-        _require_finite(target, every, cycle)
-        bound = FIRST_FRACTION * self._threshold
-        _require(every, np.abs(target - actual), bound, FirstSetPoint, cycle)
-        standstill = np.full(len(q), self.limits.standstill)
-        for velocity in step:
-            _require(every, np.abs(velocity), standstill, NotAtStandstill, cycle)
-        self._rank = self._age = 0
+        self.check_start(target, actual, step, cycle)
+        self._in_force.reset()
         self._history[:4] = q
         self.check_set_point(q, np.zeros_like(q), "plan", cycle)
 
+    def check_start(self, target: Array, actual: Array, step: Array, cycle: int) -> None:
+        """What holds in the cycle in which the arm may begin to move.
+
+        Args:
+            target: (n,) D1, motor revolutions.
+            actual: (n,) D3, motor revolutions.
+            step: (2, n) D2 and D4, motor revolutions per cycle.
+            cycle: for the error.
+
+        Raises:
+            NotFinite, FirstSetPoint, NotAtStandstill: it may not.
+        """
+        every = self._every
+        require_finite(target, every, cycle)
+        bound = FIRST_FRACTION * self._threshold
+        require(every, np.abs(target - actual), bound, FirstSetPoint, cycle)
+        standstill = np.full(len(target), self.limits.standstill)
+        for velocity in step:
+            require(every, np.abs(velocity), standstill, NotAtStandstill, cycle)
+
     def check_feedback(
-        self, target: Array, actual: Array, current: Array, commanded: Array, cycle: int
+        self,
+        target: Array,
+        actual: Array,
+        current: Array,
+        commanded: Array,
+        cycle: int,
+        where: NDArray[np.bool_] | None = None,
     ) -> None:
         """What the packet says of the arm, before the next set-point is asked for.
 
@@ -268,6 +217,7 @@ class Guard:
             current: (n,) D5, A.
             commanded: (n,) D1 of the answer sent last, motor revolutions.
             cycle: for the error.
+            where: (n,) which joints; None for all.
 
         Raises:
             NotFinite, FollowingError, CurrentLimit: the motion must not go on.
@@ -277,8 +227,10 @@ class Guard:
         np.subtract(actual, target, out=found[1])
         found[2] = current
         np.abs(found, out=found)
+        if where is not None:
+            found[:, ~where] = 0.0
         if not (found <= self._feedback_bounds).all():
-            _report(found, found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
+            report(found, found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
 
     def check_after_gap(
         self, target: Array, velocity: Array, commanded: Array, step: Array, cycle: int
@@ -298,14 +250,14 @@ class Guard:
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: going on would be a jump.
         """
-        every = np.ones(len(step), dtype=np.bool_)
+        every = self._every
         bound = FIRST_FRACTION * self._threshold
-        _require(every, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
+        require(every, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
         standstill = self.limits.standstill
         bound = np.maximum(0.5 * np.abs(step), standstill)
         moving = np.abs(velocity[1]) > standstill
         for where, found in ((every, velocity[0]), (~moving, velocity[1])):
-            _require(where, np.abs(found - step), bound, MotionHeld, cycle)
+            require(where, np.abs(found - step), bound, MotionHeld, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """The next set-point; if it passes, it counts as sent.
@@ -321,13 +273,6 @@ class Guard:
             NotFinite, PositionLimit, VelocityLimit, VelocityMismatch, AccelerationLimit,
             JerkLimit: it must not be sent.
         """
-        rank = _RANK[bounds]
-        if rank >= self._rank:
-            self._rank, self._age = rank, 0
-        elif self._age < _MEMORY:
-            self._age += 1
-        else:
-            self._rank = rank
         history = self._history
         history[:3] = history[1:4]
         history[3] = q
@@ -336,47 +281,11 @@ class Guard:
         np.matmul(self._differences, history, out=found)
         found[0] -= self._middle
         magnitude = np.abs(found)
-        allowed = self._sets[self._rank]
+        allowed = self._sets[self._in_force.take(bounds)]
         if not (magnitude <= allowed).all():
-            _report(magnitude, found, allowed, _SET_POINT_CHECKS, cycle, self)
+            report(magnitude, found, allowed, _SET_POINT_CHECKS, cycle, self.position_limits)
 
     def position_limits(self, joint: int, value: float) -> tuple[float, float]:
         """The position meant by `value` off the middle of the range, and the limit nearest it."""
         limit = self.limits.upper if value > 0.0 else self.limits.lower
         return float(self._middle[joint] + value), float(limit[joint])
-
-
-def _require_finite(values: Array, where: NDArray[np.bool_], cycle: int) -> None:
-    bad = where & ~np.isfinite(values)
-    if bad.any():
-        joint = int(np.argmax(bad))
-        raise NotFinite(joint, float(values[joint]), np.inf, cycle)
-
-
-def _require(
-    where: NDArray[np.bool_], values: Array, bounds: Array, error: type[GuardError], cycle: int
-) -> None:
-    bad = where & ~(values <= bounds)
-    if bad.any():
-        joint = int(np.argmax(bad))
-        kind = error if np.isfinite(values[joint]) else NotFinite
-        raise kind(joint, float(values[joint]), float(bounds[joint]), cycle)
-
-
-def _report(
-    magnitude: Array,
-    found: Array,
-    allowed: Array,
-    checks: tuple[type[GuardError], ...],
-    cycle: int,
-    guard: Guard | None = None,
-) -> NoReturn:
-    """Raise for the first row and joint outside its bound; NaN before everything else."""
-    not_finite = ~np.isfinite(magnitude)
-    bad = not_finite if not_finite.any() else ~(magnitude <= allowed)
-    row, joint = (int(index) for index in np.argwhere(bad)[0])
-    value, bound = float(found[row, joint]), float(allowed[row, joint])
-    kind = NotFinite if not_finite.any() else checks[row]
-    if kind is PositionLimit and guard is not None:
-        value, bound = guard.position_limits(joint, value)
-    raise kind(joint, value, bound, cycle)

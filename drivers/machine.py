@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from drivers.errors import RequestError
-from drivers.events import Event, MotionEnded, MotionStarted, Outcome, StateChanged
+import numpy as np
+
+from drivers.errors import AxisLeft, RequestError
+from drivers.events import Event, GapSeen, MotionEnded, MotionStarted, Outcome, StateChanged
 from drivers.execution import Execution
 from drivers.motion_source import Array
+from drivers.reading import Reading
 from drivers.states import HAS_SET_POINTS, TRANSITIONS, Input, State, keeps_request
 
 _LOSS: Final = {
@@ -31,6 +34,7 @@ class Machine:
     Attributes:
         state: where the session stands.
         cycle: the controller's cycle, for events.
+        entered_at: the cycle in which the state was entered.
         interval: index of the last interval in open mode, -1 before the first.
         in_interval: whether that interval goes on.
         entering: open mode was reached and the first set-point is still to be taken.
@@ -43,6 +47,7 @@ class Machine:
     def __init__(self) -> None:
         self.state = State.SYNC
         self.cycle = 0
+        self.entered_at = 0
         self.interval = -1
         self.in_interval = False
         self.entering = False
@@ -80,6 +85,28 @@ class Machine:
         if self.state in (State.OPENING, State.OPEN):
             self.stop_reason = self.stop_reason or reason
 
+    def note_gap(self, missed: int, unanswered: int, max_gap: int) -> None:
+        """`missed` packets never arrived; `unanswered` above `max_gap` end a motion on its path."""
+        if missed:
+            self.events.append(GapSeen(missed, self.cycle))
+        if unanswered > max_gap and self.state is State.OPEN and self.execution:
+            self.stop(f"{unanswered} packets were missed in a row")
+
+    def require_axes(self, reading: Reading, mode: int) -> None:
+        """A motion needs every wanted axis in its mode, from its beginning to its end.
+
+        Raises:
+            AxisLeft: one is not.
+        """
+        execution = self.execution
+        if execution is None or not reading.powered:
+            return
+        joint = reading.strayed
+        if execution.started and self.state is State.OPEN and reading.input is not Input.OPEN:
+            joint = int(np.argmin(reading.ready))
+        if joint is not None:
+            raise AxisLeft(joint, int(reading.modes[joint]), mode, self.cycle)
+
     def begin_motion(self, position: Array) -> None:
         """The first set-point of the motion is `position`, (n,) rad.
 
@@ -111,6 +138,7 @@ class Machine:
 
     def _enter(self, before: State, after: State) -> None:
         self.state = after
+        self.entered_at = self.cycle
         self.events.append(StateChanged(before, after, self.cycle))
         if after is State.OPEN:
             self.entering = True

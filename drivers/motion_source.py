@@ -1,8 +1,19 @@
-"""What the session asks for the next set-point."""
+"""What the session asks for the next set-point, or the next correction.
+
+===========  ==========================================================  ====================
+open mode    who generates the targets                                   source
+===========  ==========================================================  ====================
+4, 5         the PC                                                      `MotionSource`
+1            the PC, with feed-forward of velocity and current           `MotionSource`, or
+                                                                         `FeedForwardSource`
+2, 7, 8, 9   the controller; the PC corrects them                        `CorrectionSource`
+===========  ==========================================================  ====================
+"""
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from collections.abc import Sequence
+from typing import Final, Literal, Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +42,10 @@ class MotionSource(Protocol):
 
     @property
     def bounds(self) -> BoundsName:
-        """Which set of bounds the set-points keep from now on: "stop" only after `stop`.
+        """Which set of bounds the set-points keep from now on.
 
-        The session grants "override" to nobody as long as none can be asked for.
+        "override" is granted from the first change of override on (`OverridableSource`), "stop"
+        from `stop` on.
         """
         ...
 
@@ -51,3 +63,81 @@ class MotionSource(Protocol):
         The session asks for drive-off if that takes longer than `session.STOP_TIMEOUT`.
         """
         ...
+
+
+class FeedForwardSource(MotionSource, Protocol):
+    """A motion that knows what it takes to follow it, for open mode 1."""
+
+    def feed_forward(self) -> tuple[Array, Array]:
+        """Velocity (n,) rad/s and motor current (n,) A that go with the set-point given last.
+
+        Asked for once after each `advance`. Both start at zero with the first set-point and have
+        to be back at zero when the motion says that it is finished. Without this method the
+        velocity fed forward is that of the set-points, and the current zero.
+        """
+        ...
+
+
+class CorrectionSource(Protocol):
+    """Corrections of a motion that the controller itself generates. Joint arrays are (n,).
+
+    Like a `MotionSource`, it is asked once per answered packet. A correction starts at zero,
+    keeps the bounds of a plan (those of a stop after `stop`), and has to be back at zero when it
+    says that it is finished; the session never clamps or fades it.
+    """
+
+    @property
+    def finished(self) -> bool:
+        """Whether the corrections given last were the end, zero."""
+        ...
+
+    def begin(self) -> None:
+        """The first packet with every axis open is answered by zeros; raise to refuse."""
+        ...
+
+    def advance(self) -> tuple[Array, Array]:
+        """The next correction: motion and motor current, A.
+
+        ====  ===========================================  ======================================
+        mode  motion                                       current
+        ====  ===========================================  ======================================
+        2     velocity fed forward, rad/s                  fed forward
+        7     offset from the controller's target, rad     none: zeros
+        8     velocity fed forward, rad/s                  none: zeros
+        9     none: zeros                                  added to the servo's own
+        ====  ===========================================  ======================================
+        """
+        ...
+
+    def stop(self) -> None:
+        """Take the correction back to zero; `finished` tells when."""
+        ...
+
+
+class OverridableSource(Protocol):
+    """A source whose speed can be changed while it runs."""
+
+    def override(self, fraction: float) -> None:
+        """Go on at this fraction (0..1) of the planned speed, within the bounds "override"."""
+        ...
+
+
+_OF_MOTIONS: Final = ("begin", "advance", "finished", "bounds", "stop")
+_OF_CORRECTIONS: Final = ("begin", "advance", "finished", "stop")
+
+
+def is_motion(source: object) -> TypeGuard[MotionSource]:
+    """Whether it has what a `MotionSource` is asked for; nothing of it is called."""
+    return _has(source, _OF_MOTIONS)
+
+
+def is_correction(source: object) -> TypeGuard[CorrectionSource]:
+    """Whether it has what a `CorrectionSource` is asked for and no bounds, as motions have."""
+    return _has(source, _OF_CORRECTIONS) and not _has(source, ("bounds",))
+
+
+def _has(source: object, names: Sequence[str]) -> bool:
+    # A property is found on the class, without running the source's code.
+    return all(
+        hasattr(type(source), name) or name in getattr(source, "__dict__", ()) for name in names
+    )

@@ -1,21 +1,35 @@
-"""The set-points of one interval in open mode: asked for, guarded, written into the answer."""
+"""One interval in open mode: set-points asked for, guarded, written into the answer."""
 
 from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.arm_wire import ArmWire
-from drivers.execution import Execution
+from drivers.checks import require
+from drivers.correction_guard import CorrectionGuard
+from drivers.errors import FirstSetPointUnknown, GuardError, MotionUnknown
+from drivers.execution import Execution, MotionExecution
 from drivers.guard import Guard
+from drivers.packets import Mode
 from drivers.reading import Reading
-from drivers.replies import D1, D2, ReplyFrame
+from drivers.replies import D1, D2, D4, D5, ReplyFrame
 
 Array = NDArray[np.float64]
 
+# Rows of `ArmWire.raw`.
+TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
+_NEEDED_FIRST: Final = (TARGET, ACTUAL, ACTUAL_VELOCITY)
+_NEEDED_AFTER_GAP: Final = (TARGET, TARGET_VELOCITY, ACTUAL_VELOCITY)
 
-class OpenMode:
-    """Writes set-points into `frame` and into the record (2, n) of what was commanded.
+
+class OpenMode(ABC):
+    """Writes into `frame` what is sent, and into the record (2, n) what was commanded.
+
+    The frame holds the safe answer already.
 
     Attributes:
         held: (n,) rad, the set-point sent last.
@@ -25,50 +39,122 @@ class OpenMode:
         self._guard = guard
         self._wire = wire
         self._frame = frame
-        n = len(wire.joint_slots)
-        self._still = np.zeros(n)
+        self._still = np.zeros(guard.limits.n_joints)
         self.held = self._still
-        self._sent = self._still
-        self._step = self._still
 
     def opening(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
-        """Some axes are open: the safe answer gives them their target, if it can be held.
+        """Some axes are open: the safe answer holds them, if they can be held.
 
         Raises:
-            GuardError: it cannot.
+            GuardError: they cannot.
         """
         raw = self._wire.raw
-        self._guard.check_hold(raw[0], raw[2], reading.held, cycle)
-        commanded[0] = np.where(reading.held, measured[0], np.nan)
-        commanded[1] = np.where(reading.held, 0.0, np.nan)
+        held = reading.held
+        self._guard.check_hold(raw[TARGET], raw[ACTUAL], held | reading.ready, cycle)
+        commanded[0] = np.where(held, measured[0], np.nan)
+        commanded[1] = np.where(held, 0.0, np.nan)
 
+    @abstractmethod
     def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
-        """The last wanted axis opened in this packet: the first set-point.
+        """The last wanted axis opened in this packet: the first answer in open mode.
 
         Raises:
             GuardError: it must not be sent.
         """
-        raw = self._wire.raw
-        target = raw[0].copy()
-        position = measured[0].copy()
-        self._guard.begin(position, target, raw[2], raw[1:4:2], cycle)
-        self._guard.check_feedback(target, raw[2], raw[4], target, cycle)
-        self.held = position
-        self._sent = target
-        self._write(target, self._still, commanded)
 
-    def next(self, execution: Execution | None, commanded: Array, cycle: int) -> None:
-        """One period on: the motion's next set-point, or the last one where nothing moves.
+    @abstractmethod
+    def next(
+        self, execution: Execution | None, measured: Array, commanded: Array, cycle: int
+    ) -> None:
+        """One period on: what the source gives, or rest where nothing was begun.
 
         Raises:
             RefusalError: the arm does not follow, the source failed or the guard said no.
         """
+
+    @abstractmethod
+    def require_carried_on(self, cycle: int) -> None:
+        """The packet read last, the first after a long gap, against what was sent last.
+
+        Raises:
+            NotFinite, MotionNotCarriedOn: going on would be a jump.
+        """
+
+    @abstractmethod
+    def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
+        """Axes still open stay at rest; those that closed have the safe answer.
+
+        Raises:
+            GuardError: an axis still open does not follow, or takes too much current.
+        """
+
+    def require_start(self, cycle: int) -> None:
+        """A motion begins where the arm was held: the conditions of the first set-point.
+
+        Raises:
+            NotFinite, FirstSetPoint: they do not hold.
+        """
+        self._require_fresh(_NEEDED_FIRST, FirstSetPointUnknown, cycle)
         raw = self._wire.raw
-        self._guard.check_feedback(raw[0], raw[2], raw[4], self._sent, cycle)
-        if execution is None or not execution.started:
-            self._guard.check_set_point(self.held, self._still, "plan", cycle)
-            self._write(self._sent, self._still, commanded)
+        self._guard.check_start(raw[TARGET], raw[ACTUAL], raw[1:4:2], cycle)
+
+    def _require_fresh(self, rows: tuple[int, ...], error: type[GuardError], cycle: int) -> None:
+        age = self._wire.age
+        if age is None:
             return
+        every = np.ones(len(self._still), dtype=np.bool_)
+        for row in rows:
+            require(every, age[row].astype(np.float64), self._still, error, cycle)
+
+
+class PositionMode(OpenMode):
+    """Modes 1, 4 and 5: the PC generates the targets."""
+
+    def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int) -> None:
+        super().__init__(guard, wire, frame)
+        self._sent = self._still
+        self._step = self._still
+        self._kept = np.ones(len(self._still), dtype=np.bool_)
+        self._feed_forward = (
+            CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
+        )
+
+    def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
+        """The first set-point is the target received, at zero velocity."""
+        self._require_fresh(_NEEDED_FIRST, FirstSetPointUnknown, cycle)
+        raw = self._wire.raw
+        target = raw[TARGET].copy()
+        position = measured[0].copy()
+        self._guard.begin(position, target, raw[ACTUAL], raw[1:4:2], cycle)
+        self._guard.check_feedback(target, raw[ACTUAL], raw[CURRENT], target, cycle)
+        if self._feed_forward is not None:
+            self._feed_forward.begin()
+        self.held = position
+        self._sent = target
+        self._kept[...] = True
+        self._rest(commanded)
+
+    def require_start(self, cycle: int) -> None:
+        """The arm has to stand at the set-point that was held, too."""
+        super().require_start(cycle)
+        raw = self._wire.raw
+        self._guard.check_start(self._sent, raw[ACTUAL], raw[1:4:2], cycle)
+
+    def next(
+        self,
+        execution: Execution | None,
+        measured: Array,  # noqa: ARG002  the motion does not come from there
+        commanded: Array,
+        cycle: int,
+    ) -> None:
+        """The motion's next set-point, or the last one where nothing moves."""
+        raw = self._wire.raw
+        self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
+        if execution is None:
+            self._guard.check_set_point(self.held, self._still, "plan", cycle)
+            self._rest(commanded)
+            return
+        assert isinstance(execution, MotionExecution)
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
@@ -76,30 +162,49 @@ class OpenMode:
         np.subtract(position, self.held, out=commanded[1])
         commanded[1] /= self._guard.period
         commanded[0] = position
-        self._wire.write(self._frame.floats, motor, step)
+        frame = self._frame.floats
+        self._wire.write(frame, motor, step)
+        if self._feed_forward is not None:
+            self._write_feed_forward(self._feed_forward, execution, step, cycle)
         self.held = position
         self._sent = motor
 
+    def _write_feed_forward(
+        self, guard: CorrectionGuard, execution: MotionExecution, step: Array, cycle: int
+    ) -> None:
+        frame, wire = self._frame.floats, self._wire
+        if not execution.feeds_forward:
+            wire.put(frame, D4, step)
+            return
+        velocity, current = execution.feed_forward(cycle)
+        guard.check_motion(velocity, execution.granted, cycle)
+        guard.check_current(current, None, cycle)
+        if execution.finished:
+            guard.check_end(cycle)
+        wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
+        wire.put(frame, D5, current)
+
     def require_carried_on(self, cycle: int) -> None:
-        """The packet read last, the first after a long gap, against the set-point sent last.
-
-        Raises:
-            NotFinite, MotionNotCarriedOn, MotionHeld: the arm is not where and as fast as it was.
-        """
+        """Target and velocity received against the set-point sent last."""
+        self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle)
         raw = self._wire.raw
-        self._guard.check_after_gap(raw[0], raw[1:4:2], self._sent, self._step, cycle)
+        self._guard.check_after_gap(raw[TARGET], raw[1:4:2], self._sent, self._step, cycle)
 
-    def leaving(self, reading: Reading, commanded: Array) -> None:
-        """Axes still open keep the last set-point; those that closed have the safe answer."""
-        ready = reading.ready
-        slots = self._wire.joint_slots[ready]
-        self._frame.floats[slots, D1] = self._sent[ready]
+    def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
+        """Axes open all the time keep the last set-point; those open again, their target."""
+        self.opening(reading, measured, commanded, cycle)
+        raw, kept = self._wire.raw, self._kept
+        kept &= reading.ready
+        self._guard.check_feedback(
+            raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=kept
+        )
+        slots = self._wire.joint_slots[kept]
+        self._frame.floats[slots, D1] = self._sent[kept]
         self._frame.floats[slots, D2] = 0.0
-        commanded[0] = np.where(ready, self.held, np.nan)
-        commanded[1] = np.where(ready, 0.0, np.nan)
+        commanded[0, kept] = self.held[kept]
 
-    def _write(self, motor: Array, step: Array, commanded: Array) -> None:
-        self._step = step
-        self._wire.write(self._frame.floats, motor, step)
+    def _rest(self, commanded: Array) -> None:
+        self._step = self._still
+        self._wire.write(self._frame.floats, self._sent, self._still)
         commanded[0] = self.held
         commanded[1] = 0.0

@@ -65,6 +65,22 @@ class Mode(IntEnum):
     FOLLOWING_ERROR = 508
 
 
+MODE_FIELDS: Final[Mapping[int, tuple[int, ...]]] = {
+    Mode.POSITION_FEED_FORWARD: (1, 2, 4, 5),
+    Mode.FEED_FORWARD: (4, 5),
+    Mode.POSITION: (1, 2),
+    Mode.POSITION_RELATIVE: (1, 2),
+    Mode.DELTA_POSITION: (1,),
+    Mode.VELOCITY: (4,),
+    Mode.DELTA_CURRENT: (5,),
+    Mode.POSITION_FEED_FORWARD_PRIMED: (1, 2, 4, 5),
+    Mode.FEED_FORWARD_PRIMED: (4, 5),
+    Mode.POSITION_PRIMED: (1, 2),
+    Mode.POSITION_RELATIVE_PRIMED: (1, 2),
+    Mode.DELTA_POSITION_PRIMED: (1,),
+}
+"""Which of D1..D5 an answer fills in each open mode; all others have to be zero."""
+
 AXIS_DTYPE: Final = np.dtype([("mode", "<i4"), ("d", "<f4", (5,)), ("extra", "<f4", (3,))])
 """One axis block: mode, D1..D5, extra1..extra3."""
 

@@ -43,13 +43,15 @@ class Reader:
     """Reads packets of one session; remembers the last, because modes rarely change.
 
     Args:
-        slots: (n,) slot of each wanted axis.
-        arms: arm of each slot, from 1.
+        slots: (n,) slot of each wanted axis; none if the arm has no open axis.
+        arms: arm of each slot, from 1; None if unknown: any drive that is on counts.
         arm: the arm that is moved, from 1.
         mode: the open mode wanted.
     """
 
-    def __init__(self, slots: NDArray[np.intp], arms: tuple[int, ...], arm: int, mode: int) -> None:
+    def __init__(
+        self, slots: NDArray[np.intp], arms: tuple[int, ...] | None, arm: int, mode: int
+    ) -> None:
         self._slots = slots
         self._arms = arms
         self._arm = arm
@@ -67,7 +69,7 @@ class Reader:
 
     def _understand(self, status: bytes, modes: Words) -> Reading:
         wanted = modes[self._slots]
-        drive_on = status[self._arm - 1] == DRIVE_ON
+        drive_on = (DRIVE_ON in status) if self._arms is None else status[self._arm - 1] == DRIVE_ON
         is_open = np.isin(wanted, list(OPEN_MODES))
         ready = wanted == self._mode
         strayed = np.flatnonzero(is_open & ~ready)

@@ -28,9 +28,12 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
     ``cycle`` controller's cycles since its init packet, missed ones counted in; ``number`` wire
     sequence number; ``arrival`` s, for diagnosis only; ``gap`` packets missed before this one;
     ``interval`` index of the interval in open mode, -1 outside; ``state`` `State` after this
-    packet; ``status`` status byte of the arm; ``mode`` of each joint. Joint arrays are joint side
-    in SI (rad, rad/s), currents motor side in A, ``diagonal_inertia`` kg·m²; ``commanded_*`` is
-    what this packet was answered, NaN where no set-point was sent.
+    packet; ``status`` status byte of the arm; ``mode`` of each joint; ``age`` cycles since the
+    oldest joint value of each of `MEASURED` was sent (0: in this packet). Joint arrays are joint
+    side in SI (rad, rad/s), currents motor side in A, ``diagonal_inertia`` kg·m²; ``commanded_*``
+    is what this packet was answered, NaN where no set-point was sent. Where the controller makes
+    the targets, ``commanded_position`` is its target with the offset added (mode 7, else NaN) and
+    ``commanded_velocity`` the velocity fed forward (modes 2 and 8, else NaN).
     """
     joint = (n_joints,)
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
@@ -43,6 +46,7 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
         ("status", "u1"),
         *((name, "<f8", joint) for name in (*MEASURED, *COMMANDED)),
         ("mode", "<i4", joint),
+        ("age", "<u2", (len(MEASURED),)),
     ]
     return np.dtype(fields, align=True)
 
@@ -53,12 +57,19 @@ class CycleRing:
     The writer never waits and never looks at the reader: where the reader is too slow, the oldest
     records are overwritten and counted in `overflow`. Drained records stay readable through
     `last` until they are overwritten.
+
+    Args:
+        n_joints: n.
+        capacity: number of rows, unless they are given.
+        rows: (capacity,) of `cycle_dtype`, memory to keep them in (shared with a reader, say).
     """
 
-    def __init__(self, n_joints: int, capacity: int = 4096) -> None:
+    def __init__(
+        self, n_joints: int, capacity: int = 4096, rows: NDArray[np.void] | None = None
+    ) -> None:
         self.n_joints = n_joints
-        self.capacity = capacity
-        self.rows = np.zeros(capacity, cycle_dtype(n_joints))
+        self.rows = np.zeros(capacity, cycle_dtype(n_joints)) if rows is None else rows
+        self.capacity = len(self.rows)
         # Column views: assigning through them costs a third of assigning to a record's field.
         self.cycle = self.rows["cycle"]
         self.arrival = self.rows["arrival"]
@@ -68,6 +79,7 @@ class CycleRing:
         self.state = self.rows["state"]
         self.status = self.rows["status"]
         self.mode = self.rows["mode"]
+        self.age = self.rows["age"]
         joint_bytes = 8 * n_joints
         self.measured = self._block(MEASURED[0], len(MEASURED), joint_bytes)
         self.commanded = self._block(COMMANDED[0], len(COMMANDED), joint_bytes)

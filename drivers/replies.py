@@ -3,7 +3,9 @@
 The safe answer is the one that an independent program gave on real robots (facts on the C4G Open
 wire, section 6): everything echoed while the drive is off, target position and velocity given
 back in modes 501 and 0, a mode that is not available answered by mode 0 and zeros. An axis in an
-open mode that nobody moves gets the target received, at zero velocity. Each axis is answered by
+open mode that nobody moves gets the target received, at zero velocity; zeros where the answer
+would be a correction, whatever the status byte says of the drive, because an echo would make an
+offset of a position. Each axis is answered by
 its own mode, because axes change modes in different cycles.
 """
 
@@ -62,28 +64,31 @@ class SafeAnswer:
     mask: Words
 
 
-def safe_answer(status: bytes, modes: Words, arms: Sequence[int]) -> SafeAnswer:
+def safe_answer(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeAnswer:
     """Work it out.
 
     Args:
         status: 4 status bytes received.
         modes: (n,) modes received.
-        arms: arm of each slot, from 1.
+        arms: arm of each slot, from 1; None if unknown: every drive counts as on if any is.
     """
     n = len(modes)
+    on = [byte == DRIVE_ON for byte in status]
+    if arms is None:
+        arms = (1,) * n
+        on = [any(on)] * N_ARMS
     answered = np.zeros(n, np.int32)
     mask = np.zeros((n, WORDS_PER_AXIS), np.int32)
     for slot in range(n):
         mode = int(modes[slot])
-        if status[arms[slot] - 1] != DRIVE_ON:
+        if not on[arms[slot] - 1] and mode not in INCREMENTAL:
             answered[slot] = mode
             mask[slot, D1:] = _ALL_BITS
         elif mode in _KEPT:
             answered[slot] = mode
             mask[slot, list(_KEPT[mode])] = _ALL_BITS
     given_back = bytes(
-        status[arm - 1] if arm in arms and status[arm - 1] != DRIVE_ON else 0
-        for arm in range(1, N_ARMS + 1)
+        status[arm - 1] if arm in arms and not on[arm - 1] else 0 for arm in range(1, N_ARMS + 1)
     )
     return SafeAnswer(given_back, answered, mask)
 

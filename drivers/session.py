@@ -10,10 +10,12 @@ init                  init packet; two more sync after a      the same bytes, nu
 drive off             drive not on                            everything echoed
 driving on            mode 501                                target position, velocity given back
 closed                mode 0 (or 10) in every wanted axis     the same
-opening               some wanted axes open, not all          open axes: target, zero velocity;
-                                                              the others as when closed
+opening               some wanted axes open, not all          open axes: target, zero velocity
+                                                              (modes 1, 4, 5), or zeros; the
+                                                              others as when closed
 open                  all wanted axes open                    guarded set-points, see below
 exiting               still open, end of open mode asked for  the last set-point, zero velocity
+                                                              (modes 1, 4, 5), or zeros
 freezing              mode 500 or 502                         mode 0, zeros; silence may last long
 faulted               open after a fault, a mode unknown      505 (508 for a following error) while
                       here, or nothing at all                 open and powered; else the safe answer
@@ -21,25 +23,32 @@ ended                 mode 504, answered once                 nothing
 ====================  ======================================  =====================================
 
 Which state follows which is the table `drivers.states.TRANSITIONS`. Open mode is entered only
-from driving on, closed, opening or freezing, so after an init packet, a drive-off or a fault the
+from driving on, closed or opening, so after an init packet, a drive-off, a pause or a fault the
 controller has to report closed axes first, and a new motion has to be requested.
 
-Every fresh, well-formed packet gets exactly one answer, a duplicate the same bytes again; stale
-and malformed ones get none and are counted. Motion advances one period per answered packet,
-whatever was missed; more than `max_gap` missed in a row bring it to rest on its path, if the
-controller carried it on. Unanswered, a controller may as well have held the last target and so
-stopped the arm; one set-point further at full speed would then be a jump. Hence, after such a gap,
-the motion is refused unless for each axis the target received (D1) is within 10 % of the
-following-error threshold of the set-point sent last, and its velocity (D2) within half the
-velocity sent last or what counts as standstill; an arm that itself stands (D4) is held against
-the latter too.
+Every fresh, well-formed packet gets exactly one answer, a duplicate (the same bytes) the same
+bytes again; stale and malformed ones get none and are counted. Motion advances one period per
+answered packet, whatever was missed; more than `max_gap` missed in a row, stale ones among them,
+bring it to rest on its path, if the controller carried it on. Unanswered, a controller may as well
+have held the last target and so stopped the arm; one set-point further at full speed would then be
+a jump. Hence, after such a gap, the motion is refused unless for each axis the target received
+(D1) is within 10 % of the following-error threshold of the set-point sent last, and its velocity
+(D2) within half the velocity sent last or what counts as standstill; an arm that itself stands
+(D4) is held against the latter too. Corrections of targets that the controller generates (modes 2,
+7, 8, 9) are refused after such a gap unless they were zero. A link may say how old each value is:
+one that is needed for such a decision, or for the first set-point, and was not sent in this very
+packet counts as unknown and refuses the motion.
 
-In open mode the first set-point is the target received in the packet in which the last wanted
-axis opened, at zero velocity, held against actual position and standstill. D2 is the step of the
-motor from one sent set-point to the next, formed in float64. After the motion the end is held
-for `settle_cycles`; the next answer asks for the end of open mode (status byte 1), and asks again
-every `EXIT_RETRY_CYCLES` in case that answer was lost. Without a requested motion the first
-set-point is held.
+In open mode the first set-point is the target received in the packet in which the last wanted axis
+opened, at zero velocity, held against actual position and standstill. D2 is the step of the motor
+from one sent set-point to the next, formed in float64; which of D1..D5 an open mode has is the
+table `drivers.packets.MODE_FIELDS`. A motion requested while the axes are open already begins
+under the same conditions, from the set-point held. While axes are open, moving or not, following
+error and current are watched. After the motion the end is held for `settle_cycles`; the next
+answer asks for the end of open mode (status byte 1), and asks again every `EXIT_RETRY_CYCLES` in
+case that answer was lost; after `EXIT_TIMEOUT` that is a fault. The end is asked for as well where
+a motion waits that long for the last axis to open. Without a requested motion the first set-point
+is held.
 """
 
 from __future__ import annotations
@@ -50,22 +59,20 @@ from typing import Final
 import numpy as np
 
 from drivers.answers import Answers
+from drivers.arm_wire import Ages
 from drivers.drive_train import DriveTrain
-from drivers.errors import AxisLeft, PacketError, RefusalError
+from drivers.errors import PacketError, RefusalError, RequestError
 from drivers.events import (
     Counters,
     Event,
-    GapSeen,
     InitReceived,
     LinkLost,
-    PacketRejected,
     Refused,
-    Rejection,
 )
-from drivers.execution import Execution
+from drivers.execution import execution_of
 from drivers.guard import Guard
 from drivers.machine import Machine
-from drivers.motion_source import MotionSource
+from drivers.motion_source import CorrectionSource, MotionSource
 from drivers.packets import (
     DRIVE_ON,
     INIT_LENGTH,
@@ -78,18 +85,18 @@ from drivers.packets import (
     is_init,
     packet_number,
 )
-from drivers.reading import Reading
 from drivers.record import CycleRing
-from drivers.replies import MODE, Words, words_of
+from drivers.replies import MODE, words_of
 from drivers.sequence import Sequence
-from drivers.states import Input, State
+from drivers.states import CORRECTION_MODES, POSITION_MODES, Input, State
+from drivers.tally import Tally
 
 FLIGHT_RECORDER: Final = 50
 """Records that go with a refusal."""
 STOP_TIMEOUT: Final = 10.0
 """s that a motion may take from being told to stop to rest; drive-off is asked for after that."""
-SERVED_MODES: Final = (Mode.POSITION, Mode.POSITION_RELATIVE)
-"""Open modes a motion can run in: those whose set-point is D1 and D2."""
+SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
+"""Open modes a motion can run in."""
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
 
 
@@ -100,12 +107,14 @@ class Session:
         drive_train: of the arm.
         guard: checks each set-point; its period must be the controller's cycle.
         ring: one record per cyclic packet answered goes there.
-        mode: open mode in which the arm is moved, 4 or 5.
+        mode: open mode in which the arm is moved, one of `SERVED_MODES`.
         max_gap: packets that may be missed in a row without stopping a motion.
         arm: number of the arm, 1..4.
         settle_cycles: how long the end of a motion is held before open mode is left.
         init_timeout: s of silence allowed before the init packet and in a pause.
         silence_timeout: s of silence allowed otherwise.
+        accept_init: adopt the controller's gear ratios, calibration and coupling where they
+            differ from the cell's, instead of refusing to move.
 
     Attributes:
         deadline: when silence becomes a fault, on the clock of `now`. Each packet that is answered
@@ -126,6 +135,7 @@ class Session:
         settle_cycles: int = 200,
         init_timeout: float = 300.0,
         silence_timeout: float = 1.0,
+        accept_init: bool = False,
     ) -> None:
         n = drive_train.n_joints
         if not n == guard.limits.n_joints == ring.n_joints:
@@ -134,11 +144,13 @@ class Session:
                 f"{ring.n_joints} joints"
             )
         if mode not in SERVED_MODES:
-            raise ValueError(f"motion in mode {mode} is not served; modes 4 and 5 are")
+            served = ", ".join(str(int(m)) for m in SERVED_MODES)
+            raise ValueError(f"motion in mode {mode} is not served; modes {served} are")
         if not 1 <= arm <= N_ARMS:
             raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
         self.deadline = math.inf
-        self.counters = Counters()
+        self._tally = Tally()
+        self.counters: Counters = self._tally.counters
         self._drive_train = drive_train
         self._guard = guard
         self._ring = ring
@@ -148,6 +160,7 @@ class Session:
         self._settle_cycles = settle_cycles
         self._init_timeout = init_timeout
         self._silence_timeout = silence_timeout
+        self._accept_init = accept_init
         self._machine = Machine()
         self._sequence = Sequence()
         self._answers: Answers | None = None
@@ -155,7 +168,7 @@ class Session:
         self._heard_at: float | None = None
         self._last_packet = b""
         self._last_reply = b""
-        self._rejected: dict[Rejection, int] = {}
+        self._unanswered = 0
 
     @property
     def state(self) -> State:
@@ -178,6 +191,11 @@ class Session:
         return self._guard.period if self._answers is None else self._answers.init.period
 
     @property
+    def drive_train(self) -> DriveTrain:
+        """In force: the cell's, or the one with the controller's values that were adopted."""
+        return self._drive_train if self._answers is None else self._answers.announced.drive_train
+
+    @property
     def requested(self) -> bool:
         """Whether a motion was requested and has not ended."""
         return self._machine.execution is not None
@@ -185,20 +203,37 @@ class Session:
     def events(self) -> list[Event]:
         """What happened since the last call, in order; rejected packets come last, summed up."""
         events, self._machine.events = self._machine.events, []
-        events.extend(PacketRejected(kind, count) for kind, count in self._rejected.items())
-        self._rejected.clear()
+        events.extend(self._tally.drain())
         return events
 
-    def request(self, source: MotionSource) -> None:
+    def request(self, source: MotionSource | CorrectionSource) -> None:
         """Run a motion as soon as every wanted axis is open, then leave open mode.
 
         Raises:
-            RequestError: none can be promised now.
+            RequestError: none can be promised now, or the source is not of the kind that the
+                open mode needs (see `drivers.motion_source`).
         """
-        stop_cycles = round(STOP_TIMEOUT / self._guard.period)
-        n = self._drive_train.n_joints
-        execution = Execution(source, n, self._settle_cycles, stop_cycles)
+        n, stop_cycles = self._drive_train.n_joints, round(STOP_TIMEOUT / self._guard.period)
+        execution = execution_of(source, self._mode, n, self._settle_cycles, stop_cycles)
+        if execution is None:
+            reason = f"a {type(source).__name__} is not the kind of source mode {self._mode} needs"
+            raise RequestError(self.state.name.lower(), reason)
         self._machine.request(execution, self._answers.unusable if self._answers else None)
+
+    def override(self, fraction: float) -> None:
+        """Run the requested motion at this fraction (0..1) of its speed from now on.
+
+        Raises:
+            RequestError: there is none, it is being stopped, or it knows no override.
+        """
+        execution = self._machine.execution
+        reason = "no motion was requested" if execution is None else execution.override(fraction)
+        if reason is not None:
+            raise RequestError(self.state.name.lower(), reason, "change of override")
+
+    def discarded(self, kind: str, count: int) -> None:
+        """The link dropped `count` packets before the session saw them: counted and told."""
+        self._tally.discarded(kind, count)
 
     def stop(self, reason: str = "a stop was asked for") -> None:
         """Bring the motion to rest on its path and leave open mode; drop one not begun yet."""
@@ -220,13 +255,19 @@ class Session:
         self._sequence.broken = True
         self._machine.take(Input.SILENCE)
 
-    def reply(self, packet: bytes, now: float) -> bytes | None:
-        """The answer to a packet that arrived at `now` (s, any monotonic clock), if it gets one."""
+    def reply(self, packet: bytes, now: float, ages: Ages | None = None) -> bytes | None:
+        """The answer to a packet that arrived at `now` (s, any monotonic clock), if it gets one.
+
+        Args:
+            packet: its bytes.
+            now: when it arrived.
+            ages: (n_axes, 8) cycles since D1..D5, extra1..3 of each slot were sent by the
+                controller; None if all were sent with this packet.
+        """
         if self._heard_at is None or now >= self.deadline:
             self.tick(now)
         if self.state is State.ENDED:
-            self.counters.ended += 1
-            self._reject("ended")
+            self._tally.ended()
             return None
         try:
             # Bytes may hold any number; what is not finite is for the guard, not for numpy.
@@ -237,10 +278,9 @@ class Session:
                 powered = DRIVE_ON in packet[4 : 4 + N_ARMS]
                 if self._expects_sync(number, powered):
                     return self._sync(packet, number, now, powered)
-                return self._cyclic(packet, number, now)
+                return self._cyclic(packet, number, now, ages)
         except PacketError:
-            self.counters.malformed += 1
-            self._reject("malformed")
+            self._tally.malformed()
             return None
 
     def _start_over(self, packet: bytes, now: float) -> bytes:
@@ -250,10 +290,16 @@ class Session:
         init = InitPacket.decode(packet)
         self._cold_start = self.state is State.SYNC and self._sequence.last > 0
         self._machine.take(Input.INIT)
-        self._answers = Answers(init, self._drive_train, self._guard, self._arm, self._mode)
+        answers = Answers(
+            init, self._drive_train, self._guard, self._arm, self._mode, self._accept_init
+        )
+        self._answers = answers
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self._machine.cycle = 0
-        self._machine.events.append(InitReceived(init, self._answers.unusable))
+        told = answers.announced
+        self._machine.events.append(
+            InitReceived(init, told.unusable, told.differences, told.adopted)
+        )
         return self._answered(packet, echo(packet), now)
 
     def _expects_sync(self, number: int, powered: bool) -> bool:
@@ -280,28 +326,36 @@ class Session:
         self._sequence.accept(number)
         return self._answered(packet, echo(packet), now)
 
-    def _cyclic(self, packet: bytes, number: int, now: float) -> bytes | None:
+    def _cyclic(self, packet: bytes, number: int, now: float, ages: Ages | None) -> bytes | None:
         answers, machine, ring = self._answers, self._machine, self._ring
         assert answers is not None
         decoded = CyclicPacket.decode(packet, answers.init.n_axes)
-        if self._sequence.is_duplicate(number):
+        if self._sequence.is_duplicate(number) and packet == self._last_packet:
             self.counters.duplicates += 1
             return self._last_reply
         if self._sequence.is_stale(number):
-            self.counters.stale += 1
-            self._reject("stale")
+            self._unanswered += 1
+            self._tally.stale()
             return None
         missed = self._sequence.accept(number)
         machine.cycle = self._sequence.cycle
         words = words_of(decoded)
+        self.counters.missed += missed
+        # After a number that was corrupted the controller's own look stale for a while.
+        unanswered, self._unanswered = missed + self._unanswered, 0
         reading = answers.reader.read(decoded.status, words[:, MODE])
-        row = self._record(answers, number, now, missed, reading, words)
+        row = ring.slot
+        ring.arrival[row] = now
+        ring.number[row] = number
+        ring.gap[row] = missed
+        ring.cycle[row] = machine.cycle
+        answers.record(ring, row, reading, words, ages)
         refusal = None
         try:
-            self._note_gap(missed)
-            self._require_axes(reading)
+            machine.note_gap(missed, unanswered, self._max_gap)
+            machine.require_axes(reading, self._mode)
             machine.take(reading.input)
-            if missed > self._max_gap:
+            if unanswered > self._max_gap:
                 answers.require_carried_on(machine)
             measured, commanded = ring.measured[row], ring.commanded[row]
             status = answers.answer(machine, reading, words, measured, commanded)
@@ -319,51 +373,6 @@ class Session:
             machine.end("refused", str(refusal))
         return self._answered(packet, answers.finish(number, status), now)
 
-    def _note_gap(self, missed: int) -> None:
-        if missed:
-            self.counters.missed += missed
-            self._machine.events.append(GapSeen(missed, self._sequence.cycle))
-        if missed > self._max_gap and self.state is State.OPEN and self._machine.execution:
-            self._machine.stop(f"{missed} packets were missed in a row")
-
-    def _require_axes(self, reading: Reading) -> None:
-        """A motion needs every wanted axis in its mode, from its beginning to its end."""
-        execution = self._machine.execution
-        if execution is None or not reading.powered:
-            return
-        joint = reading.strayed
-        if execution.started and self.state is State.OPEN and reading.input is not Input.OPEN:
-            joint = int(np.argmin(reading.ready))
-        if joint is not None:
-            mode = int(reading.modes[joint])
-            raise AxisLeft(joint, mode, self._mode, self._sequence.cycle)
-
-    def _record(
-        self,
-        answers: Answers,
-        number: int,
-        now: float,
-        missed: int,
-        reading: Reading,
-        words: Words,
-    ) -> int:
-        """Begin the record of this cycle; returns its row."""
-        ring = self._ring
-        row = ring.slot
-        ring.cycle[row] = self._sequence.cycle
-        ring.arrival[row] = now
-        ring.number[row] = number
-        ring.gap[row] = missed
-        ring.status[row] = reading.status
-        ring.commanded[row] = math.nan
-        if answers.wire is None:
-            ring.mode[row] = -1
-            ring.measured[row] = math.nan
-        else:
-            ring.mode[row] = reading.modes
-            answers.wire.read(words.view(np.float32), ring.measured[row])
-        return row
-
     def _answered(self, packet: bytes, reply: bytes, now: float) -> bytes:
         self.counters.answered += 1
         self._last_packet = packet
@@ -380,6 +389,3 @@ class Session:
             self.deadline = now + self._init_timeout
         else:
             self.deadline = now + self._silence_timeout
-
-    def _reject(self, kind: Rejection) -> None:
-        self._rejected[kind] = self._rejected.get(kind, 0) + 1

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from typing import Final
 
-from drivers.packets import Mode
+from drivers.packets import MODE_FIELDS, Mode
 
 
 class State(IntEnum):
@@ -61,29 +61,19 @@ class Input(IntEnum):
     """Nothing came for too long."""
 
 
-HOLDABLE: Final = frozenset(
-    {
-        Mode.POSITION_FEED_FORWARD,
-        Mode.POSITION,
-        Mode.POSITION_RELATIVE,
-        Mode.POSITION_FEED_FORWARD_PRIMED,
-        Mode.POSITION_PRIMED,
-        Mode.POSITION_RELATIVE_PRIMED,
-    }
-)
+OPEN_MODES: Final = frozenset(MODE_FIELDS)
+HOLDABLE: Final = frozenset(mode for mode, d in MODE_FIELDS.items() if d[:2] == (1, 2))
 """Open modes in which D1 is an absolute position: the target received is the safe answer."""
-INCREMENTAL: Final = frozenset(
-    {
-        Mode.FEED_FORWARD,
-        Mode.DELTA_POSITION,
-        Mode.VELOCITY,
-        Mode.DELTA_CURRENT,
-        Mode.FEED_FORWARD_PRIMED,
-        Mode.DELTA_POSITION_PRIMED,
-    }
-)
+INCREMENTAL: Final = OPEN_MODES - HOLDABLE
 """Open modes in which zero is the safe answer."""
-OPEN_MODES: Final = HOLDABLE | INCREMENTAL
+POSITION_MODES: Final = frozenset(
+    {Mode.POSITION_FEED_FORWARD, Mode.POSITION, Mode.POSITION_RELATIVE}
+)
+"""Open modes in which the PC generates the targets."""
+CORRECTION_MODES: Final = frozenset(
+    {Mode.FEED_FORWARD, Mode.DELTA_POSITION, Mode.VELOCITY, Mode.DELTA_CURRENT}
+)
+"""Open modes in which the PC corrects targets that the controller generates."""
 CLOSED_MODES: Final = frozenset({Mode.CLOSED, Mode.CLOSED_MIRRORED})
 PAUSE_MODES: Final = frozenset({Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER})
 
@@ -96,13 +86,15 @@ def read_input(
     Args:
         drive_on: whether the arm's status byte is 5.
         all_modes: mode of every slot.
-        wanted_modes: modes of the axes that are to be moved.
+        wanted_modes: modes of the axes that are to be moved; none is open if there are none.
         mode: the open mode they are wanted in.
     """
     if all(m == Mode.END_OF_SESSION for m in all_modes):
         return Input.END
     if not drive_on:
         return Input.OFF
+    if not wanted_modes:
+        return Input.CLOSED
     if any(m in PAUSE_MODES for m in wanted_modes):
         return Input.PAUSE
     if all(m == mode for m in wanted_modes):
@@ -141,7 +133,7 @@ TRANSITIONS: Final[Mapping[State, Mapping[Input, State]]] = {
     State.DRIVE_OFF: {**_ANY, **_MUST_CLOSE_FIRST},
     State.DRIVING_ON: {**_ANY, **_MAY_OPEN},
     State.CLOSED: {**_ANY, **_MAY_OPEN},
-    State.OPENING: {**_ANY, **_MAY_OPEN},
+    State.OPENING: {**_ANY, **_MAY_OPEN, Input.EXIT: State.EXITING},
     State.OPEN: {
         **_ANY,
         Input.OPEN: State.OPEN,
@@ -149,7 +141,8 @@ TRANSITIONS: Final[Mapping[State, Mapping[Input, State]]] = {
         Input.EXIT: State.EXITING,
     },
     State.EXITING: {**_ANY, **_LEAVING, Input.EXIT: State.EXITING},
-    State.FREEZING: {**_ANY, **_MAY_OPEN},
+    # Nobody knows what a pause leaves behind, nor what came before it has to be remembered.
+    State.FREEZING: {**_ANY, **_MUST_CLOSE_FIRST},
     # A cold start of the controller begins with sync packets, after a silence.
     State.FAULTED: {**_ANY, **_MUST_CLOSE_FIRST, Input.SYNC: State.SYNC},
     State.ENDED: {},

@@ -23,9 +23,6 @@ class _SetPoints(NamedTuple):
     position: Array
     velocity: Array
 
-    def shifted(self, offset: Array) -> _SetPoints:
-        return _SetPoints(self.position + offset, self.velocity)
-
     def none(self) -> _SetPoints:
         return _SetPoints(self.position[:0], self.velocity[:0])
 
@@ -124,7 +121,8 @@ class TrajectoryPlayer:
                 joint, float(position[joint]), float(self._start[joint]), self._tolerance
             )
         self._offset = offset
-        self._table = self._plan.shifted(offset)
+        # The table stays as it is: to copy it would cost the cycle of the first set-point.
+        self._table = self._plan
         self._last = self._start + offset
         self._given = 0
         self._begun = True
@@ -138,7 +136,7 @@ class TrajectoryPlayer:
         if self.finished:
             return self._last, self._rest
         self._given = row + 1
-        self._last = self._table.position[row]
+        self._last = self._table.position[row] + self._offset
         return self._last, self._table.velocity[row]
 
     def stop(self) -> None:
@@ -156,7 +154,7 @@ class TrajectoryPlayer:
         motion_time = played * self._period + gone_on[:, 0]
         # The path may end before the time law does; what follows is rest.
         rows = 1 + int(np.searchsorted(motion_time[:-1], self._trajectory.duration))
-        self._table = self._tabulate(motion_time[:rows], rate[:rows]).shifted(self._offset)
+        self._table = self._tabulate(motion_time[:rows], rate[:rows])
 
     def _cycles(self, duration: float) -> int:
         return max(1, ceil(duration / self._period - _ROUNDING))

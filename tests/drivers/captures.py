@@ -6,6 +6,8 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 CAPTURES = (
     "a_505",
     "a_508",
@@ -20,6 +22,8 @@ CAPTURES = (
     "b_ufmg_mode4",
     "s_TestMode4_movement_7ax_stagger",
 )
+"""The letter says who wrote the ends: `a_*` a model of the controller and one laboratory's PC
+program, `b_*` one laboratory's controller and another's PC program, `s_*` the tail of a session."""
 ETHERNET = 1
 
 
@@ -28,6 +32,14 @@ class Datagram:
     time: float
     from_controller: bool
     payload: bytes
+
+
+def capture_path(shared_data: Path, name: str) -> Path:
+    """Where a capture lies; skips the test if that one is not there."""
+    path = shared_data / "c4g_captures" / f"{name}.pcap"
+    if not path.is_file():
+        pytest.skip(f"the capture {name} is not in {path.parent.name} beside this checkout")
+    return path
 
 
 def read_datagrams(path: Path) -> list[Datagram]:
@@ -53,3 +65,16 @@ def read_datagrams(path: Path) -> list[Datagram]:
         payload = udp[8:udp_length]
         datagrams.append(Datagram(seconds + 1e-6 * fraction, sender == controller, payload))
     return datagrams
+
+
+def conversation(shared_data: Path, name: str) -> list[tuple[bytes, bytes | None]]:
+    """Each packet of the controller with the answer it got, if any."""
+    pairs: list[tuple[bytes, bytes | None]] = []
+    for datagram in read_datagrams(capture_path(shared_data, name)):
+        if datagram.from_controller:
+            pairs.append((datagram.payload, None))
+        else:
+            packet, earlier = pairs[-1]
+            assert earlier is None, f"{name}: two answers to one packet"
+            pairs[-1] = (packet, datagram.payload)
+    return pairs

@@ -21,6 +21,7 @@ from drivers import (
     StateChanged,
 )
 from drivers.packets import DRIVE_ON, cyclic_length, next_number
+from drivers.states import POSITION_MODES
 
 N = 6
 PERIOD_MS = 2
@@ -145,6 +146,30 @@ class Table:
         self.positions = self.positions[: self.index + 1]
 
 
+class Correction:
+    """Plays rows of corrections (m, n), motion and current, to their end even if stopped."""
+
+    def __init__(self, motion=None, current=None, rows=0):
+        rows = next((len(part) for part in (motion, current) if part is not None), rows)
+        self.motion = np.zeros((rows, N)) if motion is None else np.asarray(motion, dtype=float)
+        self.current = np.zeros((rows, N)) if current is None else np.asarray(current, dtype=float)
+        self.index = self.begun = self.stops = 0
+
+    @property
+    def finished(self):
+        return self.index >= len(self.motion)
+
+    def begin(self):
+        self.begun += 1
+
+    def advance(self):
+        self.index += 1
+        return self.motion[self.index - 1], self.current[self.index - 1]
+
+    def stop(self):
+        self.stops += 1
+
+
 class GoesOn(Table):
     """A table of a stop: has the bounds of one from being told to, and plays on to its end."""
 
@@ -154,6 +179,12 @@ class GoesOn(Table):
 
 def still(rows: int, position=START) -> Table:
     return Table(np.tile(position, (rows, 1)))
+
+
+def bump(height, cycles: int) -> np.ndarray:
+    """From zero to `height` (n,) and back, with zero jerk at both ends, (cycles, n)."""
+    s = np.linspace(0.0, 1.0, cycles)[:, None]
+    return (4.0 * s * (1.0 - s)) ** 4 * np.asarray(height)
 
 
 def smooth_move(distance, cycles: int, start=START) -> Table:
@@ -166,13 +197,25 @@ def smooth_move(distance, cycles: int, start=START) -> Table:
 class Rig:
     """Session and controller. The arm is where the last answer told it to be."""
 
-    def __init__(self, *, guard_limits=None, init=None, slots=None, ring_capacity=4096, **options):
+    def __init__(
+        self,
+        *,
+        guard_limits=None,
+        init=None,
+        slots=None,
+        ring_capacity=4096,
+        period=PERIOD,
+        **options,
+    ):
         self.train = drive_train()
         self.ring = CycleRing(N, ring_capacity)
-        self.guard = Guard(guard_limits or limits(), PERIOD)
+        self.period = period
+        self.guard = Guard(guard_limits or limits(), period)
         options = {"settle_cycles": 5, **options}
+        self.mode = options.get("mode", Mode.POSITION)
+        self.ages = None
         self.session = Session(self.train, self.guard, self.ring, **options)
-        self.init = init or init_packet()
+        self.init = init or init_packet(sample_time=round(1000 * period))
         self.now = 0.0
         self.number = 0
         self.status = DRIVE_ON
@@ -201,8 +244,8 @@ class Rig:
 
     def send(self, packet: bytes) -> bytes | None:
         """Any bytes, one cycle later."""
-        self.now += PERIOD
-        reply = self.session.reply(packet, self.now)
+        self.now += self.period
+        reply = self.session.reply(packet, self.now, self.ages)
         self.events += self.session.events()
         self.transcript.append((packet, reply))
         return reply
@@ -232,7 +275,7 @@ class Rig:
         """Packets that never arrive."""
         for _ in range(cycles):
             self.packet()
-            self.now += PERIOD
+            self.now += self.period
 
     def cycle(self, count: int = 1) -> CyclicPacket | None:
         """Whole cycles; the answer to the last of them."""
@@ -252,7 +295,7 @@ class Rig:
         told = answer.axes
         if np.isin(told["mode"], NOT_SET_POINTS).any():
             return
-        moved = np.isin(told["mode"], (Mode.POSITION, Mode.POSITION_RELATIVE))
+        moved = np.isin(told["mode"], (*POSITION_MODES,))
         for target, field in ((0, 0), (2, 0), (1, 1), (3, 1)):
             self.axes["d"][moved, target] = told["d"][moved, field]
 
@@ -266,7 +309,7 @@ class Rig:
     def open(self) -> CyclicPacket | None:
         """Through closed into open mode, all axes at once."""
         self.close()
-        self.modes = Mode.POSITION
+        self.modes = self.mode
         return self.cycle()
 
     def run(self, cycles: int = 2000) -> None:

@@ -16,6 +16,8 @@ from drivers import (
     MotionEnded,
     SimulatedTransport,
     State,
+    StateChanged,
+    TransportClosed,
     exchange,
 )
 
@@ -167,3 +169,113 @@ def test_the_exchange_ends_when_it_is_told_to():
 def test_one_event_of_the_end_per_motion():
     rig, _, _ = run([Lose(150, count=10_000)], stays=1000)
     assert len(rig.seen(MotionEnded)) == 1
+
+
+class Piled:
+    """A link whose packets pile up now and then: each is there when the test says so."""
+
+    ages = None
+
+    def __init__(self, batches):
+        self.batches = [list(batch) for batch in batches]
+        self.now = 0.0
+        self.sent = []
+        self.waiting = []
+
+    def receive(self, timeout):
+        if not self.waiting and timeout > 0.0:
+            if not self.batches:
+                raise TransportClosed("the script is at its end")
+            self.waiting = self.batches.pop(0)
+            self.now += PERIOD * len(self.waiting)
+        return self.waiting.pop(0) if self.waiting else None
+
+    def send(self, packet):
+        self.sent.append(packet)
+
+    def rejected(self):
+        return {}
+
+    def forget_peer(self):
+        pass
+
+    def close(self):
+        pass
+
+
+class TestHeldUp:
+    """What the exchange does with packets that piled up while it was not running."""
+
+    def moving(self):
+        rig = Rig()
+        source = Cruise()
+        rig.session.request(source)
+        rig.open()
+        rig.cycle(300)
+        return rig, source
+
+    def serve(self, rig, on_time, late):
+        """One packet when it is due, so that the exchange knows what that is; then a pile."""
+        link = Piled([[on_time], late])
+        link.now = rig.now
+        exchange(link, rig.session, until=lambda: False)
+        return link.sent
+
+    def test_what_was_left_unanswered_is_counted_and_seen_as_a_gap(self):
+        rig, source = self.moving()
+        on_time = rig.packet()
+        late = [rig.packet() for _ in range(3)]
+        advances = source.advances
+        sent = self.serve(rig, on_time, late)
+        assert len(sent) == 2
+        assert source.advances == advances + 2
+        assert rig.session.counters.discarded == {"late": 2}
+        assert rig.session.counters.missed == 2
+        assert sent[1][:4] == (rig.number + 1).to_bytes(4, "little")
+
+    def test_more_than_the_session_bears_stop_the_motion(self):
+        rig, source = self.moving()
+        on_time = rig.packet()
+        self.serve(rig, on_time, [rig.packet() for _ in range(6)])
+        assert rig.session.counters.discarded == {"late": 5}
+        assert source.stops == 1 or rig.session.state is State.FAULTED
+
+    def test_with_closed_axes_every_packet_is_answered(self):
+        rig = Rig()
+        rig.close()
+        on_time = rig.packet()
+        late = [rig.packet() for _ in range(4)]
+        assert len(self.serve(rig, on_time, late)) == 5
+
+    def test_an_init_packet_among_them_is_never_left_out(self):
+        rig, _ = self.moving()
+        on_time, late = rig.packet(), rig.packet()
+        assert len(self.serve(rig, on_time, [late, rig.init.encode()])) == 3
+        assert State.INIT in [
+            event.after for event in rig.session.events() if isinstance(event, StateChanged)
+        ]
+
+    def test_each_packet_keeps_the_ages_it_came_with(self):
+        rig, _ = self.moving()
+        on_time, late = rig.packet(), rig.packet()
+        link = Piled([[on_time], [late, rig.init.encode(), b"short"]])
+        link.now = rig.now
+        ages = []
+        link.ages = np.zeros((N, 8), dtype=np.uint16)
+        receive, reply = link.receive, rig.session.reply
+
+        def aging(timeout):
+            link.ages += 1
+            return receive(timeout)
+
+        link.receive = aging
+        rig.session.reply = lambda packet, now, age: ages.append(age[0, 0]) or reply(packet, now)
+        exchange(link, rig.session, until=lambda: False)
+        assert ages == [1, 2, 3, 4]
+
+    def test_a_duplicate_is_answered_as_one(self):
+        rig, _ = self.moving()
+        on_time, late = rig.packet(), rig.packet()
+        sent = self.serve(rig, on_time, [late, late])
+        assert sent[1] == sent[2]
+        assert rig.session.counters.discarded == {}

@@ -172,6 +172,52 @@ class TestLongGaps:
         assert rig.state is State.OPEN
 
 
+class TestCorruptedNumbers:
+    """A number that was changed on its way makes the controller's own look stale for a while."""
+
+    def corrupted(self, ahead: int):
+        rig, source = moving()
+        true = rig.number
+        rig.number = true + ahead - 1
+        rig.cycle()
+        assert rig.state is State.OPEN
+        rig.number = true + 1
+        return rig, source
+
+    def test_another_packet_with_the_same_number_is_no_duplicate(self):
+        rig, _ = moving()
+        packet, reply = rig.transcript[-1]
+        other = bytearray(packet)
+        other[4] = 0
+        assert rig.send(bytes(other)) is None
+        assert rig.session.counters.stale == 1
+        assert rig.send(packet) == reply
+
+    def test_no_old_set_point_is_given_out_when_the_numbers_meet(self):
+        rig, _ = self.corrupted(64)
+        answers = [rig.cycle() for _ in range(63)]
+        assert answers == [None] * 63
+        assert rig.session.counters.stale == 63
+
+    def test_packets_that_went_unanswered_meanwhile_are_a_gap(self):
+        rig, source = self.corrupted(3)
+        assert (rig.cycle(), rig.cycle()) == (None, None)
+        rig.cycle()
+        assert rig.state is State.OPEN
+        assert source.stops == 0
+        rig, source = self.corrupted(64)
+        rig.cycle(63)
+        rig.axes["d"][:, [1, 3]] = 0.0
+        assert_refused(rig, rig.cycle(), MotionHeld)
+
+    def test_a_stale_packet_or_two_are_not(self):
+        rig, source = moving()
+        for packet, _ in rig.transcript[-5:-3]:
+            assert rig.send(packet) is None
+        rig.cycle()
+        assert (rig.state, source.stops) == (State.OPEN, 0)
+
+
 class TestStop:
     def test_stop_brings_the_motion_to_rest_on_its_path_and_leaves(self):
         rig = Rig()

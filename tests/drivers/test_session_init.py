@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import N, Rig, init_packet, still
+from rig import START, N, Rig, drive_train, init_packet, smooth_move, still
 
-from drivers import InitReceived, Mode, RequestError
+from drivers import InitReceived, Mode, RequestError, State
+from drivers.packets import NO_SLOT
 
 
 class TestInitOfAnotherArm:
@@ -93,3 +94,162 @@ class TestInitThatDoesNotFit:
         assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
         assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
         assert np.isnan(rig.records["position"]).all()
+
+
+class TestDifferences:
+    """Each is named with the axis and both values, whether or not anything can be done."""
+
+    def told(self, init, **options) -> InitReceived:
+        rig = Rig(init=init, **options)
+        rig.start()
+        return rig.seen(InitReceived)[0]
+
+    def test_none(self):
+        event = self.told(init_packet())
+        assert (event.differences, event.unusable, event.adopted) == ((), None, False)
+
+    def test_of_the_cycle(self):
+        event = self.told(init_packet(sample_time=1))
+        assert event.differences == ("cycle is 1 ms in the controller, 2 ms in the cell",)
+
+    def test_of_axes_that_are_not_open(self):
+        axes_map = np.full((4, 10), NO_SLOT)
+        axes_map[0, :N] = [0, NO_SLOT, 1, 2, NO_SLOT, 3]
+        event = self.told(init_packet(n_axes=4, open_axes_map=axes_map))
+        assert event.differences == (
+            "axis 2 of arm 1 is not open in the controller, joint 2 in the cell",
+            "axis 5 of arm 1 is not open in the controller, joint 5 in the cell",
+        )
+
+    def test_of_an_arm_that_is_not_there(self):
+        event = self.told(init_packet(), arm=3)
+        assert "axis 1 of arm 3 is not open" in event.differences[0]
+
+    def test_of_everything_at_once(self):
+        init = init_packet(sample_time=4, open_axes_map=np.full((4, 10), 1))
+        init.record["gear_ratio"][0, 0, 0] = 119.5
+        init.record["kinematic_influence"][0, 0, 5] = 0.04
+        event = self.told(init)
+        assert [difference.split(" is ")[0] for difference in event.differences] == [
+            "cycle",
+            "packet open_axes_map",
+            "gear ratio of axis 1",
+            "k65 of axis 6",
+        ]
+        assert event.unusable == "; ".join(event.differences)
+
+
+class TestAcceptedInit:
+    def other(self, **changes) -> Rig:
+        init = init_packet()
+        for name, (axis, value) in changes.items():
+            init.record[name][0, 0, axis] = value
+        return Rig(init=init, accept_init=True)
+
+    def test_the_controllers_values_are_in_force(self):
+        rig = self.other(
+            gear_ratio=(2, -111.5), calibration=(4, 0.75), kinematic_influence=(4, 0.004)
+        )
+        assert rig.session.drive_train is rig.train
+        rig.start()
+        event = rig.seen(InitReceived)[0]
+        assert (event.unusable, event.adopted) == (None, True)
+        assert [text.split(" is ")[0] for text in event.differences] == [
+            "gear ratio of axis 3",
+            "calibration of axis 5",
+            "k64 of axis 6",
+        ]
+        train = rig.session.drive_train
+        np.testing.assert_array_equal(train.gear_ratio, [-120, 150, -111.5, 90, 80, -60])
+        np.testing.assert_array_equal(train.calibration, [0.5, -1.25, 2, 0, 0.75, -0.75])
+        np.testing.assert_allclose([train.k54, train.k64, train.k65], [0.01, 0.004, 0.03], 1e-6)
+        np.testing.assert_array_equal(train.joint_sign, rig.train.joint_sign)
+        np.testing.assert_array_equal(train.torque_constant, rig.train.torque_constant)
+
+    def test_records_and_set_points_use_them(self):
+        rig = self.other(gear_ratio=(2, -111.5), calibration=(4, 0.75))
+        rig.start()
+        rig.train = rig.session.drive_train
+        rig.put_arm_at(START)
+        move = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
+        rig.session.request(smooth_move(move, 300))
+        rig.open()
+        np.testing.assert_allclose(rig.records[-1]["position"], START, atol=1e-6)
+        rig.run()
+        assert rig.ended.outcome == "completed"
+        end = rig.axes["d"][:, 0]
+        np.testing.assert_allclose(rig.train.joint_position(end), START + move, atol=1e-6)
+        motor = drive_train().motor_revolutions(START + move)
+        assert abs(end[2] - motor[2]) > 0.01
+        np.testing.assert_allclose(end[4] - motor[4], 0.5, atol=1e-5)
+
+    def test_the_guard_stays_with_the_joints(self):
+        rig = self.other(gear_ratio=(2, -111.5))
+        rig.start()
+        rig.train = rig.session.drive_train
+        rig.put_arm_at(START)
+        rig.session.request(smooth_move(np.array([0, 0, 2.0, 0, 0, 0]), 3000))
+        rig.open()
+        rig.cycle(3000)
+        assert (rig.refusal.joint, rig.refusal.bound) == (2, pytest.approx(2.0, rel=1e-5))
+        assert 2.0 < rig.refusal.value < 2.01
+
+    @pytest.mark.parametrize(
+        ("field", "axis", "value"),
+        [
+            ("gear_ratio", 2, np.nan),
+            ("gear_ratio", 2, 0.0),
+            ("gear_ratio", 2, np.inf),
+            ("calibration", 1, np.nan),
+            ("calibration", 1, -np.inf),
+            ("kinematic_influence", 3, np.nan),
+            ("kinematic_influence", 5, np.inf),
+        ],
+    )
+    def test_what_is_no_value_cannot_be_accepted(self, field, axis, value):
+        rig = self.other(**{field: (axis, value)})
+        rig.start()
+        event = rig.seen(InitReceived)[0]
+        assert len(event.differences) == 1
+        assert "cannot be accepted" in event.unusable
+        assert not event.adopted
+        assert rig.session.drive_train is rig.train
+        with pytest.raises(RequestError, match="cannot be accepted"):
+            rig.session.request(still(3))
+
+    def test_nor_can_another_cycle_or_an_axis_that_is_closed(self):
+        init = init_packet(sample_time=1)
+        init.record["gear_ratio"][0, 0, 2] = -111.5
+        rig = Rig(init=init, accept_init=True)
+        rig.start()
+        event = rig.seen(InitReceived)[0]
+        assert event.unusable == "cycle is 1 ms in the controller, 2 ms in the cell"
+        assert len(event.differences) == 2
+        assert not event.adopted
+        rig = Rig(init=init_packet(n_axes=5), accept_init=True)
+        rig.start()
+        assert "axis 6 of arm 1 is not open" in rig.seen(InitReceived)[0].unusable
+
+    def test_without_a_difference_the_cells_values_stay(self):
+        rig = Rig(accept_init=True)
+        rig.start()
+        assert not rig.seen(InitReceived)[0].adopted
+        assert rig.session.drive_train is rig.train
+
+    def test_a_later_init_packet_is_judged_by_itself(self):
+        rig = self.other(gear_ratio=(2, -111.5))
+        rig.start()
+        assert rig.session.drive_train is not rig.train
+        rig.init = init_packet()
+        rig.start()
+        assert rig.session.drive_train is rig.train
+        assert rig.state is State.INIT
+
+    def test_nothing_is_adopted_unless_it_was_asked_for(self):
+        init = init_packet()
+        init.record["calibration"][0, 0, 0] = 0.75
+        rig = Rig(init=init)
+        rig.start()
+        event = rig.seen(InitReceived)[0]
+        assert not event.adopted
+        assert event.unusable == event.differences[0]

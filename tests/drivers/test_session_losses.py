@@ -102,14 +102,28 @@ class TestLostMotion:
         assert rig.state is State.CLOSED
         assert source.advances == advances
 
-    def test_the_first_set_point_rule_holds_again_after_a_pause(self):
+    @pytest.mark.parametrize("pause", [Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER])
+    def test_after_a_pause_the_axes_have_to_close_first(self, pause):
         rig, _ = moving()
-        rig.modes = Mode.PAUSE_BY_CONTROLLER
+        rig.modes = pause
         rig.cycle()
-        rig.axes["d"][0, 2] += 0.5
         rig.modes = Mode.POSITION
         assert all_drive_off(rig.cycle())
-        assert "received target" in str(rig.refusal)
+        assert rig.state is State.FAULTED
+        rig.axes["d"][:, [1, 3]] = 0.0
+        rig.open()
+        assert rig.state is State.OPEN
+
+    @pytest.mark.parametrize("pause", [Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER])
+    def test_a_pause_does_not_lead_from_a_fault_to_open_mode(self, pause):
+        rig = Rig()
+        rig.close()
+        rig.session.tick(rig.now + 2.0)
+        assert rig.state is State.FAULTED
+        rig.modes = pause
+        rig.cycle()
+        rig.modes = Mode.POSITION
+        assert all_drive_off(rig.cycle())
 
     def test_a_waiting_motion_is_lost_when_the_controller_starts_over(self):
         rig = Rig()

@@ -285,3 +285,24 @@ class TestRequest:
         rig.cycle()
         with pytest.raises(RequestError, match="new one"):
             rig.session.request(still(3))
+
+
+@pytest.mark.parametrize("period", [0.001, 0.002])
+@pytest.mark.parametrize("mode", [1, 4, 5])
+def test_a_motion_at_either_cycle_in_every_mode_of_positions(period, mode):
+    rig = Rig(mode=mode, period=period)
+    source = smooth_move(MOVE, round(0.6 / period))
+    source.velocities = np.diff(source.positions, axis=0, prepend=source.positions[:1]) / period
+    rig.session.request(source)
+    rig.open()
+    rig.cycle(200)
+    np.testing.assert_allclose(
+        rig.records[-1]["commanded_velocity"], source.velocities[200], rtol=1e-6, atol=1e-9
+    )
+    d = rig.axes["d"].astype(np.float64)
+    np.testing.assert_allclose(
+        rig.train.joint_velocity(d[:, 1], period), source.velocities[200], rtol=1e-5, atol=1e-7
+    )
+    rig.run()
+    assert rig.ended.outcome == "completed"
+    assert rig.session.period == period

@@ -63,11 +63,11 @@ def test_open_mode_is_entered_only_from_where_axes_were_closed_with_the_drive_on
     entered_from = {
         state for state, row in TRANSITIONS.items() for after in row.values() if after is State.OPEN
     }
-    allowed = {State.DRIVING_ON, State.CLOSED, State.OPENING, State.FREEZING, State.OPEN}
+    allowed = {State.DRIVING_ON, State.CLOSED, State.OPENING, State.OPEN}
     assert entered_from == allowed
 
 
-@pytest.mark.parametrize("state", [State.INIT, State.DRIVE_OFF, State.FAULTED])
+@pytest.mark.parametrize("state", [State.INIT, State.DRIVE_OFF, State.FREEZING, State.FAULTED])
 @pytest.mark.parametrize("what", [Input.OPEN, Input.PARTLY_OPEN])
 def test_open_axes_are_not_believed_before_closed_ones(state, what):
     assert TRANSITIONS[state][what] is State.FAULTED
@@ -78,9 +78,9 @@ def test_a_fault_is_left_only_by_what_cannot_move():
     assert not moving
 
 
-def test_only_open_mode_can_be_left_on_request():
+def test_only_open_axes_can_be_left_on_request():
     asking = [state for state, row in TRANSITIONS.items() if Input.EXIT in row]
-    assert asking == [State.OPEN, State.EXITING]
+    assert asking == [State.OPENING, State.OPEN, State.EXITING]
 
 
 class TestReading:

@@ -78,6 +78,24 @@ class TransportContract:
             times.append(near.now)
         assert times == sorted(times)
 
+    def test_a_link_without_trouble_has_discarded_nothing(self, link):
+        near, far = link
+        far.send(bytes(48))
+        near.receive(PATIENCE)
+        near.send(bytes(48))
+        assert near.rejected() == {}
+
+    def test_a_forgotten_peer_that_goes_on_is_heard_and_answered(self, link):
+        near, far = link
+        far.send(bytes(48))
+        near.receive(PATIENCE)
+        near.forget_peer()
+        far.send(bytes(range(84)))
+        assert near.receive(PATIENCE) == bytes(range(84))
+        near.send(b"answer" * 10)
+        far.wait()
+        assert far.replies[-1] == b"answer" * 10
+
     def test_a_closed_link_says_so(self, link):
         near, _ = link
         near.close()

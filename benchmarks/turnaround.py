@@ -1,0 +1,297 @@
+"""From request to answer: exchange process and controller process on the loopback device, 1 kHz.
+
+The controller is paced by absolute deadlines; the exchange runs a long motion of six joints under
+the guard while an ordinary process drains its ring. In the same run, in blocks that alternate, a
+bare echo process with the same scheduling shows what this machine can do at all (the floor), and
+`cyclictest`, where it is installed, what it does without any network or Python.
+
+    python -m benchmarks.turnaround [--cycles N] [--busy] [--json]
+
+An answer that comes later than one cycle after its request is missed; for each, it is said where
+the time went. With `--busy` all is done once more beside a process that keeps a processor busy.
+"""
+
+# ruff: noqa: E402  the number of BLAS threads has to stand before numpy is imported
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+import argparse
+import json
+import multiprocessing
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.session import N, drive_train
+from benchmarks.turnaround_ends import (
+    HOST,
+    PERIOD,
+    WARM_UP,
+    Settings,
+    Sweep,
+    control,
+    drain,
+    echo,
+    spin,
+)
+from drivers import GuardLimits
+from drivers.exchange import ExchangeProcess, ExchangeSettings, RealTimeSettings
+from drivers.transports import UdpSpec
+
+Array = NDArray[np.float64]
+
+CLOSED_CYCLES = 5
+CYCLICTEST_SECONDS = 10
+AIM_P50_US = 60.0
+AIM_P99_US = 100.0
+"""How far above the floor the exchange may be."""
+_spawn = multiprocessing.get_context("spawn")
+
+
+def limits() -> GuardLimits:
+    """Limits that the sweep keeps."""
+    return GuardLimits(
+        lower=np.full(N, -3.0),
+        upper=np.full(N, 3.0),
+        velocity=np.full(N, 3.0),
+        acceleration=np.full(N, 20.0),
+        jerk=np.full(N, 300.0),
+        following_error=np.full(N, 2.0),
+        current=np.full(N, 20.0),
+    )
+
+
+def exchange_settings(port: int, realtime: RealTimeSettings) -> ExchangeSettings:
+    """A session that bears the pauses while the floor is measured, and any stall."""
+    session = {"silence_timeout": 3600.0, "max_gap": 1_000_000}
+    return ExchangeSettings(
+        UdpSpec(HOST, port, HOST),
+        drive_train(),
+        limits(),
+        PERIOD,
+        session,
+        realtime=realtime,
+        needs_archive=False,
+        preload=("benchmarks.turnaround_ends",),
+    )
+
+
+def free_port() -> int:
+    """A UDP port nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def steal_ticks() -> int:
+    """Ticks that the host of a virtual machine kept its processors for others."""
+    return int(Path("/proc/stat").read_text().split("\n", 1)[0].split()[8])
+
+
+def measure(cycles: int, blocks: int, folder: Path) -> dict[str, Any]:
+    """One run; the times in it and what the processes said."""
+    last = max(os.sched_getaffinity(0))
+    answering = RealTimeSettings(priority=50, cpu=last)
+    asking = replace(answering, priority=60, cpu=min(os.sched_getaffinity(0)))
+    ends = folder / "ends.npz"
+    arrivals = folder / "arrivals.npz"
+    ours, theirs = _spawn.Pipe()
+    port = free_port()
+    stolen = steal_ticks()
+    exchange = ExchangeProcess.start(exchange_settings(port, answering))
+    floor = _spawn.Process(target=echo, args=(theirs, answering), daemon=True)
+    reader = _spawn.Process(target=drain, args=(os.getpid(), exchange.ring_fd, str(arrivals)))
+    controller = None
+    try:
+        reader.start()
+        floor.start()
+        while not ours.poll(0.1):
+            exchange.beat()
+        settings = Settings(port, ours.recv(), cycles, blocks, asking, str(ends))
+        controller = _spawn.Process(target=control, args=(settings,))
+        exchange.submit(Sweep(cycles + 2 * WARM_UP))
+        controller.start()
+        while controller.is_alive():
+            exchange.beat()
+            controller.join(0.1)
+        arrivals.with_suffix(".end").touch()
+        while reader.is_alive():
+            exchange.beat()
+            reader.join(0.1)
+        status = exchange.status()
+        ended = exchange.wait(2.0)
+    finally:
+        for process in (reader, floor, controller):
+            if process is not None and process.is_alive():
+                process.kill()
+        if exchange.alive:
+            exchange.kill()
+    with np.load(ends) as file:
+        times = dict(file)
+    with np.load(arrivals) as file:
+        times |= {f"exchange_{name}": array for name, array in file.items()}
+    log = exchange.log
+    exchange.close()
+    if times["trouble"] or ended != 0:
+        raise SystemExit(f"the run failed: {times['trouble']} {ended} {log}")
+    times |= {"status": status, "realtime": exchange.realtime, "steal": steal_ticks() - stolen}
+    return times
+
+
+def trip(times: dict[str, Any], end: str) -> Array:
+    """From request to answer, s, of every measured cycle; infinite where none ever came."""
+    skipped = WARM_UP + (CLOSED_CYCLES if end == "ours" else 0)
+    taken = (times[f"{end}_received"] - times[f"{end}_sent"])[skipped:]
+    return np.where(np.isnan(taken), np.inf, taken)
+
+
+def accounts(times: dict[str, Any]) -> list[dict[str, Any]]:
+    """Each missed answer of the exchange, and where the time went."""
+    first = WARM_UP + CLOSED_CYCLES
+    taken = trip(times, "ours")
+    arrival = np.full(len(taken) + first + 1, np.nan)
+    cycle = times["exchange_cycle"]
+    inside = (cycle >= 1) & (cycle <= len(arrival))
+    arrival[cycle[inside] - 1] = times["exchange_arrival"][inside]
+    rows = []
+    for index in np.flatnonzero(taken > PERIOD):
+        at = int(index) + first
+        to_exchange = float(arrival[at] - times["ours_sent"][at])
+        answered = float(times["ours_received"][at] - arrival[at])
+        if np.isnan(to_exchange):
+            what = "the exchange was held up and left it unanswered for a later one"
+        elif to_exchange > 0.5 * PERIOD:
+            what = "the exchange was held up before it received"
+        elif np.isnan(answered):
+            what = "the answer was lost"
+        else:
+            what = "the exchange, or the controller waiting for it, was held up after it received"
+        rows.append(
+            {
+                "cycle": int(index),
+                "what": what,
+                "to_exchange_us": _us(to_exchange),
+                "from_exchange_us": _us(answered),
+                "controller_woke_late_us": _us(float(times["ours_woke_late"][at])),
+            }
+        )
+    return rows
+
+
+def _us(seconds: float) -> float | None:
+    return round(1e6 * seconds, 1) if np.isfinite(seconds) else None
+
+
+def summary(times: dict[str, Any]) -> dict[str, Any]:
+    """The figures of one run."""
+    result: dict[str, Any] = {}
+    for end, prefix, late in (("ours", "", "missed"), ("floor", "floor_", "floor_late")):
+        taken = trip(times, end)
+        in_time = np.where(np.isfinite(taken), taken, taken[np.isfinite(taken)].max())
+        for name, share in (("p50_us", 50.0), ("p99_us", 99.0), ("p999_us", 99.9), ("max_us", 100)):
+            result[prefix + name] = _us(float(np.percentile(in_time, share)))
+        result[late] = int((taken > PERIOD).sum())
+    status = times["status"]
+    result |= {
+        "cycles": len(trip(times, "ours")),
+        "controller_late": int((times["ours_woke_late"] > PERIOD).sum()),
+        "left_unanswered": status.late,
+        "worst_turnaround_us": round(status.worst_turnaround_us, 1),
+        "pickup_us": round(status.pickup_us, 1),
+        "records_lost": int(times["exchange_overflow"]),
+        "steal_ticks": times["steal"],
+        "scheduling": times["realtime"].scheduling,
+        "misses": accounts(times),
+    }
+    return result
+
+
+def cyclictest() -> dict[str, Any]:
+    """Wake-up latency as `cyclictest` sees it, where it is installed and permitted."""
+    command = shutil.which("cyclictest")
+    if command is None:
+        return {}
+    last = str(max(os.sched_getaffinity(0)))
+    options = ["-q", "-m", "-p50", "-i1000", "-t1", "-a", last, "-h20000"]
+    run = subprocess.run(
+        [command, *options, f"-D{CYCLICTEST_SECONDS}"], capture_output=True, text=True, check=False
+    )
+    rows = [line.split() for line in run.stdout.splitlines() if line[:1].isdigit()]
+    if run.returncode != 0 or not rows:
+        return {}
+    latency = np.repeat([int(row[0]) for row in rows], [int(row[1]) for row in rows])
+    highest = [line for line in run.stdout.splitlines() if line.startswith("# Max Latencies")]
+    return {
+        "cyclictest_p50_us": float(np.percentile(latency, 50)),
+        "cyclictest_p99_us": float(np.percentile(latency, 99)),
+        "cyclictest_max_us": int(highest[0].split(":")[1]),
+        "cyclictest_late": int((latency > 1000).sum()),
+    }
+
+
+def run(cycles: int, blocks: int, *, busy: bool) -> dict[str, Any]:
+    """One run with `cyclictest` after it, beside a load or not."""
+    load = _spawn.Process(target=spin, args=(os.getpid(),), daemon=True)
+    if busy:
+        load.start()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            result = summary(measure(cycles, blocks, Path(folder)))
+        return result | cyclictest()
+    finally:
+        if busy:
+            load.kill()
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--cycles", type=int, default=100_000)
+    parser.add_argument("--blocks", type=int, default=10)
+    parser.add_argument("--busy", action="store_true", help="once more beside a busy processor")
+    parser.add_argument("--json", action="store_true", help="only the line of JSON")
+    options = parser.parse_args()
+    begin = time.monotonic()
+    result = run(options.cycles, options.blocks, busy=False)
+    if options.busy:
+        beside = run(options.cycles, options.blocks, busy=True)
+        result |= {f"busy_{name}": value for name, value in beside.items()}
+    result["seconds"] = round(time.monotonic() - begin)
+    if not options.json:
+        show(result)
+    print(json.dumps(result))
+
+
+def show(result: dict[str, Any]) -> None:
+    """The figures, one per line, and every miss."""
+    for name, value in result.items():
+        if not name.endswith("misses"):
+            print(f"  {name:28s} {value}")
+    for prefix in ("", "busy_"):
+        for miss in result.get(f"{prefix}misses", ()):
+            print(f"  {prefix}missed cycle {miss['cycle']}: {miss['what']} ({miss})")
+        if f"{prefix}p50_us" in result:
+            over_p50 = result[f"{prefix}p50_us"] - result[f"{prefix}floor_p50_us"]
+            over_p99 = result[f"{prefix}p99_us"] - result[f"{prefix}floor_p99_us"]
+            more = result[f"{prefix}missed"] - result[f"{prefix}floor_late"]
+            print(
+                f"  {prefix or 'idle '}above the floor: p50 {over_p50:+.1f} us (aim {AIM_P50_US})"
+            )
+            print(f"  {' ':5}p99 {over_p99:+.1f} us (aim {AIM_P99_US}), misses {more:+d} (aim 0)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""The processes of `benchmarks.turnaround`: a controller, an echo, a reader of the ring, a load."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.session import AMPLITUDE, FREQUENCY, N, drive_train
+from drivers import CyclicPacket, InitPacket, Mode
+from drivers.exchange.realtime import RealTimeSettings, enter
+from drivers.exchange.shared_ring import RingReader
+from drivers.motion_source import BoundsName
+from drivers.packets import DRIVE_ON, LAST_NUMBER, next_number
+
+Array = NDArray[np.float64]
+
+HOST: Final = "127.0.0.1"
+PERIOD_MS: Final = 1
+PERIOD: Final = PERIOD_MS / 1000.0
+START: Final = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
+WARM_UP: Final = 300
+"""Cycles at the beginning that are not measured."""
+_TIMEVAL: Final = struct.Struct("@qq")
+
+
+class Sweep:
+    """Joint sinusoids, faded in over two seconds, for a given number of cycles; from a table."""
+
+    bounds: BoundsName = "plan"
+
+    def __init__(self, cycles: int) -> None:
+        t = np.arange(cycles + 1)[:, None] * PERIOD
+        s = np.clip(t / 2.0, 0.0, 1.0)
+        fade = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
+        rate = 0.5 * 140.0 * s**3 * (1.0 - s) ** 3
+        phase = 2.0 * np.pi * FREQUENCY * t
+        slope = fade * 2.0 * np.pi * FREQUENCY * np.cos(phase) + rate * np.sin(phase)
+        self.position = START + AMPLITUDE * fade * np.sin(phase)
+        self.velocity = AMPLITUDE * slope
+        self.start = START
+        self._offset = np.zeros(N)
+        self._index = 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether the table is at its end."""
+        return self._index + 1 >= len(self.position)
+
+    def begin(self, position: Array) -> None:
+        """Shift the table to where the arm is."""
+        self._offset = position - self.start
+
+    def advance(self) -> tuple[Array, Array]:
+        """The next row."""
+        self._index += 1
+        return self.position[self._index] + self._offset, self.velocity[self._index]
+
+    def stop(self) -> None:
+        """Not asked for."""
+        raise NotImplementedError("the benchmark never stops")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the controller is to do: `blocks` times the floor, then the exchange, alternating."""
+
+    exchange_port: int
+    echo_port: int
+    cycles: int
+    blocks: int
+    realtime: RealTimeSettings
+    result: str
+
+
+class Pace:
+    """Absolute deadlines, one per cycle; a stall is not made up for."""
+
+    def __init__(self) -> None:
+        self.next = time.monotonic()
+
+    def wait(self) -> float:
+        """Until the next deadline; returns how late this process woke."""
+        self.next += PERIOD
+        now = time.monotonic()
+        if now < self.next:
+            time.sleep(self.next - now)
+            now = time.monotonic()
+        late = now - self.next
+        if late > PERIOD:
+            self.next = now
+        return late
+
+
+class Asking:
+    """One socket of the controller, and the times of every request and answer."""
+
+    def __init__(self, port: int, cycles: int) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.connect((HOST, port))
+        patience = _TIMEVAL.pack(0, int(PERIOD * 1e6))
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, patience)
+        self.sent = np.full(cycles, np.nan)
+        self.received = np.full(cycles, np.nan)
+        self.woke_late = np.full(cycles, np.nan)
+        self.asked = 0
+
+    def ask(self, packet: bytes, number: int, answer_ahead: int, late: float) -> bytes | None:
+        """Send, and wait for the answer for one cycle; late ones are noted where they belong."""
+        index = self.asked
+        self.asked += 1
+        self.woke_late[index] = late
+        self.sent[index] = now = time.monotonic()
+        self.socket.send(packet)
+        end = now + PERIOD
+        while now < end:
+            try:
+                answer = self.socket.recv(2048)
+            except BlockingIOError:
+                return None
+            now = time.monotonic()
+            behind = (number + answer_ahead - int.from_bytes(answer[:4], "little")) % LAST_NUMBER
+            if behind <= index:
+                self.received[index - behind] = now
+            if behind == 0:
+                return answer if now < end else None
+        return None
+
+
+class Controller:
+    """Packets of an arm that is where it was told to be, in open mode."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._blocks = settings.blocks
+        self._block = settings.cycles // settings.blocks
+        # Ten cycles more: closed, and the last answers.
+        self.ours = Asking(settings.exchange_port, settings.cycles + WARM_UP + 10)
+        self.floor = Asking(settings.echo_port, settings.cycles + WARM_UP + 10)
+        self._number = 10
+        self._packet = bytearray()
+        self._view = CyclicPacket.zeros(1, N).axes
+        self._view["d"][:, 0] = self._view["d"][:, 2] = drive_train().motor_revolutions(START)
+        self._view["d"][:, 4] = 1.0
+
+    def start(self) -> None:
+        """Restart with the init packet."""
+        drives = drive_train()
+        init = InitPacket.build(
+            N,
+            PERIOD_MS,
+            {
+                "following_error": np.full(N, 2.0),
+                "current_limit": np.full(N, 20.0),
+                "gear_ratio": drives.gear_ratio,
+                "calibration": drives.calibration,
+                "kinematic_influence": [0.0, 0.0, 0.0, drives.k54, drives.k64, drives.k65],
+            },
+        )
+        for _ in range(100):
+            self.ours.socket.send(init.encode())
+            time.sleep(0.01)
+            try:
+                self.ours.socket.recv(2048)
+                return
+            except BlockingIOError:
+                continue
+        raise RuntimeError("the exchange process does not answer the init packet")
+
+    def _ask_ours(self, late: float, mode: int) -> None:
+        self._number = next_number(self._number)
+        self._view["mode"] = mode
+        header = struct.pack("<iII", self._number, DRIVE_ON, 0)
+        reply = self.ours.ask(header + self._view.tobytes(), self._number, 1, late)
+        if reply is None or mode == Mode.CLOSED:
+            return
+        told = np.frombuffer(reply, self._view.dtype, offset=12)
+        if (told["mode"] != mode).any():
+            raise RuntimeError(f"the exchange asks for mode {told['mode'].tolist()}")
+        self._view["d"][:, 0] = self._view["d"][:, 2] = told["d"][:, 0]
+        self._view["d"][:, 1] = self._view["d"][:, 3] = told["d"][:, 1]
+
+    def run(self) -> None:
+        """All blocks."""
+        self.start()
+        pace = Pace()
+        for _ in range(5):
+            self._ask_ours(pace.wait(), Mode.CLOSED)
+        echo = 0
+        for block in range(self._blocks + 1):
+            cycles = self._block if block else WARM_UP
+            for _ in range(cycles):
+                late = pace.wait()
+                echo = next_number(echo)
+                self.floor.ask(struct.pack("<i", echo) + bytes(224), echo, 0, late)
+            for _ in range(cycles):
+                self._ask_ours(pace.wait(), Mode.POSITION)
+        time.sleep(0.01)
+        self.end()
+
+    def end(self) -> None:
+        """Mode 504: the session is over."""
+        self._view["mode"] = Mode.END_OF_SESSION
+        self._number = next_number(self._number)
+        header = struct.pack("<iII", self._number, 0, 0)
+        self.ours.socket.send(header + self._view.tobytes())
+
+
+def control(settings: Settings) -> None:
+    """The controller's process."""
+    controller = Controller(settings)
+    report = enter(settings.realtime)
+    trouble = ""
+    try:
+        controller.run()
+    except RuntimeError as error:
+        trouble = str(error)
+        controller.end()
+    ours, floor = controller.ours, controller.floor
+    np.savez(
+        settings.result,
+        **{
+            f"{name}_{field}": getattr(end, field)[: end.asked]
+            for name, end in (("ours", ours), ("floor", floor))
+            for field in ("sent", "received", "woke_late")
+        },
+        scheduling=np.array(report.scheduling),
+        trouble=np.array(trouble),
+    )
+
+
+def echo(told: Connection, realtime: RealTimeSettings) -> None:
+    """The floor: a process that does nothing but send back what it gets."""
+    server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    server.bind((HOST, 0))
+    told.send(server.getsockname()[1])
+    enter(realtime)
+    receive, send = server.recvfrom, server.sendto
+    while True:
+        packet, sender = receive(1501)
+        send(packet, sender)
+
+
+def drain(supervisor: int, ring_fd: int, result: str) -> None:
+    """An ordinary process that reads every record, and keeps the times of arrival."""
+    reader = RingReader(os.open(f"/proc/{supervisor}/fd/{ring_fd}", os.O_RDWR), N)
+    kept: list[NDArray[np.void]] = []
+    done = Path(result).with_suffix(".end")
+    while not done.exists() and os.getppid() == supervisor:
+        time.sleep(0.02)
+        kept.append(reader.drain()[["cycle", "arrival"]])
+    kept.append(reader.drain()[["cycle", "arrival"]])
+    records = np.concatenate(kept)
+    np.savez(
+        result,
+        cycle=records["cycle"],
+        arrival=records["arrival"],
+        overflow=np.array(reader.overflow),
+    )
+
+
+def spin(supervisor: int) -> None:
+    """Keep a processor busy at ordinary priority."""
+    while os.getppid() == supervisor:
+        sum(range(100_000))

@@ -1,0 +1,42 @@
+"""The exchange: answering a controller's packets, in this process or in one of its own."""
+
+from __future__ import annotations
+
+from drivers.exchange.control import ArchiveState, ControlBlock
+from drivers.exchange.errors import ExchangeError
+from drivers.exchange.event_log import EventReader, EventWriter
+from drivers.exchange.loop import exchange
+from drivers.exchange.notices import (
+    ExchangeEnded,
+    ExchangeEvent,
+    ExchangeFailed,
+    ExchangeStarted,
+    Leaving,
+    OverrideRefused,
+)
+from drivers.exchange.process import ExchangeProcess, ExchangeStatus
+from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
+from drivers.exchange.settings import ExchangeSettings
+from drivers.exchange.shared_ring import RingReader, SharedCycleRing
+
+__all__ = [
+    "ArchiveState",
+    "ControlBlock",
+    "EventReader",
+    "EventWriter",
+    "ExchangeEnded",
+    "ExchangeError",
+    "ExchangeEvent",
+    "ExchangeFailed",
+    "ExchangeProcess",
+    "ExchangeSettings",
+    "ExchangeStarted",
+    "ExchangeStatus",
+    "Leaving",
+    "OverrideRefused",
+    "RealTimeReport",
+    "RealTimeSettings",
+    "RingReader",
+    "SharedCycleRing",
+    "exchange",
+]

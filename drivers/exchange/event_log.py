@@ -1,0 +1,111 @@
+"""Events in shared memory: a ring of bytes that one process writes and others read.
+
+Each frame is length, checksum and index, then one pickled event. The writer first says which
+frames it is about to overwrite, then writes, then says how far it got; a reader copies, then
+looks which of the frames it copied were given up meanwhile. Order of stores as in `shared_ring`.
+"""
+
+from __future__ import annotations
+
+import pickle
+import struct
+import zlib
+from typing import Final
+
+from drivers.exchange import memory
+from drivers.exchange.notices import ExchangeEvent
+
+CAPACITY: Final = 4 << 20
+"""Bytes: some hundred refusals with their flight recorders, or 50 000 small events."""
+_HEADER_BYTES: Final = 256
+_FRAME: Final = struct.Struct("<IIQ")
+_HEAD, _TAIL = 8, 16
+
+
+def create(capacity: int = CAPACITY) -> int:
+    """Descriptor of memory for a log of `capacity` bytes."""
+    return memory.create("hil-events", _HEADER_BYTES + capacity)
+
+
+class _Log:
+    def __init__(self, fd: int) -> None:
+        whole = memoryview(memory.attach(fd))
+        self._words = whole[:_HEADER_BYTES].cast("Q")
+        self._bytes = whole[_HEADER_BYTES:]
+        self._capacity = len(self._bytes)
+
+    def _get(self, position: int, count: int) -> bytes:
+        begin = position % self._capacity
+        first = bytes(self._bytes[begin : begin + count])
+        return first + bytes(self._bytes[: count - len(first)])
+
+
+class EventWriter(_Log):
+    """The writer's end."""
+
+    def __init__(self, fd: int) -> None:
+        super().__init__(fd)
+        self._head = 0
+        self._tail = 0
+        self._count = 0
+
+    def write(self, event: ExchangeEvent) -> None:
+        """Append one event, over the oldest where there is no room.
+
+        Raises:
+            ValueError: longer than the whole log.
+        """
+        body = pickle.dumps(event, protocol=5)
+        frame = _FRAME.pack(len(body), zlib.crc32(body), self._count) + body
+        if len(frame) > self._capacity:
+            raise ValueError(f"an event of {len(frame)} bytes in a log of {self._capacity}")
+        self._count += 1
+        end = self._head + len(frame)
+        while end - self._tail > self._capacity:
+            length = _FRAME.unpack(self._get(self._tail, _FRAME.size))[0]
+            self._tail += _FRAME.size + length
+        self._words[_TAIL] = self._tail
+        begin = self._head % self._capacity
+        first = min(len(frame), self._capacity - begin)
+        self._bytes[begin : begin + first] = frame[:first]
+        self._bytes[: len(frame) - first] = frame[first:]
+        self._head = end
+        self._words[_HEAD] = end
+
+
+class EventReader(_Log):
+    """A reader's end, from the oldest event still there.
+
+    Attributes:
+        lost: events overwritten before this reader had them.
+    """
+
+    def __init__(self, fd: int) -> None:
+        super().__init__(fd)
+        self._position: int = self._words[_TAIL]
+        # Index of the next event; unknown to who comes when the first are gone.
+        self._expected: int | None = None if self._position else 0
+        self.lost = 0
+
+    def drain(self) -> list[ExchangeEvent]:
+        """The events not read yet, in order."""
+        head = self._words[_HEAD]
+        begin = max(self._position, self._words[_TAIL])
+        copy = self._get(begin, head - begin)
+        valid = self._words[_TAIL]
+        self._position = head
+        events: list[ExchangeEvent] = []
+        # Where the writer lapped all that was copied, its oldest frame begins beyond the copy.
+        at = max(begin, valid)
+        while at < head:
+            length, checksum, index = _FRAME.unpack_from(copy, at - begin)
+            at += _FRAME.size
+            body = copy[at - begin : at - begin + length]
+            at += length
+            self.lost += index - (index if self._expected is None else self._expected)
+            self._expected = index + 1
+            if zlib.crc32(body) == checksum:
+                events.append(pickle.loads(body))
+            else:
+                self.lost += 1
+        return events

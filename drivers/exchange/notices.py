@@ -1,0 +1,59 @@
+"""What the exchange process says of itself, in the same log as the session's events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.events import Event
+from drivers.exchange.realtime import RealTimeReport
+
+
+@dataclass(frozen=True)
+class ExchangeStarted:
+    """The link is open.
+
+    Attributes:
+        pid: of the process.
+        realtime: what the system granted.
+        notes: options of the link that the system refused, in words.
+    """
+
+    pid: int
+    realtime: RealTimeReport
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class OverrideRefused:
+    """The motion going on cannot change its speed, for the reason given."""
+
+    fraction: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Leaving:
+    """No motion is accepted any more; what goes on is brought to rest and open mode left."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class ExchangeEnded:
+    """The last thing a process says that ends properly."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class ExchangeFailed:
+    """The last thing a process says that ends because of an error in itself.
+
+    The controller's own watch has to act.
+    """
+
+    trace: str
+
+
+ExchangeEvent = Event | ExchangeStarted | OverrideRefused | Leaving | ExchangeEnded | ExchangeFailed
+"""Everything in an event log."""

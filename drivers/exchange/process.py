@@ -1,0 +1,271 @@
+"""The supervisor's handle on an exchange process."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.errors import RequestError
+from drivers.exchange import control, event_log, memory
+from drivers.exchange.errors import ExchangeError
+from drivers.exchange.event_log import EventReader
+from drivers.exchange.inbox import LONGEST_MESSAGE, hand_over
+from drivers.exchange.notices import ExchangeEvent
+from drivers.exchange.realtime import RealTimeReport
+from drivers.exchange.settings import ExchangeSettings
+from drivers.exchange.shared_ring import SharedCycleRing
+from drivers.motion_source import MotionSource
+from drivers.states import State
+
+START_TIMEOUT: Final = 60.0
+"""s until a process that was started has opened its link; imports may be slow on a cold disk."""
+ANSWER_TIMEOUT: Final = 5.0
+"""s until a program has been accepted or refused."""
+_BEAT: Final = 0.1
+
+
+@dataclass(frozen=True)
+class ExchangeStatus:
+    """The exchange's fields of the control block, at one moment; see `ControlBlock`."""
+
+    state: State
+    cycle: int
+    interval: int
+    heartbeat_age: float
+    program_accepted: int
+    program_refused: int
+    pickup_us: float
+    ended_count: int
+    overflow: int
+    answered: int
+    missed: int
+    duplicates: int
+    stale: int
+    malformed: int
+    foreign: int
+    late: int
+    refused: int
+    worst_turnaround_us: float
+    finished: bool
+
+
+class ExchangeProcess:
+    """An exchange that runs in a process, and a process session, of its own.
+
+    It outlives this process for as long as it takes to stop the arm on its path and to leave
+    open mode; it does so when `beat` was not called for half a second. Use `start`.
+
+    Attributes:
+        pid: of the process.
+        realtime: what the system granted it.
+        notes: options of the link that the system refused, in words.
+        ring_fd: memory of the cycle records, for a `RingReader`.
+        event_fd: memory of the events, for an `EventReader`.
+        control_fd: memory of the control block, for a `ControlBlock`.
+    """
+
+    def __init__(self, settings: ExchangeSettings) -> None:
+        n_joints = settings.drive_train.n_joints
+        self.ring_fd = SharedCycleRing.create(n_joints, settings.ring_capacity).fd
+        self.event_fd = event_log.create()
+        self.control_fd = control.create()
+        self._log_fd = memory.create("hil-exchange-log", 0)
+        self._control = control.ControlBlock(self.control_fd)
+        self._events = EventReader(self.event_fd)
+        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.beat()
+        settings_fd = memory.create("hil-settings", 0)
+        try:
+            os.pwrite(settings_fd, pickle.dumps(settings, protocol=5), 0)
+            fds = (theirs.fileno(), settings_fd, self.ring_fd, self.event_fd, self.control_fd)
+            self._process = _spawn(fds, self._log_fd)
+        finally:
+            os.close(settings_fd)
+            theirs.close()
+        self.pid = self._process.pid
+        self.realtime: RealTimeReport
+        self.notes: tuple[str, ...]
+
+    @classmethod
+    def start(cls, settings: ExchangeSettings) -> ExchangeProcess:
+        """Start the process and wait until its link is open.
+
+        Raises:
+            TransportError: the link cannot be opened.
+            ExchangeError: it did not get that far; the message has its last words.
+        """
+        exchange = cls(settings)
+        try:
+            ready = exchange._answer(START_TIMEOUT)
+            if isinstance(ready, BaseException):
+                raise ready
+        except BaseException:
+            exchange.kill()
+            exchange.close()
+            raise
+        exchange.realtime, exchange.notes = ready
+        return exchange
+
+    def beat(self) -> None:
+        """Sign of life; to be given at least every 0.2 s, from any thread."""
+        self._control.supervisor_heartbeat = time.monotonic()
+
+    def submit(self, source: MotionSource) -> int:
+        """Hand a motion over, to be run as soon as every wanted axis is open.
+
+        Its arrays of 4 KiB and more arrive read-only. Reading it takes the exchange about 0.2 ms
+        per MB, so that answers may come late meanwhile; axes should be closed. Gives signs of
+        life while it waits; a motion that is not accepted in time is withdrawn.
+
+        Returns:
+            The program's id.
+
+        Raises:
+            RequestError: the session refuses it.
+            ExchangeError: the exchange does not answer.
+        """
+        identity = self._control.program_id + 1
+        try:
+            hand_over(self._channel, identity, source)
+        except OSError as error:
+            raise ExchangeError(f"the exchange process is gone: {error}") from error
+        self._control.program_id = identity
+        answered = 0
+        try:
+            while answered != identity:  # the answer to one that was withdrawn may still come
+                answered, refusal = self._answer(ANSWER_TIMEOUT)
+        except BaseException:
+            # Nobody waits for this motion any more: it must not begin after all.
+            self._control.program_id = identity + 1
+            raise
+        if refusal is not None:
+            raise RequestError(*refusal)
+        return identity
+
+    def stop(self) -> None:
+        """Ask for a stop on the path and for the end of open mode."""
+        self._control.stop_count += 1
+
+    def override(self, fraction: float) -> None:
+        """Ask the motion going on for another fraction of its speed.
+
+        Where it cannot, `OverrideRefused` is among the events.
+        """
+        self._control.override = fraction
+        self._control.override_count += 1
+
+    def finish(self) -> None:
+        """Ask it to leave open mode and to end when the axes have been closed for a second."""
+        self._control.finish = 1
+
+    def events(self) -> list[ExchangeEvent]:
+        """What happened since the last call, in order."""
+        return self._events.drain()
+
+    def status(self) -> ExchangeStatus:
+        """Where it stands."""
+        block = self._control
+        return ExchangeStatus(
+            state=State(block.state),
+            heartbeat_age=time.monotonic() - block.exchange_heartbeat,
+            finished=bool(block.finished),
+            **{name: getattr(block, name) for name in _COPIED},
+        )
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    @property
+    def log(self) -> str:
+        """What it wrote to its standard error: nothing, unless something is wrong."""
+        size = os.fstat(self._log_fd).st_size
+        return os.pread(self._log_fd, size, 0).decode(errors="replace")
+
+    def wait(self, timeout: float) -> int | None:
+        """Its exit status, or None if it still runs after `timeout` s; gives signs of life."""
+        end = time.monotonic() + timeout
+        while True:
+            self.beat()
+            left = end - time.monotonic()
+            try:
+                return self._process.wait(max(0.0, min(left, _BEAT)))
+            except subprocess.TimeoutExpired:
+                if left <= _BEAT:
+                    return None
+
+    def terminate(self) -> None:
+        """Ask for a stop on the path and for the end of the process, by signal."""
+        if self.alive:
+            self._process.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it at once: an arm in motion is left to the controller's own watch."""
+        self._process.kill()
+        self._process.wait()
+
+    def close(self) -> None:
+        """Give up this end, and the memory; a process that still runs stops the arm and ends."""
+        self._channel.close()
+        for name in ("ring_fd", "event_fd", "control_fd", "_log_fd"):
+            fd, closed = getattr(self, name), -1
+            if fd != closed:
+                os.close(fd)
+                setattr(self, name, closed)
+
+    def _answer(self, timeout: float) -> Any:
+        """The next message of the exchange."""
+        end = time.monotonic() + timeout
+        self._channel.settimeout(_BEAT)
+        while True:
+            self.beat()
+            try:
+                message = self._channel.recv(LONGEST_MESSAGE)
+            except TimeoutError:
+                if time.monotonic() < end:
+                    continue
+                raise ExchangeError(f"the exchange process was silent for {timeout:g} s") from None
+            except OSError:
+                message = b""
+            if not message:
+                status = self._process.wait()
+                words = self.log.strip() or "it said nothing"
+                raise ExchangeError(f"the exchange process ended with status {status}: {words}")
+            return pickle.loads(message)
+
+
+_COPIED: Final = tuple(
+    name
+    for name in ExchangeStatus.__dataclass_fields__
+    if name not in ("state", "heartbeat_age", "finished")
+)
+_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def _spawn(fds: Sequence[int], log: int) -> subprocess.Popen[bytes]:
+    environment = {
+        **os.environ,
+        # What this process can import, that one can: programs are made of classes.
+        "PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path),
+        # A pool of threads would be locked into memory and never used.
+        **dict.fromkeys(_THREADS, "1"),
+    }
+    return subprocess.Popen(
+        [sys.executable, "-m", "drivers.exchange", *map(str, fds)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=log,
+        pass_fds=fds,
+        start_new_session=True,
+        env=environment,
+    )

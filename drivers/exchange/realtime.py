@@ -1,0 +1,140 @@
+"""What the operating system can do for a process that has to answer within a millisecond."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
+"""Holding this file open at 0 keeps the processors out of their slow idle states."""
+LIMITS_FILE: Final = "/etc/security/limits.d/90-hil.conf"
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+_HEAP: Final = 32 << 20
+"""Bytes of heap asked for, and so locked, before the cycle begins."""
+_held: list[int] = []
+
+
+@dataclass(frozen=True)
+class RealTimeSettings:
+    """What to ask for; each refusal is reported and none is fatal.
+
+    Attributes:
+        priority: of SCHED_FIFO, 1..99; 0 stays with ordinary scheduling.
+        cpu: the only processor to run on; None leaves it to the system.
+        lock_memory: keep every page in memory.
+        hold_cpu_awake: hold `/dev/cpu_dma_latency` at 0 for as long as the process lives.
+    """
+
+    priority: int = 50
+    cpu: int | None = None
+    lock_memory: bool = True
+    hold_cpu_awake: bool = True
+
+
+@dataclass(frozen=True)
+class RealTimeReport:
+    """What was granted.
+
+    Attributes:
+        scheduling: in words.
+        memory_locked: whether every page, also of memory asked for later, stays in memory.
+        cpu_awake: whether the processors are kept out of slow idle states.
+        refused: one sentence per refusal, with its remedy.
+    """
+
+    scheduling: str
+    memory_locked: bool
+    cpu_awake: bool
+    refused: tuple[str, ...] = ()
+
+
+def enter(settings: RealTimeSettings) -> RealTimeReport:
+    """Make this process as punctual as the system lets it be.
+
+    Also freezes what exists so far for the garbage collector and switches it off: from here on
+    the process must not make reference cycles.
+    """
+    refused: list[str] = []
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    locked = settings.lock_memory and _lock_memory(refused)
+    awake = settings.hold_cpu_awake and _hold_cpu_awake(refused)
+    if settings.cpu is not None:
+        _pin(settings.cpu, refused)
+    return RealTimeReport(_schedule(settings.priority, refused), locked, awake, tuple(refused))
+
+
+def _schedule(priority: int, refused: list[str]) -> str:
+    if priority > 0:
+        try:
+            # A program started from here must not inherit the class.
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(0, policy, os.sched_param(priority))
+        except (OSError, ValueError) as error:
+            refused.append(
+                f"SCHED_FIFO {priority} was refused ({error}); permit it with the line "
+                f"'@realtime - rtprio 98' in {LIMITS_FILE}, join that group and log in again"
+            )
+    policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+    if policy == os.SCHED_FIFO:
+        return f"SCHED_FIFO {os.sched_getparam(0).sched_priority}"
+    return "ordinary"
+
+
+def _lock_memory(refused: list[str]) -> bool:
+    remedy = (
+        f"permit it with the line '@realtime - memlock unlimited' in {LIMITS_FILE}, join that "
+        "group and log in again"
+    )
+    soft, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    privileged = os.geteuid() == 0
+    if soft != hard:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (hard, hard))
+    libc = ctypes.CDLL(None, use_errno=True)
+    # Memory given back to the system would have to be asked for, page by page, in some cycle.
+    libc.mallopt(_M_TRIM_THRESHOLD, -1)
+    libc.mallopt(_M_MMAP_MAX, 0)
+    # Under a finite limit a locked future would make some later allocation fail, at any moment.
+    finite = hard != resource.RLIM_INFINITY and not privileged
+    flags = _MCL_CURRENT if finite else _MCL_CURRENT | _MCL_FUTURE
+    if libc.mlockall(flags) != 0:
+        refused.append(f"locking memory was refused ({os.strerror(ctypes.get_errno())}); {remedy}")
+        return False
+    if finite:
+        refused.append(f"only memory in use now is locked (the limit is {hard} bytes); {remedy}")
+        return False
+    reserve = bytearray(_HEAP)
+    del reserve
+    return True
+
+
+def _hold_cpu_awake(refused: list[str]) -> bool:
+    try:
+        fd = os.open(CPU_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
+        os.write(fd, struct.pack("=i", 0))
+    except OSError as error:
+        refused.append(
+            f"{CPU_LATENCY} could not be held at 0 ({error.strerror}); permit it with the udev "
+            'rule \'KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"\''
+        )
+        return False
+    _held.append(fd)  # closing it would end the request
+    return True
+
+
+def _pin(cpu: int, refused: list[str]) -> None:
+    try:
+        os.sched_setaffinity(0, {cpu})
+    except OSError as error:
+        available = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
+        refused.append(
+            f"processor {cpu} cannot be used ({error.strerror}); choose one of {available}"
+        )

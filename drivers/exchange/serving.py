@@ -1,0 +1,223 @@
+"""What the exchange process does between two packets: orders in, state and events out."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import socket
+import time
+from typing import Final, Protocol
+
+from drivers.errors import DriverError, RequestError
+from drivers.events import MotionEnded
+from drivers.exchange.control import STALE, ArchiveState, ControlBlock
+from drivers.exchange.event_log import EventWriter
+from drivers.exchange.inbox import Inbox
+from drivers.exchange.notices import ExchangeEvent, Leaving, OverrideRefused
+from drivers.exchange.shared_ring import SharedCycleRing
+from drivers.session import Session
+from drivers.states import State
+from drivers.transports.base import Transport
+
+ORPHAN_LINGER: Final = 2.0
+"""s that packets are answered, after the axes were closed, for nobody."""
+FINISH_LINGER: Final = 1.0
+"""s that packets are answered, after the axes were closed, when the supervisor wants to end."""
+_SLOW_EVERY: Final = 32
+"""Packets between two looks at what need not be looked at in each cycle."""
+_MAY_BE_OPEN: Final = frozenset({State.OPENING, State.OPEN, State.EXITING, State.FAULTED})
+
+
+class Terminated(Protocol):
+    """True once the process was told to end: stop on the path, leave open mode, end."""
+
+    def __bool__(self) -> bool: ...
+
+
+class Serving:
+    """The `until` of `exchange` in a process of its own; called after each answer.
+
+    Attributes:
+        reason: why it ended or is about to, in words.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        transport: Transport,
+        ring: SharedCycleRing,
+        events: EventWriter,
+        control: ControlBlock,
+        channel: socket.socket,
+        *,
+        terminated: Terminated,
+        needs_archive: bool,
+    ) -> None:
+        self._terminated = terminated
+        self.reason = ""
+        self._session = session
+        self._transport = transport
+        self._ring = ring
+        self._events = events
+        self._control = control
+        self._inbox = Inbox(channel)
+        self._needs_archive = needs_archive
+        self._rows = ring.written
+        self._worst = 0.0
+        self._overrides = control.override_count
+        self._stops = control.stop_count
+        self._linger = ORPHAN_LINGER
+        self._calls = 0
+        self._answered = 0
+        self._heard = self._began = time.monotonic()
+        self._closed_since = math.inf
+        self._open = False
+
+    def __call__(self) -> bool:
+        """Whether the exchange is to end."""
+        now = time.monotonic()
+        self._measure()
+        self._orders(now)
+        self._report(now)
+        return bool(self.reason) and self._over(now)
+
+    def say(self, event: ExchangeEvent) -> None:
+        """Put something into the event log."""
+        self._events.write(event)
+
+    def _measure(self) -> None:
+        """How long the packet just answered took, from `now` of its record to this moment."""
+        rows = self._ring.written
+        if rows == self._rows:
+            return
+        self._rows = rows
+        arrival = float(self._ring.arrival[(rows - 1) % self._ring.capacity])
+        self._worst = max(self._worst, self._transport.now - arrival)
+
+    def _orders(self, now: float) -> None:
+        control, session = self._control, self._session
+        self._calls += 1
+        if self._calls % _SLOW_EVERY == 0 and self._inbox.hung_up():
+            self._leave("the supervisor closed its end", ORPHAN_LINGER)
+        if control.stop_count != self._stops:
+            self._stops = control.stop_count
+            session.stop("the supervisor asked for a stop")
+        if control.override_count != self._overrides:
+            self._overrides = control.override_count
+            self._change_override(control.override)
+        if control.program_id != self._inbox.taken:
+            self._take_program(now)
+        if session.requested and self._needs_archive:
+            trouble = self._archive_trouble(now)
+            if trouble:
+                session.stop(trouble)
+        self._reasons_to_leave(now)
+        if self.reason:
+            session.stop(self.reason)
+
+    def _reasons_to_leave(self, now: float) -> None:
+        if self._terminated:
+            self._leave("the exchange process was told to terminate", ORPHAN_LINGER)
+        elif now - max(self._control.supervisor_heartbeat, self._began) > STALE:
+            self._leave("the supervisor gives no sign of life", ORPHAN_LINGER)
+        elif self._control.finish:
+            self._leave("the supervisor wants to end", FINISH_LINGER)
+
+    def _leave(self, reason: str, linger: float) -> None:
+        if not self.reason:
+            self.reason, self._linger = reason, linger
+            self.say(Leaving(reason))
+
+    def _archive_trouble(self, now: float) -> str:
+        if self._control.archive_state != ArchiveState.READY:
+            return "the archive cannot be written"
+        if now - self._control.archive_heartbeat > STALE:
+            return "the archive process gives no sign of life"
+        return ""
+
+    def _change_override(self, fraction: float) -> None:
+        try:
+            self._session.override(fraction)
+        except DriverError as error:
+            self.say(OverrideRefused(fraction, str(error)))
+
+    def _take_program(self, now: float) -> None:
+        """Read the program that was handed over, request it, and say what became of it."""
+        name = self._session.state.name.lower()
+        refusal = None
+        try:
+            handed_over = self._inbox.take()
+            if handed_over is None:
+                return  # withdrawn before, or its descriptor is still on the way
+            source = handed_over.unpacked()
+            if handed_over.identity != self._control.program_id:
+                raise RequestError(name, "it was withdrawn")
+            if self.reason:
+                raise RequestError(name, self.reason)
+            if self._needs_archive and (trouble := self._archive_trouble(now)):
+                raise RequestError(name, trouble)
+            self._session.request(source)
+        except RequestError as error:
+            refusal = error
+        except Exception as error:  # whatever the classes of a foreign program raise
+            refusal = RequestError(name, f"the program cannot be read: {error!r}")
+        if refusal is None:
+            self._control.program_accepted = self._inbox.taken
+        else:
+            self._control.program_refused = self._inbox.taken
+        self._control.pickup_us = 1e6 * (time.monotonic() - now)
+        self._inbox.answer(refusal)
+
+    def _report(self, now: float) -> None:
+        control, session = self._control, self._session
+        control.exchange_heartbeat = now
+        for event in session.events():
+            self._events.write(event)
+            if isinstance(event, MotionEnded):
+                control.ended_count += 1
+        control.state = session.state
+        control.cycle = int(self._ring.cycle[(self._rows - 1) % self._ring.capacity])
+        control.interval = session.interval
+        if self._calls % _SLOW_EVERY == 0 or session.counters.answered == self._answered:
+            self._report_counters()
+        if session.counters.answered != self._answered:
+            self._answered = session.counters.answered
+            self._heard = now
+        self._open = session.state in _MAY_BE_OPEN and now - self._heard < FINISH_LINGER
+        if not self._open:
+            self._closed_since = min(self._closed_since, now)
+        elif not self.reason:
+            # Once the end is wanted, a controller that opens again and again must not put it off.
+            self._closed_since = math.inf
+
+    def _report_counters(self) -> None:
+        control, counters = self._control, self._session.counters
+        discarded = counters.discarded
+        control.overflow = self._ring.overflow
+        control.answered = counters.answered
+        control.missed = counters.missed
+        control.duplicates = counters.duplicates
+        control.stale = counters.stale
+        control.malformed = counters.malformed + discarded.get("malformed", 0)
+        control.foreign = discarded.get("foreign", 0)
+        control.late = discarded.get("late", 0)
+        control.refused = counters.refused
+        control.worst_turnaround_us = 1e6 * self._worst
+
+    def _over(self, now: float) -> bool:
+        return not self._open and now - self._closed_since >= self._linger
+
+    def conclude(self) -> None:
+        """Put out what happened last."""
+        self._report(time.monotonic())
+        self._report_counters()
+
+
+def portable(error: BaseException) -> bytes:
+    """An error as bytes that another process can read, whatever it holds."""
+    try:
+        body = pickle.dumps(error)
+        pickle.loads(body)
+    except Exception:
+        body = pickle.dumps(DriverError(f"{type(error).__name__}: {error}"))
+    return body

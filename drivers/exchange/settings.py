@@ -1,0 +1,41 @@
+"""What an exchange process is told before it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.drive_train import DriveTrain
+from drivers.exchange.realtime import RealTimeSettings
+from drivers.guard import GuardLimits
+from drivers.transports.base import TransportSpec
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangeSettings:
+    """Everything the exchange needs; pickles.
+
+    Attributes:
+        transport: the link.
+        drive_train: of the arm.
+        guard_limits: bounds of every set-point.
+        period: the controller's cycle, s.
+        session: further keyword arguments of `Session`.
+        realtime: what to ask the system for.
+        ring_capacity: cycle records kept for whoever archives them.
+        preload: modules imported before the link opens, so that programs made of their classes
+            are read quickly.
+        needs_archive: whether a motion is accepted and goes on only while the archive process
+            lives and has an archive ready.
+    """
+
+    transport: TransportSpec
+    drive_train: DriveTrain
+    guard_limits: GuardLimits
+    period: float
+    session: Mapping[str, Any] = field(default_factory=dict)
+    realtime: RealTimeSettings = field(default_factory=RealTimeSettings)
+    ring_capacity: int = 20_000
+    preload: tuple[str, ...] = ()
+    needs_archive: bool = True

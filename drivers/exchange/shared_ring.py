@@ -1,0 +1,139 @@
+"""The ring of cycle records in shared memory: one process writes, others read.
+
+The writer fills a row and then raises the count of rows written; it never waits and never looks
+back. A reader copies rows and then reads the count again, to find out which of them were
+overwritten meanwhile. That is sound where stores of one processor are seen by others in their
+order and loads are not moved ahead of earlier ones, as on x86.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.exchange import memory
+from drivers.record import CycleRing, cycle_dtype
+
+_MAGIC: Final = 0x31474E4952434948
+_HEADER_BYTES: Final = 256
+# Indices of 8-byte words, those of different writers on different cache lines.
+_TAG, _JOINTS, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
+
+
+class SharedCycleRing(CycleRing):
+    """A `CycleRing` that other processes can read, the writer's end.
+
+    Attributes:
+        fd: descriptor of the memory.
+    """
+
+    def __init__(self, fd: int, n_joints: int) -> None:
+        mapped = memory.attach(fd)
+        words = memoryview(mapped).cast("B")[:_HEADER_BYTES].cast("q")
+        capacity = _checked(words, n_joints)
+        rows: NDArray[np.void] = np.frombuffer(
+            mapped, cycle_dtype(n_joints), capacity, _HEADER_BYTES
+        )
+        super().__init__(n_joints, capacity, rows)
+        self.fd = fd
+        self._words = words
+        self._lost = 0
+        self._written = words[_WRITTEN]
+
+    @classmethod
+    def create(cls, n_joints: int, capacity: int) -> SharedCycleRing:
+        """Ask for memory for `capacity` records."""
+        if capacity < 2:
+            raise ValueError(f"a shared ring of {capacity} records; at least 2 are needed")
+        size = _HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize
+        fd = memory.create("hil-cycles", size)
+        words = memoryview(memory.attach(fd)).cast("B")[:_HEADER_BYTES].cast("q")
+        words[_JOINTS], words[_CAPACITY], words[_TAG] = n_joints, capacity, _MAGIC
+        return cls(fd, n_joints)
+
+    @classmethod
+    def attach(cls, fd: int, n_joints: int) -> SharedCycleRing:
+        """Write into memory that another process asked for.
+
+        Raises:
+            ValueError: it is not a ring of `n_joints` joints.
+        """
+        return cls(fd, n_joints)
+
+    @property
+    def written(self) -> int:
+        """Records written so far."""
+        return self._written
+
+    def commit(self) -> None:
+        """Make the row at `slot` part of the ring."""
+        words = self._words
+        if words[_READ] <= self._written - self.capacity:
+            self._lost += 1
+        self._written += 1
+        words[_WRITTEN] = self._written
+
+    @property
+    def overflow(self) -> int:
+        """Records overwritten before the reader had them, so far."""
+        return self._lost
+
+    def drain(self) -> NDArray[np.void]:
+        """Not the writer's business; see `RingReader`."""
+        raise NotImplementedError("a shared ring is drained by a RingReader")
+
+
+class RingReader:
+    """Reads a shared ring from the oldest record still there; one reader acknowledges.
+
+    Args:
+        fd: descriptor of the memory.
+        n_joints: of the records.
+        acknowledge: whether the writer is told how far this reader got, so that it counts what
+            it overwrites; one reader at a time may.
+
+    Attributes:
+        overflow: records that were overwritten before this reader had them.
+        capacity: of the ring.
+
+    Raises:
+        ValueError: it is not a ring of `n_joints` joints.
+    """
+
+    def __init__(self, fd: int, n_joints: int, *, acknowledge: bool = True) -> None:
+        mapped = memory.attach(fd)
+        self._words = memoryview(mapped).cast("B")[:_HEADER_BYTES].cast("q")
+        self.capacity = _checked(self._words, n_joints)
+        self._rows: NDArray[np.void] = np.frombuffer(
+            mapped, cycle_dtype(n_joints), self.capacity, _HEADER_BYTES
+        )
+        self._acknowledge = acknowledge
+        self._read = self._oldest()
+        self.overflow = 0
+
+    def _oldest(self) -> int:
+        # The row behind the last one written may be half overwritten already.
+        return max(0, self._words[_WRITTEN] + 1 - self.capacity)
+
+    def drain(self) -> NDArray[np.void]:
+        """A copy of the records not read yet, (k,), oldest first."""
+        end = self._words[_WRITTEN]
+        begin = max(self._read, self._oldest())
+        records = self._rows.take(np.arange(begin, end), mode="wrap")
+        torn = min(max(0, self._oldest() - begin), len(records))
+        self.overflow += begin - self._read + torn
+        self._read = end
+        if self._acknowledge:
+            self._words[_READ] = end
+        return records[torn:]
+
+
+def _checked(words: memoryview, n_joints: int) -> int:
+    """Capacity of the ring whose header this is."""
+    if len(words) < _HEADER_BYTES // 8 or words[_TAG] != _MAGIC:
+        raise ValueError("this memory is not a ring of cycle records")
+    if words[_JOINTS] != n_joints:
+        raise ValueError(f"this ring is for {words[_JOINTS]} joints, not {n_joints}")
+    return int(words[_CAPACITY])

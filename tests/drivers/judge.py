@@ -1,0 +1,391 @@
+"""Judges a session from outside: by the packets, the answers and the records it left.
+
+Two judges that share nothing with the code under test but the record's layout and the drive
+train (which has tests of its own): `Reception` says which packets get an answer at all,
+`Conduct` what may stand in the answer. Both raise AssertionError.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import oracle
+
+from drivers import DriveTrain, GuardLimits, State
+
+LAST = 0x7FFF
+REFUSALS = (oracle.DRIVE_OFF_REQUEST, oracle.FOLLOWING_ERROR)
+MODE_FIELDS = {1: (1, 2, 4, 5), 2: (4, 5), 4: (1, 2), 5: (1, 2), 7: (1,), 8: (4,), 9: (5,)}
+"""Fields of an answer in open mode (facts, section 6); every other one is zero."""
+POSITION_MODES = (1, 4, 5)
+EPS = np.finfo(np.float64).eps
+
+Kind = Literal["nothing", "again", "echo", "init", "cyclic"]
+
+
+def number_of(packet: bytes) -> int:
+    return int.from_bytes(packet[:4], "little", signed=True)
+
+
+@dataclass
+class Reception:
+    """Which packets get an answer, and which packets are the last one once more.
+
+    Attributes:
+        window: numbers ahead of the last one that are later packets of the same session.
+    """
+
+    window: int
+    last: int = 0
+    n_axes: int | None = None
+    silent: bool = False
+    ended: bool = False
+    cold: bool = False
+    synced: bool = False
+    at_init: bool = False
+    last_packet: bytes = b""
+
+    def expect(self, packet: bytes) -> Kind:
+        """What kind of answer it gets; takes note of a packet that gets one."""
+        kind = self._expect(packet)
+        if kind in ("echo", "init", "cyclic"):
+            self.last, self.last_packet, self.silent = number_of(packet), packet, False
+            self.at_init = kind == "init" or (kind == "echo" and self.at_init)
+        return kind
+
+    def _expect(self, packet: bytes) -> Kind:
+        if self.ended:
+            return "nothing"
+        if len(packet) == 1200 and number_of(packet) == 10:
+            return self._init(packet)
+        number = number_of(packet)
+        if len(packet) < 12 or not 1 <= number <= LAST:
+            return "nothing"
+        on = oracle.DRIVE_ON in packet[4:8]
+        if self.n_axes is None:
+            if on or len(packet) >= 1200:
+                return "nothing"
+            self.synced = True
+            return "echo"
+        if self.at_init and self.cold and number in (11, 12) and not on:
+            return "echo" if len(packet) < 1200 else "nothing"
+        ahead = (number - self.last) % LAST
+        if self.silent and not on and number < 10 and ahead != 1:
+            if len(packet) < 1200:
+                self.n_axes, self.at_init, self.synced = None, False, True
+                return "echo"
+            return "nothing"
+        if not oracle.length(self.n_axes) <= len(packet) <= oracle.length(20):
+            return "nothing"
+        if self.silent:
+            return "cyclic"
+        if ahead == 0:
+            # The same number on other bytes is another packet, of no known time.
+            return "again" if packet == self.last_packet else "nothing"
+        return "cyclic" if ahead <= self.window else "nothing"
+
+    def _init(self, packet: bytes) -> Kind:
+        n = int.from_bytes(packet[12:16], "little", signed=True)
+        if not 1 <= n <= 20:
+            return "nothing"
+        if self.at_init and packet == self.last_packet:
+            return "again"
+        self.cold = self.n_axes is None and self.synced
+        self.n_axes, self.synced = n, False
+        return "init"
+
+
+@dataclass
+class Conduct:
+    """What may stand in the answers to cyclic packets, once an init packet came.
+
+    Args:
+        limits: of the guard.
+        train: in force.
+        mode: open mode wanted.
+        arm: wanted, from 1.
+        slots: slot of each joint.
+        arms: arm of each slot, from 1.
+        threshold: (n,) following error in force, motor revolutions.
+        current: (n,) A, in force.
+
+    Attributes:
+        usable: whether this session may move the arm at all.
+        entitled: a motion was requested and accepted, and has not ended.
+        stopping: a stop was asked for (or a long gap was) in this interval.
+        overridden: a change of override was accepted in this interval.
+        tally: how often which law was put to use.
+    """
+
+    limits: GuardLimits
+    train: DriveTrain
+    mode: int
+    arm: int
+    slots: tuple[int, ...]
+    arms: tuple[int, ...]
+    threshold: np.ndarray
+    current: np.ndarray
+    period: float = 0.002
+    usable: bool = True
+    entitled: bool = False
+    stopping: bool = False
+    overridden: bool = False
+    barrier: bool = True
+    sent: list[np.ndarray] = field(default_factory=list)
+    motor: np.ndarray | None = None
+    exiting: bool = False
+    kept: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    tally: dict[str, int] = field(default_factory=dict)
+
+    def interrupted(self) -> None:
+        """An init packet came, or nothing for long: closed axes have to be seen first."""
+        self.barrier = True
+        self.sent, self.motor, self.exiting = [], None, False
+
+    def judge(self, packet: bytes, reply: bytes, record: np.void, gap_stop: bool) -> None:
+        """One fresh cyclic packet, the answer, and the record made of it."""
+        n = len(self.arms)
+        received, answer = oracle.parse(packet, n), oracle.parse(reply, n)
+        assert len(reply) == oracle.length(n)
+        assert answer.number == oracle.answer_number(received.number)
+        assert answer.functionality == oracle.ZERO
+        safe = oracle.safe_answer(received, self.arms)
+        on = received.status[self.arm - 1] == oracle.DRIVE_ON
+        modes = [received.axes[slot].mode for slot in self.slots]
+        self._status(answer, safe, in_open_mode=on and any(m in oracle.OPEN for m in modes))
+        if not self.usable:
+            self._unusable(received, answer, safe, record)
+            return
+        is_open = on and any(mode in oracle.OPEN for mode in modes)
+        ready = [on and mode == self.mode for mode in modes]
+        commanded = record["commanded_position"], record["commanded_velocity"]
+        paused = on and any(mode in (500, 502) for mode in modes)
+        if not is_open and not paused:
+            self._note(on, modes)
+        if is_open and self._refused(answer):
+            self._refusal(answer, safe)
+            assert np.isnan(commanded).all(), "a refused set-point was recorded as sent"
+            self.interrupted()
+            self._count("refused")
+            return
+        if paused:
+            assert answer == safe, "a pause: not the safe answer"
+            assert np.isnan(commanded).all()
+            self._over("paused")
+            return
+        if is_open:
+            assert not self.barrier, "a set-point although closed axes were not seen before"
+        for slot in range(n):
+            if slot not in self.slots or not ready[self.slots.index(slot)]:
+                assert answer.axes[slot] == safe.axes[slot], f"slot {slot}: not the safe answer"
+        self.stopping = self.stopping or gap_stop
+        # The record's word counts for nothing but this: set-points end with the exit.
+        leaving, self.exiting = self.exiting, bool(record["state"] == State.EXITING)
+        if all(ready) and not leaving:
+            self._open(received, answer, record)
+            self.kept = np.ones(len(ready), bool)
+        elif any(ready) and self.motor is not None:
+            self._leaving(answer, safe, ready)
+        elif any(ready):
+            for slot, up in zip(self.slots, ready, strict=True):
+                assert not up or answer.axes[slot] == safe.axes[slot], "opening: not held"
+            self._count("opening")
+        else:
+            held = [mode in oracle.HOLDS_A_POSITION and on for mode in modes]
+            assert np.isnan(np.asarray(commanded)[:, ~np.array(held)]).all()
+            self._over("safe")
+
+    def _unusable(
+        self, received: oracle.Packet, answer: oracle.Packet, safe: oracle.Packet, record: np.void
+    ) -> None:
+        """No axis of the arm may be open: drive-off is asked for, all else is as ever."""
+        axes = [a for a, arm in zip(received.axes, self.arms, strict=True) if arm == self.arm]
+        on = received.status[self.arm - 1] == oracle.DRIVE_ON
+        if answer != safe:
+            assert on
+            assert any(axis.mode in oracle.OPEN for axis in axes)
+            self._refusal(answer, safe)
+        assert np.isnan(record["commanded_position"]).all()
+        self.interrupted()
+        self._count("unusable")
+
+    def _over(self, what: str) -> None:
+        """This interval in open mode, if it was one, is over."""
+        self.sent, self.motor, self.exiting = [], None, False
+        self.stopping = self.overridden = False
+        self._count(what)
+
+    def _count(self, what: str) -> None:
+        self.tally[what] = self.tally.get(what, 0) + 1
+
+    def _status(self, answer: oracle.Packet, safe: oracle.Packet, in_open_mode: bool) -> None:
+        expected = bytearray(safe.status)
+        if answer.status != safe.status:
+            expected[self.arm - 1] = 1
+            assert in_open_mode, "the end of open mode was asked for outside of it"
+            self._count("exit asked")
+        assert answer.status == bytes(expected)
+
+    def _note(self, on: bool, modes: list[int]) -> None:
+        """Closed axes lift the barrier; a drive that is off, or an unknown mode, puts it up."""
+        if on and all(mode in (0, 10, 501) for mode in modes):
+            self.barrier = False
+        else:
+            self.barrier = True
+
+    def _refused(self, answer: oracle.Packet) -> bool:
+        return any(answer.axes[slot].mode in REFUSALS for slot in self.slots)
+
+    def _refusal(self, answer: oracle.Packet, safe: oracle.Packet) -> None:
+        modes = [axis.mode for axis in answer.axes]
+        drive_off = all(mode == oracle.DRIVE_OFF_REQUEST for mode in modes)
+        reported = [k for k, mode in enumerate(modes) if mode in REFUSALS]
+        assert drive_off or (len(reported) == 1 and reported[0] in self.slots), modes
+        for slot, (ours, theirs) in enumerate(zip(answer.axes, safe.axes, strict=True)):
+            assert ours.mode == theirs.mode or slot in reported
+            for word, wanted in zip(ours.d, theirs.d, strict=True):
+                finite = np.isfinite(np.frombuffer(wanted, np.float32)[0])
+                assert word == (wanted if finite else oracle.ZERO), "a target with a refusal"
+
+    def _leaving(self, answer: oracle.Packet, safe: oracle.Packet, ready: list[bool]) -> None:
+        for joint, (slot, up) in enumerate(zip(self.slots, ready, strict=True)):
+            self.kept[joint] &= up
+            if not up:
+                continue
+            axis = answer.axes[slot]
+            # An axis that was closed and is open again has its target, as when opening.
+            if self.mode in POSITION_MODES and self.kept[joint]:
+                assert axis.floats[0] == np.float32(self.motor[joint]), "leaving: not held"
+                assert axis.keep(1) == axis
+            else:
+                assert axis == safe.axes[slot]
+        # To be held is a motion as well: nobody is brought to rest by a jump.
+        if self.mode in POSITION_MODES:
+            self._advance(self.sent[-1], 1, 0.0)
+        elif self.mode != 9:
+            self._advance(np.zeros(len(ready)), int(self.mode == 7), 0.0)
+        self._count("leaving")
+
+    def _open(self, received: oracle.Packet, answer: oracle.Packet, record: np.void) -> None:
+        r = np.array([received.axes[slot].floats for slot in self.slots]).T
+        a = np.array([answer.axes[slot].floats for slot in self.slots]).T
+        fields = MODE_FIELDS[self.mode]
+        for slot in self.slots:
+            axis = answer.axes[slot]
+            assert axis.mode == self.mode
+            assert axis == axis.keep(*fields), "a field that this mode has no use for"
+        assert np.isfinite(a).all(), "not finite, and sent"
+        assert (np.abs(r[2] - r[0]) <= self.threshold * (1 + 2e-6)).all(), "following error"
+        assert (np.abs(r[4]) <= self.current * (1 + 2e-6)).all(), "current"
+        first = self.motor is None
+        if first:
+            self._first(r)
+        if self.mode in POSITION_MODES:
+            self._position(received, answer, a, r, record)
+        else:
+            self._correction(a, r, record)
+        self._count("first" if first else "set-point")
+
+    def _first(self, r: np.ndarray) -> None:
+        assert (np.abs(r[0] - r[2]) <= 0.1 * self.threshold).all(), "first set-point elsewhere"
+        assert (np.abs(r[[1, 3]]) <= self.limits.standstill).all(), "first set-point in motion"
+
+    def _position(
+        self,
+        received: oracle.Packet,
+        answer: oracle.Packet,
+        a: np.ndarray,
+        r: np.ndarray,
+        record: np.void,
+    ) -> None:
+        q = record["commanded_position"].copy()
+        motor = self.train.motor_revolutions(q)
+        rounding = 8 * EPS * np.maximum(1.0, np.abs(motor))
+        if self.motor is None:
+            for slot in self.slots:
+                assert answer.axes[slot] == received.axes[slot].keep(1), "first: target, at rest"
+            self.sent = [q, q, q, q]
+        else:
+            assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
+            low, high = np.float32(motor - rounding), np.float32(motor + rounding)
+            assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
+            step = motor - self.motor
+            # Positions are compared in float64; both carry the rounding of their making.
+            slack = 3 * rounding + np.spacing(np.float32(np.abs(a[1])))
+            assert (np.abs(a[1] - step) <= slack).all(), "D2 is not the step"
+            self.sent.append(q)
+        if np.any(q != self.sent[-2]):
+            assert self.entitled, "moved without a motion requested"
+            self._count("moving")
+        self._differences(np.array(self.sent[-4:]), first_order=1)
+        span = 0.5 * (self.limits.upper - self.limits.lower)
+        assert (q >= self.limits.lower - 2e-6 * span).all(), "position"
+        assert (q <= self.limits.upper + 2e-6 * span).all(), "position"
+        if self.mode == 1:
+            self._beside(a)
+        self.motor = motor
+        del self.sent[:-3]
+
+    def _factors(self) -> tuple[float, float]:
+        """What acceleration and jerk may be multiplied by, from what was asked for."""
+        limits = self.limits
+        if self.stopping:
+            return limits.stop_acceleration, limits.stop_jerk
+        if self.overridden:
+            return limits.override_acceleration, limits.override_jerk
+        return 1.0, 1.0
+
+    def _differences(self, rows: np.ndarray, first_order: int, noise: float = 0.0) -> None:
+        """Of the last four rows of a position (first order 1) or of a velocity (0)."""
+        factor_a, factor_j = self._factors()
+        limits = self.limits
+        bounds = (limits.velocity, factor_a * limits.acceleration, factor_j * limits.jerk)
+        for k, (bound, name) in enumerate(
+            zip(bounds, ("velocity", "acceleration", "jerk"), strict=True)
+        ):
+            order = first_order + k
+            found = np.abs(np.diff(rows, order, axis=0)[-1]) / self.period**order
+            rounding = 2**order * (8 * EPS * np.abs(rows).max() + noise) / self.period**order
+            assert (found <= bound * (1 + 2e-6) + rounding).all(), (name, found / bound)
+
+    def _beside(self, a: np.ndarray) -> None:
+        assert (np.abs(a[4]) <= self.current * (1 + 2e-6)).all(), "current fed forward"
+        velocity = self.train.joint_velocity(a[3], self.period)
+        assert (np.abs(velocity) <= self.limits.velocity * (1 + 1e-5)).all(), "velocity fed forward"
+        assert self.entitled or not a[3:5].any()
+
+    def _correction(self, a: np.ndarray, r: np.ndarray, record: np.void) -> None:
+        n = len(self.slots)
+        zero = np.zeros(n)
+        if self.motor is None:
+            assert not a.any(), "the first correction is not zero"
+            self.sent = [zero, zero, zero, zero]
+        if a.any():
+            assert self.entitled, "corrected without a request"
+            self._count("moving")
+        if self.mode == 7:
+            dq = 2 * np.pi * self.train.joint_from_motor @ a[0]
+            float32 = np.spacing(np.float32(np.abs(a[0]).max()))
+            noise = 2 * np.pi * np.abs(self.train.joint_from_motor).sum(axis=1).max() * float32
+            target = self.train.joint_position(r[0]) + dq
+            span = self.limits.upper - self.limits.lower
+            slack = 2e-6 * span + noise
+            assert (target <= self.limits.upper + slack).all(), "target with offset"
+            assert (target >= self.limits.lower - slack).all(), "target with offset"
+            self._advance(dq, 1, float(noise))
+        elif self.mode in (2, 8):
+            # While open mode is being left the answer is zero, and no correction is recorded.
+            qd = np.nan_to_num(record["commanded_velocity"])
+            per_cycle = self.train.motor_revolutions_per_cycle(qd, self.period)
+            np.testing.assert_allclose(a[3], per_cycle, rtol=1e-6, atol=1e-12)
+            self._advance(qd, 0, 0.0)
+        servo = r[4] if self.mode == 9 else zero
+        assert (np.abs(servo + a[4]) <= self.current * (1 + 2e-6)).all(), "current"
+        self.motor = zero
+
+    def _advance(self, row: np.ndarray, first_order: int, noise: float) -> None:
+        self.sent.append(row)
+        self._differences(np.array(self.sent[-4:]), first_order, noise)
+        del self.sent[:-3]

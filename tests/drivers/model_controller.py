@@ -1,0 +1,72 @@
+"""A controller's side of a session, as far as packets show it, that can be told to misbehave."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle
+from judge import POSITION_MODES
+from rig import START, drive_train, init_packet
+
+PERIOD = 0.002
+N = 6
+# Two slots of axes that are not the cell's: axis 7 of the same arm, axis 1 of arm 2.
+AXES = ((1, 2), (1, 0), (2, 0), (1, 5), (1, 3), (1, 6), (1, 1), (1, 4))
+ARMS = tuple(arm for arm, _ in AXES)
+SLOTS = tuple(AXES.index((1, joint)) for joint in range(N))
+
+
+def init_bytes(**arm_1) -> bytes:
+    init = init_packet(arm_1=arm_1)
+    init.record["n_axes"] = len(AXES)
+    table = np.full((4, 10), 0xFF)
+    for slot, (arm, axis) in enumerate(AXES):
+        table[arm - 1, axis] = slot
+    init.record["open_axes_map"] = table
+    return init.encode()
+
+
+GOOD_INIT = init_bytes()
+OTHER_ARM = init_bytes(gear_ratio=np.full(N, 99.0))
+
+
+class Controller:
+    """Status, modes and axis data of the packets to come."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.status = [oracle.DRIVE_ON, 0, 0, 0]
+        self.modes = [0] * len(AXES)
+        self.d = np.zeros((len(AXES), 8), np.float32)
+        self.put_arm_at(START)
+        self.exit_asked = False
+
+    def put_arm_at(self, q) -> None:
+        motor = drive_train().motor_revolutions(q)
+        for slot, value in zip(SLOTS, motor, strict=True):
+            self.d[slot, [0, 2]] = value
+            self.d[slot, [1, 3, 4]] = 0.0, 0.0, 0.5
+
+    def wanted(self, mode: int) -> None:
+        for slot in SLOTS:
+            self.modes[slot] = mode
+
+    def packet(self) -> bytes:
+        self.number = oracle.answer_number(self.number)
+        axes = tuple(
+            oracle.Axis(mode, tuple(bytes(word) for word in row.view("V4")))
+            for mode, row in zip(self.modes, self.d, strict=True)
+        )
+        return oracle.build(oracle.Packet(self.number, bytes(self.status), bytes(4), axes))
+
+    def obey(self, reply: bytes, mode: int) -> None:
+        """Go where the answer says; close the axes if it asks for that."""
+        answer = oracle.parse(reply, len(AXES))
+        refused = any(axis.mode in (505, 508) for axis in answer.axes)
+        if refused or answer.status[0] == 1:
+            self.wanted(0)
+            self.d[:, [1, 3]] = 0.0
+        elif mode in POSITION_MODES:
+            for slot in SLOTS:
+                if self.modes[slot] == mode:
+                    position, step = answer.axes[slot].floats[:2]
+                    self.d[slot, :4] = position, step, position, step

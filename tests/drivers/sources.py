@@ -1,0 +1,214 @@
+"""Motions and corrections of every kind, good, at the edge of the bounds, and broken."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+
+PERIOD = 0.002
+JERK = 100.0
+
+WILD = (float("nan"), float("inf"), -float("inf"), 1e300, -1e300, 5e-324, 3.0, -0.5, 1e-3, 1e-7)
+
+
+class Breaks:
+    """What is wrong with a source, and when."""
+
+    def __init__(self, what: str = "", index: int = 0, joint: int = 0, value: float = 0.0):
+        self.what, self.index, self.joint, self.value = what, index, joint, value
+
+    def __repr__(self) -> str:
+        return f"{self.what} at {self.index} in joint {self.joint}: {self.value}"
+
+
+class Scripted:
+    """Plays a table (m, n) of motion and one of what goes with it, with one fault."""
+
+    def __init__(self, motion: np.ndarray, beside: np.ndarray, breaks: Breaks):
+        self.motion, self.beside, self.breaks = motion, beside, breaks
+        self.index = 0
+        self.begun = self.stopped = False
+        self._buffers = np.zeros((2, motion.shape[1]))
+
+    def _breaks(self, *what: str) -> bool:
+        return self.breaks.what in what and self.index >= self.breaks.index
+
+    @property
+    def finished(self):
+        if self._breaks("finished raises"):
+            raise RuntimeError("finished")
+        if self._breaks("finishes early"):
+            return True
+        if self._breaks("never ends"):
+            return False
+        return self.index + 1 >= len(self.motion)
+
+    def advance(self):
+        if self._breaks("raises"):
+            raise ZeroDivisionError("advance")
+        self.index = min(self.index + 1, len(self.motion) - 1)
+        motion, beside = self._buffers
+        # The same arrays every time, as a source without allocations would.
+        motion[:], beside[:] = self.motion[self.index], self.beside[self.index]
+        at, joint = self.index == self.breaks.index, self.breaks.joint
+        if at and self.breaks.what == "motion":
+            motion[joint] = self.breaks.value
+        if at and self.breaks.what == "jumps":
+            motion[joint] += self.breaks.value
+        if at and self.breaks.what == "beside":
+            beside[joint] = self.breaks.value
+        if self._breaks("shape"):
+            return motion[:-1], beside
+        if self._breaks("columns"):
+            return motion[:, None], beside
+        if self._breaks("nothing"):
+            return None
+        if self._breaks("words"):
+            return ["one"] * len(motion), beside
+        return motion, beside
+
+    def stop(self):
+        self.stopped = True
+        if self._breaks("stop raises"):
+            raise KeyError("stop")
+        if not self._breaks("ignores stop"):
+            self._ramp_down()
+
+    def _ramp_down(self):
+        """Half a cosine in velocity: within the bounds of a stop where it was not accelerating."""
+        k, cycles = self.index, 400
+        step = self.motion[k] - self.motion[max(k - 1, 0)]
+        share = 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, cycles + 1))[1:, None]
+        rows = self.motion[k] + np.cumsum(share * step, axis=0)
+        self.motion = np.vstack([self.motion[: k + 1], rows])
+        self.beside = np.vstack([self.beside[: k + 1], share * step / PERIOD])
+        self.beside[-1] = 0.0
+
+
+class ScriptedMotion(Scripted):
+    """A `MotionSource`; with `feed` also a `FeedForwardSource`, see `fed`."""
+
+    def __init__(self, motion, beside, breaks, bounds="plan"):
+        super().__init__(motion, beside, breaks)
+        self._bounds = bounds
+
+    @property
+    def start(self):
+        return self.motion[0]
+
+    @property
+    def bounds(self):
+        if self._breaks("lies about bounds"):
+            return ("stop", "override", "none", 7)[self.breaks.joint % 4]
+        return "stop" if self.stopped and self._bounds == "stop" else "plan"
+
+    def begin(self, position):
+        if self.breaks.what == "begin raises":
+            raise ValueError("begin")
+        self.begun = True
+        self.motion = self.motion - self.motion[0] + position
+
+    def override(self, fraction):
+        if self.breaks.what == "override raises":
+            raise ValueError(fraction)
+
+
+class FedMotion(ScriptedMotion):
+    """Feeds forward its own velocity and a current."""
+
+    def feed_forward(self):
+        current = np.zeros(len(self._buffers[0]))
+        current[self.breaks.joint] = 0.1 * (self.index % 7)
+        if self._breaks("current"):
+            current[self.breaks.joint] = self.breaks.value
+        if self.index + 1 >= len(self.motion):
+            current[:] = 0.0
+        return self._buffers[1], current
+
+
+class ScriptedCorrection(Scripted):
+    """A `CorrectionSource`."""
+
+    def _ramp_down(self):
+        share = 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, 401))[1:, None]
+        self.motion, self.beside = (
+            np.vstack([table[: self.index + 1], share * table[self.index]])
+            for table in (self.motion, self.beside)
+        )
+        self.motion[-1] = self.beside[-1] = 0.0
+
+    def begin(self):
+        if self.breaks.what == "begin raises":
+            raise ValueError("begin")
+        self.begun = True
+
+
+def smooth(cycles: int, distance: np.ndarray) -> np.ndarray:
+    """(cycles + 1, n) from zero to `distance` along a polynomial with zero jerk at both ends."""
+    s = np.linspace(0.0, 1.0, cycles + 1)[:, None]
+    return s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3) * distance
+
+
+def at_the_edge(hold: int, share: float, direction: np.ndarray) -> np.ndarray:
+    """(m, n) displacement: jerk of `share` of the bound, +, -, -, +, from rest to rest."""
+    jerk = JERK * share * np.repeat([1.0, -1.0, -1.0, 1.0], hold)[:, None] * direction
+    rows = np.cumsum(np.cumsum(np.cumsum(jerk, axis=0), axis=0), axis=0) * PERIOD**3
+    return np.vstack([np.zeros_like(direction), rows, rows[-1:]])
+
+
+FAULTS = (
+    "motion",
+    "jumps",
+    "beside",
+    "raises",
+    "shape",
+    "columns",
+    "nothing",
+    "words",
+    "never ends",
+    "lies about bounds",
+    "finished raises",
+    "finishes early",
+    "begin raises",
+    "stop raises",
+    "ignores stop",
+    "override raises",
+    "current",
+)
+
+
+@st.composite
+def breakages(draw) -> Breaks:
+    if draw(st.booleans()):
+        return Breaks()
+    value = draw(st.sampled_from(WILD) | st.floats(-0.01, 0.01))
+    index = draw(st.integers(0, 30))
+    return Breaks(draw(st.sampled_from(FAULTS)), index, draw(st.integers(0, 5)), value)
+
+
+@st.composite
+def displacements(draw, n: int) -> np.ndarray:
+    """(m, n) from zero, mostly within the bounds or close to them."""
+    direction = np.array(draw(st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=n, max_size=n)))
+    if draw(st.booleans()):
+        return smooth(draw(st.integers(1, 250)), 0.1 * direction)
+    share = draw(st.sampled_from([0.5, 0.99999, 1.0, 1.00001, 1.1, 2.5]))
+    return at_the_edge(draw(st.integers(1, 45)), share, direction)
+
+
+@st.composite
+def motions(draw, n: int) -> ScriptedMotion:
+    rows = draw(displacements(n))
+    velocity = np.diff(rows, axis=0, prepend=rows[:1]) / PERIOD
+    kind = draw(st.sampled_from([ScriptedMotion, FedMotion]))
+    return kind(rows, velocity, draw(breakages()), draw(st.sampled_from(["plan", "stop"])))
+
+
+@st.composite
+def corrections(draw, n: int, mode: int) -> ScriptedCorrection:
+    rows = draw(displacements(n))
+    rows = np.vstack([rows, rows[::-1]])
+    # An offset is a displacement; a velocity of that shape is within the bounds as well.
+    motion = rows if mode != 9 else np.zeros_like(rows)
+    current = 20.0 * rows if mode in (2, 9) else np.zeros_like(rows)
+    return ScriptedCorrection(motion, current, draw(breakages()))

@@ -1,0 +1,359 @@
+"""One to four arms, one to twenty open axes, in any slots: each axis gets its own answer.
+
+Expected answers come from the oracle, which knows of slots and arms only what the test drew.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import oracle
+import pytest
+from arms_bench import CLOSED, ON, OPEN, Bench
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from rig import Table
+
+from drivers import (
+    FollowingError,
+    InitReceived,
+    MotionEnded,
+    Refused,
+    RequestError,
+    State,
+)
+
+
+@st.composite
+def layouts(draw, *, complete: bool = True, most: int = 20):
+    """(slots, arm, n): the wanted arm has at least the cell's joints, or lacks one of them."""
+    arms = draw(st.lists(st.integers(1, 4), min_size=1, max_size=4, unique=True))
+    wanted = arms[0]
+    n = draw(st.integers(1, 10))
+    axes = [(wanted, axis) for axis in range(n)]
+    if not complete:
+        axes.pop(draw(st.integers(0, n - 1)))
+    axes += [(wanted, axis) for axis in range(n, 10) if draw(st.booleans())]
+    for arm in arms[1:]:
+        chosen = draw(st.lists(st.integers(0, 9), min_size=1, max_size=10, unique=True))
+        axes += [(arm, axis) for axis in chosen]
+    axes = axes[:most]
+    assume(axes)
+    return tuple(draw(st.permutations(axes))), wanted, n
+
+
+others = st.sampled_from([0, 0, 4, 5, 1, 2, 7, 8, 9, 10, 3, 500, 501, 502, 504, 508, -1])
+statuses = st.sampled_from([5, 5, 5, 0, 1, 255])
+
+
+def sideways(n: int, rows: int) -> np.ndarray:
+    """Each joint by its own distance, slowly enough for the guard."""
+    share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, rows))[:, None]
+    return share * np.linspace(0.0002, 0.001, n)
+
+
+@settings(max_examples=80)
+@given(layouts(), st.data())
+def test_the_wanted_arm_s_joints_move_and_every_other_axis_gets_its_safe_answer(layout, data):
+    slots, arm, n = layout
+    bench = Bench(slots, arm, n)
+    bench.start()
+    path = bench.train.joint_position([bench.d1[s] for s in bench.joint_slots]) + sideways(n, 12)
+    bench.session.request(Table(path))
+    rest = [k for k, axis in enumerate(slots) if axis not in [(arm, j) for j in range(n)]]
+    moved = 0
+    for cycle in range(18):
+        for slot in rest:
+            bench.modes[slot] = data.draw(others)
+        for other in set(bench.arms) - {arm}:
+            bench.status[other - 1] = data.draw(statuses)
+        bench.set_joints(CLOSED if cycle < 2 else OPEN)
+        received, answer = bench.cycle()
+        expected = oracle.safe_answer(received, bench.arms)
+        leaving = bench.session.state is State.EXITING
+        if leaving and cycle == 2 + 12 + 2:
+            status = bytearray(expected.status)
+            status[arm - 1] = 1
+            expected = expected._replace(status=bytes(status))
+        if cycle >= 2:
+            row = path[min(cycle - 2, 11)]
+            axes = list(expected.axes)
+            for joint, slot in enumerate(bench.joint_slots):
+                step = answer.axes[slot].d[1]
+                motor = struct.pack("<f", bench.train.motor_revolutions(row)[joint])
+                axes[slot] = oracle.Axis(OPEN, (motor, step, *(oracle.ZERO,) * 6))
+                moved += answer.axes[slot].floats[1] != 0.0
+            expected = expected._replace(axes=tuple(axes))
+        assert oracle.differences(answer, expected) == [], (cycle, slots)
+        bench.obey(answer)
+    assert moved == 11 * n
+    bench.set_joints(CLOSED)
+    bench.cycle()
+    (ended,) = bench.seen(MotionEnded)
+    assert ended.outcome == "completed"
+
+
+@pytest.mark.parametrize(
+    ("arm", "status"), [(1, "01000000"), (2, "00010000"), (3, "00000100"), (4, "00000001")]
+)
+def test_the_end_of_open_mode_is_asked_for_in_the_status_byte_of_the_arm(arm, status):
+    slots = tuple((a, axis) for axis in (1, 0) for a in (4, 3, 2, 1))
+    bench = Bench(slots, arm, 2)
+    bench.start()
+    bench.session.request(Table(np.tile(bench.q, (2, 1))))
+    bench.cycle()
+    bench.set_joints(OPEN)
+    answers = [bench.cycle()[1].status.hex() for _ in range(12)]
+    assert answers.count(status) == 1
+    assert set(answers) == {status, "00000000"}
+
+
+def opened(slots, arm, n, **options) -> Bench:
+    bench = Bench(slots, arm, n, **options)
+    bench.start()
+    bench.cycle()
+    bench.set_joints(OPEN)
+    bench.cycle()
+    assert bench.session.state is State.OPEN
+    return bench
+
+
+TWO_ARMS = tuple((arm, axis) for axis in range(3) for arm in (2, 1))
+
+
+def test_a_drive_that_is_off_on_another_arm_changes_nothing():
+    bench = opened(TWO_ARMS, 1, 3)
+    bench.status[1] = 0
+    received, answer = bench.cycle()
+    assert bench.session.state is State.OPEN
+    for slot, (arm, _) in enumerate(TWO_ARMS):
+        ours, theirs = answer.axes[slot], received.axes[slot]
+        assert ours == (theirs if arm == 2 else theirs.keep(1))
+    assert answer.status == bytes(4)
+
+
+def test_the_drive_of_the_wanted_arm_going_off_ends_open_mode_whatever_the_others_do():
+    bench = opened(TWO_ARMS, 1, 3)
+    bench.status[0] = 0
+    for slot, (arm, _) in enumerate(TWO_ARMS):
+        bench.modes[slot] = OPEN if arm == 2 else CLOSED
+    received, answer = bench.cycle()
+    assert bench.session.state is State.DRIVE_OFF
+    assert oracle.differences(answer, oracle.safe_answer(received, bench.arms)) == []
+
+
+@settings(max_examples=40)
+@given(layouts(), st.data())
+def test_a_following_error_is_reported_in_the_slot_of_the_joint_and_nowhere_else(layout, data):
+    slots, arm, n = layout
+    bench = opened(slots, arm, n)
+    joint = data.draw(st.integers(0, n - 1))
+    offending = bench.joint_slots[joint]
+    bench.error[offending] = 2.5
+    received, answer = bench.cycle()
+    expected = oracle.safe_answer(received, bench.arms)
+    axes = list(expected.axes)
+    axes[offending] = axes[offending]._replace(mode=oracle.FOLLOWING_ERROR)
+    assert oracle.differences(answer, expected._replace(axes=tuple(axes))) == []
+    error = bench.seen(Refused)[-1].error
+    assert type(error) is FollowingError
+    assert error.joint == joint
+
+
+@settings(max_examples=40)
+@given(layouts())
+def test_drive_off_is_requested_in_every_slot(layout):
+    slots, arm, n = layout
+    bench = opened(slots, arm, n)
+    bench.d1[bench.joint_slots[0]] = np.nan
+    _, answer = bench.cycle()
+    assert {axis.mode for axis in answer.axes} == {oracle.DRIVE_OFF_REQUEST}
+    assert all(np.isfinite(axis.floats).all() for axis in answer.axes)
+
+
+def test_axes_that_open_one_after_the_other_are_answered_each_by_its_own_mode():
+    slots = ((1, 4), (1, 0), (1, 5), (1, 3), (1, 1), (1, 2))
+    bench = Bench(slots, 1, 6)
+    bench.start()
+    bench.cycle()
+    for slot in (3, 0, 5, 1, 4, 2):
+        bench.modes[slot] = OPEN
+        received, answer = bench.cycle()
+        assert oracle.differences(answer, oracle.safe_answer(received, bench.arms)) == []
+    assert bench.session.state is State.OPEN
+
+
+class TestLinearTrack:
+    """Six rotary joints in the cell, an open seventh axis that the cell does not know."""
+
+    SLOTS = tuple((1, axis) for axis in (6, 0, 1, 2, 3, 4, 5))
+
+    @pytest.mark.parametrize("track", [CLOSED, OPEN])
+    def test_the_six_joints_are_moved_and_the_track_is_held(self, track):
+        bench = Bench(self.SLOTS, 1, 6)
+        bench.start()
+        path = bench.train.joint_position(bench.d1[1:]) + sideways(6, 12)
+        bench.session.request(Table(path))
+        bench.cycle()
+        bench.set_joints(OPEN)
+        bench.modes[0] = track
+        for row in path:
+            received, answer = bench.cycle()
+            assert answer.axes[0] == oracle.safe_axis(received.axes[0], drive_on=True)
+            motor = bench.train.motor_revolutions(row)
+            assert [a.floats[0] for a in answer.axes[1:]] == np.float32(motor).tolist()
+            bench.obey(answer)
+
+    def test_records_hold_the_six_joints(self):
+        bench = opened(self.SLOTS, 1, 6)
+        record = bench.ring.last(1)[0]
+        expected = bench.train.joint_position(bench.d1[1:])
+        np.testing.assert_allclose(record["position"], expected, rtol=0, atol=1e-12)
+        assert record["mode"].tolist() == [OPEN] * 6
+
+
+def lacking(arm: int, *axes: int) -> list[str]:
+    return [f"axis {axis} of arm {arm} is not open in the controller" for axis in axes]
+
+
+class TestArmWithoutAllItsJoints:
+    def never_moved(self, bench: Bench, says: list[str]) -> None:
+        """Through every kind of packet: no set-point of its own, no motion accepted."""
+        bench.start()
+        (init,) = bench.seen(InitReceived)
+        for part in says:
+            assert part in init.unusable
+        for mode in (CLOSED, OPEN, 5, 501, CLOSED):
+            bench.modes = [mode] * len(bench.slots)
+            received, answer = bench.cycle()
+            safe = oracle.safe_answer(received, bench.arms)
+            for ours, theirs in zip(answer.axes, safe.axes, strict=True):
+                assert ours.mode in (theirs.mode, oracle.DRIVE_OFF_REQUEST)
+                assert ours.d == theirs.d
+        with pytest.raises(RequestError, match="open"):
+            bench.session.request(Table(np.tile(bench.q, (2, 1))))
+        assert np.isnan(bench.ring.last(100)["commanded_position"]).all()
+
+    def test_only_axis_6_open(self):
+        self.never_moved(Bench(((1, 5),), 1, 6), lacking(1, 1, 2, 3, 4, 5))
+
+    def test_only_another_arm_open(self):
+        slots = tuple((2, axis) for axis in range(6))
+        self.never_moved(Bench(slots, 1, 6), lacking(1, 1, 2, 3, 4, 5, 6))
+
+    @settings(max_examples=30)
+    @given(layouts(complete=False))
+    def test_any_joint_that_is_not_open(self, layout):
+        slots, arm, n = layout
+        bench = Bench(slots, arm, n)
+        missing = [j + 1 for j, slot in enumerate(bench.joint_slots) if slot is None]
+        self.never_moved(bench, lacking(arm, *missing))
+
+    @pytest.mark.parametrize("theirs", [OPEN, CLOSED, 8])
+    def test_another_arm_at_work_is_answered_by_its_own_status_and_mode(self, theirs):
+        """This arm's drive is off: that says nothing of the axes of arm 2."""
+        slots = ((1, 5), (2, 0), (2, 1))
+        bench = Bench(slots, 1, 6)
+        bench.start()
+        bench.status = [0, ON, 0, 0]
+        bench.modes = [CLOSED, theirs, theirs]
+        received, answer = bench.cycle()
+        assert oracle.differences(answer, oracle.safe_answer(received, bench.arms)) == []
+
+
+class TestAxisMaps:
+    @pytest.mark.parametrize("none", [0xFF, -1])
+    def test_both_ways_of_saying_that_an_axis_is_not_open(self, none):
+        bench = opened(TWO_ARMS, 2, 3, none=none)
+        assert bench.seen(InitReceived)[0].unusable is None
+        assert bench.ring.last(1)[0]["mode"].tolist() == [OPEN] * 3
+
+    def bad(self, change) -> np.ndarray:
+        table = np.full((4, 10), 0xFF)
+        table[0, :6] = np.arange(6)
+        change(table)
+        return table
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda t: t.__setitem__((0, 3), 2),
+            lambda t: t.__setitem__((0, 3), 6),
+            lambda t: t.__setitem__((0, 3), -2),
+            lambda t: t.__setitem__((0, 3), 2**31 - 1),
+            lambda t: t.__setitem__((0, 3), 0xFF),
+            lambda t: t.__setitem__((0, 6), 6),
+            lambda t: t.__setitem__((1, 0), 0),
+            lambda t: t.__setitem__(slice(None), 1),
+            lambda t: t.__setitem__(slice(None), 0xFF),
+            lambda t: t.__setitem__(slice(None), 0),
+        ],
+        ids=[
+            "a slot given twice",
+            "a slot beyond the packet",
+            "a negative slot",
+            "a huge slot",
+            "a slot given to nobody",
+            "more slots than axes",
+            "a slot given to two arms",
+            "every axis in slot 1",
+            "no axis open",
+            "every axis in slot 0",
+        ],
+    )
+    def test_a_map_that_cannot_be_is_answered_safely_and_never_moved(self, change):
+        slots = tuple((1, axis) for axis in range(6))
+        bench = Bench(slots, 1, 6, open_axes_map=self.bad(change))
+        TestArmWithoutAllItsJoints().never_moved(bench, ["open_axes_map"])
+
+    @pytest.mark.parametrize("mode", [5, 7, 9])
+    def test_without_a_map_no_open_axis_gets_an_echo_while_any_drive_is_on(self, mode):
+        """Whose axis it is nobody knows; an echoed position would be a delta in mode 7."""
+        slots = tuple((1, axis) for axis in range(6))
+        table = np.full((4, 10), 1)
+        bench = Bench(slots, 1, 6, open_axes_map=table)
+        bench.start()
+        bench.status = [0, ON, 0, 0]
+        bench.modes = [mode] * 6
+        received, answer = bench.cycle()
+        for ours, theirs in zip(answer.axes, received.axes, strict=True):
+            assert ours.mode in (mode, oracle.DRIVE_OFF_REQUEST)
+            assert ours.d == oracle.safe_axis(theirs, drive_on=True).d
+
+    @settings(max_examples=60)
+    @given(st.lists(st.integers(-3, 25) | st.just(255), min_size=40, max_size=40), st.data())
+    def test_any_map_whatever_moves_the_arm_only_if_it_is_a_bijection(self, table, data):
+        n_axes = data.draw(st.integers(1, 20))
+        slots = tuple((1 + k // 10, k % 10) for k in range(n_axes))
+        bench = Bench(slots, 1, 1, open_axes_map=np.array(table).reshape(4, 10))
+        bench.start()
+        given_slots = sorted(slot for slot in table if slot not in (255, -1))
+        sound = given_slots == list(range(n_axes)) and table[0] not in (255, -1)
+        assert (bench.seen(InitReceived)[0].unusable is None) == sound
+        received, answer = bench.cycle()
+        if not sound:
+            assert oracle.differences(answer, oracle.safe_answer(received, (1,) * n_axes)) == []
+
+    @pytest.mark.parametrize("count", [0, -1, 21, 2**31 - 1])
+    def test_a_number_of_axes_that_cannot_be_gets_no_answer(self, count):
+        bench = Bench(TWO_ARMS, 1, 3)
+        good = bench.start()
+        assert good is not None
+        fresh = Bench(TWO_ARMS, 1, 3)
+        packet = bytearray(good)
+        packet[:4] = struct.pack("<i", 10)
+        packet[12:16] = struct.pack("<i", count)
+        assert fresh.send(bytes(packet)) is None
+        assert fresh.session.counters.malformed == 1
+        assert fresh.session.state is State.SYNC
+
+
+def test_twenty_axes_of_four_arms_at_1_ms():
+    axes = [(arm, axis) for arm in (1, 2, 3, 4) for axis in range(5)]
+    slots = tuple(axes[(7 * k + 3) % 20] for k in range(20))
+    bench = opened(slots, 3, 5, sample_time=1)
+    received, answer = bench.cycle()
+    assert len(oracle.build(received)) == 732
+    assert oracle.differences(answer, oracle.safe_answer(received, bench.arms)) == []
+    assert bench.session.period == 0.001

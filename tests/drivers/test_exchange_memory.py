@@ -1,0 +1,263 @@
+"""What the exchange shares with other processes: ring, event log, control block, programs."""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import pickle
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rig import Cruise, N, still
+
+from drivers import GapSeen, StateChanged
+from drivers.events import PacketRejected
+from drivers.exchange import (
+    ControlBlock,
+    EventReader,
+    EventWriter,
+    RingReader,
+    SharedCycleRing,
+    control,
+    event_log,
+    program,
+)
+from drivers.record import CycleRing, cycle_dtype
+from drivers.states import State
+
+
+def write(ring: CycleRing, numbers) -> None:
+    for number in numbers:
+        row = ring.slot
+        ring.number[row] = number
+        ring.cycle[row] = 10 * number
+        ring.measured[row] = number
+        ring.commanded[row] = -number
+        ring.commit()
+
+
+class TestRing:
+    def test_what_is_written_is_read_elsewhere_once(self):
+        ring = SharedCycleRing.create(N, 100)
+        reader = RingReader(ring.fd, N)
+        write(ring, range(5))
+        records = reader.drain()
+        assert records["number"].tolist() == [0, 1, 2, 3, 4]
+        assert records["cycle"].tolist() == [0, 10, 20, 30, 40]
+        np.testing.assert_array_equal(records["position"], np.arange(5.0)[:, None] * np.ones(N))
+        np.testing.assert_array_equal(records["commanded_velocity"][3], np.full(N, -3.0))
+        assert len(reader.drain()) == 0
+
+    def test_it_keeps_what_a_private_ring_keeps(self):
+        shared, private = SharedCycleRing.create(N, 50), CycleRing(N, 50)
+        write(shared, range(70))
+        write(private, range(70))
+        assert shared.last(50).tobytes() == private.last(50).tobytes()
+        assert shared.rows.dtype == cycle_dtype(N)
+
+    def test_a_reader_that_comes_later_begins_with_what_is_still_there(self):
+        ring = SharedCycleRing.create(N, 10)
+        write(ring, range(25))
+        reader = RingReader(ring.fd, N)
+        assert reader.drain()["number"].tolist() == list(range(16, 25))
+        assert reader.overflow == 0
+
+    def test_the_writer_counts_what_it_overwrites_unread(self):
+        ring = SharedCycleRing.create(N, 10)
+        reader = RingReader(ring.fd, N)
+        write(ring, range(10))
+        assert ring.overflow == 0
+        write(ring, range(10, 13))
+        assert ring.overflow == 3
+        reader.drain()
+        write(ring, range(13, 23))
+        assert ring.overflow == 3
+        write(ring, range(23, 24))
+        assert ring.overflow == 4
+
+    def test_a_spectator_changes_nothing(self):
+        ring = SharedCycleRing.create(N, 10)
+        spectator = RingReader(ring.fd, N, acknowledge=False)
+        write(ring, range(10))
+        assert len(spectator.drain()) == 9
+        write(ring, range(10, 13))
+        assert ring.overflow == 3
+
+    @given(st.lists(st.integers(0, 25), max_size=30))
+    def test_every_record_is_read_in_order_or_counted_as_lost(self, steps):
+        ring = SharedCycleRing.create(1, 10)
+        reader = RingReader(ring.fd, 1)
+        seen, written = [], 0
+        for count in steps:
+            write(ring, range(written, written + count))
+            written += count
+            seen += reader.drain()["number"].tolist()
+        assert seen == sorted(set(seen))
+        assert len(seen) + reader.overflow == written
+        os.close(ring.fd)
+
+    def test_records_overwritten_while_they_are_copied_are_not_given_out(self):
+        ring = SharedCycleRing.create(N, 10)
+        reader = RingReader(ring.fd, N)
+        write(ring, range(9))
+        rows = reader._rows
+
+        class Overtaken:
+            def take(self, index, mode):
+                write(ring, range(9, 13))
+                return rows.take(index, mode=mode)
+
+        reader._rows = Overtaken()
+        assert reader.drain()["number"].tolist() == [4, 5, 6, 7, 8]
+        assert reader.overflow == 4
+
+    def test_memory_of_something_else_is_refused(self):
+        ring = SharedCycleRing.create(N, 10)
+        with pytest.raises(ValueError, match="for 6 joints, not 7"):
+            RingReader(ring.fd, 7)
+        with pytest.raises(ValueError, match="not a ring"):
+            SharedCycleRing.attach(control.create(), N)
+        with pytest.raises(ValueError, match="at least 2"):
+            SharedCycleRing.create(N, 1)
+
+    def test_draining_is_the_readers_business(self):
+        with pytest.raises(NotImplementedError):
+            SharedCycleRing.create(N, 10).drain()
+
+
+def gaps(numbers):
+    return [GapSeen(1, number) for number in numbers]
+
+
+class TestEventLog:
+    def test_events_arrive_in_order_and_equal(self):
+        fd = event_log.create(4096)
+        writer, reader = EventWriter(fd), EventReader(fd)
+        events = [GapSeen(2, 7), StateChanged(State.OPEN, State.EXITING, 9)]
+        for event in events:
+            writer.write(event)
+        assert reader.drain() == events
+        assert reader.drain() == []
+        assert reader.lost == 0
+
+    def test_several_readers_each_get_all(self):
+        fd = event_log.create(4096)
+        writer = EventWriter(fd)
+        writer.write(GapSeen(1, 1))
+        assert EventReader(fd).drain() == EventReader(fd).drain() == [GapSeen(1, 1)]
+
+    @given(st.lists(st.integers(0, 12), max_size=40), st.integers(300, 1100))
+    def test_every_event_is_read_in_order_or_counted_as_lost(self, steps, capacity):
+        fd = event_log.create(capacity)
+        writer, reader = EventWriter(fd), EventReader(fd)
+        written, seen = 0, []
+        for count in steps:
+            for cycle in range(written, written + count):
+                writer.write(PacketRejected("x" * (cycle % 30), cycle))
+            written += count
+            seen += [event.count for event in reader.drain()]
+        assert seen == sorted(set(seen))
+        assert len(seen) + reader.lost == written
+        os.close(fd)
+
+    def test_a_torn_frame_is_lost_and_not_believed(self):
+        fd = event_log.create(4096)
+        writer, reader = EventWriter(fd), EventReader(fd)
+        for event in gaps([1, 2, 3]):
+            writer.write(event)
+        length = struct.unpack("<I", os.pread(fd, 4, 256))[0]
+        os.pwrite(fd, b"\xff", 256 + 16 + length // 2)
+        assert reader.drain() == gaps([2, 3])
+        assert reader.lost == 1
+
+    def test_frames_given_up_while_they_are_copied_are_not_given_out(self):
+        fd = event_log.create(400)
+        writer, reader = EventWriter(fd), EventReader(fd)
+        for event in gaps([1, 2, 3]):
+            writer.write(event)
+        copy = reader._get
+
+        def overtaken(position, count):
+            for event in gaps([4, 5]):
+                writer.write(event)
+            reader._get = copy
+            return copy(position, count)
+
+        reader._get = overtaken
+        seen = reader.drain() + reader.drain()
+        assert seen == gaps(range(6 - len(seen), 6))
+        assert 0 < len(seen) < 5
+        assert len(seen) + reader.lost == 5
+
+    def test_an_event_longer_than_the_log_is_an_error(self):
+        writer = EventWriter(event_log.create(100))
+        with pytest.raises(ValueError, match="an event of"):
+            writer.write(PacketRejected("x" * 200, 1))
+
+
+class TestControlBlock:
+    def test_each_field_keeps_its_own_value(self):
+        fd = control.create()
+        here, there = ControlBlock(fd), ControlBlock(fd)
+        fields = {
+            name: kind for name, kind in vars(ControlBlock).items() if hasattr(kind, "__set__")
+        }
+        fields.pop("__dict__", None)
+        fields.pop("__weakref__", None)
+        assert len(fields) > 20
+        for index, name in enumerate(fields):
+            setattr(here, name, index - 7)
+        assert {name: getattr(there, name) for name in fields} == {
+            name: index - 7 for index, name in enumerate(fields)
+        }
+
+    def test_memory_of_something_else_is_refused(self):
+        with pytest.raises(ValueError, match="not a control block"):
+            ControlBlock(SharedCycleRing.create(N, 10).fd)
+
+
+class TestProgram:
+    def test_it_plays_as_the_original_does(self):
+        there = program.unpack(program.pack(still(5000)))
+        here = still(5000)
+        there.begin(there.start)
+        here.begin(here.start)
+        for _ in range(3):
+            np.testing.assert_array_equal(there.advance(), here.advance())
+
+    def test_large_arrays_are_mapped_and_read_only_small_ones_are_not(self):
+        source = still(5000)
+        there = program.unpack(program.pack(source))
+        assert not there.positions.flags.writeable
+        assert isinstance(_root(there.positions), mmap.mmap)
+        small = program.unpack(program.pack(Cruise()))
+        small.start += 1.0
+
+    def test_its_memory_cannot_change_any_more(self):
+        fd = program.pack(still(10))
+        with pytest.raises(OSError, match="not permitted"):
+            os.pwrite(fd, b"x", 0)
+        with pytest.raises(PermissionError):
+            mmap.mmap(fd, 10)
+        assert fcntl.fcntl(fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_WRITE
+
+    def test_memory_that_could_still_change_is_refused(self):
+        with pytest.raises((ValueError, OSError)):
+            program.unpack(control.create())
+
+    def test_what_does_not_pickle_is_not_handed_over(self):
+        source = still(10)
+        source.callback = lambda: None
+        with pytest.raises((pickle.PicklingError, AttributeError)):
+            program.pack(source)
+
+
+def _root(array):
+    base = array
+    while not isinstance(base, mmap.mmap):
+        base = base.obj if isinstance(base, memoryview) else base.base
+    return base

@@ -1,0 +1,467 @@
+"""The exchange in a process of its own, against a controller on the loopback device."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig import PERIOD, START, Cruise, N, drive_train, limits, smooth_move, still
+from udp_controller import HOST, UdpController
+
+from drivers import MotionEnded, MotionStarted, RequestError, State, StateChanged
+from drivers.exchange import (
+    ArchiveState,
+    ControlBlock,
+    ExchangeEnded,
+    ExchangeError,
+    ExchangeFailed,
+    ExchangeProcess,
+    ExchangeSettings,
+    ExchangeStarted,
+    Leaving,
+    OverrideRefused,
+    RealTimeSettings,
+    RingReader,
+    process,
+)
+from drivers.transports import TransportError, UdpSpec
+
+MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
+ORDINARY = RealTimeSettings(priority=0, lock_memory=False, hold_cpu_awake=False)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((HOST, 0))
+        return probe.getsockname()[1]
+
+
+def settings(port: int, **changes) -> ExchangeSettings:
+    session = {"settle_cycles": 5, **changes.pop("session", {})}
+    chosen = {"needs_archive": False, "realtime": ORDINARY, "ring_capacity": 5000, **changes}
+    return ExchangeSettings(
+        UdpSpec(HOST, port, HOST), drive_train(), limits(), PERIOD, session, **chosen
+    )
+
+
+@contextmanager
+def running(**changes):
+    port = free_port()
+    exchange = ExchangeProcess.start(settings(port, **changes))
+    controller = UdpController(port, exchange.beat)
+    try:
+        controller.start()
+        yield exchange, controller
+    finally:
+        controller.close()
+        if exchange.alive:
+            exchange.kill()
+        exchange.close()
+
+
+def run_to_the_end(exchange: ExchangeProcess, controller: UdpController, seconds=5.0) -> list:
+    """Cycle on until the process has ended; its events."""
+    controller.until(lambda: not exchange.alive, seconds)
+    return exchange.events()
+
+
+def the(kind, events):
+    found = [event for event in events if isinstance(event, kind)]
+    assert len(found) == 1, events
+    return found[0]
+
+
+def set_going(exchange: ExchangeProcess, controller: UdpController) -> None:
+    exchange.submit(Cruise())
+    controller.open = True
+    controller.until(lambda: controller.moved > 0.2)
+
+
+def test_a_whole_motion_is_run_recorded_and_told():
+    with running() as (exchange, controller):
+        reader = RingReader(exchange.ring_fd, N)
+        exchange.submit(smooth_move(MOVE, 300))
+        controller.open = True
+        controller.until(lambda: exchange.status().ended_count == 1)
+        controller.cycle(3)
+        events = exchange.events()
+        assert the(MotionEnded, events).outcome == "completed"
+        started = the(MotionStarted, events)
+        assert the(ExchangeStarted, events).pid == exchange.pid
+        np.testing.assert_allclose(controller.path[-1], START + MOVE, atol=1e-6)
+        records = reader.drain()
+        in_motion = records[records["interval"] == started.interval]
+        commanded = in_motion["commanded_position"]
+        # The record has what was sent, at the accuracy before the wire's float32.
+        np.testing.assert_allclose(commanded[: len(controller.path)], controller.path, atol=1e-6)
+        assert (np.diff(records["cycle"]) == 1).all()
+        assert reader.overflow == 0
+        status = exchange.status()
+        assert status.state is State.CLOSED
+        assert (status.missed, status.refused, status.overflow, status.late) == (0, 0, 0, 0)
+        assert status.heartbeat_age < 0.5
+        exchange.finish()
+        events = run_to_the_end(exchange, controller)
+        assert exchange.wait(1.0) == 0
+        assert exchange.status().finished
+        assert the(ExchangeEnded, events).reason == "the supervisor wants to end"
+        assert exchange.log == ""
+
+
+def test_a_controller_that_opens_again_and_again_cannot_put_off_the_end():
+    with running() as (exchange, controller):
+        controller.cycle_time = PERIOD
+        exchange.finish()
+        end = time.monotonic() + 10.0
+        while exchange.alive:
+            assert time.monotonic() < end, "the exchange does not end"
+            controller.open = True  # it closes when asked to, and opens with the next packet
+            controller.cycle(3)
+        assert controller.exits > 10
+        assert exchange.wait(1.0) == 0
+
+
+def test_one_process_runs_one_motion_after_the_other():
+    with running() as (exchange, controller):
+        ended = []
+        for _ in range(3):
+            start = controller.train.joint_position(controller.axes["d"][:, 0].astype(float))
+            exchange.submit(smooth_move(MOVE / 10, 150, start))
+            controller.open = True
+            controller.until(lambda: not controller.open)
+            controller.cycle(2)
+            ended += [event for event in exchange.events() if isinstance(event, MotionEnded)]
+        assert [(event.outcome, event.interval) for event in ended] == [
+            ("completed", 0),
+            ("completed", 1),
+            ("completed", 2),
+        ]
+
+
+def test_a_program_of_many_megabytes_is_handed_over_between_packets():
+    with running() as (exchange, controller):
+        controller.cycle(5)
+        exchange.submit(still(100_000))
+        status = exchange.status()
+        assert status.program_accepted == 1
+        assert status.pickup_us > 0.0
+        controller.open = True
+        controller.cycle(20)
+        assert the(MotionStarted, exchange.events()).interval == 0
+        assert controller.unanswered == 0
+
+
+class TestRefusedPrograms:
+    def test_what_the_session_refuses_is_refused_to_the_supervisor(self):
+        with running() as (exchange, controller):
+            exchange.submit(still(10))
+            with pytest.raises(RequestError, match="another motion was requested") as caught:
+                exchange.submit(still(10))
+            assert caught.value.state == "closed"
+            status = exchange.status()
+            assert (status.program_accepted, status.program_refused) == (1, 2)
+            controller.cycle(5)
+            assert exchange.alive
+
+    def test_a_program_that_cannot_be_read_there(self):
+        with (
+            running() as (exchange, _),
+            pytest.raises(RequestError, match="cannot be read"),
+        ):
+            exchange.submit(Trap())
+
+    def test_none_without_an_archive(self):
+        with running(needs_archive=True) as (exchange, _):
+            with pytest.raises(RequestError, match="archive cannot be written"):
+                exchange.submit(still(10))
+            control = ControlBlock(exchange.control_fd)
+            control.archive_state = ArchiveState.READY
+            with pytest.raises(RequestError, match="archive process gives no sign of life"):
+                exchange.submit(still(10))
+            control.archive_heartbeat = time.monotonic()
+            exchange.submit(still(10))
+
+    def test_none_once_the_end_was_asked_for(self):
+        with running() as (exchange, controller):
+            exchange.finish()
+            controller.cycle(5)
+            with pytest.raises(RequestError, match="the supervisor wants to end"):
+                exchange.submit(still(10))
+
+
+def test_a_program_that_was_given_up_does_not_begin_after_all(monkeypatch):
+    with running() as (exchange, controller):
+        monkeypatch.setattr(process, "ANSWER_TIMEOUT", 0.3)
+        os.kill(exchange.pid, signal.SIGSTOP)
+        with pytest.raises(ExchangeError, match=r"silent for 0\.3 s"):
+            exchange.submit(smooth_move(MOVE, 300))
+        os.kill(exchange.pid, signal.SIGCONT)
+        controller.open = True
+        controller.cycle(100)
+        assert exchange.status().program_refused == 1
+        assert controller.moved == 0.0
+        controller.open = False
+        controller.cycle(2)
+        assert exchange.submit(still(10)) == 3
+
+
+class Trap:
+    """Pickles, and fails where it is unpickled."""
+
+    def __reduce__(self):
+        return _spring, ()
+
+
+def _spring():
+    raise OSError("sprung")
+
+
+class TestStops:
+    def test_asked_for(self):
+        with running() as (exchange, controller):
+            set_going(exchange, controller)
+            exchange.stop()
+            controller.until(lambda: not controller.open)
+            controller.cycle(3)
+            controller.assert_stopped_on_its_path(PERIOD)
+            ended = the(MotionEnded, exchange.events())
+            assert (ended.outcome, ended.reason) == ("stopped", "the supervisor asked for a stop")
+            assert exchange.alive
+
+    def test_by_sigterm_which_also_ends_the_process(self):
+        with running() as (exchange, controller):
+            set_going(exchange, controller)
+            exchange.terminate()
+            events = run_to_the_end(exchange, controller)
+            controller.assert_stopped_on_its_path(PERIOD)
+            assert the(MotionEnded, events).outcome == "stopped"
+            assert "told to terminate" in the(Leaving, events).reason
+            assert exchange.wait(1.0) == 0
+
+    def test_by_the_end_of_the_session(self):
+        with running() as (exchange, controller):
+            set_going(exchange, controller)
+            exchange.finish()
+            events = run_to_the_end(exchange, controller)
+            controller.assert_stopped_on_its_path(PERIOD)
+            assert the(MotionEnded, events).outcome == "stopped"
+
+    @pytest.mark.parametrize("end", ["silent", "failed"])
+    def test_by_the_end_of_the_archive(self, end):
+        with running(needs_archive=True) as (exchange, controller):
+            control = ControlBlock(exchange.control_fd)
+
+            def beat():
+                exchange.beat()
+                control.archive_heartbeat = time.monotonic()
+
+            controller.beat = beat
+            beat()
+            control.archive_state = ArchiveState.READY
+            set_going(exchange, controller)
+            controller.cycle_time = PERIOD
+            if end == "silent":
+                controller.beat = exchange.beat
+                reason = "the archive process gives no sign of life"
+            else:
+                control.archive_state = ArchiveState.FAILED
+                reason = "the archive cannot be written"
+            controller.until(lambda: not controller.open)
+            controller.cycle(3)
+            controller.assert_stopped_on_its_path(PERIOD)
+            ended = the(MotionEnded, exchange.events())
+            assert (ended.outcome, ended.reason) == ("stopped", reason)
+            assert exchange.alive
+
+    def test_by_a_supervisor_that_is_silent(self):
+        with running() as (exchange, controller):
+            set_going(exchange, controller)
+            controller.cycle_time = PERIOD  # half a second must not be half the joint's range
+            controller.beat = lambda: None
+            silent_from = time.monotonic()
+            controller.until(lambda: not controller.open)
+            assert time.monotonic() - silent_from > 0.4
+            events = run_to_the_end(exchange, controller)
+            controller.assert_stopped_on_its_path(PERIOD)
+            assert "no sign of life" in the(Leaving, events).reason
+            assert exchange.wait(1.0) == 0
+
+    def test_an_arm_that_is_only_held_is_let_go_too(self):
+        with running() as (exchange, controller):
+            controller.open = True
+            controller.cycle(20)
+            exchange.terminate()
+            events = run_to_the_end(exchange, controller)
+            assert controller.exits == 1
+            assert controller.moved == 0.0
+            assert the(ExchangeEnded, events)
+
+    def test_without_supervisor_and_controller_it_ends(self):
+        with running() as (exchange, controller):
+            set_going(exchange, controller)
+            silent_from = time.monotonic()
+            while exchange.alive:  # which is no sign of life
+                assert time.monotonic() - silent_from < 10.0
+                time.sleep(0.05)
+            events = exchange.events()
+            assert "no sign of life" in the(Leaving, events).reason
+            assert the(MotionEnded, events).outcome == "lost"
+
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+    def test_not_by_an_interrupt_or_a_hang_up(self, number):
+        with running() as (exchange, controller):
+            set_going(exchange, controller)
+            os.kill(exchange.pid, number)
+            moved = controller.moved
+            controller.cycle(200)
+            assert controller.open
+            assert controller.moved == pytest.approx(moved + 200 * PERIOD * Cruise.SPEED, rel=0.01)
+            assert not [event for event in exchange.events() if isinstance(event, MotionEnded)]
+
+
+SUPERVISOR = """
+import sys, threading, time
+sys.path[:0] = {path!r}
+from rig import Cruise
+from test_exchange_process import settings
+from drivers.exchange import ExchangeProcess
+exchange = ExchangeProcess.start(settings({port}))
+print(exchange.pid, flush=True)
+def beat():
+    while True:
+        exchange.beat()
+        time.sleep(0.05)
+threading.Thread(target=beat, daemon=True).start()
+exchange.submit(Cruise())
+print("submitted", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP])
+def test_the_death_of_the_supervisor_stops_the_arm_on_its_path(number):
+    port = free_port()
+    here = str(Path(__file__).parent)
+    script = SUPERVISOR.format(path=[here, str(Path(here).parents[1])], port=port)
+    supervisor = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+    controller = UdpController(port)
+    try:
+        pid = int(supervisor.stdout.readline())
+        controller.start()
+        said = threading.Thread(target=supervisor.stdout.readline)
+        said.start()
+        controller.until(lambda: not said.is_alive())
+        controller.open = True
+        controller.until(lambda: controller.moved > 0.2)
+        # As the end of a terminal does: to its whole process group.
+        os.killpg(supervisor.pid, number)
+        supervisor.wait()
+        died = time.monotonic()
+        controller.until(lambda: not controller.open)
+        assert time.monotonic() - died < 5.0
+        controller.assert_stopped_on_its_path(PERIOD)
+        controller.unanswered = 0
+        controller.until(lambda: not Path(f"/proc/{pid}").exists() or _zombie(pid), 5.0)
+        assert time.monotonic() - died > 2.0, "it goes on answering for a while"
+    finally:
+        controller.close()
+        supervisor.stdout.close()
+        supervisor.kill()
+        supervisor.wait()
+
+
+def _zombie(pid: int) -> bool:
+    return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+
+
+class TestItsOwnEnd:
+    def test_killed_the_supervisor_sees_it_and_the_controller_hears_nothing(self):
+        with running() as (exchange, controller):
+            set_going(exchange, controller)
+            os.kill(exchange.pid, signal.SIGKILL)
+            assert exchange.wait(1.0) == -signal.SIGKILL
+            assert not exchange.alive
+            assert not exchange.status().finished
+            controller.cycle(2)
+            assert controller.unanswered == 2
+            with pytest.raises(ExchangeError, match="gone"):
+                exchange.submit(still(10))
+
+    def test_a_fault_of_its_own_is_in_the_log_and_in_the_status(self):
+        with running(session={"max_gap": "no number"}) as (exchange, controller):
+            controller.cycle(1)
+            controller.number += 3
+            controller.cycle(1)
+            assert exchange.wait(2.0) == 70
+            assert "TypeError" in the(ExchangeFailed, exchange.events()).trace
+            assert "TypeError" in exchange.log
+            assert not exchange.status().finished
+
+
+class TestStart:
+    def test_a_port_in_use_is_told_to_whoever_starts_it(self):
+        with running() as (_, controller), pytest.raises(TransportError, match="another program"):
+            ExchangeProcess.start(settings(controller.socket.getpeername()[1]))
+
+    def test_what_cannot_be_imported_is_told_too(self):
+        with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+            ExchangeProcess.start(settings(free_port(), preload=("no_such_module",)))
+
+    def test_the_system_is_asked_and_its_refusals_have_remedies(self):
+        impossible = RealTimeSettings(priority=50, cpu=4096)
+        with running(realtime=impossible) as (exchange, _):
+            report = exchange.realtime
+            assert report.scheduling in ("SCHED_FIFO 50", "ordinary")
+            assert any("processor 4096 cannot be used" in line for line in report.refused)
+            assert len(report.refused) == 1 + (report.scheduling == "ordinary") + (
+                not report.memory_locked
+            ) + (not report.cpu_awake)
+
+
+def test_records_that_nobody_reads_are_counted_when_they_are_overwritten():
+    with running(ring_capacity=100) as (exchange, controller):
+        reader = RingReader(exchange.ring_fd, N)
+        controller.cycle(350)
+        controller.until(lambda: exchange.status().overflow >= 250)
+        lost_so_far = exchange.status().overflow
+        records = reader.drain()
+        assert len(records) == 99
+        assert reader.overflow >= lost_so_far
+        assert records["number"][-1] == controller.number
+        controller.cycle(50)
+        assert len(reader.drain()) == 50
+
+
+def test_a_live_change_of_speed_that_a_motion_cannot_make_is_refused():
+    with running() as (exchange, controller):
+        set_going(exchange, controller)
+        exchange.override(0.5)
+        controller.cycle(5)
+        assert the(OverrideRefused, exchange.events()).fraction == 0.5
+        exchange.override(float("nan"))
+        controller.cycle(5)
+        assert np.isnan(the(OverrideRefused, exchange.events()).fraction)
+        assert controller.open
+
+
+def test_states_are_told_in_order():
+    with running() as (exchange, controller):
+        controller.open = True
+        controller.cycle(5)
+        states = [event.after for event in exchange.events() if isinstance(event, StateChanged)]
+        assert states == [State.INIT, State.CLOSED, State.OPEN]

@@ -1,0 +1,493 @@
+"""Open modes other than 4 and 5: exactly the fields each needs, guarded, from zero to zero."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rig import (
+    PERIOD,
+    START,
+    Correction,
+    Cruise,
+    N,
+    Rig,
+    Table,
+    all_drive_off,
+    assert_refused,
+    bump,
+    init_packet,
+    limits,
+    smooth_move,
+)
+
+from drivers import (
+    AccelerationLimit,
+    CurrentLimit,
+    FirstSetPoint,
+    FollowingError,
+    JerkLimit,
+    Mode,
+    NotAtStandstill,
+    NotFinite,
+    PositionLimit,
+    RequestError,
+    SourceFailed,
+    State,
+    VelocityLimit,
+)
+from drivers.errors import (
+    CommandedCurrentLimit,
+    CorrectionNotCarriedOn,
+    CorrectionNotEnded,
+)
+from drivers.packets import DRIVE_ON, MODE_FIELDS
+from drivers.states import CORRECTION_MODES, HOLDABLE, INCREMENTAL, POSITION_MODES
+
+MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
+HEIGHT = np.array([0.01, -0.005, 0.02, 0.01, -0.01, 0.005])
+AMPERES = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 0.25])
+MOVED = (2, 7, 8)
+CURRENTS = (2, 9)
+WIDE = {"jerk": np.full(N, 1e12), "acceleration": np.full(N, 1e9)}
+
+
+def correction(mode: int, cycles: int = 400) -> Correction:
+    """A smooth one with all that the mode has fields for."""
+    return Correction(
+        bump(HEIGHT, cycles) if mode in MOVED else None,
+        bump(AMPERES, cycles) if mode in CURRENTS else None,
+    )
+
+
+def begun(mode: int, source, **options) -> Rig:
+    rig = Rig(mode=mode, **options)
+    rig.session.request(source)
+    rig.open()
+    return rig
+
+
+def only_fields_of(mode: int, answer) -> bool:
+    others = [d - 1 for d in range(1, 6) if d not in MODE_FIELDS[mode]]
+    return not answer.axes["d"][:, others].any() and not answer.axes["extra"].any()
+
+
+def test_the_table_of_fields_is_that_of_the_documented_modes():
+    assert {int(mode): fields for mode, fields in MODE_FIELDS.items() if mode < 10} == {
+        1: (1, 2, 4, 5), 2: (4, 5), 4: (1, 2), 5: (1, 2), 7: (1,), 8: (4,), 9: (5,),
+    }  # fmt: skip
+    for mode, fields in MODE_FIELDS.items():
+        assert mode < 10 or MODE_FIELDS[mode - 10] == fields
+    assert {1, 4, 5, 11, 14, 15} == HOLDABLE
+    assert {2, 7, 8, 9, 12, 17} == INCREMENTAL
+    assert {1, 4, 5} == POSITION_MODES
+    assert {2, 7, 8, 9} == CORRECTION_MODES
+
+
+class TestEveryMode:
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
+    def test_without_a_motion_the_arm_is_held_with_the_fields_of_the_mode(self, mode):
+        rig = Rig(mode=mode)
+        for answer in (rig.open(), rig.cycle(20)):
+            assert (answer.axes["mode"] == mode).all()
+            assert only_fields_of(mode, answer)
+            assert answer.status == bytes(4)
+        if mode in CORRECTION_MODES:
+            assert not answer.axes["d"].any()
+        else:
+            motor = rig.train.motor_revolutions(START).astype(np.float32)
+            np.testing.assert_array_equal(answer.axes["d"][:, 0], motor)
+
+    @pytest.mark.parametrize("mode", sorted(POSITION_MODES))
+    def test_corrections_are_no_motion(self, mode):
+        with pytest.raises(RequestError, match=f"kind of source mode {mode} needs"):
+            Rig(mode=mode).session.request(correction(2))
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_a_motion_is_no_correction(self, mode):
+        with pytest.raises(RequestError, match=f"kind of source mode {mode} needs"):
+            Rig(mode=mode).session.request(Cruise())
+
+    @pytest.mark.parametrize("source", [None, object(), 3, "begin"])
+    def test_something_else_is_neither(self, source):
+        for mode in (4, 8):
+            with pytest.raises(RequestError):
+                Rig(mode=mode).session.request(source)
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
+    def test_an_axis_that_does_not_follow_is_a_fault_even_if_nothing_moves(self, mode):
+        rig = Rig(mode=mode)
+        rig.open()
+        rig.axes["d"][3, 2] += 2.01
+        answer = rig.cycle()
+        assert answer.axes["mode"].tolist() == [mode] * 3 + [508] + [mode] * 2
+        assert type(rig.refusal) is FollowingError
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
+    @pytest.mark.parametrize(("column", "kind"), [(2, FirstSetPoint), (1, NotAtStandstill)])
+    def test_open_mode_begins_only_where_the_arm_stands(self, mode, column, kind):
+        rig = Rig(mode=mode)
+        rig.close()
+        rig.axes["d"][1, column] += {1: 6e-4, 2: 0.21}[column]
+        rig.modes = mode
+        assert all_drive_off(rig.cycle())
+        assert type(rig.refusal) is kind
+
+    @pytest.mark.parametrize("mode", [3, 6, 11, 12, 14, 15, 17])
+    def test_modes_that_are_not_served_are_answered_and_never_moved(self, mode):
+        rig = Rig()
+        rig.session.request(Cruise())
+        rig.close()
+        rig.modes = mode
+        answer = rig.cycle()
+        if mode in (3, 6):
+            assert not answer.axes["mode"].any()
+            assert not answer.axes["d"].any()
+        else:
+            assert all_drive_off(answer)
+        assert rig.state is State.FAULTED
+        assert rig.ended.outcome in ("lost", "refused")
+
+
+class WithFeedForward(Table):
+    """A table that also feeds forward rows (m, n) of velocity and current."""
+
+    def __init__(self, positions, velocity=None, current=None):
+        super().__init__(positions)
+        rows = len(self.positions)
+        self.forward = np.zeros((rows, N)) if velocity is None else velocity
+        self.current = np.zeros((rows, N)) if current is None else current
+
+    def feed_forward(self):
+        return self.forward[self.index], self.current[self.index]
+
+
+class TestPositionWithFeedForward:
+    def test_without_feed_forward_d4_is_the_step_and_d5_is_zero(self):
+        rig = begun(1, smooth_move(MOVE, 300))
+        for _ in range(250):
+            answer = rig.cycle()
+            d = answer.axes["d"]
+            np.testing.assert_array_equal(d[:, 3], d[:, 1])
+            assert not d[:, 4].any()
+            assert not d[:, 2].any()
+        assert np.abs(d[:, 3]).max() > 0
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    def test_what_the_source_feeds_forward_goes_into_d4_and_d5(self):
+        move = smooth_move(MOVE, 300)
+        speed = 1.1 * move.velocities
+        speed[-1] = 0.0
+        current = bump(AMPERES, 301)
+        rig = begun(1, WithFeedForward(move.positions, speed, current))
+        for row in range(1, 280):
+            d = rig.cycle().axes["d"]
+            motor = rig.train.motor_revolutions_per_cycle(speed[row], PERIOD)
+            np.testing.assert_allclose(d[:, 3], motor, rtol=1e-6, atol=1e-9)
+            np.testing.assert_allclose(d[:, 4], current[row], rtol=1e-6)
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    @pytest.mark.parametrize("part", ["velocity", "current"])
+    def test_not_finite(self, part, value):
+        rows = np.zeros((10, N))
+        rows[4, 2] = value
+        rig = begun(1, WithFeedForward(np.tile(START, (10, 1)), **{part: rows}))
+        assert_refused(rig, rig.cycle(4), NotFinite)
+
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_too_much_current_is_refused_not_clamped(self, sign):
+        rows = np.zeros((10, N))
+        rows[3, 5] = sign * 7.5
+        rows[4, 5] = sign * 7.51
+        small = init_packet(arm_1={"current_limit": [20, 20, 20, 20, 20, 7.5]})
+        rig = begun(1, WithFeedForward(np.tile(START, (10, 1)), current=rows), init=small)
+        assert rig.cycle(3).axes["d"][5, 4] == np.float32(sign * 7.5)
+        error = assert_refused(rig, rig.cycle(), CommandedCurrentLimit)
+        assert (error.joint, error.bound, error.unit) == (5, pytest.approx(7.5, rel=1e-5), "A")
+        assert isinstance(error, CurrentLimit)
+
+    def test_a_velocity_that_jumps_is_refused(self):
+        rows = np.zeros((10, N))
+        rows[4, 2] = 0.001
+        rig = begun(1, WithFeedForward(np.tile(START, (10, 1)), velocity=rows))
+        assert assert_refused(rig, rig.cycle(4), JerkLimit).joint == 2
+
+    @pytest.mark.parametrize("part", ["velocity", "current"])
+    def test_feed_forward_left_on_at_the_end_is_refused(self, part):
+        rows = np.zeros((10, N))
+        rows[9, 2] = 3e-5
+        rig = begun(1, WithFeedForward(np.tile(START, (10, 1)), **{part: rows}))
+        rig.cycle(8)
+        error = assert_refused(rig, rig.cycle(), CorrectionNotEnded)
+        assert error.unit == {"velocity": "rad/s", "current": "A"}[part]
+
+    @pytest.mark.parametrize("given", [None, (1.0, 2.0), (np.zeros(5), np.zeros(6)), ("a", "b")])
+    def test_feed_forward_that_is_something_else(self, given):
+        source = WithFeedForward(np.tile(START, (10, 1)))
+        source.feed_forward = lambda: given
+        assert_refused((rig := begun(1, source)), rig.cycle(), SourceFailed)
+
+    def test_in_other_modes_nobody_asks_for_it(self):
+        source = WithFeedForward(np.tile(START, (10, 1)))
+        source.feed_forward = None
+        rig = begun(4, source)
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+
+class TestCorrections:
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_a_whole_correction_from_zero_to_zero_to_exit(self, mode):
+        source = correction(mode)
+        rig = Rig(mode=mode)
+        rig.session.request(source)
+        first = rig.open()
+        assert not first.axes["d"].any()
+        for row in range(400):
+            answer = rig.cycle()
+            assert only_fields_of(mode, answer)
+            d = answer.axes["d"].astype(np.float64)
+            motion = rig.train.motor_from_joint @ source.motion[row] / (2 * np.pi)
+            if mode == 7:
+                np.testing.assert_allclose(d[:, 0], motion, rtol=1e-6, atol=1e-9)
+            if mode in (2, 8):
+                np.testing.assert_allclose(d[:, 3], motion * PERIOD, rtol=1e-6, atol=1e-12)
+            if mode in (2, 9):
+                np.testing.assert_allclose(d[:, 4], source.current[row], rtol=1e-6)
+        assert source.begun == 1
+        rig.run()
+        assert rig.ended.outcome == "completed"
+        assert source.index == 400
+
+    def test_the_record_holds_velocities_and_offset_targets(self):
+        rig = begun(8, source := correction(8))
+        rig.cycle(100)
+        np.testing.assert_array_equal(rig.records[-1]["commanded_velocity"], source.motion[99])
+        assert np.isnan(rig.records[-1]["commanded_position"]).all()
+        rig = begun(7, source := correction(7))
+        rig.cycle(100)
+        np.testing.assert_allclose(
+            rig.records[-1]["commanded_position"], START + source.motion[99], atol=1e-6
+        )
+        assert np.isnan(rig.records[-1]["commanded_velocity"]).all()
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_a_stop_takes_it_back_to_zero_and_leaves(self, mode):
+        rig = begun(mode, source := correction(mode))
+        rig.cycle(50)
+        rig.session.stop()
+        rig.run()
+        assert (rig.ended.outcome, source.stops) == ("stopped", 1)
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    @pytest.mark.parametrize("part", ["motion", "current"])
+    def test_not_finite(self, mode, part, value):
+        source = correction(mode)
+        getattr(source, part)[10, 3] = value
+        rig = begun(mode, source)
+        has_field = mode in (MOVED if part == "motion" else CURRENTS)
+        answer = rig.cycle(11)
+        assert_refused(rig, answer, NotFinite if has_field else SourceFailed)
+        assert np.isfinite(answer.axes["d"]).all()
+
+    @pytest.mark.parametrize(("mode", "part"), [(7, "current"), (8, "current"), (9, "motion")])
+    def test_what_the_mode_has_no_field_for_is_refused_not_dropped(self, mode, part):
+        source = correction(mode)
+        getattr(source, part)[10, 3] = 1e-6
+        rig = begun(mode, source)
+        error = assert_refused(rig, rig.cycle(11), SourceFailed)
+        assert "no field" in str(error)
+
+    @pytest.mark.parametrize("mode", [2, 8])
+    def test_velocity_and_its_differences_have_bounds(self, mode):
+        t = PERIOD * np.arange(1, 400)[:, None]
+        one = np.array([0, 0, 1.0, 0, 0, 0])
+        slow = limits(**(WIDE | {"velocity": np.full(N, 0.5)}))
+        cases = [
+            (100 * t**2 / 2, limits(acceleration=np.full(N, 1e9)), JerkLimit),
+            (8 * t, limits(jerk=np.full(N, 1e12)), AccelerationLimit),
+            (0.4 + 0.1 * np.minimum(t / 0.1, 1.0), slow, VelocityLimit),
+        ]
+        for rows, bounds, kind in cases:
+            for scale, refused in ((0.999, False), (1.001, True)):
+                rig = begun(mode, Correction(scale * rows * one), guard_limits=bounds)
+                for _ in range(60):
+                    answer = rig.cycle()
+                    if all_drive_off(answer):
+                        break
+                assert all_drive_off(answer) == refused, (kind, scale)
+                if refused:
+                    assert assert_refused(rig, answer, kind).joint == 2
+
+    def test_an_offset_has_the_bounds_of_set_points(self):
+        t = PERIOD * np.arange(1, 400)[:, None]
+        one = np.array([0, 0, 1.0, 0, 0, 0])
+        cases = [
+            (100.5 * t**3 / 6, limits(acceleration=np.full(N, 1e9)), JerkLimit),
+            (8.01 * t**2 / 2, limits(jerk=np.full(N, 1e12)), AccelerationLimit),
+            (2.01 * t, limits(**WIDE), VelocityLimit),
+        ]
+        for rows, bounds, kind in cases:
+            rig = begun(7, Correction(0.99 * rows * one), guard_limits=bounds)
+            rig.cycle(30)
+            assert rig.state is State.OPEN
+            rig = begun(7, Correction(rows * one), guard_limits=bounds)
+            for _ in range(30):
+                answer = rig.cycle()
+                if all_drive_off(answer):
+                    break
+            assert assert_refused(rig, answer, kind).joint == 2
+
+    def test_target_and_offset_together_stay_inside_the_range(self):
+        tight = limits(upper=START + 0.005, lower=START - 0.005)
+        rig = begun(7, correction(7), guard_limits=tight)
+        for _ in range(400):
+            if all_drive_off(answer := rig.cycle()):
+                break
+        error = assert_refused(rig, answer, PositionLimit)
+        # The first joint of those that go furthest beyond: 10 and 20 thousandths.
+        assert error.joint == 2
+        assert error.bound == pytest.approx(START[2] + 0.005)
+        assert error.value > error.bound
+
+    @pytest.mark.parametrize("mode", [2, 8, 9])
+    def test_the_controllers_own_target_has_to_stay_inside_the_range_too(self, mode):
+        rig = begun(mode, correction(mode), guard_limits=limits(upper=START + 0.005))
+        rig.put_arm_at(START + np.array([0, 0, 0, 0, 0.006, 0]))
+        assert assert_refused(rig, rig.cycle(), PositionLimit).joint == 4
+
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_in_mode_9_the_servos_current_and_ours_together_are_limited(self, sign):
+        rows = np.full((400, N), sign * 5.0)
+        rig = begun(9, Correction(current=rows))
+        rig.axes["d"][:, 4] = sign * 15.0
+        rig.cycle()
+        assert rig.state is State.OPEN
+        rig.axes["d"][4, 4] = sign * 15.01
+        error = assert_refused(rig, rig.cycle(), CommandedCurrentLimit)
+        assert (error.joint, error.value) == (4, pytest.approx(20.01))
+        rig = begun(9, Correction(current=rows))
+        rig.axes["d"][:, 4] = -sign * 19.9
+        rig.cycle()
+        assert rig.state is State.OPEN
+
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_in_mode_2_the_current_fed_forward_is_limited_by_itself(self, sign):
+        rows = np.full((400, N), sign * 20.0)
+        rows[1, 3] = sign * 20.01
+        rig = begun(2, Correction(current=rows))
+        rig.axes["d"][:, 4] = sign * 15.0
+        rig.cycle()
+        assert rig.state is State.OPEN
+        assert assert_refused(rig, rig.cycle(), CommandedCurrentLimit).joint == 3
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_a_correction_left_on_at_the_end_is_refused(self, mode):
+        source = correction(mode)
+        left = {2: 3e-5, 7: 5e-9, 8: 3e-6, 9: 3e-5}[mode]
+        (source.current if mode in CURRENTS else source.motion)[-1, 1] = left
+        rig = begun(mode, source)
+        rig.cycle(399)
+        error = assert_refused(rig, rig.cycle(), CorrectionNotEnded)
+        assert error.value > error.bound
+        assert error.unit == ("A" if mode in CURRENTS else "rad" if mode == 7 else "rad/s")
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_rounding_at_the_end_is_no_correction(self, mode):
+        source = correction(mode)
+        source.motion[-1] += 1e-16 * (mode in MOVED)
+        source.current[-1] += 1e-16 * (mode in CURRENTS)
+        rig = begun(mode, source)
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_after_a_long_gap_nothing_tells_whether_it_was_kept(self, mode):
+        rig = begun(mode, correction(mode))
+        rig.cycle(50)
+        rig.miss(2)
+        rig.cycle()
+        assert rig.state is State.OPEN
+        rig.miss(3)
+        assert_refused(rig, rig.cycle(), CorrectionNotCarriedOn)
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_after_a_long_gap_one_that_was_zero_is_ended(self, mode):
+        rig = begun(mode, source := Correction(rows=300))
+        rig.cycle(5)
+        rig.miss(3)
+        rig.run()
+        assert (rig.ended.outcome, source.stops) == ("stopped", 1)
+
+    @pytest.mark.parametrize("what", ["begin", "advance", "finished", "stop"])
+    def test_a_source_that_raises(self, what):
+        def fails(self):
+            raise ZeroDivisionError("no row 17")
+
+        odd = type("Odd", (Correction,), {what: property(fails) if what == "finished" else fails})
+        rig = Rig(mode=8)
+        rig.session.request(odd(rows=20))
+        answer = rig.open()
+        if what == "stop":
+            rig.session.stop()
+        if what in ("advance", "stop"):
+            answer = rig.cycle()
+        error = assert_refused(rig, answer, SourceFailed)
+        assert "ZeroDivisionError: no row 17" in str(error)
+
+    @pytest.mark.parametrize("given", [None, 1.0, (1.0, 2.0), (np.zeros(5), np.zeros(6))])
+    def test_a_source_that_gives_something_else(self, given):
+        source = Correction(rows=20)
+        source.advance = lambda: given
+        rig = begun(8, source)
+        assert_refused(rig, rig.cycle(), SourceFailed)
+
+    def test_a_source_may_reuse_its_arrays(self):
+        class Reusing(Correction):
+            buffer = np.zeros(N), np.zeros(N)
+
+            def advance(self):
+                for kept, given in zip(self.buffer, super().advance(), strict=True):
+                    kept[:] = given
+                return self.buffer
+
+        def replies(kind):
+            source = correction(2)
+            rig = begun(2, kind(source.motion, source.current))
+            rig.cycle(100)
+            return [reply for _, reply in rig.transcript]
+
+        assert replies(Reusing) == replies(Correction)
+
+    def test_axes_in_other_slots_and_of_other_arms_get_no_correction(self):
+        axes_map = np.full((4, 10), 0xFF)
+        axes_map[0, 0] = 3
+        axes_map[1, :N] = [6, 5, 4, 2, 1, 0]
+        init = init_packet(n_axes=7, open_axes_map=axes_map)
+        for name in ("gear_ratio", "calibration", "kinematic_influence", "current_limit"):
+            init.record[name][0, 1] = init.record[name][0, 0]
+        init.record["following_error"] = 2.0
+        rig = Rig(mode=8, init=init, slots=axes_map[1, :N].astype(int), arm=2)
+        rig.status = 0
+        source = correction(8)
+        rig.session.request(source)
+        packet = rig.packet
+        rig.packet = lambda: (of := packet())[:4] + bytes([0, DRIVE_ON, 0, 0]) + of[8:]
+        rig.open()
+        d = rig.cycle(100).axes["d"]
+        motor = rig.train.motor_from_joint @ source.motion[99] / (2 * np.pi) * PERIOD
+        np.testing.assert_allclose(d[axes_map[1, :N].astype(int), 3], motor, rtol=1e-6, atol=1e-12)
+        assert rig.state is State.OPEN
+        assert not d[3, 1:3].any()
+
+
+def test_the_open_mode_wanted_is_the_only_one_that_moves():
+    rig = Rig(mode=Mode.VELOCITY)
+    rig.session.request(correction(8))
+    rig.close()
+    rig.modes = Mode.FEED_FORWARD
+    assert all_drive_off(rig.cycle())
+    assert rig.ended.outcome == "refused"

@@ -1,0 +1,50 @@
+"""Packets that got no answer, or never reached the session."""
+
+from __future__ import annotations
+
+import pytest
+from rig import Rig
+
+from drivers import PacketRejected
+
+
+def test_what_the_link_discarded_is_counted_and_told_once():
+    rig = Rig()
+    rig.session.discarded("foreign", 3)
+    rig.session.discarded("torn", 1)
+    rig.session.discarded("foreign", 2)
+    assert rig.session.counters.discarded == {"foreign": 5, "torn": 1}
+    assert rig.session.events() == [PacketRejected("foreign", 5), PacketRejected("torn", 1)]
+    assert rig.session.events() == []
+    rig.session.discarded("foreign", 1)
+    assert rig.session.events() == [PacketRejected("foreign", 1)]
+    assert rig.session.counters.discarded == {"foreign": 6, "torn": 1}
+
+
+@pytest.mark.parametrize("count", [0, -1])
+def test_nothing_discarded_is_not_told(count):
+    rig = Rig()
+    rig.session.discarded("foreign", count)
+    assert rig.session.counters.discarded == {}
+    assert rig.session.events() == []
+
+
+def test_sessions_do_not_share_their_counts():
+    one, other = Rig(), Rig()
+    one.session.discarded("torn", 1)
+    assert other.session.counters.discarded == {}
+
+
+def test_it_is_told_together_with_what_the_session_rejected():
+    rig = Rig()
+    rig.close()
+    rig.session.events()
+    rig.send(b"short")
+    rig.send(rig.transcript[0][0][:100])
+    rig.session.discarded("malformed", 3)
+    assert rig.session.counters.malformed == 2
+    assert [event for event in rig.events + rig.session.events()
+            if isinstance(event, PacketRejected)] == [
+        PacketRejected("malformed", 1), PacketRejected("malformed", 1),
+        PacketRejected("malformed", 3),
+    ]  # fmt: skip

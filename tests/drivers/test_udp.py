@@ -1,0 +1,334 @@
+"""The UDP link, on the loopback device."""
+
+from __future__ import annotations
+
+import pickle
+import socket
+import time
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from rig import N, drive_train, init_packet, limits
+from transport_contract import TransportContract
+
+from drivers import (
+    CycleRing,
+    CyclicPacket,
+    Guard,
+    Mode,
+    PacketRejected,
+    Session,
+    State,
+    exchange,
+)
+from drivers.transports import TransportError, UdpSpec, UdpTransport
+
+HOST = "127.0.0.1"
+STRANGER = "127.0.0.2"
+PATIENCE = 0.5
+
+
+class Controller:
+    """A socket of the controller's host."""
+
+    def __init__(self, port: int, host: str = HOST, own_port: int = 0):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind((host, own_port))
+        self.socket.connect((HOST, port))
+        self.socket.settimeout(PATIENCE)
+        self.replies: list[bytes] = []
+
+    def send(self, packet: bytes) -> None:
+        self.socket.send(packet)
+
+    def wait(self) -> None:
+        self.replies.append(self.socket.recv(2048))
+
+    def heard_nothing(self) -> bool:
+        self.socket.setblocking(False)
+        try:
+            self.socket.recv(2048)
+        except BlockingIOError:
+            return True
+        finally:
+            self.socket.settimeout(PATIENCE)
+        return False
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+@pytest.fixture
+def near():
+    transport = UdpSpec(HOST, 0, HOST).open()
+    yield transport
+    transport.close()
+
+
+@pytest.fixture
+def controller(near):
+    far = Controller(near.address[1])
+    yield far
+    far.close()
+
+
+@pytest.fixture
+def another(near):
+    """Another port of the controller's host."""
+    far = Controller(near.address[1])
+    yield far
+    far.close()
+
+
+@pytest.fixture
+def stranger(near):
+    far = Controller(near.address[1], STRANGER)
+    yield far
+    far.close()
+
+
+class TestContract(TransportContract):
+    @pytest.fixture
+    def link(self, near, controller):
+        # A datagram of a plausible length decides the port; the contract also sends shorter ones.
+        controller.send(bytes(48))
+        near.receive(PATIENCE)
+        return near, controller
+
+
+class TestPeer:
+    def test_another_host_gets_no_answer_and_is_counted(self, near, stranger):
+        stranger.send(bytes(48))
+        assert near.receive(0.05) is None
+        near.send(bytes(48))
+        assert stranger.heard_nothing()
+        assert near.rejected() == {"foreign": 1, "unsent": 1}
+        assert near.rejected() == {}
+
+    def test_the_first_sender_is_the_peer_until_it_is_forgotten(self, near, controller, another):
+        controller.send(b"a" * 48)
+        assert near.receive(PATIENCE) == b"a" * 48
+        another.send(b"b" * 48)
+        assert near.receive(0.05) is None
+        assert near.rejected() == {"foreign": 1}
+        near.forget_peer()
+        another.send(b"c" * 48)
+        assert near.receive(PATIENCE) == b"c" * 48
+        near.send(b"answer")
+        another.wait()
+        assert another.replies == [b"answer"]
+        assert controller.heard_nothing()
+
+    def test_a_forgotten_peer_is_not_answered(self, near, controller):
+        controller.send(bytes(48))
+        near.receive(PATIENCE)
+        near.forget_peer()
+        near.send(bytes(48))
+        assert controller.heard_nothing()
+
+    @pytest.mark.parametrize("length", [0, 12, 47, 1501, 9000])
+    def test_an_implausible_datagram_does_not_become_the_peer(
+        self, near, controller, another, length
+    ):
+        another.send(bytes(length))
+        controller.send(b"x" * 48)
+        assert near.receive(PATIENCE) == b"x" * 48
+        assert near.rejected() == {"malformed": 1}
+
+    def test_longer_than_any_packet_is_malformed_and_not_answered(self, near, controller):
+        controller.send(bytes(1500))
+        assert near.receive(PATIENCE) == bytes(1500)
+        controller.send(bytes(1501))
+        assert near.receive(0.05) is None
+        assert near.rejected() == {"malformed": 1}
+
+    def test_strangers_do_not_lengthen_the_wait(self, near, stranger):
+        for _ in range(200):
+            stranger.send(bytes(48))
+        before = time.monotonic()
+        assert near.receive(0.05) is None
+        assert 0.05 <= time.monotonic() - before < 0.25
+
+    def test_a_packet_behind_strangers_is_received(self, near, controller, stranger):
+        for _ in range(20):
+            stranger.send(bytes(48))
+        controller.send(b"x" * 48)
+        assert near.receive(PATIENCE) == b"x" * 48
+        assert near.rejected() == {"foreign": 20}
+
+
+class TestWaiting:
+    @pytest.mark.parametrize("timeout", [1e-9, 0.0005, 0.003, 0.0101])
+    def test_it_waits_no_shorter_than_asked(self, near, timeout):
+        before = time.monotonic()
+        assert near.receive(timeout) is None
+        assert timeout <= time.monotonic() - before < timeout + 0.2
+
+    def test_changing_patience_is_honoured(self, near):
+        for timeout in (0.03, 0.01, 0.0, 0.02, 0.02):
+            before = time.monotonic()
+            assert near.receive(timeout) is None
+            assert timeout <= time.monotonic() - before < timeout + 0.2
+
+    def test_what_the_kernel_drops_is_an_overrun(self, near, controller):
+        controller.send(bytes(48))
+        near.receive(PATIENCE)
+        for _ in range(3000):
+            controller.send(bytes(1200))
+        received = 0
+        while near.receive(0.0) is not None:
+            received += 1
+        assert received < 3000
+        assert near.rejected() == {"overrun": 3000 - received}
+        assert near.rejected() == {}
+
+
+class TestOpening:
+    def test_a_port_in_use_is_named_with_the_remedy(self, near):
+        port = near.address[1]
+        with pytest.raises(TransportError, match="another program has it") as caught:
+            UdpTransport(HOST, port, HOST)
+        assert str(port) in str(caught.value)
+        assert f"ss -ulnp sport = :{port}" in caught.value.remedy
+
+    def test_a_privileged_port_names_the_setting(self):
+        with (
+            patch("socket.socket.bind", side_effect=PermissionError(13, "Permission denied")),
+            pytest.raises(TransportError, match="privileged") as caught,
+        ):
+            UdpTransport(HOST, 1000)
+        assert "net.ipv4.ip_unprivileged_port_start=1000" in caught.value.remedy
+
+    def test_an_address_of_no_device_here(self):
+        with pytest.raises(TransportError, match="no network device"):
+            UdpTransport(HOST, 0, "192.0.2.1")
+
+    def test_an_address_that_is_none(self):
+        with pytest.raises(TransportError, match="controller's address is not known"):
+            UdpTransport("no host", 0)
+
+    @pytest.mark.parametrize("port", [-1, 65536])
+    def test_a_port_that_is_none(self, port):
+        with pytest.raises(TransportError, match="no such port"):
+            UdpTransport(HOST, port)
+
+    def test_a_closed_link_frees_its_port(self, near):
+        port = near.address[1]
+        near.close()
+        UdpTransport(HOST, port, HOST).close()
+
+    def test_refused_options_are_noted_and_not_fatal(self):
+        with patch("socket.socket.setsockopt", side_effect=PermissionError(1, "not permitted")):
+            transport = UdpTransport(HOST, 0)
+        transport.close()
+        assert len(transport.notes) == 3
+        assert any("SO_PRIORITY" in note for note in transport.notes)
+
+    def test_the_description_and_its_error_pickle(self):
+        spec = UdpSpec("10.2.12.150", 1000, "10.2.12.149")
+        assert pickle.loads(pickle.dumps(spec)) == spec
+        error = TransportError("UDP port 1000", "taken", "free it")
+        copy = pickle.loads(pickle.dumps(error))
+        assert (str(copy), copy.link, copy.reason, copy.remedy) == (
+            str(error),
+            "UDP port 1000",
+            "taken",
+            "free it",
+        )
+
+
+class TestSession:
+    """A session behind the port: the controller's words arrive as they are, answers go back."""
+
+    @pytest.fixture
+    def session(self):
+        guard = Guard(limits(), 0.002)
+        return Session(drive_train(), guard, CycleRing(N))
+
+    def serve(self, near, session, packets: int) -> None:
+        """Until so many packets were received, whatever became of them."""
+        seen = 0
+        receive = near.receive
+
+        def counted(timeout):
+            nonlocal seen
+            packet = receive(timeout)
+            seen += packet is not None
+            return packet
+
+        near.receive = counted
+        end = time.monotonic() + 2.0
+        exchange(near, session, until=lambda: seen >= packets or time.monotonic() > end)
+        assert seen == packets
+
+    def packet(self, number: int) -> bytes:
+        axes = CyclicPacket.zeros(1, N).axes
+        axes["mode"] = Mode.CLOSED
+        axes["d"][:, :2] = number
+        return CyclicPacket(number, bytes([5, 0, 0, 0]), bytes(4), axes).encode()
+
+    def test_duplicated_reordered_and_short_datagrams(self, near, controller, session):
+        first, second, third = (self.packet(number) for number in (11, 12, 13))
+        sent = [init_packet().encode(), first, first, third, second, third[:100], self.packet(14)]
+        for packet in sent:
+            controller.send(packet)
+        self.serve(near, session, len(sent))
+        for _ in range(5):
+            controller.wait()
+        assert controller.heard_nothing()
+        numbers = [int.from_bytes(reply[:4], "little") for reply in controller.replies]
+        assert numbers == [11, 12, 12, 14, 15]
+        assert controller.replies[1] == controller.replies[2]
+        assert session.counters.duplicates == 1
+        assert session.counters.stale == 1
+        assert session.counters.malformed == 1
+        assert session.counters.missed == 1
+        assert session.state is State.CLOSED
+
+    def test_a_foreign_packet_is_an_event_of_the_session(self, near, controller, stranger, session):
+        stranger.send(self.packet(11))
+        controller.send(init_packet().encode())
+        self.serve(near, session, 1)
+        exchange(near, session, until=iter([False, True]).__next__)
+        assert session.counters.discarded == {"foreign": 1}
+        assert PacketRejected("foreign", 1) in session.events()
+        assert stranger.heard_nothing()
+
+    def test_before_the_init_packet_a_controller_may_change_its_port(
+        self, near, controller, another, session
+    ):
+        controller.send(int.to_bytes(1, 4, "little") + bytes(728))
+        self.serve(near, session, 1)
+        exchange(near, session, until=iter([False, True]).__next__)
+        another.send(init_packet().encode())
+        self.serve(near, session, 1)
+        another.wait()
+        assert session.state is State.INIT
+
+    def test_a_lost_session_may_go_on_from_another_port(self, near, controller, another, session):
+        session = Session(drive_train(), Guard(limits(), 0.002), CycleRing(N), silence_timeout=0.15)
+        controller.send(init_packet().encode())
+        controller.send(self.packet(11))
+        self.serve(near, session, 2)
+        another.send(init_packet().encode())
+        assert near.receive(0.02) is None
+        exchange(near, session, until=lambda: session.state is State.FAULTED)
+        another.send(init_packet().encode())
+        self.serve(near, session, 1)
+        another.wait()
+        assert session.state is State.INIT
+
+    def test_the_answer_to_a_packet_goes_out_before_the_next_is_looked_at(
+        self, near, controller, session
+    ):
+        controller.send(init_packet().encode())
+        self.serve(near, session, 1)
+        controller.wait()
+        for number in range(11, 60):
+            controller.send(self.packet(number))
+            self.serve(near, session, 1)
+            controller.wait()
+            answer = CyclicPacket.decode(controller.replies[-1], N)
+            assert answer.number == number + 1
+            np.testing.assert_array_equal(answer.axes["d"][:, 0], number)
