@@ -4,6 +4,27 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DriverError
+
+
+class TransportError(DriverError):
+    """A link that cannot be opened.
+
+    Attributes:
+        link: the address it was to have, in words.
+        reason: what is in the way.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, link: str, reason: str, remedy: str) -> None:
+        super().__init__(f"{link} cannot be opened: {reason}; {remedy}")
+        self.link = link
+        self.reason = reason
+        self.remedy = remedy
+
 
 class Transport(Protocol):
     """The PC's end of a link that carries whole packets of up to 1200 bytes, in order.
@@ -15,6 +36,15 @@ class Transport(Protocol):
     @property
     def now(self) -> float:
         """Monotonic time in s, on the link's own clock."""
+        ...
+
+    @property
+    def ages(self) -> NDArray[np.uint16] | None:
+        """How old the values of the packet received last are, in cycles since they were sent.
+
+        (n_axes, 8) for D1..D5, extra1..3 of each axis; None where a packet carries all of them
+        at once, so that all are fresh.
+        """
         ...
 
     def receive(self, timeout: float) -> bytes | None:
@@ -33,6 +63,29 @@ class Transport(Protocol):
         """
         ...
 
+    def rejected(self) -> dict[str, int]:
+        """Packets discarded below the session since the last call, by kind.
+
+        Kinds are words such as "foreign", "malformed", "torn", "corrupt", "overrun", "unsent".
+        """
+        ...
+
+    def forget_peer(self) -> None:
+        """The session was lost: its next packet may come from elsewhere at the same address."""
+        ...
+
     def close(self) -> None:
         """Give the link up. Closing twice changes nothing."""
+        ...
+
+
+class TransportSpec(Protocol):
+    """What is needed to open a link; pickles, so that another process can open it."""
+
+    def open(self) -> Transport:
+        """Open the link.
+
+        Raises:
+            TransportError: it cannot be opened.
+        """
         ...

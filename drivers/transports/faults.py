@@ -1,14 +1,20 @@
 """Faults of a link, as a script that says what happens in which cycle.
 
-Cycles are those of the transport: 0 is the first packet the controller sends.
+Cycles are those of the controller: 0 is the first packet it sends. `FaultyLink` turns a script into
+what arrives and when, for a link in virtual time and for a real one alike.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from math import isfinite
+from typing import Final, Literal
 
 Direction = Literal["to_pc", "to_controller"]
+
+OVERTAKEN_BY: Final = 1.25
+"""Cycles by which a packet is held up that the next one is to overtake."""
 
 
 @dataclass(frozen=True)
@@ -20,27 +26,63 @@ class Lose:
     count: int = 1
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise ValueError(f"Lose: count {self.count} is not positive")
+        _require_cycles(self, self.cycle, self.count)
+
+
+@dataclass(frozen=True)
+class Delay:
+    """The packets of `count` cycles from `cycle` on arrive later, by `seconds` plus `cycles`."""
+
+    cycle: int
+    seconds: float = 0.0
+    cycles: float = 0.0
+    direction: Direction = "to_pc"
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        _require_cycles(self, self.cycle, self.count)
+        for value in (self.seconds, self.cycles):
+            if not (isfinite(value) and value >= 0.0):
+                raise ValueError(f"Delay: {value} is not a time of 0 or more")
+        if not self.seconds + self.cycles > 0.0:
+            raise ValueError("Delay: neither seconds nor cycles were given")
 
 
 @dataclass(frozen=True)
 class Duplicate:
-    """The controller's packet of this cycle arrives twice."""
+    """The packets of `count` cycles from `cycle` on arrive twice."""
 
     cycle: int
+    direction: Direction = "to_pc"
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        _require_cycles(self, self.cycle, self.count)
+
+
+@dataclass(frozen=True)
+class Reorder:
+    """The packet of this cycle is overtaken by that of the next."""
+
+    cycle: int
+    direction: Direction = "to_pc"
+
+    def __post_init__(self) -> None:
+        _require_cycles(self, self.cycle, 1)
 
 
 @dataclass(frozen=True)
 class Corrupt:
-    """One byte of the packet of this cycle is changed: exclusive-or of `mask` at `offset`."""
+    """One byte of the packets of some cycles is changed: exclusive-or of `mask` at `offset`."""
 
     cycle: int
     offset: int
     mask: int = 0xFF
     direction: Direction = "to_pc"
+    count: int = 1
 
     def __post_init__(self) -> None:
+        _require_cycles(self, self.cycle, self.count)
         if not 1 <= self.mask <= 0xFF:
             raise ValueError(f"Corrupt: mask {self.mask} is not one of 1..255")
         if self.offset < 0:
@@ -55,4 +97,53 @@ class Corrupt:
         return bytes(changed)
 
 
-Fault = Lose | Duplicate | Corrupt
+Fault = Lose | Delay | Duplicate | Reorder | Corrupt
+
+
+def _require_cycles(fault: object, cycle: int, count: int) -> None:
+    name = type(fault).__name__
+    if cycle < 0:
+        raise ValueError(f"{name}: cycle {cycle} is negative")
+    if count < 1:
+        raise ValueError(f"{name}: count {count} is not positive")
+
+
+class FaultyLink:
+    """What arrives of each packet, and when. Pure: the same question has the same answer.
+
+    Args:
+        faults: the script.
+        period: the controller's cycle, s.
+    """
+
+    def __init__(self, faults: Sequence[Fault], period: float) -> None:
+        self._period = period
+        self._planned: dict[tuple[int, Direction], list[Fault]] = {}
+        for fault in faults:
+            for cycle in range(fault.cycle, fault.cycle + getattr(fault, "count", 1)):
+                self._planned.setdefault((cycle, fault.direction), []).append(fault)
+
+    def carry(self, cycle: int, direction: Direction, packet: bytes) -> list[tuple[float, bytes]]:
+        """The deliveries of the packet sent in `cycle`: delay in s, and bytes.
+
+        An empty packet stands for none: a controller that is silent in this cycle.
+        """
+        if not packet:
+            return []
+        planned = self._planned.get((cycle, direction))
+        if planned is None:
+            return [(0.0, packet)]
+        delay, copies = 0.0, 1
+        for fault in planned:
+            match fault:
+                case Lose():
+                    return []
+                case Delay():
+                    delay += fault.seconds + fault.cycles * self._period
+                case Reorder():
+                    delay += OVERTAKEN_BY * self._period
+                case Duplicate():
+                    copies += 1
+                case Corrupt():
+                    packet = fault.apply(packet)
+        return [(delay, packet)] * copies

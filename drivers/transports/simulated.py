@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Protocol
+from math import inf
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import TransportClosed
-from drivers.transports.faults import Corrupt, Direction, Duplicate, Fault, Lose
+from drivers.transports.faults import Fault, FaultyLink
 
 
 class Peer(Protocol):
@@ -19,12 +23,20 @@ class Peer(Protocol):
         ...
 
     def next_packet(self) -> bytes | None:
-        """The packet of the next cycle; None when there will be no more."""
+        """The packet of the next cycle, empty for none; None when there will be no more."""
         ...
 
     def accept(self, reply: bytes | None) -> None:
         """The answer to it; None if none arrived within the cycle."""
         ...
+
+
+class _Delayed(NamedTuple):
+    """Something under way: when it arrives, the cycle it was sent in, what it is."""
+
+    due: float
+    cycle: int
+    packet: bytes
 
 
 class SimulatedTransport:
@@ -33,66 +45,89 @@ class SimulatedTransport:
     Deterministic: the same peer, session and faults give the same bytes at the same times. Time
     is a count of cycles, so that it does not drift.
 
+    The peer gets at most one answer per cycle, and none that was sent in an earlier one: an answer
+    held up past the end of its cycle came too late, and for the peer there was none.
+
     Args:
         peer: the controller's end.
         faults: what goes wrong, see `drivers.transports.faults`.
 
     Attributes:
         cycle: cycles begun so far.
-        surplus_replies: answers beyond the first of a cycle (those to duplicates); the peer, which
-            takes one answer a cycle, does not see them.
+        surplus_replies: answers beyond the first of a cycle (those to duplicates).
+        late_replies: answers that arrived after the cycle in which they were sent.
     """
 
     def __init__(self, peer: Peer, faults: Sequence[Fault] = ()) -> None:
         self.cycle = 0
         self.surplus_replies: list[bytes] = []
+        self.late_replies: list[bytes] = []
         self._peer = peer
-        self._lost: set[tuple[int, Direction]] = set()
-        self._duplicated: set[int] = set()
-        self._corrupted: dict[tuple[int, Direction], list[Corrupt]] = {}
-        for fault in faults:
-            self._plan(fault)
+        self._link = FaultyLink(faults, peer.period)
         self._arrived: deque[bytes] = deque()
+        self._to_pc: list[_Delayed] = []
+        self._to_controller: list[_Delayed] = []
         self._waiting = 0.0
         self._awaiting_reply = False
         self._closed = False
-
-    def _plan(self, fault: Fault) -> None:
-        if isinstance(fault, Lose):
-            cycles = range(fault.cycle, fault.cycle + fault.count)
-            self._lost.update((cycle, fault.direction) for cycle in cycles)
-        elif isinstance(fault, Duplicate):
-            self._duplicated.add(fault.cycle)
-        else:
-            self._corrupted.setdefault((fault.cycle, fault.direction), []).append(fault)
 
     @property
     def now(self) -> float:
         """Virtual time in s."""
         return self.cycle * self._peer.period + self._waiting
 
+    @property
+    def ages(self) -> NDArray[np.uint16] | None:
+        """None: every field of a packet is of its own cycle."""
+        return None
+
+    def rejected(self) -> dict[str, int]:
+        """Nothing is discarded below the session."""
+        return {}
+
+    def forget_peer(self) -> None:
+        """There is only one peer."""
+
     def receive(self, timeout: float) -> bytes | None:
-        """The peer's next packet, one cycle later; None if that is further off than `timeout`.
+        """The next packet to arrive; None if that is further off than `timeout`.
 
         Raises:
             TransportClosed: closed, or the peer has no more packets.
         """
         self._require_open()
-        if self._arrived:
-            return self._arrived.popleft()
         left = timeout
         while True:
-            until_next = self._peer.period - self._waiting
-            if left < until_next:
-                self._waiting += max(0.0, left)
+            if self._arrived:
+                return self._arrived.popleft()
+            left = self._pass_time(left)
+            if left < 0.0:
                 return None
-            left -= until_next
+
+    def _pass_time(self, patience: float) -> float:
+        """Go on to the next event; what is left of the patience, negative if it ran out first."""
+        until_cycle = self._peer.period - self._waiting
+        until_arrival = self._next_due() - self.now
+        until_event = min(until_cycle, max(0.0, until_arrival))
+        if patience < until_event:
+            self._waiting += max(0.0, patience)
+            return -1.0
+        if until_arrival < until_cycle:
+            self._waiting += until_event
+        else:
             packet = self._next_cycle()
             if packet is not None:
-                return packet
+                self._arrived.append(packet)
+        self._deliver()
+        return patience - until_event
+
+    def _next_due(self) -> float:
+        """When the next delayed packet arrives, either way."""
+        if not (self._to_pc or self._to_controller):
+            return inf
+        return min(delayed.due for delayed in (*self._to_pc, *self._to_controller))
 
     def _next_cycle(self) -> bytes | None:
-        """Run one cycle; the packet that arrived in it, if one did."""
+        """Begin a cycle; the packet that arrives at once, if one does."""
         if self._awaiting_reply:
             self._peer.accept(None)
         packet = self._peer.next_packet()
@@ -103,29 +138,48 @@ class SimulatedTransport:
         self.cycle += 1
         self._waiting = 0.0
         self._awaiting_reply = True
-        if (index, "to_pc") in self._lost:
-            return None
-        packet = self._corrupt(packet, index, "to_pc")
-        if index in self._duplicated:
-            self._arrived.append(packet)
-        return packet
+        deliveries = self._link.carry(index, "to_pc", packet)
+        at_once = [content for delay, content in deliveries if delay <= 0.0]
+        self._to_pc += [
+            _Delayed(self.now + delay, index, content) for delay, content in deliveries if delay > 0
+        ]
+        self._arrived.extend(at_once[1:])
+        return at_once[0] if at_once else None
+
+    def _deliver(self) -> None:
+        """Hand over what has arrived by now, in the order of its arrival."""
+        if not (self._to_pc or self._to_controller):
+            return
+        now = self.now
+        self._arrived.extend(d.packet for d in sorted(self._to_pc) if d.due <= now)
+        self._to_pc = [d for d in self._to_pc if d.due > now]
+        for reply in sorted(d for d in self._to_controller if d.due <= now):
+            self._hand_over(reply.packet, reply.cycle)
+        self._to_controller = [d for d in self._to_controller if d.due > now]
 
     def send(self, packet: bytes) -> None:
-        """Answer the packet of this cycle.
+        """Answer the packet received last; the answer belongs to the present cycle.
 
         Raises:
             TransportClosed: closed.
         """
         self._require_open()
-        if not self._awaiting_reply:
-            self.surplus_replies.append(packet)
-            return
-        self._awaiting_reply = False
         index = self.cycle - 1
-        if (index, "to_controller") in self._lost:
-            self._peer.accept(None)
+        for delay, content in self._link.carry(index, "to_controller", packet):
+            if delay > 0.0:
+                self._to_controller.append(_Delayed(self.now + delay, index, content))
+            else:
+                self._hand_over(content, index)
+
+    def _hand_over(self, reply: bytes, sent_in: int) -> None:
+        """Give the peer an answer, if it waits for one of that cycle."""
+        if sent_in != self.cycle - 1:
+            self.late_replies.append(reply)
+        elif self._awaiting_reply:
+            self._awaiting_reply = False
+            self._peer.accept(reply)
         else:
-            self._peer.accept(self._corrupt(packet, index, "to_controller"))
+            self.surplus_replies.append(reply)
 
     def close(self) -> None:
         """Give the link up."""
@@ -135,8 +189,3 @@ class SimulatedTransport:
     def _require_open(self) -> None:
         if self._closed:
             raise TransportClosed("the simulated link was closed")
-
-    def _corrupt(self, packet: bytes, index: int, direction: Direction) -> bytes:
-        for fault in self._corrupted.get((index, direction), ()):
-            packet = fault.apply(packet)
-        return packet

@@ -1,0 +1,268 @@
+"""The link over UDP/IPv4: the PC serves, the controller sends first and sets the pace.
+
+One datagram is one packet. A cycle costs two system calls, one `recvfrom` and one `sendto`: the
+kernel keeps the time-out of the first, so that nothing has to be asked before it.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import socket
+import struct
+import time
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import TransportClosed
+from drivers.packets import cyclic_length
+from drivers.transports.base import TransportError
+
+LONGEST: Final = 1500
+"""Bytes of the longest datagram that is looked at (the buffer of the makers' library)."""
+PRIORITY: Final = 6
+"""SO_PRIORITY: the highest a program without privileges may set."""
+TYPE_OF_SERVICE: Final = 0x28
+"""IP_TOS of the makers' library (class AF11)."""
+BUSY_POLL: Final = 50
+"""Microseconds the kernel may poll the network device before it sleeps."""
+_SHORTEST_PLAUSIBLE: Final = cyclic_length(1)
+# Numbers of asm-generic/socket.h that the socket module does not name.
+_SO_BUSY_POLL: Final = 46
+_SO_MEMINFO: Final = 55
+_MEMINFO: Final = struct.Struct("=9I")
+_TIMEVAL: Final = struct.Struct("@qq")
+
+
+@dataclass(frozen=True)
+class UdpSpec:
+    """A UDP link, to be opened.
+
+    Attributes:
+        peer_host: IPv4 address (or name) of the controller; nobody else is listened to.
+        port: of the PC, 1000 in the controller's set-up; 0 takes any that is free.
+        bind: IPv4 address of the PC's network device on the link; "0.0.0.0" takes all of them.
+    """
+
+    peer_host: str
+    port: int
+    bind: str = "0.0.0.0"
+
+    def open(self) -> UdpTransport:
+        """Bind the port.
+
+        Raises:
+            TransportError: address unknown, port taken, or not permitted.
+        """
+        return UdpTransport(self.peer_host, self.port, self.bind)
+
+
+class UdpTransport:
+    """A bound port that listens to one host.
+
+    The first datagram of a plausible length from that host, at the beginning and after
+    `forget_peer`, decides the port that is listened to from then on. Datagrams from any other
+    address are counted as "foreign" and get no answer; what is longer than 1500 bytes is counted
+    as "malformed"; what the kernel dropped because its queue was full, as "overrun".
+
+    Args:
+        peer_host: IPv4 address or name of the controller.
+        port: of the PC; 0 takes any that is free.
+        bind: IPv4 address of the PC's network device.
+
+    Attributes:
+        address: host and port bound.
+        notes: socket options that the system refused, in words. None of them is needed.
+
+    Raises:
+        TransportError: address unknown, port taken, or not permitted.
+    """
+
+    def __init__(self, peer_host: str, port: int, bind: str = "0.0.0.0") -> None:
+        self._host = _resolve(peer_host)
+        self._socket = _bound(bind, port)
+        self.address: tuple[str, int] = self._socket.getsockname()
+        self.notes = _set_options(self._socket)
+        self._timeout = -1.0
+        self._receive = self._socket.recvfrom
+        self._send = self._socket.sendto
+        self._peer: tuple[str, int] | None = None
+        self._rejected: dict[str, int] = {}
+        self._dropped = 0
+        self._closed = False
+
+    @property
+    def now(self) -> float:
+        """CLOCK_MONOTONIC in s, the same in every process of this machine."""
+        return time.monotonic()
+
+    @property
+    def ages(self) -> NDArray[np.uint16] | None:
+        """None: a datagram carries every value."""
+        return None
+
+    def receive(self, timeout: float) -> bytes | None:
+        """The next datagram of the peer, or None after `timeout` s without one.
+
+        Raises:
+            TransportClosed: closed, or the socket failed.
+        """
+        end = time.monotonic() + timeout
+        while True:
+            flags = 0 if timeout == self._timeout else self._have_patience(timeout)
+            try:
+                packet, sender = self._receive(LONGEST + 1, flags)
+            except BlockingIOError:
+                pass
+            except OSError as error:
+                raise TransportClosed(self._trouble(error)) from error
+            else:
+                if (sender == self._peer and len(packet) <= LONGEST) or self._accepts(
+                    packet, sender
+                ):
+                    return packet
+            # Strangers do not lengthen the wait, and the kernel, which counts in scheduler ticks,
+            # may have ended it a tick early.
+            timeout = end - time.monotonic()
+            if timeout <= 0.0:
+                return None
+
+    def send(self, packet: bytes) -> None:
+        """Answer the peer; a datagram that the system does not take is counted as "unsent".
+
+        Raises:
+            TransportClosed: closed.
+        """
+        if self._peer is None:
+            if self._closed:
+                raise TransportClosed("the UDP link was closed")
+            self._count("unsent")
+            return
+        try:
+            self._send(packet, socket.MSG_DONTWAIT, self._peer)
+        except OSError as error:
+            if self._closed:
+                raise TransportClosed(self._trouble(error)) from error
+            # A full queue or a cable pulled out: to the controller it is an answer that was lost.
+            self._count("unsent")
+
+    def rejected(self) -> dict[str, int]:
+        """Datagrams discarded since the last call, by kind."""
+        counts, self._rejected = self._rejected, {}
+        dropped = 0 if self._closed else _dropped(self._socket)
+        if dropped > self._dropped:
+            counts["overrun"] = dropped - self._dropped
+            self._dropped = dropped
+        return counts
+
+    def forget_peer(self) -> None:
+        """Let the next datagram of the controller's host decide the port again."""
+        self._peer = None
+
+    def close(self) -> None:
+        """Give the port up. Closing twice changes nothing."""
+        self._closed = True
+        self._socket.close()
+
+    def _trouble(self, error: Exception) -> str:
+        return "the UDP link was closed" if self._closed else f"the UDP socket failed: {error}"
+
+    def _have_patience(self, timeout: float) -> int:
+        """Have the kernel wait for `timeout` s; returns the flags of the call that waits."""
+        if timeout <= 0.0 or self._closed:
+            return socket.MSG_DONTWAIT
+        # Rounded up: zero would mean for ever.
+        seconds, microseconds = divmod(math.ceil(timeout * 1e6), 1_000_000)
+        value = _TIMEVAL.pack(seconds, microseconds)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
+        self._timeout = timeout
+        return 0
+
+    def _accepts(self, packet: bytes, sender: tuple[str, int]) -> bool:
+        if sender != self._peer:
+            # A stray short datagram must not decide the port for the whole session.
+            first = self._peer is None and _SHORTEST_PLAUSIBLE <= len(packet) <= LONGEST
+            if sender[0] != self._host or not first:
+                known = self._peer is None and sender[0] == self._host
+                self._count("malformed" if known else "foreign")
+                return False
+            self._peer = sender
+        if len(packet) > LONGEST:
+            self._count("malformed")
+            return False
+        return True
+
+    def _count(self, kind: str) -> None:
+        self._rejected[kind] = self._rejected.get(kind, 0) + 1
+
+
+def _resolve(host: str) -> str:
+    try:
+        return socket.gethostbyname(host)
+    except OSError as error:
+        raise TransportError(
+            f"the UDP link to {host!r}",
+            f"the controller's address is not known ({error})",
+            "give its IPv4 address, such as 10.2.12.150",
+        ) from error
+
+
+def _bound(bind: str, port: int) -> socket.socket:
+    link = f"UDP port {port} on {bind}"
+    if not 0 <= port <= 65535:
+        raise TransportError(link, "there is no such port", "use one of 1..65535")
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        udp.bind((bind, port))
+    except OSError as error:
+        udp.close()
+        reason, remedy = _BIND_FAILURES.get(
+            error.errno or 0, (str(error), "check the address of the PC on the link")
+        )
+        raise TransportError(link, reason, remedy.format(port=port)) from error
+    return udp
+
+
+_BIND_FAILURES: Final = {
+    errno.EADDRINUSE: (
+        "another program has it",
+        "find that program with: ss -ulnp sport = :{port}",
+    ),
+    errno.EACCES: (
+        "a port below 1024 is privileged",
+        "permit it with: sudo sysctl net.ipv4.ip_unprivileged_port_start={port}",
+    ),
+    errno.EADDRNOTAVAIL: (
+        "no network device of this PC has that address",
+        "list the addresses with: ip -4 address",
+    ),
+}
+
+
+def _set_options(udp: socket.socket) -> tuple[str, ...]:
+    """Priority on the way out and polling on the way in; returns what was refused, in words."""
+    notes = []
+    for name, level, option, value in (
+        # IP_TOS comes first because it sets a priority of its own.
+        ("IP_TOS", socket.IPPROTO_IP, socket.IP_TOS, TYPE_OF_SERVICE),
+        ("SO_PRIORITY", socket.SOL_SOCKET, socket.SO_PRIORITY, PRIORITY),
+        ("SO_BUSY_POLL", socket.SOL_SOCKET, _SO_BUSY_POLL, BUSY_POLL),
+    ):
+        try:
+            udp.setsockopt(level, option, value)
+        except OSError as error:
+            notes.append(f"{name} = {value} was refused ({error.strerror})")
+    return tuple(notes)
+
+
+def _dropped(udp: socket.socket) -> int:
+    """Datagrams the kernel dropped for want of room since the socket was made."""
+    try:
+        return int(
+            _MEMINFO.unpack(udp.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))[8]
+        )
+    except (OSError, struct.error):  # kernels before 4.12
+        return 0

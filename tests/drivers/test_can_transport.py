@@ -1,0 +1,336 @@
+"""The PC's end on buses of python-can: the contract on each of them, and what can go wrong."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import pickle
+
+import can
+import numpy as np
+import pytest
+from can_bench import (
+    PROFILES,
+    init_packet,
+    virtual_ends,
+)
+from can_contract import CanContract, Far
+from slcan_adapter import SlcanBus
+
+from drivers import CyclicPacket, TransportClosed
+from drivers.transports.base import TransportError
+from drivers.transports.can import (
+    BusRates,
+    CanAxesError,
+    CanBusLoadError,
+    CanModeError,
+    CanSpec,
+    CanTransport,
+    CanValueError,
+)
+from sim_fixtures.can_end import CanFarEnd, open_far_end
+from sim_fixtures.far_end import FarEndError
+
+GROUP = "239.74.163.77"
+_ports = itertools.count(20000 + os.getpid() % 10000)
+
+
+@pytest.fixture(params=PROFILES)
+def profile(request):
+    return request.param
+
+
+class TestVirtual(CanContract):
+    @pytest.fixture
+    def link(self, profile):
+        near, far = virtual_ends(profile)
+        yield near, Far(far)
+        near.close()
+        far.close()
+
+
+def multicast_works() -> bool:
+    """Whether this machine hands a multicast datagram back to itself."""
+    try:
+        with can.Bus(GROUP, "udp_multicast", port=next(_ports), hop_limit=0) as bus:
+            other = can.Bus(GROUP, "udp_multicast", port=bus._multicast.port, hop_limit=0)
+            with other:
+                bus.send(can.Message(arbitration_id=1, data=b"?"))
+                return other.recv(0.5) is not None
+    except (can.CanError, OSError, ImportError):
+        return False
+
+
+@pytest.mark.skipif(not multicast_works(), reason="no msgpack, or no route for multicast")
+class TestUdpMulticast(CanContract):
+    @pytest.fixture
+    def link(self, profile):
+        channel = f"{GROUP}/{next(_ports)}"
+        near = CanSpec("udp_multicast", channel, profile, period=0.002).open()
+        far = open_far_end("udp_multicast", channel, profile)
+        yield near, Far(far)
+        near.close()
+        far.close()
+
+
+class TestSlcan(CanContract):
+    """Through pyserial on a pseudo-terminal to a small emulated adapter."""
+
+    @pytest.fixture
+    def link(self, profile):
+        bus = SlcanBus()
+        options = {"sleep_after_open": 0.0}
+        near = CanSpec("slcan", bus.ports[0], profile, period=0.002, options=options).open()
+        far = open_far_end("slcan", bus.ports[1], profile, options=options)
+        far.receive(0.0)
+        yield near, Far(far)
+        near.close()
+        far.close()
+        bus.close()
+        assert bus.refused == []
+
+    def test_the_adapter_is_told_the_bit_rates(self, profile):
+        bus = SlcanBus()
+        options = {"sleep_after_open": 0.0}
+        CanSpec("slcan", bus.ports[0], profile, period=0.002, options=options).open().close()
+        bus.close()
+        assert [rate for rate in bus.rates[0] if rate] == (
+            ["S8", "Y5"] if profile == "fd" else ["S8"]
+        )
+
+    def test_an_adapter_that_is_pulled_out_is_a_closed_link(self):
+        bus = SlcanBus()
+        options = {"sleep_after_open": 0.0}
+        near = CanSpec("slcan", bus.ports[0], period=0.002, options=options).open()
+        bus.close()
+        with pytest.raises(TransportClosed):
+            for _ in range(20):
+                near.receive(0.01)
+        near.close()
+
+
+def cyclic_link(profile: str):
+    near, far = virtual_ends(profile)
+    far.send(init_packet())
+    near.receive(1.0)
+    return near, far
+
+
+def open_packet(number: int) -> bytes:
+    packet = CyclicPacket.zeros(number, 6)
+    packet.axes["mode"] = 4
+    return CyclicPacket(number, bytes((5, 0, 0, 0)), bytes(4), packet.axes).encode()
+
+
+def test_an_answer_that_cannot_be_carried_becomes_drive_off_and_closes_the_link(profile):
+    near, far = cyclic_link(profile)
+    far.send(open_packet(11))
+    near.receive(1.0)
+    reply = CyclicPacket.zeros(12, 6)
+    reply.axes["mode"] = 4
+    reply.axes["d"][2, 4] = 0.5
+    with pytest.raises(TransportClosed, match="mode 4") as caught:
+        near.send(reply.encode())
+    assert isinstance(caught.value.__cause__, CanModeError)
+    assert (CyclicPacket.decode(far.receive(1.0), 6).axes["mode"] == 505).all()
+    with pytest.raises(TransportClosed):
+        near.receive(0.0)
+
+
+@pytest.mark.parametrize(
+    ("profile", "value"),
+    [("fd", np.nan), ("fd", np.inf), ("classic", np.nan), ("classic", np.inf), ("classic", 1024.0)],
+)
+def test_a_target_that_is_no_number_or_out_of_its_field_never_leaves(profile, value):
+    near, far = cyclic_link(profile)
+    far.send(open_packet(11))
+    near.receive(1.0)
+    reply = CyclicPacket.zeros(12, 6)
+    reply.axes["mode"] = 4
+    reply.axes["d"][5, 0] = value
+    with pytest.raises(TransportClosed) as caught:
+        near.send(reply.encode())
+    assert isinstance(caught.value.__cause__, CanValueError)
+    assert caught.value.__cause__.slot == 5
+    assert (CyclicPacket.decode(far.receive(1.0), 6).axes["mode"] == 505).all()
+
+
+def test_a_session_with_more_axes_is_refused_by_both_ends(profile):
+    init = init_packet(7, 2)
+    near, far = virtual_ends(profile)
+    with pytest.raises(CanAxesError, match="7 axes"):
+        far.send(init)
+    segments = CanFarEnd(can.Bus("seven", "virtual"), BusRates("fd"))
+    near = CanTransport(can.Bus("seven", "virtual"), BusRates("fd"))
+    segments._port.send(_as_segments(init))
+    with pytest.raises(TransportClosed, match="7 axes"):
+        near.receive(1.0)
+
+
+def _as_segments(packet):
+    from drivers.transports.can.layout import SEGMENT_UP, Frame
+    from drivers.transports.can.segments import Segmenter
+
+    return [Frame(SEGMENT_UP, payload) for payload in Segmenter(64).split(packet)]
+
+
+def test_axes_of_another_arm_are_refused(profile):
+    table = np.full((4, 10), 255)
+    table[1, :6] = range(6)
+    _, far = virtual_ends(profile)
+    with pytest.raises(CanAxesError, match="arm 2"):
+        far.send(init_packet(open_axes_map=table))
+
+
+def test_a_controller_with_a_cycle_too_short_for_the_bus_is_refused():
+    _, far = virtual_ends("classic")
+    with pytest.raises(CanBusLoadError, match=r"135\.0 %"):
+        far.send(init_packet(6, 1))
+
+
+def test_an_init_packet_that_makes_no_sense_is_left_to_the_session(profile):
+    near, far = virtual_ends(profile)
+    broken = init_packet(open_axes_map=np.full((4, 10), 3))
+    far.send(broken)
+    assert near.receive(1.0) == broken
+    far.send(open_packet(11))
+    assert near.receive(1.0) == open_packet(11), "as segments: no cyclic frames were agreed on"
+
+
+def test_frames_of_others_are_ignored_and_counted(profile):
+    near, far = cyclic_link(profile)
+    bus = far._port._bus
+    fd = profile == "fd"
+    bus.send(can.Message(arbitration_id=0x7FF, is_extended_id=False, data=b"hello", is_fd=fd))
+    bus.send(can.Message(arbitration_id=0x110, is_extended_id=True, data=b"hello", is_fd=fd))
+    bus.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=b"hello", is_fd=not fd))
+    bus.send(can.Message(is_error_frame=True))
+    far.send(open_packet(11))
+    assert near.receive(1.0) is not None
+    assert near.rejected() == {"foreign": 3, "bus_error": 1}
+    assert near.rejected() == {}
+
+
+def test_strangers_do_not_lengthen_the_wait(profile):
+    near, far = cyclic_link(profile)
+    for _ in range(500):
+        far._port._bus.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
+    before = near.now
+    assert near.receive(0.0) is None
+    assert near.now - before < 0.5
+
+
+def test_an_endless_flood_of_strangers_does_not_hold_the_loop_up():
+    class Flood(Failing):
+        def _recv_internal(self, timeout):
+            return can.Message(arbitration_id=0x7FF, is_extended_id=False, is_fd=True), True
+
+    near = CanTransport(Flood(None), BusRates("fd"))
+    assert near.receive(0.01) is None
+    assert near.rejected()["foreign"] >= 1000
+    near.close()
+
+
+def test_cyclic_frames_before_any_init_packet_are_counted(profile):
+    near, far = cyclic_link(profile)
+    late = CanTransport(can.Bus(far._port._bus.channel_id, "virtual"), BusRates(profile))
+    far.send(open_packet(11))
+    assert late.receive(0.05) is None
+    assert late.rejected() == {"unannounced": 2 if profile == "fd" else 7}
+    late.close()
+    near.close()
+
+
+class Failing(can.BusABC):
+    """A bus that raises what it is told to."""
+
+    def __init__(self, error):
+        super().__init__("failing")
+        self.error = error
+
+    def send(self, msg, timeout=None):
+        raise self.error
+
+    def _recv_internal(self, timeout):
+        raise self.error
+
+    def shutdown(self):
+        super().shutdown()
+        raise can.CanOperationError("nothing left to close")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [can.CanOperationError("adapter gone"), OSError(19, "no such device"), ValueError("bad fd")],
+)
+def test_a_bus_that_fails_is_a_closed_link_with_its_cause(error):
+    near = CanTransport(Failing(error), BusRates("fd"))
+    with pytest.raises(TransportClosed) as caught:
+        near.receive(0.0)
+    assert caught.value.__cause__ is error
+    near.close()
+    near.close()
+
+
+@pytest.mark.parametrize(
+    "error", [can.CanOperationError("no buffers", 105), can.CanTimeoutError("nobody acknowledges")]
+)
+def test_a_frame_that_the_bus_does_not_take_is_lost_and_counted(error):
+    near = CanTransport(Failing(error), BusRates("fd"))
+    near.send(bytes(48))
+    assert near.rejected() == {"unsent": 1}
+    near.close()
+
+
+def test_a_send_that_fails_otherwise_is_a_closed_link():
+    near = CanTransport(Failing(OSError(9, "bad file descriptor")), BusRates("fd"))
+    with pytest.raises(TransportClosed, match="bad file"):
+        near.send(bytes(48))
+    near.close()
+
+
+def test_a_bus_that_is_not_there_is_named_with_its_remedy():
+    with pytest.raises(TransportError, match="ip link set vcan77") as caught:
+        CanSpec("socketcan", "vcan77", period=0.001).open()
+    assert caught.value.__cause__ is not None
+    with pytest.raises(TransportError, match="dialout"):
+        CanSpec("slcan", "/dev/no-such-port", period=0.001).open()
+    with pytest.raises(TransportError, match="python-can"):
+        CanSpec("no-such-interface", "0", period=0.001).open()
+    with pytest.raises(FarEndError, match="vcan77"):
+        open_far_end("socketcan", "vcan77")
+
+
+def test_a_description_is_checked_before_the_bus_is_opened():
+    CanSpec("virtual", "0", period=0.001).check(mode=4)
+    with pytest.raises(CanBusLoadError, match=r"10 classic frames .* 135\.0 %"):
+        CanSpec("virtual", "0", "classic", period=0.001).open()
+    CanSpec("virtual", "0", "classic", period=0.001, n_axes=2).check()
+    with pytest.raises(CanBusLoadError):
+        CanSpec("virtual", "0", data_bitrate=1_000_000, period=0.001).check()
+    with pytest.raises(CanAxesError, match="7 axes"):
+        CanSpec("virtual", "0", period=0.002, n_axes=7).check()
+    with pytest.raises(ValueError, match="profile"):
+        CanSpec("virtual", "0", "xl", period=0.002).check()
+
+
+@pytest.mark.parametrize("mode", [1, 2, 8, 9, 10, 14, 3])
+def test_modes_that_do_not_fit_are_refused_by_name(profile, mode):
+    spec = CanSpec("virtual", "0", profile, period=0.002)
+    with pytest.raises(CanModeError, match=f"mode {mode} ") as caught:
+        spec.check(mode=mode)
+    assert caught.value.mode == mode
+
+
+def test_descriptions_and_errors_pickle():
+    spec = CanSpec("slcan", "/dev/ttyACM0", "classic", 500_000, period=0.004, n_axes=3)
+    assert pickle.loads(pickle.dumps(spec)) == spec
+    for error in (
+        CanAxesError("seven"),
+        CanBusLoadError(0.8, 0.7, 0.001, "9 frames"),
+        CanModeError(8, 1, "no room"),
+        CanValueError("D1", 2, 5e4, "little"),
+    ):
+        copy = pickle.loads(pickle.dumps(error))
+        assert (type(copy), str(copy), vars(copy)) == (type(error), str(error), vars(error))
+        assert isinstance(error, TransportError)
