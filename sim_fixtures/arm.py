@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.effects import FrictionDrift, TorqueRipple, UnmodelledEffects
 from sim_fixtures.elastic_plant import ElasticPlant
+from sim_fixtures.mishaps import Mishaps
 from sim_fixtures.noise import NoiseSource
 from sim_fixtures.plant import Plant
 from sim_fixtures.servo import CurrentLoop
@@ -25,6 +26,7 @@ class SimulatedArm:
     Attributes:
         plant: the mechanics.
         currents: currents that flowed in the last sub-step, (n,) [A].
+        mishaps: what happens to the mechanics from outside.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class SimulatedArm:
             delay_substeps=round(effects.delay / self._substep),
         )
         self.currents = [0.0] * n
+        self.mishaps = Mishaps(holding)
         self._ripple: TorqueRipple | None = None
         if effects.torque_ripple > 0.0:
             self._ripple = TorqueRipple(effects.torque_ripple * truth.coulomb, ripple_rng)
@@ -81,6 +84,10 @@ class SimulatedArm:
         """Let one period pass under target currents (n,) [A]; None for a drive that is off."""
         plant = self.plant
         plant.close_brakes(braked)
+        mishaps = self.mishaps
+        if mishaps.changed:
+            plant.jam(mishaps.jam)
+        load = None if braked else mishaps.load
         if self._drift is not None:
             plant.scale_friction(self._drift.scale(plant.velocity, self._period))
         noise = self._current_noise.draw()
@@ -93,7 +100,10 @@ class SimulatedArm:
             torque = np.array(self._drive.joint_torques(self.currents))
             if self._ripple is not None:
                 torque += self._ripple.torque(self._motors())
+            if load is not None:
+                torque += load
             plant.step(torque, self._substep)
+        mishaps.pass_cycle()
 
     def _motors(self) -> list[float]:
         position: list[float] = self.plant.motor_position.tolist()

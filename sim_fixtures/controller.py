@@ -19,6 +19,8 @@ belongs to the position of packet k stands that many cycles *later* in the recor
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain
 from math import isfinite
 
 import numpy as np
@@ -26,26 +28,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.errors import PacketError
 from drivers.packets import (
-    AXIS_DTYPE,
-    DRIVE_ON,
     EXIT_FROM_OPEN,
     MAX_AXES,
-    N_ARMS,
     CyclicPacket,
-    InitPacket,
     Mode,
     next_number,
     packet_number,
 )
 from sim_fixtures.arm import SimulatedArm
+from sim_fixtures.controller_faults import ControllerFault
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.effects import UnmodelledEffects
 from sim_fixtures.errors import SettingError
+from sim_fixtures.layout import Layout
+from sim_fixtures.mishaps import Mishap
 from sim_fixtures.nominal_model import NominalModel
+from sim_fixtures.own_motion import OwnMotion
 from sim_fixtures.plant import Plant
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep
 from sim_fixtures.servo import Servo
-from sim_fixtures.settings import ControllerSettings
+from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings
+from sim_fixtures.targets import Demand, Targets, Wanted
 from sim_fixtures.truth import PlantTruth, standard_parameters
 
 Array = NDArray[np.float64]
@@ -53,8 +56,6 @@ Array = NDArray[np.float64]
 EARTH = (0.0, 0.0, -9.81)
 NO_EFFECTS = UnmodelledEffects()
 
-_ON = bytes((DRIVE_ON, 0, 0, 0))
-_OFF = bytes(N_ARMS)
 _COMMON_MODE = {Phase.DRIVING_ON: Mode.DRIVING_ON, Phase.ENDING: Mode.END_OF_SESSION}
 
 
@@ -80,6 +81,7 @@ class SimulatedController:
         initial_position: ArrayLike | None = None,
         gravity: ArrayLike = EARTH,
         announced: SimulatedDrive | None = None,
+        faults: Sequence[ControllerFault] = (),
     ) -> None:
         """Power the cabinet up; the arm rests with closed brakes.
 
@@ -93,13 +95,15 @@ class SimulatedController:
             initial_position: joint angles [rad]; the URDF's zero if not given.
             gravity: m/s2 in the base frame.
             announced: what the init packet tells the PC instead of `drive`.
+            faults: what goes wrong with controller and robot, by the number of the packet.
 
         Raises:
             SettingError: sizes that do not match.
         """
-        if truth.n_joints != drive.n_axes or drive.n_axes > 10:
-            raise SettingError("drive", f"{drive.n_axes} axes", f"{truth.n_joints}, at most 10")
-        model_rng, noise_rng = np.random.default_rng(seed).spawn(2)
+        n = drive.n_axes
+        if truth.n_joints != n or n > AXES_PER_ARM:
+            raise SettingError("drive", f"{n} axes", f"{truth.n_joints}, at most {AXES_PER_ARM}")
+        model_rng, noise_rng, tail_rng = np.random.default_rng(seed).spawn(3)
         self.truth = truth
         self.settings = settings
         self.period = settings.period
@@ -116,10 +120,36 @@ class SimulatedController:
             drive, model, gains, period=settings.period, current_resolution=resolution
         )
         self._servo.start_at(self._arm.encoders())
-        self._program = LoopProgram(drive.n_axes, settings)
+        self._layout = Layout(n, settings, tail_rng)
+        self._targets = Targets(drive, settings, self._own_motion())
+        self._targets.release(self._servo)
+        self._faults = self._schedule(faults)
+        self._cycle = 0
+        self._silent = 0
+        self._program = LoopProgram(n, settings)
         self._number = 1 if settings.cold_start else 10
-        self._axes = np.zeros(drive.n_axes, AXIS_DTYPE)
+        self._nothing: Wanted = (None,) * n
         self._awaiting = False
+
+    def _own_motion(self) -> OwnMotion | None:
+        settings = self.settings
+        if not settings.own_motion:
+            return None
+        speed = settings.own_speed * np.array(self.plant.model.velocityLimit)
+        return OwnMotion(settings.own_motion, speed=speed, period=settings.period)
+
+    def _schedule(self, faults: Sequence[ControllerFault]) -> dict[int, list[ControllerFault]]:
+        """Sort faults by cycle.
+
+        Raises:
+            SettingError: an axis that this arm does not have.
+        """
+        schedule: dict[int, list[ControllerFault]] = {}
+        for fault in faults:
+            if not 1 <= getattr(fault, "axis", 1) <= self._drive.n_axes:
+                raise SettingError("faults", fault, f"axes 1..{self._drive.n_axes}")
+            schedule.setdefault(fault.cycle, []).append(fault)
+        return schedule
 
     @property
     def plant(self) -> Plant:
@@ -156,6 +186,7 @@ class SimulatedController:
     def finish(self) -> None:
         """Let the program end: drive off, 504, no more packets. Waits for the arm to stand."""
         self._program.finish()
+        self._targets.end_own_motion()
 
     def drive_on(self) -> None:
         """Press the operator's button after the drive was lost."""
@@ -165,21 +196,56 @@ class SimulatedController:
         """Press the other button: the drive goes off, the brakes close."""
         self._program.trip("emergency stop")
 
+    def lose_drive(self, reason: str) -> None:
+        """The drive goes off, for this reason; the brakes close."""
+        self._program.trip(reason)
+
+    def restart(self, *, warm: bool) -> None:
+        """Begin anew: cold after `boot_time` of silence, warm with the init packet at once."""
+        self._program = self._program.restarted(replace(self.settings, cold_start=not warm))
+        self._number = 10 if warm else 1
+        self._silent = 0 if warm else round(self.settings.boot_time / self.period)
+
+    def axis_leaves(self, axis: int) -> None:
+        """One axis (from 1) leaves open mode by itself."""
+        self._program.axis_leaves(axis - 1)
+
+    def pause(self, mode: int, cycles: int) -> None:
+        """Report mode 500 or 502 for some cycles, then closed axes."""
+        self._program.pause(mode, cycles)
+
+    def suffer(self, kind: Mishap, axis: int, size: float, cycles: int) -> None:
+        """Something befalls the mechanics of one axis (from 1); see `Mishaps.begin`."""
+        if kind == "slip":
+            size *= self._drive.following_error[axis - 1]
+        self._arm.mishaps.begin(kind, axis - 1, size, cycles)
+
+    @property
+    def foreign_targets(self) -> list[float]:
+        """Targets of the axes of other arms [motor rev]."""
+        return self._layout.foreign_targets
+
     def next_packet(self) -> bytes | None:
         """Return the packet of the cycle that begins; None once the session has ended.
 
-        A packet that was never followed by `accept` counts as not answered.
+        It is empty while a controller that was restarted cold is silent. A packet that was never
+        followed by `accept` counts as not answered.
         """
         if self._awaiting:
             self.accept(None)
+        for fault in self._faults.get(self._cycle, ()):
+            fault.inflict(self)
+        self._cycle += 1
         phase = self._program.phase
         if phase is Phase.ENDED:
             return None
         self._awaiting = True
+        if self._silent:
+            return b""
         if phase is not Phase.START:
             return self._cyclic_packet(phase)
         if self._program.start_step is StartStep.INIT:
-            return self._init_packet()
+            return self._layout.init(self._announced, self.period)
         return CyclicPacket.zeros(self._number, MAX_AXES).encode()
 
     def accept(self, reply: bytes | None) -> None:
@@ -187,30 +253,33 @@ class SimulatedController:
         if not self._awaiting:
             return
         self._awaiting = False
-        program, servo = self._program, self._servo
-        target, delta = servo.target, [0.0] * self._drive.n_axes
-        answer = MISSING
-        if reply is not None:
-            answer, demand = self._read(reply)
-            if demand is not None:
-                target, delta = demand
-        if not all(map(isfinite, (*target, *delta))):
-            program.trip("the PC sent a target that is not a number")
-        program.advance(answer, standing=not any(delta))
-        self._run(target, delta)
+        if self._silent:
+            self._silent -= 1
+            self._run(Demand([], [], [], []))
+            return
+        answer, wanted = self._read(reply) if reply is not None else (MISSING, self._nothing)
+        demand = self._targets.advance(self._servo, self._program, wanted)
+        if not all(map(isfinite, chain(*demand))):
+            self._program.trip("the PC sent a number that is none")
+        done = self._targets.own_motion_done
+        self._program.advance(answer, not any(demand.delta), done)
+        self._run(demand)
         self._number = next_number(self._number)
 
-    def _run(self, target: Sequence[float], delta: Sequence[float]) -> None:
+    def _run(self, demand: Demand) -> None:
         """Move the arm for one period and read its encoders."""
         servo, program = self._servo, self._program
         if program.powered:
-            self._arm.run_cycle(servo.advance(target, delta), braked=program.braked)
+            servo.feed(demand.speed, demand.current)
+            currents = servo.advance(demand.target, demand.delta)
+            self._arm.run_cycle(currents, braked=program.braked)
             servo.measure(self._arm.encoders())
             self._watch_following_error()
         else:
             self._arm.run_cycle(None, braked=True)
             servo.measure(self._arm.encoders())
             servo.release()
+            self._targets.release(servo)
 
     def _watch_following_error(self) -> None:
         """Switch the drive off where an axis does not follow."""
@@ -223,68 +292,49 @@ class SimulatedController:
                     f"threshold {threshold:g}"
                 )
 
-    def _read(self, reply: bytes) -> tuple[Answer, tuple[list[float], list[float]] | None]:
-        """Return what a reply asks for, and its targets where they count."""
-        starting = self._program.phase is Phase.START
+    def _read(self, reply: bytes) -> tuple[Answer, Wanted]:
+        """Return what a reply asks for, and what it says of each axis where that counts."""
+        program, layout = self._program, self._layout
         try:
             if packet_number(reply) != next_number(self._number):
                 raise PacketError("number", packet_number(reply), "that of this cycle")
-            if starting:
-                return Answer(valid=True), None
-            packet = CyclicPacket.decode(reply, self._drive.n_axes)
+            if program.phase is Phase.START:
+                return Answer(valid=True), self._nothing
+            packet = CyclicPacket.decode(reply, layout.n_slots)
         except PacketError:
             self.rejected_replies += 1
-            return MISSING, None
+            return MISSING, self._nothing
         modes: list[int] = packet.axes["mode"].tolist()
         answer = Answer(
             valid=True,
-            exit=packet.status[0] == EXIT_FROM_OPEN,
+            exit=packet.status[self.settings.arm - 1] == EXIT_FROM_OPEN,
             drive_off=Mode.DRIVE_OFF_REQUEST in modes,
             following_error=Mode.FOLLOWING_ERROR in modes,
         )
-        if answer.drive_off or answer.following_error or not self._program.listening:
-            return answer, None
-        return answer, self._demand(modes, packet)
-
-    def _demand(self, modes: list[int], packet: CyclicPacket) -> tuple[list[float], list[float]]:
-        """Return targets for the next tick; axes that are not open, or not answered, hold."""
-        target, delta = list(self._servo.target), [0.0] * self._drive.n_axes
-        wanted: list[list[float]] = packet.axes["d"].tolist()
+        if answer.drive_off or answer.following_error or not program.listening:
+            return answer, self._nothing
+        layout.obey(packet)
+        answered = packet.axes["d"][layout.own].tolist()
         open_mode = self.settings.open_mode
-        for i, is_open in enumerate(self._program.open_axes):
-            if is_open and modes[i] == open_mode:
-                target[i], delta[i] = wanted[i][:2]
-        return target, delta
+        return answer, [
+            fields if is_open and modes[slot] == open_mode else None
+            for is_open, slot, fields in zip(program.open_axes, layout.own, answered, strict=True)
+        ]
 
     def _cyclic_packet(self, phase: Phase) -> bytes:
         """Return the packet of a running exchange."""
-        servo, program = self._servo, self._program
-        axes = self._axes
-        common = _COMMON_MODE.get(phase)
-        if common is not None:
-            axes["mode"] = common
-        else:
-            open_mode = self.settings.open_mode
-            axes["mode"] = [open_mode if is_open else 0 for is_open in program.open_axes]
-        measured = (servo.measured, servo.measured_delta)
+        servo, program, layout = self._servo, self._program, self._layout
+        common = program.pause_mode if phase is Phase.PAUSED else _COMMON_MODE.get(phase)
+        layout.set_modes(common, program.open_axes)
+        zero = [0.0] * self._drive.n_axes
         known = program.powered or phase is Phase.TRIPPED
-        demanded = (servo.target, servo.delta) if known else ([0.0] * len(axes),) * 2
-        axes["d"] = np.array((*demanded, *measured, servo.current)).T
-        axes["extra"][:, :2] = np.array((servo.model_current, servo.inertia)).T
-        status = _ON if program.powered else _OFF
-        return CyclicPacket(self._number, status, _OFF, axes).encode()
-
-    def _init_packet(self) -> bytes:
-        """Return the 1200 bytes with what the controller announces about its robot."""
-        drive = self._announced
-        arm_1: dict[str, ArrayLike] = {
-            "calibration": drive.calibration,
-            "current_limit": drive.current_limit,
-            "kinematic_influence": (0.0, 0.0, 0.0, drive.k54, drive.k64, drive.k65),
-            "gear_ratio": drive.gear_ratio,
-            "following_error": drive.following_error,
-        }
-        milliseconds = round(self.period * 1000.0)
-        return InitPacket.build(
-            drive.n_axes, milliseconds, arm_1, version=self.settings.version
-        ).encode()
+        demanded = (self._targets.own, self._targets.own_delta) if known else (zero, zero)
+        measured: Sequence[float] = servo.measured
+        slip = self._arm.mishaps.slip
+        if slip is not None:
+            measured = (slip + measured).tolist()
+        d = np.array((*demanded, measured, servo.measured_delta, servo.current)).T
+        layout.axes["d"][layout.own] = d
+        extra = np.array((servo.model_current, servo.inertia, zero)).T
+        layout.axes["extra"][layout.own] = extra
+        return layout.packet(self._number, program.powered)

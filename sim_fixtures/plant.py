@@ -91,6 +91,7 @@ class Plant:
         self._brake: Array = np.broadcast_to(np.asarray(brake_torque, dtype=np.float64), (n,))
         self._braked = False
         self._scale: Array | None = None
+        self._jam: Array | None = None
         self._coulomb: Array = truth.coulomb
         self._dry: Array = np.zeros(n)
         self._smooth: Array = np.zeros(n)
@@ -131,11 +132,18 @@ class Plant:
         self._scale = factor
         self._set_coulomb()
 
+    def jam(self, torque: Array | None) -> None:
+        """Set dry friction that comes on top of everything, (n,) [N m]; None for none."""
+        self._jam = torque
+        self._set_coulomb()
+
     def _set_coulomb(self) -> None:
         """Set the dry friction that each joint can muster [N m]."""
         coulomb = self.truth.coulomb
         if self._scale is not None:
             coulomb = coulomb * self._scale
+        if self._jam is not None:
+            coulomb = coulomb + self._jam
         self._coulomb = coulomb + self._brake if self._braked else coulomb
 
     def energy(self) -> float:

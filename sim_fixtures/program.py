@@ -8,7 +8,9 @@ or robots; once a cycle it is told what the PC's answer asked for.
                   ^           ^           ^                                   |
                   |           |           +-----------------------------------+
     TRIPPED (drive lost, axes still open for some cycles) -> DRIVE_OFF
+    PAUSED (modes 500 or 502 for some cycles) -> CLOSED
     finish() or the last interval: CLOSED -> SHUTDOWN -> ENDING (504) -> ENDED
+    a motion of the controller's own, with closed axes: CLOSED -> MOVING -> CLOSED -> SHUTDOWN
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ class Phase(IntEnum):
     DRIVE_OFF = auto()
     DRIVING_ON = auto()
     CLOSED = auto()
+    MOVING = auto()
+    PAUSED = auto()
     OPENING = auto()
     OPEN = auto()
     CLOSING = auto()
@@ -35,10 +39,21 @@ class Phase(IntEnum):
     ENDED = auto()
 
 
-POWERED = frozenset({Phase.DRIVING_ON, Phase.CLOSED, Phase.OPENING, Phase.OPEN, Phase.CLOSING})
+POWERED = frozenset(
+    {
+        Phase.DRIVING_ON,
+        Phase.CLOSED,
+        Phase.MOVING,
+        Phase.PAUSED,
+        Phase.OPENING,
+        Phase.OPEN,
+        Phase.CLOSING,
+    }
+)
 UNBRAKED = POWERED - {Phase.DRIVING_ON}
 STILL_OPEN = frozenset({Phase.CLOSING, Phase.TRIPPED})
 """Phases in which an axis keeps for some cycles the mode it had."""
+HAS_OPEN_AXES = frozenset({Phase.OPENING, Phase.OPEN, Phase.CLOSING})
 LISTENING = frozenset({Phase.OPENING, Phase.OPEN})
 
 
@@ -83,6 +98,7 @@ class LoopProgram:
         open_axes: which axes stand in open mode in the packet of this cycle, (n,).
         reason: why the drive was last lost or the session ended, in words; "" if neither.
         intervals: how often all axes have been open.
+        pause_mode: mode of every axis in phase PAUSED.
     """
 
     def __init__(self, n_axes: int, settings: ControllerSettings) -> None:
@@ -93,6 +109,11 @@ class LoopProgram:
         self._missed = 0
         self._stays_off = False
         self._finishing = False
+        self._moves = bool(settings.own_motion) and not settings.corrected
+        self._own_motion_over = False
+        self._gone: set[int] = set()
+        self._pause_cycles = 0
+        self.pause_mode = 0
         self.reason = ""
         self.intervals = 0
         self._enter(Phase.START)
@@ -115,15 +136,36 @@ class LoopProgram:
         if self.powered:
             self.reason = reason
             self._stays_off = True
-            opened = self.phase in (Phase.OPENING, Phase.OPEN, Phase.CLOSING)
+            self._own_motion_over = self._own_motion_over or self.phase is Phase.MOVING
+            opened = self.phase in HAS_OPEN_AXES
             self._enter(Phase.TRIPPED if opened else Phase.DRIVE_OFF)
 
-    def advance(self, answer: Answer, standing: bool) -> None:
+    def axis_leaves(self, axis: int) -> None:
+        """Close one axis (0-based) while the others stay open."""
+        if self.phase in HAS_OPEN_AXES:
+            self._gone.add(axis)
+            self.open_axes[axis] = False
+
+    def pause(self, mode: int, cycles: int) -> None:
+        """Report a pause, mode 500 or 502, for some cycles; nothing where the drive is off."""
+        if self.powered and self.phase is not Phase.DRIVING_ON:
+            self.pause_mode, self._pause_cycles = mode, cycles
+            self._enter(Phase.PAUSED)
+
+    def restarted(self, settings: ControllerSettings) -> LoopProgram:
+        """Return the program after a restart; somebody has to switch the drive on then."""
+        program = LoopProgram(self._n_axes, settings)
+        program._stays_off = True
+        program.reason = "the controller was restarted"
+        return program
+
+    def advance(self, answer: Answer, standing: bool, own_motion_done: bool = False) -> None:
         """End the cycle.
 
         Args:
             answer: what the PC replied to this cycle's packet.
             standing: the target of every axis stands still.
+            own_motion_done: the controller's own motion has come to its end.
         """
         self._age += 1
         self._missed = 0 if answer.valid else self._missed + 1
@@ -134,8 +176,12 @@ class LoopProgram:
             self._advance_start(answer)
         elif self.listening:
             self._advance_open(answer, standing)
+        elif self.phase is Phase.MOVING:
+            if own_motion_done:
+                self._own_motion_over = True
+                self._enter(Phase.CLOSED)
         else:
-            self._advance_timed()
+            self._advance_timed(standing)
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
@@ -144,6 +190,7 @@ class LoopProgram:
         self.listening = phase in LISTENING
         self._age = 0
         if phase is Phase.OPENING:
+            self._gone.clear()
             self._open_due_axes()
         elif phase not in STILL_OPEN:
             self.open_axes = [phase is Phase.OPEN] * self._n_axes
@@ -151,7 +198,17 @@ class LoopProgram:
     def _open_due_axes(self) -> None:
         """Open one axis after the other."""
         stagger = self._settings.opening_stagger
-        self.open_axes = [self._age >= i * stagger for i in range(self._n_axes)]
+        self.open_axes = [
+            self._age >= i * stagger and i not in self._gone for i in range(self._n_axes)
+        ]
+
+    def _close_due_axes(self) -> None:
+        """Close one axis after the other, those of an interrupted opening at once."""
+        settings, age = self._settings, self._age
+        self.open_axes = [
+            is_open and age < settings.closing_cycles + i * settings.closing_stagger
+            for i, is_open in enumerate(self.open_axes)
+        ]
 
     def _advance_start(self, answer: Answer) -> None:
         """Go through the packets of the start; an init packet that nobody answers ends it."""
@@ -172,8 +229,12 @@ class LoopProgram:
             self.reason = "the PC reported a following error (508)"
             self._enter(Phase.CLOSED)
         elif self._missed >= settings.missed_replies:
-            self.reason = f"no valid reply in {self._missed} cycles of open mode"
-            self._enter(Phase.CLOSED)
+            reason = f"no valid reply in {self._missed} cycles of open mode"
+            if settings.while_silent == "drive_off":
+                self.trip(reason)
+            else:
+                self.reason = reason
+                self._enter(Phase.CLOSED)
         elif answer.exit or (self._finishing and standing):
             self._enter(Phase.CLOSING)
         elif self.phase is Phase.OPENING:
@@ -183,7 +244,17 @@ class LoopProgram:
             else:
                 self._open_due_axes()
 
-    def _advance_timed(self) -> None:
+    def _advance_closed(self) -> None:
+        """Leave closed axes for what is on next."""
+        settings = self._settings
+        limit = settings.open_intervals
+        done = limit is not None and self.intervals >= limit
+        if self._finishing or done or self._own_motion_over:
+            self._enter(Phase.SHUTDOWN)
+        else:
+            self._enter(Phase.MOVING if self._moves else Phase.OPENING)
+
+    def _advance_timed(self, standing: bool) -> None:
         """Leave the phases that last a number of cycles."""
         settings = self._settings
         phase, age = self.phase, self._age
@@ -194,13 +265,14 @@ class LoopProgram:
                 self._enter(Phase.DRIVING_ON)
         elif phase is Phase.DRIVING_ON and age >= settings.driving_on_cycles:
             self._enter(Phase.CLOSED)
-        elif phase is Phase.CLOSED and age >= settings.closed_cycles:
-            done = settings.open_intervals is not None and (
-                self.intervals >= settings.open_intervals
-            )
-            self._enter(Phase.SHUTDOWN if self._finishing or done else Phase.OPENING)
-        elif phase is Phase.CLOSING and age >= settings.closing_cycles:
+        elif phase is Phase.CLOSED and age >= settings.closed_cycles and standing:
+            self._advance_closed()
+        elif phase is Phase.PAUSED and age >= self._pause_cycles:
             self._enter(Phase.CLOSED)
+        elif phase is Phase.CLOSING:
+            self._close_due_axes()
+            if not any(self.open_axes):
+                self._enter(Phase.CLOSED)
         elif phase is Phase.TRIPPED and age >= settings.closing_cycles:
             self._enter(Phase.DRIVE_OFF)
         elif phase is Phase.SHUTDOWN and age >= settings.drive_off_cycles:

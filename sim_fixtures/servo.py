@@ -5,6 +5,7 @@ All loops run on the motor side, once per cycle, on positions as the encoders gi
     speed demanded  = speed of the target + position gain * (target - measured)
     target current  = model current + velocity gain * (error of the speed + its integral)
 
+The PC may add to the speed demanded and to the target current in the modes that provide for it.
 The model current is the dynamic model's for the target motion of the cycle that begins. What leaves
 here is the *target* current; the current that flows follows with a lag and noise (`CurrentLoop`).
 """
@@ -76,6 +77,7 @@ class Servo:
         self._gains = [0.0] * n
         self._tick = 0
         self._integral = [0.0] * n
+        self.feed()
 
     def measure(self, revolutions: Sequence[float]) -> None:
         """Take the encoders' positions of a new tick."""
@@ -90,6 +92,19 @@ class Servo:
     def following_error(self) -> list[float]:
         """Return target minus measured [motor rev]."""
         return [t - p for t, p in zip(self.target, self.measured, strict=True)]
+
+    def feed(
+        self, speed: Sequence[float] | None = None, current: Sequence[float] | None = None
+    ) -> None:
+        """Set what is added from now on to the speed demanded and to the target current.
+
+        Args:
+            speed: (n,) [motor rev per cycle]; None for nothing.
+            current: (n,) [A]; None for nothing.
+        """
+        nothing = (0.0,) * self._drive.n_axes
+        self._fed_speed = nothing if speed is None else tuple(speed)
+        self._fed_current = nothing if current is None else tuple(current)
 
     def advance(self, target: Sequence[float], delta: Sequence[float]) -> list[float]:
         """Close the loops for the cycle that begins and move on to its target.
@@ -142,26 +157,28 @@ class Servo:
         settings, rate = self._settings, 1.0 / self._period
         resolution, integral = self._resolution, self._integral
         currents = []
-        for i, (target, delta, before, measured, moved, gain, model, limit) in enumerate(
-            zip(
-                self.target,
-                self.delta,
-                self._delta_before,
-                self.measured,
-                self.measured_delta,
-                gains,
-                self.model_current,
-                self._drive.current_limit,
-                strict=True,
-            )
-        ):
+        rows = zip(
+            self.target,
+            self.delta,
+            self._delta_before,
+            self._fed_speed,
+            self._fed_current,
+            self.measured,
+            self.measured_delta,
+            gains,
+            self.model_current,
+            self._drive.current_limit,
+            strict=True,
+        )
+        for i, row in enumerate(rows):
+            target, delta, before, fed, extra, measured, moved, gain, model, limit = row
             error = target - measured
             # the encoder's difference is the speed half a cycle ago, as the mean of the targets'
-            lag = rate * (0.5 * (delta + before) - moved) + settings.position_gain * error
+            lag = rate * (0.5 * (delta + before) + fed - moved) + settings.position_gain * error
             total = integral[i]
-            if delta != 0.0 or abs(error) > self._deadband:
+            if delta != 0.0 or fed != 0.0 or abs(error) > self._deadband:
                 total += settings.integral_rate * self._period * lag
-            wanted = model + gain * (lag + total)
+            wanted = model + extra + gain * (lag + total)
             current = max(-limit, min(limit, wanted))
             if current == wanted or lag * wanted < 0.0:  # no winding up against the limit
                 integral[i] = total

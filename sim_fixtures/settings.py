@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from math import inf, isfinite
+from typing import Final, Literal
 
 from sim_fixtures.errors import SettingError
+
+WhileSilent = Literal["hold", "continue", "drive_off"]
+
+WHILE_SILENT: Final[tuple[WhileSilent, ...]] = ("hold", "continue", "drive_off")
+OPEN_MODES: Final = (1, 2, 4, 5, 7, 8, 9)
+CORRECTED_MODES: Final = (2, 7, 8, 9)
+"""Open modes in which the controller goes on making its own targets, and the PC corrects."""
+AXES_PER_ARM: Final = 10
+ARMS: Final = 4
+MAX_SLOTS: Final = 20
 
 
 def _require(
@@ -60,7 +71,7 @@ class ControllerSettings:
 
     Attributes:
         period: cycle, s; a whole number of ms, for so it stands in the init packet.
-        open_mode: mode that the controller's program opens the axes in; 4 is absolute position.
+        open_mode: mode that the controller's program opens the axes in: 1, 2, 4, 5, 7, 8 or 9.
         substeps: integration steps of the plant per cycle.
         current_noise: standard deviation of the current that flows about the target, A; white
             from cycle to cycle, on each axis.
@@ -69,13 +80,29 @@ class ControllerSettings:
             what makes the servo's current tremble at standstill.
         servo: gains.
         cold_start: begin with nine sync packets, init, two more; otherwise init comes first.
+        boot_time: s of silence before a controller that was restarted cold speaks again.
         drive_off_cycles, driving_on_cycles, closed_cycles, closing_cycles: duration of each phase.
             `closed_cycles` passes before every opening.
         opening_stagger: cycles between one axis entering open mode and the next.
-        missed_replies: replies missing in a row that end open mode. Meanwhile and afterwards the
-            last target is held; at speed that stop is so hard that the drive trips.
+        closing_stagger: cycles between one axis leaving open mode and the next.
+        missed_replies: replies missing in a row that end open mode.
+        while_silent: what the arm does in open mode without a target it can use. "hold": the last
+            target is held, during and after; at speed that stop is so hard that the drive trips.
+            "continue": it goes on at the velocity of the last target, and once open mode has ended
+            comes to rest within `ramp_time`. "drive_off": the last target is held, and where
+            replies missing end open mode, the drive goes off with it.
+        ramp_time: s in which a moving axis that nobody leads any more is brought to rest.
         silence_limit: replies missing in a row, in any state, that end the session.
         open_intervals: how often the program opens before it ends by itself; None for endlessly.
+        arm: number of this arm, 1..4.
+        slots: slot of each axis in the packets; None for 0, 1, 2, ...
+        foreign_axes: axes of other arms in the packets, in the slots that are left; at rest.
+        foreign_open: whether those open together with this arm; they obey what they are sent.
+        long_packets: send 732 bytes whatever the number of axes; what follows the axes is garbage.
+        own_motion: joint angles [rad] of postures that the controller's own program moves to, one
+            after the other, with closed axes; then it ends the session. In a mode in which the
+            PC only corrects, it moves while the axes are open.
+        own_speed: of those moves, as a fraction of the URDF's velocity limits.
         version: major, minor, build in the init packet.
     """
 
@@ -92,16 +119,35 @@ class ControllerSettings:
     closed_cycles: int = 20
     closing_cycles: int = 5
     opening_stagger: int = 3
+    closing_stagger: int = 0
     missed_replies: int = 1
+    while_silent: WhileSilent = "hold"
+    ramp_time: float = 0.2
     silence_limit: int = 1000
     open_intervals: int | None = None
+    boot_time: float = 2.0
+    arm: int = 1
+    slots: tuple[int, ...] | None = None
+    foreign_axes: int = 0
+    foreign_open: bool = False
+    long_packets: bool = False
+    own_motion: tuple[tuple[float, ...], ...] = ()
+    own_speed: float = 0.3
     version: tuple[int, int, int] = (3, 20, 305)
 
     def __post_init__(self) -> None:
         milliseconds = self.period * 1000.0
         if not (milliseconds >= 0.999 and abs(milliseconds - round(milliseconds)) < 1e-9):
             raise SettingError("period", self.period, "a whole number of milliseconds, in seconds")
-        for name in ("current_noise", "current_resolution", "encoder_noise", "opening_stagger"):
+        for name in (
+            "current_noise",
+            "current_resolution",
+            "encoder_noise",
+            "opening_stagger",
+            "closing_stagger",
+            "boot_time",
+            "foreign_axes",
+        ):
             _require(self, name, 0.0)
         for field in fields(self):
             if field.name.endswith("_cycles") or field.name in (
@@ -110,5 +156,22 @@ class ControllerSettings:
                 "silence_limit",
             ):
                 _require(self, field.name, 1.0)
-        if self.open_mode not in (4, 5):
-            raise SettingError("open_mode", self.open_mode, "4 or 5, position by the PC")
+        _require(self, "ramp_time", 0.0, exclusive=True)
+        _require(self, "own_speed", 0.0, 1.0, exclusive=True)
+        self._check_choices()
+
+    def _check_choices(self) -> None:
+        if self.open_mode not in OPEN_MODES:
+            modes = ", ".join(map(str, OPEN_MODES))
+            raise SettingError("open_mode", self.open_mode, f"one of {modes}")
+        if self.while_silent not in WHILE_SILENT:
+            raise SettingError("while_silent", self.while_silent, f"one of {WHILE_SILENT}")
+        if not 1 <= self.arm <= ARMS:
+            raise SettingError("arm", self.arm, f"1..{ARMS}")
+        if not all(isfinite(angle) for posture in self.own_motion for angle in posture):
+            raise SettingError("own_motion", self.own_motion, "finite joint angles")
+
+    @property
+    def corrected(self) -> bool:
+        """Whether the controller makes the targets of open axes, and the PC corrects them."""
+        return self.open_mode in CORRECTED_MODES

@@ -199,7 +199,7 @@ def test_finish_in_drive_off_ends_without_driving_on() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"period": 0.0005}, {"substeps": 0}, {"missed_replies": 0}, {"open_mode": 7}],
+    [{"period": 0.0005}, {"substeps": 0}, {"missed_replies": 0}, {"open_mode": 3}],
 )
 def test_impossible_settings_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(SettingError):

@@ -1,0 +1,127 @@
+"""The controller's end of the CAN profile: what a gateway in the cabinet would do.
+
+Start packets travel as many frames and take longer than a cycle on a real bus, so a gateway waits
+for their answers; cyclic packets it leaves to the controller's clock.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Literal
+
+import can
+
+from drivers.errors import TransportClosed
+from drivers.transports.base import TransportError
+from drivers.transports.can.bus import open_bus
+from drivers.transports.can.bus_load import BusRates
+from drivers.transports.can.ends import ControllerEnd
+from drivers.transports.can.port import Port
+from sim_fixtures.far_end import FarEndError
+
+START_PATIENCE: Final = 0.25
+"""s that the answer to a packet sent as segments is waited for."""
+
+
+class CanFarEnd:
+    """Carries the controller's packets over a bus; fulfils `sim_fixtures.far_end.FarEnd`.
+
+    Args:
+        bus: python-can's; closed with this.
+        rates: profile and bit rates.
+        start_patience: least time in s that `receive` waits after a packet sent as segments.
+        clock: s, the arrival of frames that the bus does not stamp.
+
+    Attributes:
+        foreign: frames that are not of the profile, or of no use.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        rates: BusRates,
+        *,
+        start_patience: float = START_PATIENCE,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._end = ControllerEnd(rates)
+        self._port = Port(bus, self._end, fd=rates.profile == "fd", clock=clock)
+        self._start_patience = start_patience
+        self._awaited = False
+
+    def send(self, packet: bytes) -> None:
+        """Send one packet of the controller.
+
+        What the bus does not take is lost; an empty packet cannot be sent.
+
+        Raises:
+            CanError: an init packet of a session that the profile or the bus cannot carry.
+            TransportClosed: closed, or the bus failed.
+        """
+        if not packet:
+            return
+        self._port.send(self._end.packet(packet))
+        self._awaited = self._end.segmented
+
+    def receive(self, timeout: float) -> bytes | None:
+        """The PC's next packet, or None after `timeout` s without one.
+
+        Raises:
+            TransportClosed: closed, or the bus failed.
+        """
+        patience = max(timeout, self._start_patience) if self._awaited else timeout
+        # Asked again after that, a lost answer is not waited for a second time.
+        self._awaited = False
+        return self._port.receive(patience)
+
+    @property
+    def discarded(self) -> Counter[str]:
+        """Frames, sets and packets thrown away so far, by kind."""
+        return self._port.discarded
+
+    @property
+    def foreign(self) -> int:
+        """Frames that are none of the PC's."""
+        return self._port.discarded["foreign"]
+
+    def close(self) -> None:
+        """Give the bus up. Closing twice changes nothing."""
+        self._port.close()
+
+
+def open_far_end(
+    interface: str,
+    channel: str,
+    profile: Literal["fd", "classic"] = "fd",
+    *,
+    bitrate: int | None = None,
+    data_bitrate: int | None = None,
+    start_patience: float = START_PATIENCE,
+    options: Mapping[str, Any] | None = None,
+) -> CanFarEnd:
+    """Open the controller's end on a bus of python-can.
+
+    Args:
+        interface: "socketcan", "slcan", "udp_multicast", "virtual", ...
+        channel: "can0", "/dev/ttyACM0", ...
+        profile: "fd" or "classic".
+        bitrate: bit/s; None for 1 Mbit/s.
+        data_bitrate: bit/s of the data phase on FD; None for 5 Mbit/s.
+        start_patience: s that the answer to a start packet is waited for.
+        options: further arguments of the python-can bus.
+
+    Raises:
+        FarEndError: it cannot be opened.
+    """
+    standard = BusRates(profile)
+    rates = BusRates(profile, bitrate or standard.bitrate, data_bitrate or standard.data_bitrate)
+    try:
+        bus = open_bus(interface, channel, rates, options or {})
+    except TransportError as error:
+        raise FarEndError(error.link, f"{error.reason}; {error.remedy}") from error
+    return CanFarEnd(bus, rates, start_patience=start_patience)
+
+
+__all__ = ["START_PATIENCE", "CanFarEnd", "TransportClosed", "open_far_end"]

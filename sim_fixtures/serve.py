@@ -1,0 +1,235 @@
+"""A simulated controller in real time: it paces a link as the cabinet would.
+
+Each cycle begins at its own moment, one period after the one before, however long the work took.
+The controller's packet goes out; the first answer with the right number within a period is the
+reply, whatever else arrives is counted and dropped; then controller and arm compute their cycle.
+
+The server may itself run late. That is never laid at the PC's door: an answer has a whole period
+from the moment the packet really left, and before an answer is called missing the server looks
+into the link once more, for it may have slept while the answer lay there. A server that is late by
+a period or more goes on from where it is; it does not send the packets it owes in a burst.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum, auto
+from math import inf
+from typing import Final, Protocol
+
+from drivers.errors import PacketError
+from drivers.packets import next_number, packet_number
+from drivers.transports.faults import FaultyLink
+from sim_fixtures.far_end import FarEnd
+from sim_fixtures.tally import ServeSummary, Tally
+from sim_fixtures.wire import Clock, MonotonicClock, Wire
+
+KNOCK_INTERVAL: Final = 1.0
+"""Seconds between two first packets while nobody answers."""
+PATIENCE: Final = 3.0
+"""Seconds that the arm may take to come to rest once the session is to end."""
+_NO_CYCLE: Final = -1
+"""Of the repeated first packet: a fault scripted for cycle 0 strikes once."""
+_LOOKS: Final = 100
+"""Stray packets looked at after a cycle is over, so that a flood cannot hold the cycle up."""
+
+
+class Wish(IntEnum):
+    """What the person in front of the cabinet wants."""
+
+    GO_ON = auto()
+    END = auto()
+    GIVE_UP = auto()
+
+
+class ServedPeer(Protocol):
+    """A controller that can be served: `SimulatedController` is one."""
+
+    rejected_replies: int
+
+    @property
+    def period(self) -> float:
+        """Cycle in s."""
+        ...
+
+    def next_packet(self) -> bytes | None:
+        """The packet of the next cycle; empty if it sends none in it, None once it has ended."""
+        ...
+
+    def accept(self, reply: bytes | None) -> None:
+        """The answer to it; None if none arrived within the cycle."""
+        ...
+
+    def finish(self) -> None:
+        """End the session when the arm stands."""
+        ...
+
+    def emergency_stop(self) -> None:
+        """Switch the drive off."""
+        ...
+
+
+def serve(
+    peer: ServedPeer,
+    far_end: FarEnd,
+    *,
+    faults: FaultyLink | None = None,
+    wish: Callable[[], Wish] = lambda: Wish.GO_ON,
+    watch: Callable[[Tally], None] = lambda _: None,
+    clock: Clock | None = None,
+    patience: float = PATIENCE,
+) -> ServeSummary:
+    """Run a controller on a real link until its session has ended.
+
+    The first packet is repeated once a second until a PC answers it, so that the order of starting
+    does not matter and the PC still sees each packet of the start once.
+
+    Args:
+        peer: the controller.
+        far_end: its link, left open.
+        faults: what the link does to packets; cycle 0 is that of the first one.
+        wish: asked every cycle. At `END` the controller ends its session, with the drive switched
+            off under a moving arm if it does not stand within `patience` s; at `GIVE_UP` it falls
+            silent at once.
+        watch: called once a cycle, in the time that is left over, with the counts so far.
+        clock: time; the machine's own if left out.
+        patience: see `wish`, s.
+    """
+    clock = clock if clock is not None else MonotonicClock()
+    server = _Server(peer, Wire(far_end, faults, clock), clock, watch)
+    if server.knock(wish):
+        server.run(wish, patience)
+    return server.tally.summary()
+
+
+class _Server:
+    """One session of one controller."""
+
+    def __init__(
+        self, peer: ServedPeer, wire: Wire, clock: Clock, watch: Callable[[Tally], None]
+    ) -> None:
+        self.tally = Tally()
+        self._peer = peer
+        self._wire = wire
+        self._clock = clock
+        self._watch = watch
+        self._period = peer.period
+        self._due = 0.0
+        self._finish_by: float | None = None
+
+    def knock(self, wish: Callable[[], Wish]) -> bool:
+        """Repeat the first packet until it is answered; False if told to end before."""
+        packet = self._peer.next_packet()
+        if packet is None:
+            self.tally.ended = True
+            return False
+        while wish() is Wish.GO_ON:
+            sent = self._clock.now()
+            self._wire.send(0 if self.tally.knocks == 0 else _NO_CYCLE, packet)
+            self.tally.knocks += 1
+            reply = self._patient_reply(packet, sent + KNOCK_INTERVAL, wish)
+            if reply is not None:
+                self.tally.cycles += 1
+                self._due = max(sent + self._period, self._clock.now())
+                self._hand_over(packet, reply)
+                return True
+        return False
+
+    def _patient_reply(self, packet: bytes, until: float, wish: Callable[[], Wish]) -> bytes | None:
+        """An answer to the first packet, in steps short enough to notice a wish to end."""
+        while wish() is Wish.GO_ON and (now := self._clock.now()) < until:
+            reply = self._reply(packet, min(until, now + 0.1))
+            self._watch(self.tally)
+            if reply is not None:
+                return reply
+        return None
+
+    def run(self, wish: Callable[[], Wish], patience: float) -> None:
+        """Cycle by cycle to the end."""
+        late_by_missing = False
+        while True:
+            if not self._heed(wish(), patience):
+                return
+            self._wire.sleep_until(self._due)
+            self._note_lateness(excused=late_by_missing)
+            packet = self._peer.next_packet()
+            if packet is None:
+                self.tally.ended = True
+                return
+            answered = self._exchange(packet) if packet else self._stay_silent()
+            late_by_missing = not answered
+            self._due += self._period
+            self._watch(self.tally)
+
+    def _exchange(self, packet: bytes) -> bool:
+        """One cycle: packet, reply, computation. Whether it was answered."""
+        sent = self._clock.now()
+        self.tally.cycles += 1
+        self._wire.send(self.tally.cycles - 1, packet)
+        reply = self._reply(packet, sent + self._period)
+        if reply is not None:
+            self.tally.answer.add(self._clock.now() - sent)
+        self._hand_over(packet, reply)
+        return reply is not None
+
+    def _stay_silent(self) -> bool:
+        """A cycle in which the controller sends nothing, for it is booting."""
+        self.tally.cycles += 1
+        self._peer.accept(None)
+        return True
+
+    def _heed(self, wish: Wish, patience: float) -> bool:
+        """Ask the controller to end; take its drive away if the arm does not come to rest."""
+        if wish is Wish.END:
+            now = self._clock.now()
+            if self._finish_by is None:
+                self._finish_by = now + patience
+                self._peer.finish()
+            elif now > self._finish_by:
+                self._finish_by = inf
+                self._peer.emergency_stop()
+        return wish is not Wish.GIVE_UP
+
+    def _note_lateness(self, *, excused: bool) -> None:
+        """Count a cycle that begins late; go on from here if a whole period is gone."""
+        late = self._clock.now() - self._due
+        if late >= 0.1 * self._period and not excused:
+            self.tally.own_late += 1
+        if late >= self._period:
+            self.tally.slips += 1
+            self._due += late
+
+    def _reply(self, packet: bytes, until: float) -> bytes | None:
+        """The first answer that carries the number after that of `packet`; the rest is counted."""
+        wanted = next_number(packet_number(packet))
+        looks = _LOOKS
+        while looks:
+            answer = self._wire.receive(self.tally.cycles - 1, until)
+            if answer is None:
+                return None
+            number = _number(answer)
+            if number == wanted:
+                return answer
+            self.tally.discard(number)
+            if self._clock.now() > until:
+                looks -= 1
+        return None
+
+    def _hand_over(self, packet: bytes, reply: bytes | None) -> None:
+        """Let controller and arm compute their cycle."""
+        begun = self._clock.now()
+        rejected = self._peer.rejected_replies
+        self._peer.accept(reply)
+        self.tally.cost.add(self._clock.now() - begun)
+        number = next_number(packet_number(packet))
+        if reply is None:
+            self.tally.miss(number)
+        else:
+            self.tally.take(number, valid=self._peer.rejected_replies == rejected)
+
+
+def _number(packet: bytes) -> int | None:
+    try:
+        return packet_number(packet)
+    except PacketError:
+        return None

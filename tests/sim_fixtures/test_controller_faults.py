@@ -1,0 +1,218 @@
+"""What befalls controller and robot, and the controller's own program."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import small_cell
+
+from drivers.packets import CyclicPacket, echo, is_init, next_number, packet_number
+from sim_fixtures import Phase, SettingError, SimulatedController
+from sim_fixtures.controller_faults import (
+    AxisLeaves,
+    ControllerFault,
+    CurrentSaturation,
+    DriveDrop,
+    EmergencyStop,
+    FollowingErrorFault,
+    Pause,
+    Restart,
+)
+
+N = small_cell.N
+
+
+class Holding:
+    """A PC that gives every target back, moved by `step` [rev per cycle] while axes are open."""
+
+    def __init__(self, controller: SimulatedController, step: float = 0.0) -> None:
+        self.controller = controller
+        self.step = np.full(N, step)
+        self.packets: list[bytes] = []
+
+    def run(self, cycles: int) -> None:
+        for _ in range(cycles):
+            packet = self.controller.next_packet()
+            assert packet is not None, self.controller.reason
+            self.packets.append(packet)
+            self.controller.accept(self._answer(packet) if packet else None)
+
+    def _answer(self, packet: bytes) -> bytes:
+        if is_init(packet) or len(packet) == 732:
+            return echo(packet)
+        received = CyclicPacket.decode(packet, N)
+        reply = CyclicPacket.zeros(next_number(received.number), N)
+        reply.axes["mode"] = received.axes["mode"]
+        moving = self.step * (received.axes["mode"] == 4)
+        reply.axes["d"][:, 0] = received.axes["d"][:, 0] + moving
+        reply.axes["d"][:, 1] = moving
+        return reply.encode()
+
+    def cyclic(self, index: int) -> CyclicPacket:
+        return CyclicPacket.decode(self.packets[index], N)
+
+
+def run(cycles: int, *faults: ControllerFault, step: float = 0.0, **settings: Any) -> Holding:
+    pc = Holding(small_cell.controller(faults=faults, **settings), step)
+    pc.run(cycles)
+    return pc
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"), [(DriveDrop(100), "dropped"), (EmergencyStop(100), "emergency")]
+)
+def test_the_drive_goes_off_in_the_packet_of_that_cycle(fault: Any, reason: str) -> None:
+    pc = run(300, fault)
+    assert [pc.cyclic(k).status[0] for k in (99, 100, 299)] == [5, 0, 0]
+    assert reason in pc.controller.reason
+    pc.controller.drive_on()
+    pc.run(100)
+    assert pc.controller.phase is Phase.OPEN
+
+
+def test_a_cold_restart_is_silence_then_the_whole_start_and_waits_for_the_drive() -> None:
+    pc = run(300, Restart(100), boot_time=0.05)
+    assert pc.packets[100:150] == [b""] * 50
+    numbers = [packet_number(packet) for packet in pc.packets[150:163]]
+    assert numbers == list(range(1, 14))
+    assert is_init(pc.packets[159])
+    assert pc.cyclic(299).status[0] == 0
+    pc.controller.drive_on()
+    pc.run(100)
+    assert pc.controller.phase is Phase.OPEN
+
+
+def test_a_warm_restart_is_the_init_packet_next() -> None:
+    pc = run(120, Restart(100, warm=True))
+    assert is_init(pc.packets[100])
+    assert packet_number(pc.packets[101]) == 11
+    assert pc.cyclic(101).status[0] == 0
+
+
+def test_one_axis_leaves_and_the_others_stay() -> None:
+    pc = run(110, AxisLeaves(100, 2))
+    assert pc.cyclic(99).axes["mode"].tolist() == [4, 4]
+    assert pc.cyclic(100).axes["mode"].tolist() == [4, 0]
+    assert pc.cyclic(109).axes["mode"].tolist() == [4, 0]
+
+
+def test_a_pause_shows_for_as_long_as_it_lasts() -> None:
+    pc = run(140, Pause(100, 20, 502))
+    assert [pc.cyclic(k).axes["mode"][0] for k in (99, 100, 119, 120)] == [4, 502, 502, 0]
+
+
+def test_a_jam_shows_only_in_motion_and_trips_the_drive_there() -> None:
+    at_rest = run(400, FollowingErrorFault(100, 1))
+    assert at_rest.controller.reason == ""
+    moving = run(400, FollowingErrorFault(100, 1), step=0.01)
+    assert "following error of axis 1" in moving.controller.reason
+    clear = run(400, FollowingErrorFault(100, 1, count=5), step=0.002)
+    assert clear.controller.reason == ""
+
+
+def test_a_slip_shows_in_what_is_reported_and_nowhere_else() -> None:
+    pc, plain = run(160, FollowingErrorFault(100, 2, "slip", 50)), run(160)
+    for k, slip in ((99, 0.0), (100, 1.5), (149, 1.5), (150, 0.0)):
+        d, expected = pc.cyclic(k).axes["d"].copy(), plain.cyclic(k).axes["d"].copy()
+        expected[1, 2] += slip * small_cell.FOLLOWING_ERROR
+        np.testing.assert_allclose(d, expected, atol=1e-6)
+
+
+def test_a_load_drives_the_current_near_its_limit_and_goes_away_again() -> None:
+    pc = run(700, CurrentSaturation(100, 1, 300))
+    current = np.array([pc.cyclic(k).axes["d"][0, 4] for k in range(90, 700)])
+    limit = small_cell.TABLE["current_limit"][0]
+    assert np.abs(current[:10]).max() < 0.5 * limit
+    assert np.abs(current[10:310]).max() > 0.8 * limit
+    assert np.abs(current[-50:]).max() < 0.5 * limit
+
+
+def test_closed_brakes_bear_the_load() -> None:
+    pc = run(300, CurrentSaturation(20, 1, 200), drive_off_cycles=250)
+    np.testing.assert_array_equal(pc.controller.plant.position, small_cell.HOME)
+
+
+def test_an_axis_that_the_arm_has_not_is_refused() -> None:
+    with pytest.raises(SettingError, match=r"axes 1\.\.2"):
+        run(1, AxisLeaves(100, 3))
+
+
+class TestOwnMotion:
+    POSTURES = ((0.6, 0.1), (0.2, -0.6))
+
+    def test_it_moves_with_closed_axes_and_ends_the_session(self) -> None:
+        controller = small_cell.controller(own_motion=self.POSTURES, own_speed=0.8)
+        pc = Holding(controller)
+        while (packet := controller.next_packet()) is not None:
+            pc.packets.append(packet)
+            controller.accept(pc._answer(packet))
+        rows = [pc.cyclic(k) for k in range(12, len(pc.packets))]
+        assert {mode for row in rows for mode in row.axes["mode"].tolist()} == {0, 501, 504}
+        np.testing.assert_allclose(controller.plant.position, self.POSTURES[-1], atol=1e-3)
+        assert controller.reason == ""
+        on = [row for row in rows if row.status[0] == 5]
+        target, measured = (np.array([row.axes["d"][:, k] for row in on]) for k in (0, 2))
+        assert np.ptp(target[:, 0]) > 5.0
+        assert np.abs(target - measured).max() < 0.3 * small_cell.FOLLOWING_ERROR
+
+    def test_the_answers_of_the_pc_do_not_matter_to_it(self) -> None:
+        def last(step: float) -> bytes:
+            return run(900, own_motion=self.POSTURES, step=step).packets[-1]
+
+        assert last(0.0) == last(0.01)
+
+    def test_after_a_trip_it_is_over(self) -> None:
+        pc = run(400, EmergencyStop(300), own_motion=self.POSTURES)
+        pc.run(200)
+        np.testing.assert_array_equal(pc.controller.plant.velocity, 0.0)
+        pc.controller.drive_on()
+        there = pc.controller.plant.position.copy()
+        for _ in range(200):
+            packet = pc.controller.next_packet()
+            if packet is None:
+                break
+            pc.controller.accept(pc._answer(packet))
+        assert pc.controller.phase is Phase.ENDED
+        np.testing.assert_allclose(pc.controller.plant.position, there, atol=1e-3)
+
+    def test_with_open_axes_too_it_is_over_after_a_trip(self) -> None:
+        pc = run(600, EmergencyStop(400), own_motion=self.POSTURES, open_mode=8)
+        pc.controller.drive_on()
+        there = pc.controller.plant.position.copy()
+        pc.run(1000)
+        assert pc.controller.phase is Phase.OPEN
+        np.testing.assert_allclose(pc.controller.plant.position, there, atol=1e-3)
+
+    def test_told_to_finish_it_ends_in_the_next_posture(self) -> None:
+        pc = run(400, own_motion=self.POSTURES)
+        assert pc.controller.phase is Phase.MOVING
+        pc.controller.finish()
+        while (packet := pc.controller.next_packet()) is not None:
+            pc.controller.accept(pc._answer(packet))
+        np.testing.assert_allclose(pc.controller.plant.position, self.POSTURES[0], atol=1e-3)
+
+    def test_in_a_mode_that_only_corrects_it_moves_with_open_axes(self) -> None:
+        pc = run(2500, own_motion=self.POSTURES, open_mode=8, own_speed=0.8)
+        assert pc.controller.phase is Phase.OPEN
+        np.testing.assert_allclose(pc.controller.plant.position, self.POSTURES[-1], atol=1e-3)
+
+
+def test_one_seed_is_one_run_with_faults_too() -> None:
+    faults = (FollowingErrorFault(90, 2, "slip", 10), Pause(110, 20), Restart(200, warm=True))
+    settings = {"encoder_noise": 0.5, "current_noise": 0.02, "foreign_axes": 3}
+    assert run(60, **settings).packets == run(60, **settings).packets
+    first = _raw(faults, settings)
+    assert first == _raw(faults, settings)
+
+
+def _raw(faults: tuple[ControllerFault, ...], settings: dict[str, Any]) -> list[bytes]:
+    controller = small_cell.controller(faults=faults, **settings)
+    packets = []
+    for _ in range(400):
+        packet = controller.next_packet()
+        assert packet
+        packets.append(packet)
+        controller.accept(echo(packet))
+    return packets

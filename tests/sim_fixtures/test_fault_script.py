@@ -1,0 +1,89 @@
+"""One line of text, one fault."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from drivers.transports.faults import Corrupt, Delay, Duplicate, Lose, Reorder
+from sim_fixtures.controller_faults import (
+    AxisLeaves,
+    CurrentSaturation,
+    DriveDrop,
+    EmergencyStop,
+    FollowingErrorFault,
+    Pause,
+    Restart,
+)
+from sim_fixtures.fault_script import GRAMMAR, FaultScriptError, parse_fault, split_faults
+
+LINES = {
+    "lose@1200": Lose(1200),
+    "lose@1200x3:to_controller": Lose(1200, "to_controller", 3),
+    "delay@1200:5ms": Delay(1200, seconds=0.005),
+    "delay@1200:250us": Delay(1200, seconds=250e-6),
+    "delay@0x4:1.5cycles:to_controller": Delay(0, cycles=1.5, direction="to_controller", count=4),
+    "duplicate@1200": Duplicate(1200),
+    "duplicate@1200x2:to_controller": Duplicate(1200, "to_controller", 2),
+    "reorder@1200": Reorder(1200),
+    "reorder@1200:to_controller": Reorder(1200, "to_controller"),
+    "corrupt@1200:offset=8": Corrupt(1200, 8),
+    "corrupt@1200:offset=8:mask=0x80:to_controller": Corrupt(1200, 8, 0x80, "to_controller"),
+    "restart@5000:cold": Restart(5000, warm=False),
+    "restart@5000": Restart(5000, warm=False),
+    "restart@5000:warm": Restart(5000, warm=True),
+    "drive-drop@7": DriveDrop(7),
+    "e-stop@7": EmergencyStop(7),
+    "axis-leaves@7:axis=3": AxisLeaves(7, 3),
+    "following-error@7:axis=2": FollowingErrorFault(7, 2),
+    "following-error@7x20:axis=2:slip": FollowingErrorFault(7, 2, "slip", 20),
+    "saturate@7x30:axis=1": CurrentSaturation(7, 1, 30),
+    "pause@7x50:502": Pause(7, 50, 502),
+    "pause@7:500": Pause(7, 50, 500),
+}
+
+
+@pytest.mark.parametrize(("line", "fault"), LINES.items())
+def test_a_line_says_which_fault(line: str, fault: object) -> None:
+    assert parse_fault(line) == fault
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("", "is not KIND@CYCLE"),
+        ("lose", "is not KIND@CYCLE"),
+        ("lose@-3", "is not KIND@CYCLE"),
+        ("lose@1200x0", "not positive"),
+        ("lose@1200:sideways", "no option 'sideways'"),
+        ("loose@1200", "none of lose, delay"),
+        ("delay@1200", "a time"),
+        ("delay@1200:0ms", "neither seconds nor cycles"),
+        ("corrupt@1200", "offset=NUMBER is missing"),
+        ("corrupt@1200:offset=far", "not offset=NUMBER"),
+        ("corrupt@1200:offset=1:mask=0", "mask 0"),
+        ("axis-leaves@7", "axis=NUMBER is missing"),
+        ("axis-leaves@7:axis=0", "count from 1"),
+        ("e-stop@7x3", "takes no count"),
+        ("restart@7:lukewarm", "no option"),
+        ("pause@7:503", "no option"),
+    ],
+)
+def test_a_line_that_is_none_says_why_and_lists_the_grammar(line: str, reason: str) -> None:
+    with pytest.raises(FaultScriptError, match=re.escape(reason)) as caught:
+        parse_fault(line)
+    assert GRAMMAR in str(caught.value)
+    assert caught.value.text == line
+
+
+def test_every_example_of_the_grammar_is_a_fault() -> None:
+    examples = re.findall(r"^([a-z-]+@\S+)", GRAMMAR, re.MULTILINE)
+    assert len(examples) == 12
+    for line in examples:
+        parse_fault(line)
+
+
+def test_faults_of_link_and_controller_are_told_apart() -> None:
+    faults = [parse_fault(line) for line in ("lose@1", "e-stop@2", "reorder@3", "restart@4")]
+    assert split_faults(faults) == ((Lose(1), Reorder(3)), (EmergencyStop(2), Restart(4)))

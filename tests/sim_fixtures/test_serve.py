@@ -1,0 +1,394 @@
+"""A controller served in real time: who is to blame for a missing answer, and what is an answer."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from heapq import heappop, heappush
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.packets import CyclicPacket, echo, next_number, packet_number
+from drivers.transports.faults import Corrupt, Delay, Duplicate, FaultyLink, Lose
+from sim_fixtures.serve import Wish, serve
+from sim_fixtures.tally import Histogram, Tally
+
+T = 0.001
+
+
+class VirtualClock:
+    """Time that passes only where somebody waits; `stalls` are naps the machine takes itself."""
+
+    def __init__(self) -> None:
+        self.time = 100.0
+        self.stalls: list[tuple[float, float]] = []
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.advance_to(self.time + max(0.0, seconds))
+
+    def advance_to(self, moment: float) -> None:
+        self.time = max(self.time, moment)
+        if self.stalls and self.time >= self.stalls[0][0]:
+            self.time += self.stalls.pop(0)[1]
+
+
+class Cabinet:
+    """A controller without a robot: numbered packets, and a list of what it was given."""
+
+    def __init__(self, clock: VirtualClock, cycles: int = 50, cost: float = 0.0) -> None:
+        self.period = T
+        self.rejected_replies = 0
+        self.sent_at: list[float] = []
+        self.accepted: list[bytes | None] = []
+        self.finished = self.stopped = False
+        self.silent_in: set[int] = set()
+        self.stands = True
+        self._clock, self._cycles, self._cost = clock, cycles, cost
+        self._number = 1
+
+    def next_packet(self) -> bytes | None:
+        over = self.finished and (self.stands or self.stopped)
+        if over or len(self.accepted) >= self._cycles:
+            return None
+        self.sent_at.append(self._clock.time)
+        if len(self.accepted) in self.silent_in:
+            return b""
+        return CyclicPacket.zeros(self._number, 1).encode()
+
+    def accept(self, reply: bytes | None) -> None:
+        self.accepted.append(reply)
+        self._number = next_number(self._number)
+        self._clock.time += self._cost
+
+    def finish(self) -> None:
+        self.finished = True
+
+    def emergency_stop(self) -> None:
+        self.stopped = True
+
+
+Answer = Callable[[int, bytes], list[tuple[float, bytes]]]
+
+
+def prompt(index: int, packet: bytes) -> list[tuple[float, bytes]]:
+    """What a good PC does: the right answer, soon."""
+    del index
+    return [(0.1 * T, echo(packet))]
+
+
+class VirtualLink:
+    """A far end with a PC behind it that answers packet `index` as `answer` says."""
+
+    def __init__(self, clock: VirtualClock, answer: Answer = prompt) -> None:
+        self.sent: list[tuple[float, bytes]] = []
+        self._clock, self._answer = clock, answer
+        self._coming: list[tuple[float, int, bytes]] = []
+        self._order = 0
+
+    def send(self, packet: bytes) -> None:
+        index = len(self.sent)
+        self.sent.append((self._clock.time, packet))
+        for delay, reply in self._answer(index, packet):
+            heappush(self._coming, (self._clock.time + delay, self._order, reply))
+            self._order += 1
+
+    def receive(self, timeout: float) -> bytes | None:
+        until = self._clock.time + timeout
+        if self._coming and self._coming[0][0] <= until:
+            self._clock.advance_to(self._coming[0][0])
+            return heappop(self._coming)[2]
+        self._clock.advance_to(until)
+        return heappop(self._coming)[2] if self._arrived() else None
+
+    def _arrived(self) -> bool:
+        return bool(self._coming) and self._coming[0][0] <= self._clock.time
+
+    def close(self) -> None: ...
+
+
+def served(answer: Answer = prompt, *, cycles: int = 50, cost: float = 0.0, **keywords):
+    clock = VirtualClock()
+    clock.stalls = keywords.pop("stalls", [])
+    cabinet = Cabinet(clock, cycles, cost)
+    cabinet.silent_in = keywords.pop("silent_in", set())
+    link = VirtualLink(clock, answer)
+    summary = serve(cabinet, link, clock=clock, **keywords)
+    return summary, cabinet, link
+
+
+def gaps(cabinet: Cabinet) -> list[float]:
+    return [b - a for a, b in pairwise(cabinet.sent_at)]
+
+
+def test_every_cycle_of_a_prompt_pc_is_answered_and_begins_on_time():
+    summary, cabinet, _ = served(cost=0.3 * T)
+    assert (summary.cycles, summary.replies, summary.missed, summary.own_late) == (50, 50, 0, 0)
+    assert all(reply is not None for reply in cabinet.accepted)
+    assert gaps(cabinet)[1:] == pytest.approx([T] * 48)
+    assert summary.ended
+
+
+def test_an_answer_after_its_cycle_is_late_and_not_taken():
+    def answer(index, packet):
+        return [(1.3 * T if index == 20 else 0.1 * T, echo(packet))]
+
+    summary, cabinet, _ = served(answer)
+    assert (summary.missed, summary.late, summary.rejected) == (1, 1, 0)
+    assert [k for k, reply in enumerate(cabinet.accepted) if reply is None] == [20]
+    assert packet_number(cabinet.accepted[21]) == 23
+
+
+def test_a_second_late_answer_is_surplus():
+    def answer(index, packet):
+        return (
+            [(1.3 * T, echo(packet)), (1.4 * T, echo(packet))] if index == 20 else prompt(0, packet)
+        )
+
+    summary, _, _ = served(answer)
+    assert (summary.late, summary.surplus, summary.rejected) == (1, 1, 0)
+
+
+def test_only_the_first_of_several_answers_is_taken():
+    def answer(index, packet):
+        second = bytearray(echo(packet))
+        second[4] = 1
+        return [(0.1 * T, echo(packet)), (0.2 * T, bytes(second))]
+
+    summary, cabinet, _ = served(answer)
+    assert summary.replies == 50
+    assert summary.surplus == 49  # that of the last cycle is never read
+    assert all(reply[4] == 0 for reply in cabinet.accepted)
+
+
+@pytest.mark.parametrize("junk", [b"", b"\0" * 5, struct.pack("<i", 0) * 12, b"\xff" * 48])
+def test_junk_before_the_answer_is_counted_and_does_not_replace_it(junk: bytes):
+    summary, _, _ = served(lambda k, packet: [(0.05 * T, junk), *prompt(k, packet)])
+    assert (summary.replies, summary.missed) == (50, 0)
+    assert summary.rejected == 50
+
+
+def test_a_flood_of_junk_ends_with_the_cycle():
+    def answer(index, packet):
+        return [(0.2 * T, b"junk")] * 5000 if index == 10 else prompt(index, packet)
+
+    class SlowLink(VirtualLink):
+        def receive(self, timeout: float) -> bytes | None:
+            packet = super().receive(timeout)
+            self._clock.time += 0.001 * T
+            return packet
+
+    clock = VirtualClock()
+    cabinet = Cabinet(clock)
+    summary = serve(cabinet, SlowLink(clock, answer), clock=clock)
+    assert summary.cycles == 50
+    assert max(gaps(cabinet)) < 1.3 * T
+
+
+def test_an_answer_the_controller_finds_wrong_counts_as_missing():
+    class Picky(Cabinet):
+        def accept(self, reply: bytes | None) -> None:
+            super().accept(reply)
+            self.rejected_replies += len(self.accepted) % 10 == 0
+
+    clock = VirtualClock()
+    summary = serve(Picky(clock), VirtualLink(clock), clock=clock)
+    assert (summary.replies, summary.missed, summary.rejected) == (45, 5, 5)
+
+
+@pytest.mark.parametrize("nap", [0.6 * T, 3 * T, 200 * T])
+def test_a_server_that_slept_does_not_blame_the_pc(nap: float):
+    summary, cabinet, _ = served(stalls=[(100.0 + 20 * T, nap)])
+    assert (summary.replies, summary.missed) == (50, 0)
+    assert summary.own_late >= 1
+    assert None not in cabinet.accepted
+
+
+def test_after_a_late_start_the_answer_still_has_a_whole_period():
+    summary, _, _ = served(
+        lambda k, packet: [((0.1 if k < 20 else 0.7) * T, echo(packet))],
+        stalls=[(100.0 + 20 * T, 0.6 * T)],
+    )
+    assert summary.own_late >= 1
+    assert summary.missed == 0
+
+
+def test_what_arrived_during_a_nap_in_the_middle_of_a_cycle_is_seen():
+    def answer(index, packet):
+        return [(0.3 * T, b"junk"), (0.5 * T, echo(packet))]
+
+    summary, _, _ = served(answer, stalls=[(100.0 + 20.25 * T, 3 * T)])
+    assert (summary.missed, summary.slips) == (0, 1)
+
+
+def test_packets_owed_after_a_long_nap_are_not_sent_in_a_burst():
+    summary, cabinet, _ = served(stalls=[(100.0 + 20 * T, 30 * T)])
+    assert summary.slips == 1
+    assert min(gaps(cabinet)[1:]) > 0.5 * T
+
+
+def test_a_short_delay_is_made_up_for():
+    _, cabinet, _ = served(stalls=[(100.0 + 20 * T, 0.5 * T)])
+    assert cabinet.sent_at[-1] - cabinet.sent_at[1] == pytest.approx(48 * T)
+
+
+def test_a_controller_too_slow_for_its_cycle_is_its_own_fault():
+    summary, _, _ = served(cost=1.2 * T)
+    assert summary.missed == 0
+    assert summary.own_late > 40
+
+
+def test_a_missing_answer_is_not_the_servers_lateness():
+    summary, _, _ = served(lambda k, p: [] if k == 20 else prompt(k, p), cost=0.3 * T)
+    assert (summary.missed, summary.own_late) == (1, 0)
+
+
+def test_the_first_packet_is_repeated_until_somebody_listens():
+    def answer(index, packet):
+        return [] if index < 3 else prompt(index, packet)
+
+    summary, _, link = served(answer)
+    assert summary.knocks == 4
+    assert len({packet for _, packet in link.sent[:4]}) == 1
+    times = [moment for moment, _ in link.sent[:4]]
+    assert [b - a for a, b in pairwise(times)] == pytest.approx([1.0] * 3)
+    assert (summary.cycles, summary.missed) == (50, 0)
+    assert [packet_number(packet) for _, packet in link.sent[3:]] == list(range(1, 51))
+
+
+def test_a_wish_to_end_before_anybody_answered_ends_at_once():
+    asked = iter(range(100))
+    summary, cabinet, _ = served(
+        lambda k, p: [], wish=lambda: Wish.END if next(asked) > 10 else Wish.GO_ON
+    )
+    assert not summary.ended
+    assert (summary.cycles, cabinet.accepted) == (0, [])
+
+
+def test_a_wish_to_end_lets_the_controller_finish():
+    clock = VirtualClock()
+    cabinet = Cabinet(clock, cycles=10_000)
+    summary = serve(
+        cabinet,
+        VirtualLink(clock),
+        clock=clock,
+        wish=lambda: Wish.END if clock.time > 100.05 else Wish.GO_ON,
+    )
+    assert summary.ended
+    assert cabinet.finished and not cabinet.stopped
+
+
+def test_an_arm_that_never_stands_loses_its_drive_when_patience_is_over():
+    clock = VirtualClock()
+    cabinet = Cabinet(clock, cycles=10_000)
+    cabinet.stands = False
+
+    def wish() -> Wish:
+        return Wish.END if len(cabinet.accepted) > 5 else Wish.GO_ON
+
+    summary = serve(cabinet, VirtualLink(clock), clock=clock, wish=wish, patience=0.5)
+    assert summary.ended and cabinet.stopped
+    assert cabinet.sent_at[-1] - cabinet.sent_at[5] == pytest.approx(0.5, abs=0.01)
+
+
+def test_giving_up_stops_in_the_middle():
+    clock = VirtualClock()
+    cabinet = Cabinet(clock, cycles=10_000)
+    summary = serve(
+        cabinet,
+        VirtualLink(clock),
+        clock=clock,
+        wish=lambda: Wish.GIVE_UP if len(cabinet.accepted) == 7 else Wish.GO_ON,
+    )
+    assert (summary.cycles, summary.ended) == (7, False)
+
+
+def test_a_silent_controller_sends_nothing_and_nobody_is_blamed():
+    summary, cabinet, link = served(silent_in={10, 11, 12})
+    assert (summary.cycles, summary.replies, summary.missed) == (50, 47, 0)
+    assert len(link.sent) == 47
+    assert cabinet.accepted[10:13] == [None] * 3
+    assert gaps(cabinet)[1:] == pytest.approx([T] * 48)
+
+
+@pytest.mark.parametrize(
+    ("fault", "missed", "late", "surplus", "rejected"),
+    [
+        (Lose(20), 1, 0, 0, 0),
+        (Lose(20, "to_controller", 3), 3, 0, 0, 0),
+        (Delay(20, seconds=0.3 * T), 0, 0, 0, 0),
+        (Delay(20, cycles=1.2), 1, 1, 0, 0),
+        (Delay(20, cycles=2.5, direction="to_controller"), 1, 1, 0, 0),
+        (Duplicate(20), 0, 0, 1, 0),
+        (Duplicate(20, "to_controller"), 0, 0, 1, 0),
+        (Corrupt(20, offset=0, direction="to_controller", mask=0x40), 1, 0, 0, 1),
+    ],
+    ids=str,
+)
+def test_faults_of_the_link(fault, missed, late, surplus, rejected):
+    summary, _, _ = served(faults=FaultyLink([fault], T))
+    assert (summary.missed, summary.late) == (missed, late)
+    assert (summary.surplus, summary.rejected) == (surplus, rejected)
+    assert summary.replies == 50 - missed
+
+
+def test_a_packet_held_back_leaves_when_its_time_has_come():
+    _, _, link = served(faults=FaultyLink([Delay(20, cycles=2.5)], T))
+    sent = [(moment, packet_number(packet)) for moment, packet in link.sent]
+    moment = next(moment for moment, number in sent if number == 21)
+    before = next(moment for moment, number in sent if number == 20)
+    assert moment - before == pytest.approx(3.5 * T)
+
+
+def test_a_fault_of_the_first_cycle_strikes_once():
+    summary, _, _ = served(faults=FaultyLink([Lose(0)], T))
+    assert (summary.knocks, summary.cycles) == (2, 50)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    delays=st.lists(st.floats(0.0, 4.0).filter(lambda d: abs(d - round(d)) > 0.01), min_size=30),
+    copies=st.lists(st.integers(0, 3), min_size=30),
+    naps=st.lists(st.tuples(st.floats(0.0, 0.03), st.floats(0.0, 0.02)), max_size=4),
+)
+def test_whatever_the_pc_does_each_cycle_takes_at_most_one_answer_of_its_own(delays, copies, naps):
+    def answer(index, packet):
+        if index == 0:
+            return prompt(index, packet)
+        delay, count = delays[index % len(delays)], copies[index % len(copies)]
+        return [(delay * T, echo(packet))] * count
+
+    stalls = sorted((100.0 + at, nap) for at, nap in naps)
+    summary, cabinet, _ = served(answer, cycles=40, stalls=stalls)
+    assert summary.cycles == 40 == summary.replies + summary.missed
+    for cycle, reply in enumerate(cabinet.accepted):
+        assert reply is None or packet_number(reply) == cycle + 2
+    assert sum(reply is not None for reply in cabinet.accepted) == summary.replies
+
+
+@given(durations=st.lists(st.floats(0.0, 0.2), min_size=1, max_size=200))
+def test_a_quantile_is_the_duration_to_the_width_of_a_bin(durations: list[float]):
+    histogram = Histogram()
+    for duration in durations:
+        histogram.add(duration)
+    ordered = sorted(durations)
+    middle = ordered[(len(ordered) + 1) // 2 - 1]
+    if middle < Histogram.BIN * Histogram.BINS:
+        assert middle <= histogram.quantile(0.5) + 1e-12
+        assert histogram.quantile(0.5) <= middle + Histogram.BIN + 1e-12
+    assert histogram.quantile(1.0) <= histogram.largest == ordered[-1]
+
+
+def test_the_memory_of_a_tally_does_not_grow():
+    tally = Tally()
+    for number in range(5000):
+        tally.take(number, valid=True)
+        tally.miss(number)
+    tally.discard(4999)
+    tally.discard(3)
+    assert (tally.late, tally.rejected) == (1, 1)

@@ -1,0 +1,160 @@
+"""Whole sessions with the simulated controller in all its variants: modes, arms, slots, lengths."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "fault_matrix"))
+
+import small_cell
+from laws import LIMITS, N
+
+from drivers import (
+    CycleRing,
+    DriveTrain,
+    Guard,
+    GuardLimits,
+    MotionEnded,
+    Refused,
+    Session,
+    SimulatedTransport,
+    exchange,
+)
+from planner import TrajectoryPlayer, plan
+from sim_fixtures import Phase
+
+HOME = np.array(small_cell.HOME)
+WAY = np.array([0.3, 0.375])
+
+
+class Swell:
+    """A correction that swells from zero to its peak, `motion` and `current`, and back."""
+
+    def __init__(self, motion: float = 0.0, current: float = 0.0, period: float = 0.001) -> None:
+        s = np.linspace(0.0, 1.0, round(0.8 / period) + 1)
+        # a bump with four zero derivatives at both ends
+        self.bump = 256.0 * (s * (1.0 - s)) ** 4
+        self.peak = motion, current
+        self.row = 0
+
+    @property
+    def finished(self) -> bool:
+        return self.row + 1 >= len(self.bump)
+
+    def begin(self) -> None:
+        self.row = 0
+
+    def advance(self):
+        self.row += 1
+        motion, current = (np.full(N, peak * self.bump[self.row]) for peak in self.peak)
+        return motion, current
+
+    def stop(self) -> None:
+        self.bump = self.bump[: self.row + 1] * (1.0 - self.row / len(self.bump))
+
+
+def run(source: Any, *, mode: int = 4, arm: int = 1, period: float = 0.001, **settings: Any):
+    table = {name: np.array(value) for name, value in small_cell.TABLE.items()}
+    limits = GuardLimits(
+        LIMITS.lower, LIMITS.upper, LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk,
+        following_error=np.full(N, small_cell.FOLLOWING_ERROR), current=table["current_limit"],
+    )  # fmt: skip
+    ring = CycleRing(N, 8192)
+    session = Session(
+        DriveTrain(**table), Guard(limits, period), ring, mode=mode, arm=arm, settle_cycles=10
+    )
+    controller = small_cell.controller(
+        open_mode=mode, arm=arm, period=period, open_intervals=1, **settings
+    )
+    session.request(source)
+    exchange(SimulatedTransport(controller), session, until=lambda: False)
+    events = session.events()
+    refusals = [event.error for event in events if isinstance(event, Refused)]
+    ends = [event for event in events if isinstance(event, MotionEnded)]
+    assert not refusals, refusals
+    assert [end.outcome for end in ends] == ["completed"], ends
+    assert controller.phase is Phase.ENDED
+    assert controller.rejected_replies == 0
+    return controller, ring.last(8192)
+
+
+def move(period: float = 0.001) -> TrajectoryPlayer:
+    path = plan(np.vstack((HOME, HOME + WAY)), LIMITS, fly=0.0)
+    return TrajectoryPlayer(path, period, LIMITS, start_tolerance=5e-3)
+
+
+def assert_moved(controller: Any, way: Any = WAY) -> None:
+    np.testing.assert_allclose(controller.plant.position, HOME + way, atol=2e-3)
+
+
+@pytest.mark.parametrize("mode", [1, 4, 5])
+@pytest.mark.parametrize("period", [0.001, 0.002])
+def test_the_modes_in_which_the_pc_makes_the_targets(mode: int, period: float) -> None:
+    controller, _ = run(move(period), mode=mode, period=period)
+    assert_moved(controller)
+
+
+@pytest.mark.parametrize(
+    ("mode", "source"),
+    [
+        (2, Swell(motion=0.2, current=0.3)),
+        (7, Swell(motion=0.02)),
+        (8, Swell(motion=0.2)),
+        (9, Swell(current=0.3)),
+    ],
+)
+def test_the_modes_in_which_the_pc_corrects_end_where_they_began(mode: int, source: Swell) -> None:
+    controller, records = run(source, mode=mode)
+    assert_moved(controller, np.zeros(N))
+    travelled = np.abs(records["position"] - HOME).max(axis=0)
+    # far more than an encoder's increment, 1e-6 rad at the joint
+    assert np.all(travelled > 1e-4), "the correction moved the arm"
+
+
+@pytest.mark.parametrize(
+    ("arm", "slots", "foreign", "foreign_open"),
+    [
+        (1, (1, 0), 0, False),
+        (1, None, 4, False),
+        (1, (5, 2), 4, True),
+        (2, (0, 3), 7, True),
+        (4, (19, 0), 18, True),
+    ],
+)
+def test_any_arm_in_any_slots_moves_and_no_other(
+    arm: int, slots: Any, foreign: int, foreign_open: bool
+) -> None:
+    controller, _ = run(
+        move(), arm=arm, slots=slots, foreign_axes=foreign, foreign_open=foreign_open
+    )
+    assert_moved(controller)
+    np.testing.assert_array_equal(controller.foreign_targets, np.arange(1.0, 1.0 + foreign) / 4.0)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"cold_start": False},
+        {"long_packets": True},
+        {"opening_stagger": 0},
+        {"opening_stagger": 40, "closing_stagger": 40},
+        {"while_silent": "continue"},
+        {"encoder_noise": 0.5, "current_noise": 0.02},
+    ],
+    ids=str,
+)
+def test_however_the_controller_goes_about_it_the_motion_completes(settings: dict) -> None:
+    controller, _ = run(move(), **settings)
+    assert_moved(controller)
+
+
+def test_one_seed_is_one_session_bit_for_bit() -> None:
+    noisy = {"encoder_noise": 0.5, "current_noise": 0.02, "long_packets": True}
+    first, second, other = (run(move(), seed=seed, **noisy)[1] for seed in (3, 3, 4))
+    assert first.tobytes() == second.tobytes()
+    assert first.tobytes() != other.tobytes()
