@@ -3,7 +3,8 @@
 ```
 HilError                   exit status 1
 ├── UnsafeError            3: a motion was refused before anything was sent
-│   └── MotionRefusedError      limits, current or collision
+│   ├── MotionRefusedError      limits, current or collision
+│   └── NotRehearsedError       the controller may be a real one
 ├── ControllerFault        4: the controller, the link or the guard ended a motion
 │   └── MotionFailedError       and what was recorded of it is archived
 ├── OperatorStopError         130: a person stopped the work

@@ -8,7 +8,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, open_archive
+from hil.archive import CONTROLLERS_OWN, Archive, open_archive
 from hil.errors import ArchiveError
 from identification.recording import Recording
 
@@ -22,6 +22,7 @@ _FIELDS = (
     "target_current",
     "motor_current",
     "commanded_position",
+    "target_position",
 )
 
 
@@ -64,11 +65,17 @@ def recording_of(archive: Archive) -> Recording:
         joint_names=archive.joint_names,
         torque=_known(columns.get("torque")),
         motor_current=current,
-        commanded_position=columns.get("commanded_position"),
+        commanded_position=_commanded(archive),
         gap_before=_gaps(archive),
         held_joints=tuple(json.loads(archive.metadata.get("held_joints", "[]"))),
         provenance=_provenance(archive),
     )
+
+
+def _commanded(archive: Archive) -> Array | None:
+    """What the arm was told: by the PC, or by the controller's own program."""
+    own = archive.metadata.get("motion") == CONTROLLERS_OWN
+    return archive.columns.get("target_position" if own else "commanded_position")
 
 
 def _time(archive: Archive) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from drivers.transports import SimulatedTransport
 from hil.campaign import Link
 from hil.cell import Cell, CellError
+from identification.excitation import CollisionChecker
 from sim_fixtures import (
     ControllerSettings,
     PlantTruth,
@@ -17,8 +19,12 @@ from sim_fixtures import (
     SimulatedDrive,
     UnmodelledEffects,
 )
+from sim_fixtures.controller_faults import ControllerFault
 
 Array = NDArray[np.float64]
+
+_CHECKED = 100
+"""Postures checked on each way of the controller's own motion."""
 
 
 def simulated_link(
@@ -27,15 +33,28 @@ def simulated_link(
     effects: bool = False,
     drive: SimulatedDrive | None = None,
     truth: PlantTruth | None = None,
+    instead_of_hardware: bool = False,
 ) -> Link:
-    """A link to a simulated controller of this cell; one seed in the cell is one run.
+    """A link in virtual time to a simulated controller of this cell; one seed is one run.
 
     Args:
         cell: names the planted truth in `[simulation]`.
         effects: switch on what the model leaves out, at the sizes the cell names.
         drive: what the robot really has, where it shall differ from the cell's drive train.
         truth: rotor inertias and friction of the plant, where they shall differ from the cell's.
+        instead_of_hardware: simulate a cell that names a real link as well.
+
+    Raises:
+        CellError: the cell is one of real hardware.
     """
+    if cell.controller.transport != "simulated" and not instead_of_hardware:
+        raise CellError(
+            cell.path,
+            "controller.transport",
+            cell.controller.transport,
+            "a cell of real hardware is not simulated",
+            'write "simulated" to try it without',
+        )
     controller = simulated_controller(cell, effects=effects, drive=drive, truth=truth)
     return Link.over(SimulatedTransport(controller), cell, finish=controller.finish)
 
@@ -46,37 +65,77 @@ def simulated_controller(
     effects: bool = False,
     drive: SimulatedDrive | None = None,
     truth: PlantTruth | None = None,
+    settings: ControllerSettings | None = None,
+    seed: int | None = None,
+    faults: Sequence[ControllerFault] = (),
 ) -> SimulatedController:
-    """The controller and arm that `simulated_link` connects to."""
-    settings = cell.simulation
-    if cell.controller.transport != "simulated":
-        raise CellError(
-            cell.path,
-            "controller.transport",
-            cell.controller.transport,
-            "a cell of real hardware is not simulated",
-            'write "simulated" to try it without',
-        )
+    """The controller and arm of a cell, whatever link the cell names.
+
+    Args:
+        cell: its `[simulation]` says what the arm really is.
+        effects: switch on what the model leaves out.
+        drive: what the robot really has; the init packet announces the cell's drive train.
+        truth: rotor inertias and friction of the plant, if not the cell's.
+        settings: how the controller behaves; `controller_settings(cell)` if left out.
+        seed: of noise and model errors; the cell's if left out.
+        faults: what goes wrong in controller and arm.
+    """
     announced = simulated_drive(cell)
     return SimulatedController(
         cell.urdf,
         drive or announced,
         truth or planted_truth(cell),
-        ControllerSettings(
-            period=cell.period,
-            open_mode=cell.controller.mode,
-            # Springs and a delay of half a cycle need steps shorter than the cycle; rigid gears,
-            # integrated to second order under a current that is constant over it, do not.
-            substeps=2 if effects else 1,
-            current_noise=settings.current_noise,
-            current_resolution=settings.current_resolution,
-        ),
-        seed=settings.seed,
+        settings or controller_settings(cell, effects=effects),
+        seed=cell.simulation.seed if seed is None else seed,
         effects=unmodelled_effects(cell) if effects else UnmodelledEffects(),
         initial_position=cell.initial,
         gravity=cell.file.robot.gravity,
         announced=announced,
+        faults=faults,
     )
+
+
+def controller_settings(cell: Cell, *, effects: bool = False) -> ControllerSettings:
+    """The simulated controller's cycle, mode and noise, from the cell file."""
+    return ControllerSettings(
+        period=cell.period,
+        open_mode=cell.controller.mode,
+        # Springs and a delay of half a cycle need steps shorter than the cycle; rigid gears,
+        # integrated to second order under a current that is constant over it, do not.
+        substeps=2 if effects else 1,
+        current_noise=cell.simulation.current_noise,
+        current_resolution=cell.simulation.current_resolution,
+    )
+
+
+def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
+    """Postures (joint angles, rad) that the controller's own program may visit, home at the end.
+
+    Drawn about the home posture within half of each joint's range (and no more than a turn), by
+    the cell's own seed; each straight way from one to the next keeps clear of floor, walls and
+    the arm itself. Where nothing is clear, there are fewer of them.
+    """
+    rng = np.random.default_rng(cell.simulation.seed)
+    limits, home = cell.joint_limits, cell.home
+    reach = np.minimum(0.25 * (limits.upper - limits.lower), np.pi)
+    checker = CollisionChecker(cell.urdf, cell.workspace)
+
+    def clear(start: Array, end: Array) -> bool:
+        share = np.linspace(0.0, 1.0, _CHECKED)[:, np.newaxis]
+        return bool(checker.clear(start + share * (end - start)).all())
+
+    here = cell.initial
+    postures: list[Array] = []
+    for _ in range(10 * count):
+        there = np.clip(
+            home + reach * rng.uniform(-1.0, 1.0, len(home)), limits.lower, limits.upper
+        )
+        if len(postures) < count and clear(here, there):
+            postures.append(there)
+            here = there
+    if clear(here, home):
+        postures.append(home)
+    return tuple(tuple(posture.tolist()) for posture in postures)
 
 
 def simulated_drive(cell: Cell) -> SimulatedDrive:
@@ -151,6 +210,8 @@ def planted_values(cell: Cell) -> Array:
 
 
 __all__ = [
+    "controller_settings",
+    "own_postures",
     "planted_truth",
     "planted_values",
     "simulated_controller",

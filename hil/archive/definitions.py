@@ -55,6 +55,9 @@ int32 gap                       # packets lost just before this one
 int32 interval                  # index of the interval of open mode
 uint8 state                     # state of the session
 uint8 status                    # status byte of the arm, as on the wire
+uint16[8] age                   # cycles since the oldest joint value of each of these was sent:
+                                # target_position, target_velocity, position, velocity,
+                                # target_current, model_current, diagonal_inertia, extra3
 """
 
 _MOTOR_CURRENT = """\

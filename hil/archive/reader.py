@@ -20,6 +20,9 @@ from hil.archive.events import ArchivedEvent
 from hil.archive.schema import CYCLE, FORMAT_VERSION, METADATA
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 
+_LATER_FIELDS = frozenset(("age",))
+"""Fields of a cycle that older archives do not have; zero is what they would have held."""
+
 
 @dataclass(frozen=True)
 class ArchiveDamage:
@@ -109,12 +112,13 @@ class Archive:
         """
         dtype = cycle_dtype(len(self.joint_names))
         names = dtype.names or ()
-        absent = [name for name in names if name not in self.columns]
+        absent = [name for name in names if name not in self.columns and name not in _LATER_FIELDS]
         if absent:
             raise ArchiveError(self.path, f"has no column {absent[0]}", field=CYCLE)
         rows = np.zeros(self.n_samples, dtype)
         for name in names:
-            rows[name] = self.columns[name]
+            if name in self.columns:
+                rows[name] = self.columns[name]
         return rows
 
 

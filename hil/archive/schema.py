@@ -24,6 +24,8 @@ FORMAT_VERSION = 1
 PROFILE = "ros2"
 METADATA = "hil"
 OUTCOME = "hil.outcome"
+CONTROLLERS_OWN = "controller"
+"""Metadata entry ``motion`` of an archive whose motion was made by the controller's own program."""
 
 CYCLE = "/hil/cycle"
 MEASURED = "/joint_states"
@@ -89,7 +91,8 @@ class CycleEncoder:
             _stamped(layout, stamp) for layout in (self._cycle, self._measured, self._commanded)
         )
         for name in self._copied:
-            cycle[name] = records[name]
+            if name in (records.dtype.names or ()):  # records of old archives have no age
+                cycle[name] = records[name]
         cycle["torque"] = torque
         measured["position"] = records["position"]
         measured["velocity"] = records["velocity"]

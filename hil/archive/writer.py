@@ -89,6 +89,11 @@ class ArchiveWriter:
         return self._path
 
     @property
+    def period(self) -> float:
+        """Cycle time of the controller [s]."""
+        return self._period
+
+    @property
     def closed(self) -> bool:
         """Whether the archive is closed."""
         return self._file.closed

@@ -1,10 +1,18 @@
 """Campaign: plan, run, archive; resumable."""
 
 from .campaign import Campaign, Interval
-from .errors import CampaignFolderError, MotionFailedError, MotionRefusedError
+from .errors import (
+    CampaignFolderError,
+    MotionFailedError,
+    MotionRefusedError,
+    NotRehearsedError,
+)
 from .folder import CampaignFolder
-from .link import Link, Stop, stop_on_interrupt
+from .link import Link
+from .live_link import LiveLink
+from .motion_link import MotionLink, Progress, Recorded
 from .plan import CampaignPlan, design
+from .stop import Stop, stop_on_interrupt
 
 __all__ = [
     "Campaign",
@@ -13,8 +21,13 @@ __all__ = [
     "CampaignPlan",
     "Interval",
     "Link",
+    "LiveLink",
     "MotionFailedError",
+    "MotionLink",
     "MotionRefusedError",
+    "NotRehearsedError",
+    "Progress",
+    "Recorded",
     "Stop",
     "design",
     "stop_on_interrupt",

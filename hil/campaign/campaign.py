@@ -11,17 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import ArchiveWriter
+from hil.archive import ArchiveSpec
 from hil.cell import Cell
 from hil.files import make_folder
 from hil.progress import Reporter
 from hil.version import software
 from planner import PiecewiseCubic, TrajectoryPlayer, plan
 
-from .errors import CampaignFolderError, MotionFailedError, MotionRefusedError
+from .errors import (
+    CampaignFolderError,
+    MotionFailedError,
+    MotionRefusedError,
+    NotRehearsedError,
+)
 from .folder import CampaignFolder
-from .link import Link, Stop
+from .motion_link import MotionLink
 from .plan import CampaignPlan, MotionChecks
+from .stop import Stop
 
 Array = NDArray[np.float64]
 
@@ -87,7 +93,7 @@ class Campaign:
 
     def run(
         self,
-        link: Link,
+        link: MotionLink,
         stop: Stop,
         reporter: Reporter,
         *,
@@ -109,18 +115,23 @@ class Campaign:
             MotionRefusedError: a motion failed its check; nothing was sent.
             MotionFailedError: a motion ended otherwise than planned; it is archived.
             ControllerFault: the controller did not come up.
+            CampaignFolderError: the folder was changed, or another run is at work on it.
+            NotRehearsedError: the link may lead to a real controller.
         """
-        self.folder.require_unchanged()
-        intervals = self._missing(link.connect(stop))
-        self._check(intervals)
-        total = sum(interval.trajectory.duration for interval in intervals)
-        with reporter.task("running the campaign (s of motion)", total) as task:
-            for interval in intervals:
-                if stop.requested:
-                    raise MotionFailedError(str(interval), "stopped", "it had not begun")
-                self._run_one(interval, link, stop, provenance, durable=durable)
-                task.advance(interval.trajectory.duration, str(interval))
-        link.close()
+        if not link.only_simulated:
+            raise NotRehearsedError
+        with self.folder.locked():
+            self.folder.require_unchanged()
+            intervals = self._missing(link.connect(stop))
+            self._check(intervals)
+            total = sum(interval.trajectory.duration for interval in intervals)
+            with reporter.task("running the campaign (s of motion)", total) as task:
+                for interval in intervals:
+                    if stop.requested:
+                        raise MotionFailedError(str(interval), "stopped", "it had not begun")
+                    self._run_one(interval, link, stop, provenance, durable=durable)
+                    task.advance(interval.trajectory.duration, str(interval))
+            link.close()
 
     def _check(self, intervals: list[Interval]) -> None:
         """Refuse the campaign if one of its motions must not be sent.
@@ -167,7 +178,7 @@ class Campaign:
     def _run_one(
         self,
         interval: Interval,
-        link: Link,
+        link: MotionLink,
         stop: Stop,
         provenance: Mapping[str, str],
         *,
@@ -183,20 +194,20 @@ class Campaign:
             start_tolerance=START_TOLERANCE,
         )
         name = self.folder.next_name(interval.kind, interval.index)
-        writer = ArchiveWriter(
+        spec = ArchiveSpec(
             self.folder.archives / name.filename,
             joint_names=cell.joint_names,
-            attachments=self._attachments(interval),
-            metadata=self._metadata() | dict(provenance),
             period=cell.period,
+            metadata=self._metadata() | dict(provenance),
+            attachments=self._attachments(interval),
             durable=durable,
         )
-        with writer:
-            ended = link.run(player, writer, stop)
-            writer.close(ended.outcome, reason=ended.reason)
+        ended = link.run(player, spec, stop)
         self.folder.add(name.filename, ended.outcome)
         if ended.outcome != "completed":
-            raise MotionFailedError(str(interval), ended.outcome, ended.reason)
+            refused = link.connection.refused if ended.outcome == "refused" else None
+            recorder = None if refused is None else refused.flight_recorder
+            raise MotionFailedError(str(interval), ended.outcome, ended.reason, recorder)
 
     def _attachments(self, interval: Interval) -> dict[str, bytes]:
         cell = self.cell

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hil.errors import ControllerFault, InputError, UnsafeError
 
 
@@ -23,11 +26,36 @@ class MotionRefusedError(UnsafeError):
 
 
 class MotionFailedError(ControllerFault):
-    """A motion ended otherwise than planned; what was recorded is archived."""
+    """A motion ended otherwise than planned; what was recorded is archived.
 
-    def __init__(self, motion: str, outcome: str, reason: str) -> None:
+    Attributes:
+        motion: which one.
+        outcome: "stopped", "refused" or "lost".
+        reason: in words.
+        flight_recorder: (k,) of `drivers.cycle_dtype`, the last records up to the refusal; None
+            where nothing was refused.
+    """
+
+    def __init__(
+        self,
+        motion: str,
+        outcome: str,
+        reason: str,
+        flight_recorder: NDArray[np.void] | None = None,
+    ) -> None:
         self.motion, self.outcome, self.reason = motion, outcome, reason
+        self.flight_recorder = flight_recorder
         super().__init__(
             f"{motion} ended {outcome}: {reason}; "
             "everything recorded is archived, run the campaign again to continue."
+        )
+
+
+class NotRehearsedError(UnsafeError):
+    """A campaign that was never rehearsed is not run on a controller that may be real."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "this campaign was not rehearsed, and its link leads out of this computer; "
+            "only a simulated controller on this computer (127.0.0.1) is driven without a rehearsal"
         )

@@ -8,8 +8,12 @@ it.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +22,8 @@ from hil.archive import ArchiveName
 from hil.files import write_atomically
 
 from .errors import CampaignFolderError
+
+LOCK = "campaign.lock"
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,31 @@ class CampaignFolder:
     @property
     def _manifest(self) -> Path:
         return self.root / "manifest.json"
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep every other run out of the folder; a run that dies lets go of it.
+
+        Raises:
+            CampaignFolderError: another run is at work on it, or the disk refuses.
+        """
+        try:
+            lock = os.open(self.root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise CampaignFolderError(
+                self.root, f"{LOCK} cannot be written ({error.strerror})", "make it writable"
+            ) from error
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(lock)
+            raise CampaignFolderError(
+                self.root, "another run is at work on it", "wait for its end, or stop it"
+            ) from error
+        try:
+            yield
+        finally:
+            os.close(lock)
 
     def seal(self) -> None:
         """Begin the manifest with the checksums of what the campaign is about."""

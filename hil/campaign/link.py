@@ -1,33 +1,20 @@
-"""One connection to a controller, and how an interval of motion is run and recorded on it.
+"""One connection to a simulated controller, and how an interval of motion is run and recorded.
 
 Exchange and archive share one thread here, which is right in virtual time, where the controller
-waits for the PC, and only there: on a real link a slow disk must not delay a reply.
+waits for the PC, and only there: on a real link a slow disk must not delay a reply
+(`hil.campaign.live_link`).
 """
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import FrameType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.drive_train import DriveTrain
 from drivers.errors import RequestError
-from drivers.events import (
-    Event,
-    GapSeen,
-    InitReceived,
-    LinkLost,
-    MotionEnded,
-    MotionStarted,
-    PacketRejected,
-    Refused,
-    StateChanged,
-)
+from drivers.events import Event, MotionEnded
 from drivers.exchange import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource
@@ -35,69 +22,47 @@ from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports import SimulatedTransport
-from hil.archive import ArchiveWriter, Level
+from hil.archive import ArchiveSpec, Recorder
 from hil.cell import Cell
 from hil.errors import ControllerFault
 
+from .motion_link import Connection, Progress, Recorded, Watch, described, unwatched
+from .stop import Stop
+
 Array = NDArray[np.float64]
-Records = NDArray[np.void]
 DRAIN_CYCLES = 100
 """Records go to the archive this many cycles at a time: 100 ms at 1 kHz, the flush period."""
-AFTERMATH_CYCLES = 500
-"""What the arm does after a motion was refused or lost is recorded for so long."""
-
-
-@dataclass
-class Stop:
-    """Set by Ctrl-C; the link then brings the arm to rest on its path."""
-
-    requested: bool = False
-
-
-@contextmanager
-def stop_on_interrupt() -> Iterator[Stop]:
-    """Turn SIGINT into a request to stop on the path.
-
-    A second one is the ordinary interrupt: it ends the program at once, and the controller is on
-    its own.
-    """
-    stop = Stop()
-
-    def request(signum: int, frame: FrameType | None) -> None:
-        if stop.requested:
-            signal.default_int_handler(signum, frame)
-        stop.requested = True
-
-    previous = signal.signal(signal.SIGINT, request)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, previous)
+AFTERMATH_CYCLES = 1000
+"""So long a motion that was refused or lost is waited for, at most, until its archive is full."""
 
 
 @dataclass(eq=False)
 class Link:
-    """Session, transport and recorder of one connection.
+    """Session, transport and recorder of one connection in virtual time; a `MotionLink`.
 
     Attributes:
         transport: moves bytes and time, virtual time (see above).
         session: answers every packet.
         ring: the session's records, drained here.
-        drive_train: turns target currents into joint torques.
-        finish: asks the far end to end the session (only a simulated one listens).
+        finish: asks the far end to end the session.
         cycles: records archived so far.
     """
 
     transport: SimulatedTransport
     session: Session
     ring: CycleRing
-    drive_train: DriveTrain
     finish: Callable[[], None] = field(default=lambda: None)
     cycles: int = 0
+    connection: Connection = field(default_factory=Connection)
 
     @classmethod
     def over(
-        cls, transport: SimulatedTransport, cell: Cell, finish: Callable[[], None] = lambda: None
+        cls,
+        transport: SimulatedTransport,
+        cell: Cell,
+        finish: Callable[[], None] = lambda: None,
+        *,
+        accept_init: bool = False,
     ) -> Link:
         """A link to the simulated controller of `cell` over `transport`.
 
@@ -114,18 +79,17 @@ class Link:
             cell.drive_train,
             Guard(cell.guard_limits, cell.period),
             ring,
-            mode=cell.controller.mode,
-            settle_cycles=max(1, round(cell.campaign.settle_s / cell.period)),
+            **cell.session_settings(accept_init=accept_init),
         )
-        return cls(transport, session, ring, cell.drive_train, finish)
+        return cls(transport, session, ring, finish)
+
+    @property
+    def only_simulated(self) -> bool:
+        """True: virtual time reaches nothing else."""
+        return True
 
     def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
-        """Exchange until the drive is on and the axes are closed; the target position then (n,).
-
-        Raises:
-            ControllerFault: the controller did not get there within `timeout` of its own time,
-                cannot be used, or a stop was asked for.
-        """
+        """See `MotionLink.connect`; the timeout counts the controller's own time."""
         deadline = self.transport.now + timeout
         last: Array | None = None
 
@@ -138,9 +102,8 @@ class Link:
             return self.session.state is State.CLOSED or late or stop.requested
 
         exchange(self.transport, self.session, until=ready)
-        for event in self.session.events():
-            if isinstance(event, InitReceived) and event.unusable is not None:
-                raise ControllerFault(f"the controller cannot be used: {event.unusable}")
+        self._events()
+        self.connection.require_usable()
         if stop.requested:
             raise ControllerFault("stopped by the operator before anything moved")
         if self.session.state is not State.CLOSED or last is None:
@@ -150,41 +113,73 @@ class Link:
             )
         return last
 
-    def run(self, source: MotionSource, writer: ArchiveWriter, stop: Stop) -> MotionEnded:
-        """Run one motion and archive every cycle of it; say how it ended.
+    def run(self, source: MotionSource, spec: ArchiveSpec, stop: Stop) -> MotionEnded:
+        """See `MotionLink.run`."""
+        with described(spec, self.connection, self.session.drive_train).open() as writer:
+            taking = _Taking(self, Recorder(writer, self.session.drive_train))
+            self.ring.drain()
+            self._events()
+            try:
+                self.session.request(source)
+            except RequestError as error:
+                raise ControllerFault(str(error)) from error
+            until_drain, patience = DRAIN_CYCLES, AFTERMATH_CYCLES
 
-        Should archiving fail, the arm is brought to rest on its path before the error is raised.
+            def over() -> bool:
+                nonlocal until_drain, patience
+                if stop.requested:
+                    self.session.stop("stopped by the operator")
+                until_drain -= 1
+                if until_drain == 0 or not (self.session.requested or taking.recorder.ended):
+                    until_drain = DRAIN_CYCLES
+                    taking.take()
+                patience -= taking.recorder.ended is not None
+                return taking.recorder.over or patience < 0
 
-        Raises:
-            ControllerFault: the session cannot promise the motion; nothing moved.
-            Exception: what archiving failed with; the motion was stopped.
-        """
-        recorder = _Recorder(self, writer)
-        self.ring.drain()
-        try:
-            self.session.request(source)
-        except RequestError as error:
-            raise ControllerFault(str(error)) from error
-        until_drain, aftermath = DRAIN_CYCLES, AFTERMATH_CYCLES
+            exchange(self.transport, self.session, until=over)
+            taking.take()
+            if taking.failure is not None:
+                raise taking.failure
+            ended = taking.recorder.ended or MotionEnded("lost", "the link ended", -1, -1)
+            taking.recorder.close(ended.outcome, ended.reason)
+        return ended
 
-        def over() -> bool:
-            nonlocal until_drain, aftermath
-            if stop.requested:
-                self.session.stop("stopped by the operator")
-            until_drain -= 1
-            if until_drain == 0 or not (self.session.requested or recorder.ended):
-                until_drain = DRAIN_CYCLES
-                recorder.take()
-            if recorder.ended is None:
-                return False
-            aftermath -= 1
-            return recorder.ended.outcome in ("completed", "stopped") or aftermath < 0
+    def record(
+        self,
+        spec: ArchiveSpec,
+        stop: Stop,
+        *,
+        duration: float | None = None,
+        watch: Watch = unwatched,
+    ) -> Recorded:
+        """See `Recording.record`."""
+        exchange(self.transport, self.session, until=lambda: self._known(stop))
+        if self.connection.init is None:
+            raise ControllerFault("the controller did not start a session: nothing was recorded")
+        self.connection.require_usable()
+        with described(spec, self.connection, self.session.drive_train).open() as writer:
+            taking = _Taking(self, Recorder(writer, self.session.drive_train))
+            limit = None if duration is None else round(duration / writer.period)
+            until_drain = DRAIN_CYCLES
 
-        exchange(self.transport, self.session, until=over)
-        recorder.take()
-        if recorder.failure is not None:
-            raise recorder.failure
-        return recorder.ended or MotionEnded("lost", "the link ended", -1, -1)
+            def over() -> bool:
+                nonlocal until_drain
+                until_drain -= 1
+                if until_drain == 0:
+                    until_drain = DRAIN_CYCLES
+                    taking.take()
+                    watch(self._progress(taking.recorder))
+                recorder = taking.recorder
+                full = limit is not None and recorder.records + DRAIN_CYCLES - until_drain >= limit
+                return full or stop.requested or recorder.restarted or recorder.link_lost
+
+            exchange(self.transport, self.session, until=over)
+            taking.take()
+            if taking.failure is not None:
+                raise taking.failure
+            outcome, reason = how_recording_ended(taking.recorder, stop, limit)
+            taking.recorder.close(outcome, reason)
+        return Recorded(outcome, reason, taking.recorder.records, taking.recorder.records_lost)
 
     def close(self) -> None:
         """Ask the far end to end the session and answer until it does."""
@@ -196,67 +191,59 @@ class Link:
 
         exchange(self.transport, self.session, until=drop)
 
+    def _known(self, stop: Stop) -> bool:
+        self._events()
+        return self.connection.init is not None or stop.requested
 
-class _Recorder:
-    """Moves records and events of one interval into its archive."""
+    def _progress(self, recorder: Recorder) -> Progress:
+        newest = self.ring.last(1)
+        return Progress(
+            cycles=recorder.records,
+            missed=self.session.counters.missed,
+            state=self.session.state,
+            position=newest["position"][0] if len(newest) else None,
+        )
 
-    def __init__(self, link: Link, writer: ArchiveWriter) -> None:
-        self._link, self._writer = link, writer
-        self._overflow = link.ring.overflow
-        self.ended: MotionEnded | None = None
+    def _events(self) -> list[Event]:
+        events = self.session.events()
+        for event in events:
+            self.connection.note(event)
+        return events
+
+
+def how_recording_ended(recorder: Recorder, stop: Stop, limit: int | None) -> tuple[str, str]:
+    """Outcome and reason of a recording; `limit` is how many records were asked for."""
+    if recorder.restarted:
+        return "stopped", "the controller began a new session"
+    if recorder.link_lost:
+        return "lost", "nothing was heard from the controller any more"
+    if limit is not None and recorder.records >= limit:
+        return "completed", "as long as was asked for"
+    if stop.requested:
+        return ("completed" if limit is None else "stopped"), "ended by the operator"
+    return "completed", "the controller ended the session"
+
+
+class _Taking:
+    """Takes records and events from the session into the recorder."""
+
+    def __init__(self, link: Link, recorder: Recorder) -> None:
+        self.recorder = recorder
         self.failure: Exception | None = None
+        self._link = link
+        self._overflow = link.ring.overflow
 
     def take(self) -> None:
         """Archive what has come since the last call; a failure stops the motion on its path."""
-        events = self._link.session.events()
-        for event in events:
-            if isinstance(event, MotionEnded):
-                self.ended = event
-        records = self._link.ring.drain()
+        link, recorder = self._link, self.recorder
+        events, records, before = link._events(), link.ring.drain(), recorder.records
+        lost, self._overflow = link.ring.overflow - self._overflow, link.ring.overflow
         if self.failure is not None:
+            recorder.note(events)
             return
         try:
-            self._archive(records, events)
+            recorder.take(records, events, lost)
         except Exception as error:  # whatever it is, the arm comes to rest first
             self.failure = error
-            self._link.session.stop("the archive cannot be written")
-
-    def _archive(self, records: Records, events: list[Event]) -> None:
-        link, writer = self._link, self._writer
-        if len(records):
-            link.cycles += len(records)
-            writer.write(records, link.drive_train.joint_torque(records["target_current"]))
-        for event in events:
-            cycle = getattr(event, "cycle", None)
-            writer.event(cycle, type(event).__name__, describe(event), level=_level(event))
-        if link.ring.overflow > self._overflow:
-            lost = link.ring.overflow - self._overflow
-            self._overflow = link.ring.overflow
-            writer.event(None, "RecordsLost", f"{lost} records overwritten", level=Level.ERROR)
-
-
-def describe(event: Event) -> str:
-    """One line for a person."""
-    match event:
-        case StateChanged():
-            return f"{event.before.name} -> {event.after.name} in cycle {event.cycle}"
-        case GapSeen():
-            return f"{event.missed} packets missed before cycle {event.cycle}"
-        case MotionStarted():
-            return f"first set-point in cycle {event.cycle}"
-        case MotionEnded():
-            return f"{event.outcome} in cycle {event.cycle}: {event.reason}"
-        case PacketRejected():
-            return f"{event.count} {event.kind} packets got no answer"
-        case Refused():
-            return str(event.error)
-        case LinkLost():
-            return f"nothing heard for {event.silence:.3f} s in state {event.state.name}"
-        case InitReceived():
-            return event.unusable or "the controller started a session"
-
-
-def _level(event: Event) -> Level:
-    if isinstance(event, Refused | LinkLost):
-        return Level.ERROR
-    return Level.WARN if isinstance(event, GapSeen | PacketRejected) else Level.INFO
+            link.session.stop("the archive cannot be written")
+        link.cycles += recorder.records - before

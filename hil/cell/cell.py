@@ -7,7 +7,7 @@ import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,13 @@ from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from planner import JointLimits
 
+from . import link
 from .checks import check_built, check_lengths
 from .errors import CellError, first_error
 from .schema import (
     BoundsTable,
     CampaignTable,
+    CanTable,
     CellTable,
     ControllerTable,
     DriveTrainTable,
@@ -36,6 +38,9 @@ from .schema import (
     WorkspaceTable,
 )
 from .text import replaced_value
+
+if TYPE_CHECKING:
+    from drivers.transports.base import TransportSpec
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -199,6 +204,23 @@ class Cell:
             stop_jerk=bounds.stop.jerk,
         )
 
+    def transport_spec(self) -> TransportSpec:
+        """What opens the cell's link.
+
+        Raises:
+            CellError: the cell is a simulated one, or its CAN bus cannot carry the arm.
+        """
+        return link.transport_spec(self)
+
+    @property
+    def only_simulated(self) -> bool:
+        """Whether nothing but a simulated controller on this computer can be at the far end."""
+        return link.only_simulated(self)
+
+    def session_settings(self, *, accept_init: bool = False) -> dict[str, Any]:
+        """Keyword arguments of `drivers.Session`."""
+        return link.session_settings(self, accept_init=accept_init)
+
     @property
     def workspace(self) -> Workspace:
         """Floor, walls and clearance."""
@@ -236,6 +258,28 @@ class Cell:
         for (table, key), value in wanted.items():
             if value is not None:
                 text = replaced_value(text, table, key, value)
+        return Cell.from_texts(text, self.urdf, self.path)
+
+    def with_link(
+        self,
+        *,
+        transport: str | None = None,
+        host: str | None = None,
+        port: int | None = None,
+        bind: str | None = None,
+        cycle_ms: int | None = None,
+        can: CanTable | None = None,
+    ) -> Cell:
+        """This cell on another link, in its text too; None keeps what stands there."""
+        text = link.with_link(
+            self.text,
+            transport=transport,
+            host=host,
+            port=port,
+            bind=bind,
+            cycle_ms=cycle_ms,
+            can=can,
+        )
         return Cell.from_texts(text, self.urdf, self.path)
 
     def with_urdf(self, path: Path, name: str) -> Cell:

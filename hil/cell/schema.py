@@ -148,6 +148,20 @@ class DriveTrainTable(_Table):
         return self
 
 
+class CanTable(_Table):
+    """`[controller.can]`: the CAN adapter, where transport = "can" (`docs/can.md`)."""
+
+    interface: str = Field(
+        min_length=1, description='python-can\'s name of the adapter, e.g. "socketcan" or "slcan"'
+    )
+    channel: str = Field(min_length=1, description='channel of it, e.g. "can0" or "/dev/ttyACM0"')
+    profile: Literal["fd", "classic"] = Field(default="fd", description='"fd" or "classic"')
+    bitrate: int | None = Field(default=None, gt=0, description="bit/s, where we have to set it")
+    data_bitrate: int | None = Field(
+        default=None, gt=0, description="bit/s of the data phase, where we have to set it"
+    )
+
+
 class ControllerTable(_Table):
     """`[controller]`: the link to the controller."""
 
@@ -158,10 +172,27 @@ class ControllerTable(_Table):
     )
     host: str = Field(default="10.2.12.150", description="address of the controller")
     port: int = Field(default=1000, gt=0, lt=65536, description="UDP port, 1 to 65535")
+    bind: str = Field(
+        default="0.0.0.0", description="address of this PC to listen on, 0.0.0.0 for all of them"
+    )
+    can: CanTable | None = Field(default=None, description="a table that names the CAN adapter")
+    arm: int = Field(default=1, ge=1, le=4, description="arm of the controller, 1 to 4")
+    max_gap: int = Field(
+        default=2,
+        ge=0,
+        le=100,
+        description="packets missed in a row that a motion survives, 0 to 100",
+    )
     current_delay_cycles: FiniteFloat = Field(
         default=0.0,
         description="cycles by which the position of a packet is newer than its target current",
     )
+
+    @model_validator(mode="after")
+    def _adapter_named(self) -> ControllerTable:
+        if self.transport == "can" and self.can is None:
+            raise ValueError('transport = "can" needs a table [controller.can]')
+        return self
 
 
 class BoxTable(_Table):

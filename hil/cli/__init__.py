@@ -1,7 +1,7 @@
 """The command line: a thin shell over the package.
 
 Exit status: 0 done, 1 internal error, 2 bad input, 3 refused as unsafe, 4 controller fault,
-5 done, but the model is not good, 130 stopped by the operator.
+5 done, but not good (a model, or a PC that is not fit for the cycle), 130 stopped by the operator.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hil.errors import HilError
 from identification import IdentificationError
 from planner import PlannerError
 
-from . import demo, identify, imports
+from . import demo, doctor, identify, imports, record, simulate
 
 app = typer.Typer(
     name="hil",
@@ -30,6 +30,9 @@ app = typer.Typer(
 )
 app.command("demo")(demo.demo)
 app.command("identify")(identify.identify)
+app.command("record")(record.record)
+app.command("simulate")(simulate.simulate)
+app.command("doctor")(doctor.doctor)
 app.add_typer(imports.app, name="import")
 
 

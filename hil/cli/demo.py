@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from hil.campaign import Campaign, CampaignFolderError, design, stop_on_interrupt
+from hil.campaign import (
+    Campaign,
+    CampaignFolder,
+    CampaignFolderError,
+    MotionLink,
+    design,
+    stop_on_interrupt,
+)
 from hil.cell import Cell
 from hil.cli.verdict import finish
+from hil.demo_link import CAN, LOOPBACK, loopback_link
 from hil.errors import ControllerFault, OperatorStopError
 from hil.identify import identify_campaign
 from hil.progress import Reporter
@@ -19,6 +29,9 @@ from hil.progress import reporter as make_reporter
 from hil.report import write_report
 from hil.simulation import simulated_link, simulated_provenance
 from sim_fixtures.ns16 import CELL_PATH
+
+PATIENCE = 10
+"""Missing answers that end open mode on a real link: this computer need not be fit for a robot."""
 
 
 def demo(
@@ -42,6 +55,13 @@ def demo(
             "elasticity, delay.",
         ),
     ] = False,
+    link: Annotated[
+        Literal["simulated", "udp", "can"],
+        typer.Option(
+            help="simulated: in virtual time. udp, can: the controller is a process of its own, "
+            "reached over real sockets in real time."
+        ),
+    ] = "simulated",
     force: Annotated[
         bool, typer.Option("--force", help="Replace an earlier campaign in OUTPUT.")
     ] = False,
@@ -56,6 +76,8 @@ def demo(
     Leaves `archives/*.mcap`, `results.json` and `report.html` in OUTPUT and ends with one line
     that says whether the identified model predicts motions it has never seen, and how well.
     Nothing here is hardware: controller, drives and arm are simulated, packet for packet.
+    With --link udp or can the same campaign takes as long as it would on a robot, so ask for
+    fewer repetitions. The CAN bus is one within this computer, with a cycle of 2 ms.
     """
     reporter = make_reporter(quiet=quiet or json)
     if resume:
@@ -65,6 +87,14 @@ def demo(
         cell = Cell.load(CELL_PATH).with_campaign(
             repetitions=repetitions, validation_runs=validation, simulation_seed=seed
         )
+        if link != "simulated":
+            cell = cell.with_link(
+                transport=link,
+                host=LOOPBACK,
+                bind=LOOPBACK,
+                cycle_ms=2 if link == "can" else None,
+                can=CAN if link == "can" else None,
+            )
         plan = design(cell, reporter)
         _make_room(output)
         campaign = Campaign.create(output, cell, plan)
@@ -79,11 +109,20 @@ def demo(
 def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
     """Run what is missing on a simulated controller; Ctrl-C stops the arm, then the program."""
     cell, started = campaign.cell, time.perf_counter()
-    with stop_on_interrupt() as stop:
-        link = simulated_link(cell, effects=effects)
+    real_time = cell.controller.transport != "simulated"
+    if real_time:
+        reporter.say(
+            f"a simulated controller in a process of its own, over {cell.controller.transport}, "
+            f"in real time; it bears {PATIENCE - 1} missing answers in a row"
+        )
+    with stop_on_interrupt() as stop, _link(cell, effects=effects) as link:
         try:
             campaign.run(
-                link, stop, reporter, provenance=simulated_provenance(cell, effects), durable=False
+                link,
+                stop,
+                reporter,
+                provenance=simulated_provenance(cell, effects),
+                durable=real_time,
             )
         except ControllerFault as fault:
             if stop.requested:
@@ -97,8 +136,18 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
     )
 
 
+@contextmanager
+def _link(cell: Cell, *, effects: bool) -> Iterator[MotionLink]:
+    if cell.controller.transport == "simulated":
+        yield simulated_link(cell, effects=effects)
+        return
+    options = ("--missed", str(PATIENCE), *(("--effects",) if effects else ()))
+    with loopback_link(cell, options=options) as link:
+        yield link
+
+
 _OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "results.json"}
-_OURS |= {"report.html", "paper"}
+_OURS |= {"report.html", "paper", "campaign.lock"}
 
 
 def _refuse_what_is_not_ours(output: Path, *, force: bool) -> None:
@@ -124,4 +173,5 @@ def _refuse_what_is_not_ours(output: Path, *, force: bool) -> None:
 
 def _make_room(output: Path) -> None:
     if output.exists():
-        shutil.rmtree(output)
+        with CampaignFolder(output).locked():
+            shutil.rmtree(output)

@@ -85,7 +85,11 @@ def identify(
     if len(archives) == 1 and archives[0].is_dir():
         output = output or (archives[0] / "paper" if paper else archives[0])
         make_folder(output)
-        found = identify_campaign(archives[0], reporter, options)
+        loose = sorted(archives[0].glob("*.mcap"))
+        if loose and not (archives[0] / "manifest.json").exists():
+            found = identify_archives(loose, reporter, options)  # a folder of `hil record`
+        else:
+            found = identify_campaign(archives[0], reporter, options)
     else:
         folder = next((path for path in archives if path.is_dir()), None)
         if folder is not None:

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, open_archive
+from drivers.packets import DRIVE_ON
+from hil.archive import CONTROLLERS_OWN, Archive, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.recordings import recording_of
@@ -198,7 +199,7 @@ def _doubts_of(cell: Cell, archive: Archive) -> list[str]:
 
 
 def _source(archive: Archive, cell: Cell) -> Source:
-    """The recording of an archive, as far as the PC was commanding the arm.
+    """The recording of an archive, as far as it is of use.
 
     Raises:
         ArchiveError: the recording is not fit to be identified from; names file and reason.
@@ -210,16 +211,33 @@ def _source(archive: Archive, cell: Cell) -> Source:
             "holds no joint torques to fit",
             remedy="import torques, or motor currents with gear ratios and torque constants",
         )
-    if recording.commanded_position is not None:
-        commanded = np.flatnonzero(~np.isnan(recording.commanded_position).any(axis=1))
-        if not commanded.size:
-            raise ArchiveError(archive.path, "the arm was never commanded in it")
-        recording = recording.between(int(commanded[0]), int(commanded[-1]) + 1)
+    useful = _useful(archive, recording)
+    if useful is not None:
+        recording = recording.between(useful.start, useful.stop)
     try:
         recording.checked(cell.joint_names)
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
     return Source(archive.path.name, recording, float(recording.time[0]))
+
+
+def _useful(archive: Archive, recording: Recording) -> range | None:
+    """The samples that identification may look at; None for all of an imported recording.
+
+    Where the PC moved the arm, those it commanded. Where the controller's own program did, those
+    with the drive on: with it off the brakes carry the arm, and no current tells of it.
+    """
+    if archive.metadata.get("motion") == CONTROLLERS_OWN:
+        powered = np.flatnonzero(archive.columns["status"] == DRIVE_ON)
+        if not powered.size:
+            raise ArchiveError(archive.path, "the drive was never on in it")
+        return range(int(powered[0]), int(powered[-1]) + 1)
+    if recording.commanded_position is None:
+        return None
+    commanded = np.flatnonzero(~np.isnan(recording.commanded_position).any(axis=1))
+    if not commanded.size:
+        raise ArchiveError(archive.path, "the arm was never commanded in it")
+    return range(int(commanded[0]), int(commanded[-1]) + 1)
 
 
 def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Source], str]:

@@ -380,6 +380,28 @@ class TestBadInput:
             open_archive(tmp_path / NAME)
 
 
+def test_how_old_a_value_was_is_archived(tmp_path: Path) -> None:
+    rows = records(300)
+    rows["age"] = np.arange(300)[:, None] + np.arange(8)
+    path = write(tmp_path / NAME, rows)
+    assert np.array_equal(open_archive(path).columns["age"], rows["age"])
+
+
+def test_an_archive_from_before_ages_were_known_is_still_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = records(300)
+    whole = definitions._CYCLE
+    monkeypatch.setattr(definitions, "_CYCLE", whole[: whole.index("uint16[8] age")])
+    path = write(tmp_path / NAME, rows)
+    monkeypatch.undo()
+    archive = open_archive(path)
+    assert archive.complete
+    assert "age" not in archive.columns
+    rows["age"] = 0
+    assert same(archive.cycles(), rows)
+
+
 def test_the_documentation_shows_the_messages_as_they_are() -> None:
     page = Path(__file__).parents[2] / "docs" / "archive-format.md"
     text = page.read_text(encoding="utf-8")

@@ -73,7 +73,7 @@ def test_an_archive_is_whole_in_itself(campaign: Campaign) -> None:
     archive = open_archive(campaign.folder.completed("excitation")[0])
     assert archive.complete
     assert set(archive.attachments) == {
-        "cell.toml", "robot.urdf", "drive_train.json", "plan.json"
+        "cell.toml", "robot.urdf", "drive_train.json", "plan.json", "init_packet.bin"
     }  # fmt: skip
     assert archive.metadata["simulated"] == "yes"
     assert archive.outcome is not None

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.transports.udp import UdpSpec
 from hil.cell import Cell, CellError
+from hil.cell.schema import CanTable
 from hil.cell.text import replaced_value
 from sim_fixtures.ns16 import CELL_PATH, TABLE2, URDF_PATH
 
@@ -142,3 +144,64 @@ def test_campaign_settings_can_be_replaced_in_the_text_too(folder: Path) -> None
     cell = Cell.load(folder / "cell.toml").with_campaign(repetitions=7, simulation_seed=5)
     again = Cell.from_texts(cell.text, cell.urdf, cell.path)
     assert (again.campaign.repetitions, again.simulation.seed, again.campaign.seed) == (7, 5, 1)
+
+
+def test_a_cell_on_a_bus_names_its_adapter() -> None:
+    cell = Cell.load(CELL_PATH)
+    with pytest.raises(CellError, match=r"needs a table \[controller\.can\]"):
+        cell.with_link(transport="can")
+    adapter = CanTable(interface="virtual", channel="arm", profile="fd")
+    on_bus = cell.with_link(transport="can", can=adapter)
+    assert on_bus.controller.can == adapter
+    again = on_bus.with_link(can=adapter.model_copy(update={"channel": "other"}))
+    assert again.controller.can is not None
+    assert again.controller.can.channel == "other"
+    assert again.text.count("[controller.can]") == 1
+
+
+def test_what_the_bus_cannot_carry_is_refused_with_the_bus_named() -> None:
+    adapter = CanTable(interface="virtual", channel="arm", profile="classic")
+    cell = Cell.load(CELL_PATH).with_link(transport="can", can=adapter)
+    assert cell.period == 0.001
+    with pytest.raises(CellError, match=r"controller\.can"):
+        cell.transport_spec()
+
+
+def test_a_link_is_opened_as_the_cell_describes_it() -> None:
+    cell = Cell.load(CELL_PATH)
+    with pytest.raises(CellError, match="has no link to open"):
+        cell.transport_spec()
+    local = cell.with_link(transport="udp", host="127.0.0.1", port=2001, bind="127.0.0.1")
+    assert local.transport_spec() == UdpSpec("127.0.0.1", 2001, "127.0.0.1")
+
+
+@pytest.mark.parametrize(
+    ("host", "simulated"),
+    [("127.0.0.1", True), ("127.1.2.3", True), ("10.2.12.150", False), ("controller", False)],
+)
+def test_only_this_computer_is_known_to_be_no_robot(host: str, simulated: bool) -> None:
+    cell = Cell.load(CELL_PATH).with_link(transport="udp", host=host)
+    assert cell.only_simulated is simulated
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("arm", 0), ("arm", 5), ("max_gap", -1), ("max_gap", 101), ("port", 0)]
+)
+def test_settings_of_the_link_have_bounds(key: str, value: int) -> None:
+    cell = Cell.load(CELL_PATH)
+    text = replaced_value(cell.text, "controller", key, value)
+    with pytest.raises(CellError, match=rf"controller\.{key}"):
+        Cell.from_texts(text, cell.urdf, cell.path)
+
+
+def test_the_session_is_set_up_as_the_cell_says() -> None:
+    cell = Cell.load(CELL_PATH)
+    text = replaced_value(cell.text, "controller", "arm", 2)
+    settings = Cell.from_texts(text, cell.urdf, cell.path).session_settings(accept_init=True)
+    assert settings == {
+        "mode": 4,
+        "arm": 2,
+        "max_gap": 2,
+        "accept_init": True,
+        "settle_cycles": round(cell.campaign.settle_s / cell.period),
+    }

@@ -1,0 +1,129 @@
+"""What the supervisor and the archive process say to each other, as pickles over a socket pair.
+
+Both ends are our own processes, the one started by the other; nobody else can reach the socket.
+"""
+
+from __future__ import annotations
+
+import pickle
+import socket
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.drive_train import DriveTrain
+from hil.archive.recorder import ArchiveSpec
+
+
+@dataclass(frozen=True, eq=False)
+class Open:
+    """Begin an archive.
+
+    Attributes:
+        spec: which.
+        drive_train: in force on the link.
+        from_now: leave out what came before; otherwise begin with the session's oldest record
+            that is still there.
+        until_ended: close it when the motion has ended; otherwise only when told to.
+    """
+
+    spec: ArchiveSpec
+    drive_train: DriveTrain
+    from_now: bool
+    until_ended: bool
+
+
+@dataclass(frozen=True)
+class Close:
+    """Complete the archive that is open, with this outcome."""
+
+    outcome: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class End:
+    """Close what is open and end the process."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The archive is open: the motion may begin."""
+
+
+@dataclass(frozen=True)
+class Closed:
+    """The archive is complete.
+
+    Attributes:
+        outcome, reason: as in it.
+        records, records_lost: how many it holds, and how many it should hold but does not.
+    """
+
+    outcome: str
+    reason: str
+    records: int
+    records_lost: int
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The archive could not be opened or written further; what was flushed is whole."""
+
+    path: str
+    problem: str
+    remedy: str
+
+
+Command = Open | Close | End
+Answer = Opened | Closed | Failed
+
+
+class Channel:
+    """One end of the socket, a `SOCK_SEQPACKET`.
+
+    A message may be larger than the socket takes at once: it is sent in parts, the number of
+    parts first.
+    """
+
+    PART = 64 << 10
+
+    def __init__(self, end: socket.socket) -> None:
+        self._socket = end
+
+    def fileno(self) -> int:
+        """For `select`."""
+        return self._socket.fileno()
+
+    def send(self, message: Any) -> None:
+        """Send a message.
+
+        Raises:
+            OSError: the far end is gone.
+        """
+        data = pickle.dumps(message, protocol=5)
+        parts = range(0, len(data), self.PART)
+        self._socket.sendall(len(parts).to_bytes(4, "little"))
+        for start in parts:
+            self._socket.sendall(data[start : start + self.PART])
+
+    def receive(self) -> Any:
+        """The next message; waits for it.
+
+        Raises:
+            EOFError: the far end is gone.
+        """
+        head = self._part()
+        return pickle.loads(b"".join(self._part() for _ in range(int.from_bytes(head, "little"))))
+
+    def _part(self) -> bytes:
+        try:
+            part = self._socket.recv(self.PART)
+        except ConnectionError as error:
+            raise EOFError("the far end is gone") from error
+        if not part:
+            raise EOFError("the far end is gone")
+        return part
+
+    def close(self) -> None:
+        """Give the socket up."""
+        self._socket.close()

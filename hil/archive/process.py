@@ -1,0 +1,258 @@
+"""The archive process of a real link: drains the exchange's shared memory into files.
+
+Run as ``python -m hil.archive.process`` with the descriptors of ring, event log, control block and
+command socket. It is in a process session of its own and ignores SIGINT and SIGHUP: what is being
+recorded is completed whatever happens to the terminal. If the supervisor dies, it goes on until the
+exchange has ended the motion, closes the archive with the true outcome, and ends. If it cannot
+write, it says so in the control block, and the exchange brings the arm to rest.
+"""
+
+from __future__ import annotations
+
+import select
+import signal
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from socket import SOCK_SEQPACKET, socket
+from types import FrameType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.events import InitReceived
+from drivers.exchange import (
+    ArchiveState,
+    ControlBlock,
+    EventReader,
+    ExchangeEvent,
+    RingReader,
+)
+from hil.archive.commands import Answer, Channel, Close, Closed, End, Failed, Open, Opened
+from hil.archive.recorder import Recorder
+from hil.errors import ArchiveError
+
+Records = NDArray[np.void]
+
+DRAIN_PERIOD = 0.02
+"""s between two looks at the ring."""
+BEAT_PERIOD = 0.05
+"""s between two heartbeats."""
+STALL_LIMIT = 5.0
+"""s that a disk may keep us waiting before the heartbeat ends; the ring holds more."""
+SILENCE = 0.2
+"""s without a record after which an unfinished chunk is written out."""
+AFTERMATH_TIMEOUT = 2.0
+"""s after the end of a motion, by which its archive is completed on a link that is silent."""
+EXCHANGE_TIMEOUT = 1.0
+"""s without a heartbeat after which the exchange process counts as dead."""
+RECENT = 5000
+"""Records kept while no archive is open, for one that is to begin with what came before."""
+
+
+@dataclass
+class Job:
+    """The archive that is open.
+
+    Attributes:
+        recorder: fills it.
+        until_ended: whether it is closed when the motion ends.
+        overflow: of the ring's reader when it began.
+        heard: when the last record came, monotonic s.
+        flushed: whether everything taken so far was written out.
+        ended: when the motion's end was seen, monotonic s.
+    """
+
+    recorder: Recorder
+    until_ended: bool
+    overflow: int
+    heard: float
+    flushed: bool = True
+    ended: float | None = None
+
+
+class ArchiveProcess:
+    """Drains, writes, and answers the supervisor."""
+
+    def __init__(
+        self, ring: RingReader, events: EventReader, control: ControlBlock, commands: Channel
+    ) -> None:
+        self._ring, self._events, self._control = ring, events, control
+        self._commands: Channel | None = commands
+        self._job: Job | None = None
+        self._leaving = False
+        self._started = self._progress = time.monotonic()
+        self._recent: list[Records] = []
+        self._recent_events: list[ExchangeEvent] = []
+
+    def run(self) -> None:
+        """Work until told to end, or left alone with nothing to do."""
+        threading.Thread(target=self._beat, daemon=True).start()
+        while not (self._leaving and self._job is None):
+            self._progress = time.monotonic()
+            self._obey()
+            self._take()
+            if self._commands is None and self._job is None and self._exchange_gone():
+                return
+
+    def leave(self, _signum: int, _frame: FrameType | None) -> None:
+        """SIGTERM: complete the archive that is open, then end."""
+        self._leaving = True
+
+    def _beat(self) -> None:
+        while True:
+            if time.monotonic() - self._progress < STALL_LIMIT:
+                self._control.archive_heartbeat = time.monotonic()
+            time.sleep(BEAT_PERIOD)
+
+    def _obey(self) -> None:
+        """Wait a drain period for a command, and carry it out."""
+        if self._commands is None:
+            time.sleep(DRAIN_PERIOD)
+            return
+        readable, _, _ = select.select([self._commands], [], [], DRAIN_PERIOD)
+        if not readable:
+            return
+        try:
+            command = self._commands.receive()
+        except EOFError:
+            self._commands = None
+            return
+        if isinstance(command, Open):
+            self._open(command)
+        elif isinstance(command, Close):
+            self._take()
+            self._close(command.outcome, command.reason)
+        elif isinstance(command, End):
+            self._leaving = True
+            if self._job is not None and not self._job.until_ended:
+                self._close("stopped", "the recording was ended")
+
+    def _open(self, command: Open) -> None:
+        self._idle()
+        records, events = self._recent, self._recent_events
+        self._recent, self._recent_events = [], []
+        overflow = self._ring.overflow
+        try:
+            recorder = Recorder(command.spec.open(), command.drive_train)
+            if not command.from_now:
+                recorder.take(*_of_the_last_session(records, events))
+        except Exception as error:
+            self._fail(error)
+            return
+        self._job = Job(recorder, command.until_ended, overflow, heard=time.monotonic())
+        self._control.archive_state = ArchiveState.READY
+        self._answer(Opened())
+
+    def _take(self) -> None:
+        """Move what has come into the archive, and close it if the interval is over."""
+        job = self._job
+        if job is None:
+            self._idle()
+            return
+        gone = self._exchange_gone()  # looked at first, so that what it left behind is taken
+        events, records = self._events.drain(), self._ring.drain()
+        lost, job.overflow = self._ring.overflow - job.overflow, self._ring.overflow
+        now = time.monotonic()
+        try:
+            job.recorder.take(records, events, lost)
+            if len(records):
+                job.heard, job.flushed = now, False
+            elif not job.flushed and now - job.heard > SILENCE:
+                job.recorder.writer.flush()
+                job.flushed = True
+        except Exception as error:  # whatever it is, the arm must not move unrecorded
+            self._fail(error)
+            return
+        self._complete(job, now, gone=gone)
+
+    def _complete(self, job: Job, now: float, *, gone: bool) -> None:
+        """Close the archive if the interval is over."""
+        ended = job.recorder.ended
+        if ended is not None and job.ended is None:
+            job.ended = now
+        waited = job.ended is not None and now - job.ended > AFTERMATH_TIMEOUT
+        if job.until_ended and ended is not None and (job.recorder.over or waited or gone):
+            self._close(ended.outcome, ended.reason)
+        elif gone and job.until_ended:
+            self._close("lost", "the exchange process ended")
+        elif gone and self._commands is None:
+            self._close("stopped", "the supervising program ended")
+
+    def _idle(self) -> None:
+        """Keep the newest of what comes while no archive is open."""
+        records = self._ring.drain()
+        if len(records):
+            self._recent.append(records)
+        self._recent_events = [*self._recent_events, *self._events.drain()][-RECENT:]
+        while len(self._recent) > 1 and sum(map(len, self._recent[1:])) > RECENT:
+            self._recent.pop(0)
+
+    def _close(self, outcome: str, reason: str) -> None:
+        job, self._job = self._job, None
+        if job is None:
+            return
+        self._control.archive_state = ArchiveState.NONE
+        recorder = job.recorder
+        try:
+            recorder.close(outcome, reason)
+        except Exception as error:
+            self._fail(error)
+            return
+        self._answer(Closed(outcome, reason, recorder.records, recorder.records_lost))
+
+    def _fail(self, error: Exception) -> None:
+        """The arm comes to rest first: that needs nothing but this one field."""
+        self._control.archive_state = ArchiveState.FAILED
+        self._job = None
+        if isinstance(error, ArchiveError):
+            path, problem, remedy = str(error.path), error.problem, error.remedy
+        else:
+            path, problem, remedy = "", f"{type(error).__name__}: {error}", ""
+        self._answer(Failed(path, problem, remedy))
+
+    def _answer(self, answer: Answer) -> None:
+        if self._commands is None:
+            return
+        try:
+            self._commands.send(answer)
+        except OSError:
+            self._commands = None
+
+    def _exchange_gone(self) -> bool:
+        if self._control.finished:
+            return True
+        heard = max(self._control.exchange_heartbeat, self._started)
+        return time.monotonic() - heard > EXCHANGE_TIMEOUT
+
+
+def _of_the_last_session(
+    parts: list[Records], events: list[ExchangeEvent]
+) -> tuple[Records, list[ExchangeEvent]]:
+    """What belongs to the session that began last; its init packet is not news any more."""
+    records = np.concatenate(parts) if parts else np.zeros(0, np.void(0).dtype)
+    if len(records):
+        restarts = np.flatnonzero(np.diff(records["cycle"]) <= 0)
+        records = records[int(restarts[-1]) + 1 :] if restarts.size else records
+    inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
+    return records, events[inits[-1] + 1 :] if inits else events
+
+
+def main() -> None:
+    """Attach what the command line names, and work."""
+    ring, events, control, commands, n_joints = (int(text) for text in sys.argv[1:6])
+    for signum in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
+        signal.signal(signum, signal.SIG_IGN)
+    process = ArchiveProcess(
+        RingReader(ring, n_joints),
+        EventReader(events),
+        ControlBlock(control),
+        Channel(socket(fileno=commands, type=SOCK_SEQPACKET)),
+    )
+    signal.signal(signal.SIGTERM, process.leave)
+    process.run()
+
+
+if __name__ == "__main__":
+    main()

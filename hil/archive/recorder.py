@@ -1,0 +1,178 @@
+"""From the link's records and events to one archive.
+
+Shared by the two places that archive: the thread that runs a link in virtual time, and the archive
+process of a real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.drive_train import DriveTrain
+from drivers.events import InitReceived, LinkLost, MotionEnded
+from drivers.exchange import ExchangeEvent
+from hil.archive.events import Level
+from hil.archive.wording import describe, level_of
+from hil.archive.writer import ArchiveWriter
+
+Records = NDArray[np.void]
+
+AFTERMATH = 0.5
+"""s of the controller's time that are recorded after a motion was refused or lost."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArchiveSpec:
+    """An archive that is to be written; pickles.
+
+    Attributes:
+        path: the file, which must not exist.
+        joint_names: joints in the order of the records' columns.
+        period: cycle of the controller [s].
+        metadata: entries of the ``hil`` record.
+        attachments: content by file name.
+        durable: wait at each flush until the disk has the data.
+    """
+
+    path: Path
+    joint_names: tuple[str, ...]
+    period: float
+    metadata: Mapping[str, str]
+    attachments: Mapping[str, bytes] = field(default_factory=dict)
+    durable: bool = True
+
+    def with_more(self, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> Self:
+        """The same archive with further metadata and attachments, which win over earlier ones."""
+        return replace(
+            self,
+            metadata={**self.metadata, **metadata},
+            attachments={**self.attachments, **attachments},
+        )
+
+    def open(self) -> ArchiveWriter:
+        """Create the file.
+
+        Raises:
+            ArchiveWriteError: it exists, the disk refuses, or the metadata cannot stand.
+        """
+        return ArchiveWriter(
+            self.path,
+            joint_names=self.joint_names,
+            period=self.period,
+            metadata=self.metadata,
+            attachments=self.attachments,
+            durable=self.durable,
+        )
+
+
+class Recorder:
+    """Fills one archive from records and events, and closes it with the true outcome.
+
+    Only cycles of one session with the controller belong into a file: a controller that starts
+    anew counts from zero again, and what follows is left out.
+
+    Args:
+        writer: the archive.
+        drive_train: in force on the link; makes joint torques of target currents.
+
+    Attributes:
+        ended: how the motion ended, None as long as it goes on.
+        restarted: whether the controller began a new session meanwhile.
+        link_lost: whether the link fell silent meanwhile.
+        records: how many were archived.
+        records_lost: how many were overwritten before they could be archived.
+    """
+
+    def __init__(self, writer: ArchiveWriter, drive_train: DriveTrain) -> None:
+        self.writer = writer
+        self.ended: MotionEnded | None = None
+        self.restarted = False
+        self.link_lost = False
+        self.records = 0
+        self.records_lost = 0
+        self._drive_train = drive_train
+        self._newest = -1
+        self._cut = False
+
+    def take(self, records: Records, events: Sequence[ExchangeEvent], lost: int = 0) -> None:
+        """Archive what has come; `lost` records before these were overwritten unread.
+
+        The records must be those up to the newest of the events, or more.
+
+        Raises:
+            ArchiveWriteError: the disk refuses.
+        """
+        ours = self._of_this_session(events)
+        self.note(events)
+        self._write(records)
+        for event in ours:
+            cycle = getattr(event, "cycle", None)
+            self.writer.event(cycle, type(event).__name__, describe(event), level=level_of(event))
+        if lost:
+            self.records_lost += lost
+            self.writer.event(None, "RecordsLost", f"{lost} records overwritten", level=Level.ERROR)
+
+    def note(self, events: Sequence[ExchangeEvent]) -> None:
+        """Take in what events say of the interval, without archiving them."""
+        for event in events:
+            if isinstance(event, MotionEnded):
+                self.ended = event
+            self.restarted = self.restarted or isinstance(event, InitReceived)
+            self.link_lost = self.link_lost or isinstance(event, LinkLost)
+
+    @property
+    def newest(self) -> int:
+        """Cycle of the newest record archived, -1 before the first."""
+        return self._newest
+
+    @property
+    def over(self) -> bool:
+        """Whether the interval is over and all of it archived, aftermath included."""
+        if self.ended is None:
+            return False
+        if _at_rest(self.ended) or self._cut or self.restarted:
+            return True
+        aftermath = round(AFTERMATH / self.writer.period)
+        return self._newest - self.ended.cycle >= aftermath
+
+    def close(self, outcome: str, reason: str = "") -> None:
+        """Complete the archive."""
+        lost = {"records_lost": str(self.records_lost)}
+        self.writer.close(outcome, reason=reason, details=lost)
+
+    def _of_this_session(self, events: Sequence[ExchangeEvent]) -> Sequence[ExchangeEvent]:
+        """Events up to the init packet that begins another session, that one included."""
+        if self.restarted:
+            return ()
+        for index, event in enumerate(events):
+            if isinstance(event, InitReceived):
+                return events[: index + 1]
+        return events
+
+    def _write(self, records: Records) -> None:
+        """Archive the records up to the end of the session and of the aftermath."""
+        if self._cut or not len(records):
+            return
+        cycles = records["cycle"]
+        last = np.iinfo(np.int64).max
+        if self.ended is not None and not _at_rest(self.ended):
+            last = self.ended.cycle + round(AFTERMATH / self.writer.period)
+        beyond = (np.diff(cycles, prepend=self._newest) <= 0) | (cycles > last)
+        if beyond.any():
+            self._cut = True
+            records = records[: int(np.argmax(beyond))]
+        if not len(records):
+            return
+        self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
+        self.records += len(records)
+        self._newest = int(records["cycle"][-1])
+
+
+def _at_rest(ended: MotionEnded) -> bool:
+    return ended.outcome in ("completed", "stopped")

@@ -1,0 +1,65 @@
+"""What happened on a link, in one line for a person, and how serious it is."""
+
+from __future__ import annotations
+
+from drivers.events import (
+    GapSeen,
+    InitReceived,
+    LinkLost,
+    MotionEnded,
+    MotionStarted,
+    PacketRejected,
+    Refused,
+    StateChanged,
+)
+from drivers.exchange import (
+    ExchangeEnded,
+    ExchangeEvent,
+    ExchangeFailed,
+    ExchangeStarted,
+    Leaving,
+    OverrideRefused,
+)
+from hil.archive.events import Level
+
+
+def describe(event: ExchangeEvent) -> str:
+    """One line for a person."""
+    match event:
+        case StateChanged():
+            return f"{event.before.name} -> {event.after.name} in cycle {event.cycle}"
+        case GapSeen():
+            return f"{event.missed} packets missed before cycle {event.cycle}"
+        case MotionStarted():
+            return f"first set-point in cycle {event.cycle}"
+        case MotionEnded():
+            return f"{event.outcome} in cycle {event.cycle}: {event.reason}"
+        case PacketRejected():
+            return f"{event.count} {event.kind} packets got no answer"
+        case Refused():
+            return str(event.error)
+        case LinkLost():
+            return f"nothing heard for {event.silence:.3f} s in state {event.state.name}"
+        case InitReceived():
+            return event.unusable or "; ".join(
+                ["the controller started a session", *event.differences]
+            )
+        case Leaving():
+            return f"the exchange comes to its end: {event.reason}"
+        case ExchangeEnded():
+            return f"the exchange ended: {event.reason}"
+        case ExchangeFailed():
+            return f"the exchange failed: {event.trace.strip().splitlines()[-1]}"
+        case ExchangeStarted():
+            return "; ".join(["the exchange is running", *event.realtime.refused, *event.notes])
+        case OverrideRefused():
+            return f"no override of {event.fraction:g}: {event.reason}"
+
+
+def level_of(event: ExchangeEvent) -> Level:
+    """How serious an event is."""
+    if isinstance(event, Refused | LinkLost | ExchangeFailed):
+        return Level.ERROR
+    if isinstance(event, GapSeen | PacketRejected | OverrideRefused):
+        return Level.WARN
+    return Level.INFO

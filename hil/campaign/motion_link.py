@@ -1,0 +1,192 @@
+"""What a campaign needs of a link, in virtual or in real time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.drive_train import DriveTrain
+from drivers.events import InitReceived, MotionEnded, Refused
+from drivers.exchange import ExchangeEvent
+from drivers.motion_source import MotionSource
+from drivers.packets import InitPacket
+from drivers.states import State
+from hil.archive import ArchiveSpec
+from hil.errors import ControllerFault
+
+from .stop import Stop
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """How a recording of the controller's own motion ended.
+
+    Attributes:
+        outcome: "completed", "stopped" or "lost".
+        reason: in a sentence.
+        records: cycles archived.
+        records_lost: cycles overwritten before they could be archived.
+    """
+
+    outcome: str
+    reason: str
+    records: int
+    records_lost: int
+
+
+@dataclass(frozen=True, eq=False)
+class Progress:
+    """What a recording shows while it goes on.
+
+    Attributes:
+        cycles: archived so far.
+        missed: packets that never arrived.
+        state: of the session.
+        position: (n,) rad, measured last; None before the first record.
+    """
+
+    cycles: int
+    missed: int
+    state: State
+    position: Array | None = None
+
+
+Watch = Callable[[Progress], None]
+
+
+def unwatched(_progress: Progress) -> None:
+    """Nobody looks."""
+
+
+@dataclass(eq=False)
+class Connection:
+    """What has become known of the controller since the link was opened.
+
+    Attributes:
+        init: its init packet.
+        unusable: why the arm cannot be moved, None if it can.
+        differences: what it says otherwise than the cell.
+        adopted: whether its figures are used instead of the cell's.
+        refused: the last refusal of the guard.
+    """
+
+    init: InitPacket | None = None
+    unusable: str | None = None
+    differences: tuple[str, ...] = ()
+    adopted: bool = False
+    refused: Refused | None = None
+
+    def note(self, event: ExchangeEvent) -> None:
+        """Take in an event."""
+        if isinstance(event, InitReceived):
+            self.init, self.unusable = event.init, event.unusable
+            self.differences, self.adopted = event.differences, event.adopted
+        elif isinstance(event, Refused):
+            self.refused = event
+
+    def require_usable(self) -> None:
+        """Raise ControllerFault where the arm cannot be moved."""
+        if self.unusable is None:
+            return
+        remedy = ""
+        if self.differences and not self.adopted:
+            remedy = (
+                "; correct the cell file, or pass --accept-init to use the controller's figures"
+            )
+        raise ControllerFault(f"the controller cannot be used: {self.unusable}{remedy}")
+
+
+class MotionLink(Protocol):
+    """One connection to a controller: motions are run on it and archived."""
+
+    @property
+    def cycles(self) -> int:
+        """Records archived so far."""
+        ...
+
+    @property
+    def connection(self) -> Connection:
+        """What is known of the controller."""
+        ...
+
+    @property
+    def only_simulated(self) -> bool:
+        """Whether nothing but a simulated controller can be at the far end."""
+        ...
+
+    def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
+        """Exchange until the drive is on and the axes are closed; the target position then (n,).
+
+        Raises:
+            ControllerFault: the controller did not get there within `timeout` s, cannot be used,
+                or a stop was asked for.
+        """
+        ...
+
+    def run(self, source: MotionSource, spec: ArchiveSpec, stop: Stop) -> MotionEnded:
+        """Run one motion, archive every cycle of it, and say how it ended.
+
+        Should archiving fail, the arm is brought to rest on its path before the error is raised.
+
+        Raises:
+            ControllerFault: the motion was not accepted (nothing moved), or the link broke.
+            ArchiveWriteError: the archive cannot be written; the motion was stopped.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the connection; nothing moves any more."""
+        ...
+
+
+class Recording(Protocol):
+    """A connection on which the controller's own motion is recorded."""
+
+    def record(
+        self, spec: ArchiveSpec, stop: Stop, *, duration: float | None, watch: Watch
+    ) -> Recorded:
+        """Answer safely and archive every cycle from the controller's first on.
+
+        Raises:
+            ControllerFault: the controller cannot be read, or never came.
+            ArchiveWriteError: the archive cannot be written.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the connection."""
+        ...
+
+
+def described(spec: ArchiveSpec, connection: Connection, drives: DriveTrain) -> ArchiveSpec:
+    """The archive with the controller's init packet, and with the drive train in force.
+
+    Its `drive_train.json`, the cell's, is brought to what the link uses.
+    """
+    if connection.init is None:
+        return spec
+    attachments = {"init_packet.bin": connection.init.encode()}
+    metadata = {}
+    if connection.adopted:
+        attachments["drive_train.json"] = _in_force(spec.attachments["drive_train.json"], drives)
+        metadata = {
+            "accepted_init": "yes",
+            "accepted_init.differences": "; ".join(connection.differences),
+        }
+    return spec.with_more(metadata, attachments)
+
+
+def _in_force(text: bytes, drives: DriveTrain) -> bytes:
+    """A drive train table with the ratios, calibration and coupling of `drives`."""
+    table = json.loads(text)
+    table["gear_ratio"] = drives.gear_ratio.tolist()
+    table["calibration"] = drives.calibration.tolist()
+    table |= {"k54": drives.k54, "k64": drives.k64, "k65": drives.k65}
+    return json.dumps(table).encode()

@@ -1,0 +1,104 @@
+"""What a cell file says about the link, as the drivers want it."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+from typing import TYPE_CHECKING, Any
+
+from drivers.errors import DriverError
+
+from .errors import CellError
+from .schema import CanTable
+from .text import replaced_value
+
+if TYPE_CHECKING:
+    from drivers.transports.base import TransportSpec
+
+    from .cell import Cell
+
+_WITHIN_THIS_COMPUTER = frozenset(("virtual", "udp_multicast"))
+"""Interfaces of python-can that need no adapter."""
+
+
+def transport_spec(cell: Cell) -> TransportSpec:
+    """What opens the cell's link.
+
+    Raises:
+        CellError: the cell is a simulated one, or its CAN bus cannot carry the arm.
+    """
+    table = cell.controller
+    if table.transport == "udp":
+        from drivers.transports.udp import UdpSpec
+
+        return UdpSpec(peer_host=table.host, port=table.port, bind=table.bind)
+    if table.transport == "can" and table.can is not None:
+        from drivers.transports.can import CanSpec
+
+        spec = CanSpec(**table.can.model_dump(), period=cell.period, n_axes=len(cell.joint_names))
+        try:
+            spec.check(table.mode)
+        except (DriverError, ValueError) as error:
+            raise CellError(
+                cell.path, "controller.can", None, str(error), "name what the bus can carry"
+            ) from error
+        return spec
+    raise CellError(
+        cell.path,
+        "controller.transport",
+        table.transport,
+        "a simulated controller in virtual time has no link to open",
+        'write "udp" or "can"',
+    )
+
+
+def only_simulated(cell: Cell) -> bool:
+    """Whether nothing but a simulated controller on this computer can be at the far end."""
+    table = cell.controller
+    if table.transport == "udp":
+        try:
+            return ipaddress.ip_address(table.host).is_loopback
+        except ValueError:
+            return False
+    if table.transport == "can":
+        return table.can is not None and table.can.interface in _WITHIN_THIS_COMPUTER
+    return True
+
+
+def session_settings(cell: Cell, *, accept_init: bool = False) -> dict[str, Any]:
+    """Keyword arguments of `drivers.Session`."""
+    table, campaign = cell.controller, cell.file.campaign
+    settings: dict[str, Any] = {
+        "mode": table.mode,
+        "arm": table.arm,
+        "max_gap": table.max_gap,
+        "accept_init": accept_init,
+    }
+    if campaign is not None:
+        settings["settle_cycles"] = max(1, round(campaign.settle_s / cell.period))
+    return settings
+
+
+def with_link(
+    text: str,
+    *,
+    transport: str | None = None,
+    host: str | None = None,
+    port: int | None = None,
+    bind: str | None = None,
+    cycle_ms: int | None = None,
+    can: CanTable | None = None,
+) -> str:
+    """The text of a cell file with another link; None keeps what stands there."""
+    given = {"transport": transport, "host": host, "port": port, "bind": bind, "cycle_ms": cycle_ms}
+    for key, value in given.items():
+        if value is not None:
+            text = replaced_value(text, "controller", key, json.dumps(value))
+    if can is None:
+        return text
+    table = "controller.can"
+    if f"[{table}]" not in text:
+        text += f"\n[{table}]\n"
+    for key, value in can.model_dump(exclude_none=True).items():
+        text = replaced_value(text, table.replace(".", r"\."), key, json.dumps(value))
+    return text

@@ -1,0 +1,61 @@
+"""`hil doctor`: what this PC can do, and what to change."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from hil.cell import Cell
+from hil.cli.verdict import NOT_GOOD
+from hil.doctor.link import link_of
+from hil.doctor.report import as_json, show
+from hil.doctor.run import examine
+from hil.progress import reporter
+
+QUICK_SECONDS = 5.0
+
+
+def doctor(
+    cell: Annotated[
+        Path | None,
+        typer.Argument(help="Cell file: its link is looked at, and its cycle has to be fit."),
+    ] = None,
+    duration: Annotated[
+        float,
+        typer.Option(min=1.0, max=36_000.0, help="Seconds of each of the two measurements."),
+    ] = 60.0,
+    output: Annotated[
+        Path, typer.Option(help="Where archives will be written; its disk is tried.")
+    ] = Path("runs"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="5 s of each; the verdict is provisional.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Measure whether this PC can answer a controller every 1 or 2 ms, and say what to change.
+
+    Looks at permissions, processor, kernel, network card, route, port or CAN bus, and disk; then
+    measures wake-up and turnaround latency in processes with the real-time settings of the
+    exchange. Sends nothing to the controller, changes nothing, needs no root; run it as the user
+    who will run hil. Every remedy is a command to type. Without CELL the cycle is 1 ms.
+
+    Exit status: 0 fit for the cell's cycle, 5 not fit (or the link cannot work), 2 bad input.
+    """
+    loaded = None if cell is None else Cell.load(cell)
+    diagnosis = examine(
+        link=None if loaded is None else link_of(loaded),
+        cycle_ms=1 if loaded is None else loaded.controller.cycle_ms,
+        seconds=QUICK_SECONDS if quick else duration,
+        place=output,
+        reporter=reporter(quiet=json),
+    )
+    if json:
+        typer.echo(json_format.dumps(as_json(diagnosis)))
+    else:
+        show(diagnosis, Console())
+    if not diagnosis.fit:
+        raise typer.Exit(NOT_GOOD)

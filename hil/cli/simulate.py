@@ -1,0 +1,244 @@
+"""`hil simulate`: the controller's end of a real link, for somebody else's PC program."""
+
+from __future__ import annotations
+
+import json as json_format
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import typer
+
+from drivers.transports.faults import FaultyLink
+from hil.cell import Cell
+from hil.cli.simulation_status import Status
+from hil.errors import InputError
+from hil.serving import Served, buttons, open_far_end, serve_session, undisturbed
+from hil.simulation import controller_settings, own_postures, simulated_controller
+from sim_fixtures import ControllerSettings, SimulatedController
+from sim_fixtures.errors import SettingError
+from sim_fixtures.fault_script import Fault, FaultScriptError, parse_fault, split_faults
+from sim_fixtures.serve import PATIENCE
+
+OWN_MOVE: Final = 30.0
+"""Seconds that the longest move of the controller's own may take to end."""
+
+CellArgument = Annotated[
+    Path, typer.Argument(help="Cell file with a [simulation] table.", show_default=False)
+]
+Udp = Annotated[
+    str | None,
+    typer.Option(metavar="HOST:PORT", help="Where the PC program listens.", show_default=False),
+]
+Can = Annotated[
+    str | None,
+    typer.Option(
+        metavar="INTERFACE:CHANNEL[:fd|classic]",
+        help="A CAN bus instead, by its python-can names, e.g. socketcan:can0.",
+        show_default=False,
+    ),
+]
+Cycle = Annotated[
+    int | None, typer.Option(min=1, max=2, help="Cycle in ms; the cell's if left out.")
+]
+Mode = Annotated[
+    int | None,
+    typer.Option(help="Open mode: 1, 2, 4, 5, 7, 8 or 9; the cell's if left out."),
+]
+Stagger = Annotated[
+    int, typer.Option(min=0, help="Cycles between one axis entering open mode and the next.")
+]
+Missed = Annotated[
+    int, typer.Option(min=1, help="Missing replies in a row that end open mode (real: unknown).")
+]
+WhileSilent = Annotated[
+    Literal["hold", "continue", "drive-off"],
+    typer.Option(help="What the arm does in a cycle of open mode that no reply came in."),
+]
+Intervals = Annotated[
+    int | None,
+    typer.Option(min=1, help="Intervals of open mode until the session ends; endless if left out."),
+]
+FaultOption = Annotated[
+    list[str] | None,
+    typer.Option("--fault", metavar="SPEC", help="Something that goes wrong; may be repeated."),
+]
+Duration = Annotated[
+    float | None, typer.Option(min=0.0, help="Seconds after which the session is ended.")
+]
+Priority = Annotated[
+    int | None,
+    typer.Option(min=1, max=99, help="Real-time priority (SCHED_FIFO) to ask the system for."),
+]
+
+
+def simulate(
+    cell: CellArgument,
+    udp: Udp = None,
+    can: Can = None,
+    cycle: Cycle = None,
+    mode: Mode = None,
+    stagger: Stagger = 3,
+    missed: Missed = 1,
+    while_silent: WhileSilent = "hold",
+    warm_start: Annotated[
+        bool, typer.Option("--warm-start", help="Begin with the init packet, as after 506.")
+    ] = False,
+    intervals: Intervals = None,
+    own_motion: Annotated[
+        bool,
+        typer.Option(
+            "--own-motion", help="In mode 0 the controller's own program moves the arm about."
+        ),
+    ] = False,
+    own_speed: Annotated[
+        float, typer.Option(min=0.01, max=1.0, help="Of that motion: fraction of full speed.")
+    ] = 0.3,
+    effects: Annotated[
+        bool, typer.Option("--effects", help="Switch on what the identified model leaves out.")
+    ] = False,
+    fault: FaultOption = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of noise and model errors.")] = None,
+    duration: Duration = None,
+    priority: Priority = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Be the controller: a simulated C4G with its arm, for a PC program on a real network or bus.
+
+    Nothing here is hardware and nothing moves. The PC program under test runs elsewhere, listens,
+    and must do what the real controller asks of it:
+
+    - answer every packet within its cycle, with the number received plus one (32767 is followed
+      by 1);
+
+    - echo the start: nine sync packets, the init packet (number 10, 1200 bytes), two more syncs;
+
+    - answer modes 501 (driving on) and 0 (closed) with the mode received and no demand;
+
+    - once every axis reports the open mode and the status byte is 5 (drive on): start from the
+      target received and answer with the next one;
+
+    - ask for the end of open mode with status byte 1, then stay in step until 504.
+
+    Mode 505 in an answer asks for drive off, 508 reports a following error; targets in such a
+    packet are ignored. A drive that was lost stays off until somebody presses the button.
+
+    **Example**, two terminals on one machine:
+
+        hil simulate cell.toml --udp 127.0.0.1:2001 --cycle 2 --intervals 1
+
+        your_program --listen 2001
+
+    The order does not matter: the first packet is repeated every second until it is answered.
+    Ctrl-C ends the session properly (a second one at once); `kill -USR1` presses drive-on,
+    `kill -USR2` the emergency stop. `docs/simulate.md` has more, faults included.
+    """
+    loaded = Cell.load(cell)
+    settings = _settings(
+        controller_settings(loaded, effects=effects),
+        period=loaded.period if cycle is None else cycle / 1000.0,
+        open_mode=loaded.controller.mode if mode is None else mode,
+        opening_stagger=stagger,
+        missed_replies=missed,
+        while_silent=while_silent.replace("-", "_"),
+        cold_start=not warm_start,
+        open_intervals=intervals,
+        own_motion=own_postures(loaded) if own_motion else (),
+        own_speed=own_speed,
+    )
+    on_link, in_controller = split_faults([_fault(text) for text in fault or ()])
+
+    def build() -> SimulatedController:
+        return simulated_controller(
+            loaded, effects=effects, settings=settings, seed=seed, faults=in_controller
+        )
+
+    far_end = open_far_end(udp, can)
+    status = Status(udp or can or "", settings, quiet=json)
+    try:
+        with buttons(duration) as pressed, undisturbed(priority):
+            status.introduce(loaded.name)
+            served = serve_session(
+                build,
+                far_end,
+                pressed,
+                faults=FaultyLink(on_link, settings.period) if on_link else None,
+                # Its own program stops at the next posture only.
+                patience=OWN_MOVE if own_motion else PATIENCE,
+                watch=status.watch,
+            )
+    finally:
+        far_end.close()
+    if json:
+        typer.echo(json_format.dumps(_figures(served)))
+    else:
+        status.clear()
+        typer.echo("\n".join(_sentences(served)))
+    if not served.summary.ended:
+        raise typer.Exit(130 if pressed.interrupted else 4)
+
+
+def _settings(settings: ControllerSettings, **changes: Any) -> ControllerSettings:
+    try:
+        return replace(settings, **changes)
+    except SettingError as error:
+        raise InputError(None, str(error)) from error
+
+
+def _fault(text: str) -> Fault:
+    try:
+        return parse_fault(text)
+    except FaultScriptError as error:
+        raise InputError(None, str(error), field="--fault") from error
+
+
+def _figures(served: Served) -> dict[str, object]:
+    """The summary for a script; times in µs."""
+    summary = served.summary
+    counts = {
+        field.name: getattr(summary, field.name)
+        for field in fields(summary)
+        if isinstance(getattr(summary, field.name), int)
+    }
+    times = {
+        f"{name}_us": round(1e6 * getattr(summary, name), 1)
+        for name in ("answer_p50", "answer_p99", "answer_max", "cost_p50", "cost_p99", "cost_max")
+    }
+    return {
+        **counts,
+        "foreign": served.foreign,
+        "intervals": served.intervals,
+        "starts": served.starts,
+        "phase": served.phase.name.lower(),
+        "reason": served.reason,
+        **times,
+    }
+
+
+def _sentences(served: Served) -> list[str]:
+    """The summary for a person."""
+    summary = served.summary
+    if not summary.cycles:
+        return [f"no PC program answered; the first packet was sent {summary.knocks} times"]
+    end = "the session has ended (504)" if summary.ended else "the session was given up"
+    return [
+        f"{end}{': ' if served.reason else ''}{served.reason}; "
+        f"open mode was reached {_times(served.intervals)}",
+        f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
+        f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
+        f"{served.foreign} from elsewhere",
+        f"answers came after {_us(summary.answer_p50)} (median), {_us(summary.answer_p99)} "
+        f"(99 %), {_us(summary.answer_max)} (longest)",
+        f"controller and arm took {_us(summary.cost_p50)} (median), {_us(summary.cost_p99)} "
+        f"(99 %), {_us(summary.cost_max)} (longest) to compute a cycle; "
+        f"{summary.own_late} cycles began late by our own fault, {summary.slips} of them by a "
+        "whole cycle",
+    ]
+
+
+def _us(seconds: float) -> str:
+    return f"{1e6 * seconds:.0f} µs"
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

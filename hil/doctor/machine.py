@@ -1,0 +1,241 @@
+"""The computer itself: clock, processor, kernel, load, Python."""
+
+from __future__ import annotations
+
+import gzip
+import platform
+import re
+import sys
+import sysconfig
+import time
+
+from .check import Check, Status
+from .system import System
+
+_CPU = "/sys/devices/system/cpu"
+_GOOD_CLOCKS = {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page"}
+
+
+def cpus(system: System) -> list[str]:
+    """Names of the processors ("cpu0", ...)."""
+    return [name for name in system.names(_CPU) if re.fullmatch(r"cpu\d+", name)]
+
+
+def timer_resolution(resolution: float | None = None) -> Check:
+    """Whether timers are finer than the scheduler's tick; `resolution` in s."""
+    step = time.clock_getres(time.CLOCK_MONOTONIC) if resolution is None else resolution
+    return Check(
+        "timer resolution",
+        Status.OK if step <= 1e-6 else Status.BAD,
+        f"{step * 1e9:.0f} ns" if step < 1e-6 else f"{step * 1e3:g} ms",
+        "time-outs of the exchange are fractions of a millisecond",
+        () if step <= 1e-6 else ("cat /proc/cmdline   # remove highres=off, nohighres",),
+    )
+
+
+def clock_source(system: System) -> Check:
+    """Whether reading the clock is cheap."""
+    folder = "/sys/devices/system/clocksource/clocksource0"
+    source = system.text(f"{folder}/current_clocksource")
+    why = "the clock is read several times a cycle; a slow one costs microseconds each time"
+    if not source:
+        return Check("clock source", Status.UNKNOWN, "not stated by the kernel", why)
+    if source in _GOOD_CLOCKS:
+        return Check("clock source", Status.OK, source, why)
+    offered = (system.text(f"{folder}/available_clocksource") or "").split()
+    remedy = f"echo tsc | sudo tee {folder}/current_clocksource" if "tsc" in offered else ""
+    return Check("clock source", Status.WARN, source, why, (remedy,) if remedy else ())
+
+
+def governor(system: System) -> Check:
+    """Whether processors keep their full frequency."""
+    found = {system.text(f"{_CPU}/{cpu}/cpufreq/scaling_governor") for cpu in cpus(system)}
+    names = sorted(name for name in found if name)
+    why = "a processor that clocks down answers its first packet late"
+    if not names:
+        return Check("frequency governor", Status.OK, "no frequency scaling on this machine", why)
+    if names == ["performance"]:
+        return Check("frequency governor", Status.OK, "performance", why)
+    return Check(
+        "frequency governor",
+        Status.WARN,
+        ", ".join(names),
+        why,
+        (f"echo performance | sudo tee {_CPU}/cpu*/cpufreq/scaling_governor",),
+    )
+
+
+def idle_states(system: System, *, kept_awake: bool) -> Check:
+    """How long the deepest sleep in use takes to leave; no matter if processors are kept awake."""
+    deepest, slowest = "", -1
+    for cpu in cpus(system):
+        for state in system.names(f"{_CPU}/{cpu}/cpuidle"):
+            folder = f"{_CPU}/{cpu}/cpuidle/{state}"
+            latency = system.number(f"{folder}/latency")
+            if latency is None or system.number(f"{folder}/disable") == 1:
+                continue
+            if latency > slowest:
+                deepest, slowest = system.text(f"{folder}/name") or state, latency
+    why = "a sleeping processor has to wake before it can answer"
+    if slowest < 0:
+        driver = system.text(f"{_CPU}/cpuidle/current_driver")
+        found = f"idle driver {driver}" if driver and driver != "none" else "none listed"
+        return Check("idle states", Status.OK, found, why)
+    found = f"deepest is {deepest}, {slowest} µs to wake"
+    if kept_awake:
+        return Check("idle states", Status.OK, f"{found}; kept awake during an exchange", why)
+    bad = slowest > 50
+    remedy = "see 'processor kept awake': with that right, no idle state matters"
+    return Check(
+        "idle states", Status.WARN if bad else Status.OK, found, why, (f"# {remedy}",) * bad
+    )
+
+
+def isolation(system: System) -> Check:
+    """Whether a processor is kept free of other programs."""
+    isolated = system.text(f"{_CPU}/isolated")
+    why = "other programs and interrupts stay off an isolated processor"
+    if isolated:
+        return Check("isolated processors", Status.OK, isolated, why)
+    count = len(cpus(system))
+    if count < 4:
+        return Check(
+            "isolated processors", Status.OK, f"none; with {count} there is none to spare", why
+        )
+    last = count - 1
+    return Check(
+        "isolated processors",
+        Status.WARN,
+        f"none of {count}",
+        why + "; worth it only if the latency measured below is not good enough",
+        (
+            f"# add to GRUB_CMDLINE_LINUX_DEFAULT in /etc/default/grub: "
+            f"isolcpus=managed_irq,domain,{last} nohz_full={last} rcu_nocbs={last}",
+            "sudo update-grub && sudo reboot",
+        ),
+    )
+
+
+def preemption(system: System) -> Check:
+    """The kernel's preemption model."""
+    why = "how long the kernel may finish its own work before it lets a waiting program run"
+    version = system.text("/proc/version") or ""
+    if "PREEMPT_RT" in version or system.text("/sys/kernel/realtime") == "1":
+        return Check("kernel preemption", Status.OK, "PREEMPT_RT", why)
+    model = _preemption_model(system)
+    if model in ("full", "lazy"):
+        return Check("kernel preemption", Status.OK, model, why)
+    remedy = [
+        "sudo apt install linux-image-rt-amd64   # Debian; Ubuntu: sudo pro enable realtime-kernel"
+    ]
+    if model is None:
+        found = "not stated by the kernel"
+        return Check("kernel preemption", Status.UNKNOWN, found, why, tuple(remedy))
+    if "PREEMPT_DYNAMIC" in version:
+        remedy.append("# or add preempt=full to GRUB_CMDLINE_LINUX_DEFAULT in /etc/default/grub:")
+        remedy.append("sudo update-grub && sudo reboot")
+    return Check("kernel preemption", Status.WARN, model, why, tuple(remedy))
+
+
+def _preemption_model(system: System) -> str | None:
+    """From the scheduler's own file (root), the command line, or how the kernel was built."""
+    current = re.search(r"\((\w+)\)", system.text("/sys/kernel/debug/sched/preempt") or "")
+    if current:
+        return current[1]
+    chosen = re.search(r"\bpreempt=(\w+)", system.text("/proc/cmdline") or "")
+    if chosen:
+        return chosen[1]
+    config = _kernel_config(system)
+    for option, model in (
+        ("PREEMPT_NONE", "none"),
+        ("PREEMPT_VOLUNTARY", "voluntary"),
+        ("PREEMPT_LAZY", "lazy"),
+        ("PREEMPT", "full"),
+    ):
+        if re.search(rf"^CONFIG_{option}=y$", config, re.MULTILINE):
+            return model
+    return None
+
+
+def _kernel_config(system: System) -> str:
+    try:
+        with gzip.open(system.path("/proc/config.gz"), "rt", errors="replace") as file:
+            return file.read()
+    except (OSError, EOFError):
+        pass
+    release = system.text("/proc/sys/kernel/osrelease") or ""
+    return system.text(f"/boot/config-{release}") or ""
+
+
+def virtualisation(system: System) -> Check:
+    """Whether another operating system stands between this one and the hardware."""
+    why = "the host may stop a virtual machine for milliseconds, and no program in it can tell"
+    flags = re.search(r"^flags\s*:(.*)$", system.text("/proc/cpuinfo") or "", re.MULTILINE)
+    product = system.text("/sys/class/dmi/id/product_name") or ""
+    virtual = (flags is not None and "hypervisor" in flags[1].split()) or bool(
+        re.search(r"\b(KVM|QEMU|VirtualBox|VMware|Virtual Machine)\b", product, re.IGNORECASE)
+    )
+    if not virtual:
+        return Check("virtual machine", Status.OK, "no sign of one", why)
+    share = stolen_share(system.text("/proc/stat") or "")
+    found = "yes" if share is None else f"yes; {100 * share:.2f} % of its time stolen since boot"
+    advice = ("# for simulated controllers only; run an arm from a PC of its own",)
+    return Check("virtual machine", Status.WARN, found, why, advice)
+
+
+def stolen_share(stat: str, since: str = "") -> float | None:
+    """Share of processor time that the host kept for others, from texts of /proc/stat.
+
+    Args:
+        stat: the text now.
+        since: an earlier one; since boot if left out.
+    """
+    now, before = _ticks(stat), _ticks(since) or [0] * 8
+    if now is None:
+        return None
+    spent = [late - early for late, early in zip(now, before, strict=True)]
+    return spent[7] / sum(spent) if sum(spent) > 0 else None
+
+
+def _ticks(stat: str) -> list[int] | None:
+    line = re.search(r"^cpu +((?:\d+ +){7}\d+)", stat, re.MULTILINE)
+    return None if line is None else [int(word) for word in line[1].split()]
+
+
+def stolen(before: str, after: str) -> Check:
+    """How much processor time the host kept for others during the measurement."""
+    share = stolen_share(after, before)
+    name, why = "stolen time while measuring", "time in which a virtual machine did not run at all"
+    if share is None:
+        return Check(name, Status.UNKNOWN, "not stated by the kernel", why)
+    status = Status.OK if share < 1e-4 else Status.WARN
+    remedy = () if share < 1e-4 else ("# ask for dedicated processors, or use a PC of its own",)
+    return Check(name, status, f"{100 * share:.2f} %", why, remedy)
+
+
+def load(system: System) -> Check:
+    """What else is running."""
+    why = "real-time priority goes before other programs, but not before their interrupts and disk"
+    try:
+        minute = float((system.text("/proc/loadavg") or "").split()[0])
+    except (IndexError, ValueError):
+        return Check("other load", Status.UNKNOWN, "not stated by the kernel", why, ("uptime",))
+    count = max(len(cpus(system)), 1)
+    found = f"{minute:g} waiting or running over the last minute, {count} processors"
+    if minute <= 0.5 * count:
+        return Check("other load", Status.OK, found, why)
+    return Check("other load", Status.WARN, found, why, ("top   # and end what is not needed",))
+
+
+def python() -> Check:
+    """The interpreter."""
+    built = platform.python_version()
+    debug = bool(sysconfig.get_config_var("Py_DEBUG"))
+    found = f"{platform.python_implementation()} {built}{', debug build' if debug else ''}"
+    fit = not debug and sys.implementation.name == "cpython"
+    return Check(
+        "Python",
+        Status.OK if fit else Status.WARN,
+        found,
+        "figures hold for the release build of CPython",
+    )

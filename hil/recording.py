@@ -1,0 +1,99 @@
+"""Recording a motion that the controller's own program makes: answered safely, archived whole."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+from hil.archive import CONTROLLERS_OWN, ArchiveName, ArchiveSpec
+from hil.campaign import Recorded, Stop
+from hil.campaign.motion_link import Recording, Watch, unwatched
+from hil.cell import Cell
+from hil.errors import InputError
+from hil.files import make_folder
+from hil.version import software
+
+KINDS = ("excitation", "validation", "standstill")
+"""What a recording can be used for."""
+
+
+def record(
+    link: Recording,
+    cell: Cell,
+    path: Path,
+    *,
+    kind: str,
+    stop: Stop,
+    duration: float | None = None,
+    watch: Watch = unwatched,
+    durable: bool = True,
+) -> Recorded:
+    """Record what the controller does, from its first cycle on. No motion is ever requested.
+
+    Args:
+        link: to the controller.
+        cell: travels in the archive.
+        path: of the archive, which must not exist.
+        kind: one of `KINDS`.
+        stop: ends the recording.
+        duration: s of the controller's time; None: until `stop`, or the session's end.
+        watch: told of the progress.
+        durable: wait at each flush until the disk has the data.
+
+    Raises:
+        ControllerFault: the controller never came, or is not the cell's.
+        ArchiveWriteError: the archive cannot be written.
+    """
+    spec = ArchiveSpec(
+        path,
+        joint_names=cell.joint_names,
+        period=cell.period,
+        metadata={
+            "motion": CONTROLLERS_OWN,
+            "cell": cell.name,
+            **_kind(path, kind),
+            **_origin(cell),
+        },
+        attachments={
+            "cell.toml": cell.text.encode(),
+            "robot.urdf": cell.urdf.encode(),
+            "drive_train.json": cell.drive_table.model_dump_json().encode(),
+        },
+        durable=durable,
+    )
+    return link.record(spec, stop, duration=duration, watch=watch)
+
+
+def archive_path(output: Path, kind: str) -> Path:
+    """Where to record: `output` itself if it is called *.mcap, else the next name in that folder.
+
+    Raises:
+        InputError: the file exists, or the folder cannot be made.
+    """
+    if output.suffix == ".mcap":
+        if output.exists():
+            raise InputError(output, "exists already", remedy="archives are never overwritten")
+        name = ArchiveName.parse(output)
+        if name is not None and name.kind != kind:
+            raise InputError(
+                output, f"is the name of a {name.kind}", remedy=f"add --kind {name.kind}"
+            )
+        make_folder(output.parent)
+        return output
+    make_folder(output)
+    index = 0
+    while list(output.glob(f"{kind}_{index:03d}_a*.mcap")):
+        index += 1
+    return output / ArchiveName(kind, index)
+
+
+def _kind(path: Path, kind: str) -> dict[str, str]:
+    return {} if ArchiveName.parse(path) is not None else {"kind": kind}
+
+
+def _origin(cell: Cell) -> dict[str, str]:
+    """Where and with what it was recorded; a time of day only where a real arm may have moved."""
+    versions = {f"software.{name}": version for name, version in software().items()}
+    if cell.only_simulated:
+        return {"simulated": "yes", **versions}
+    return {"recorded_at": datetime.now(UTC).isoformat(timespec="seconds"), **versions}

@@ -1,0 +1,272 @@
+"""A simulated controller on a real link, from the first packet to the operator's last button."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from types import FrameType
+from typing import Final
+
+from drivers.errors import DriverError
+from drivers.transports.faults import FaultyLink
+from hil.errors import ControllerFault, InputError
+from sim_fixtures import SimulatedController
+from sim_fixtures.errors import PlantDiverged, SettingError
+from sim_fixtures.far_end import FarEnd, FarEndError, UdpFarEnd
+from sim_fixtures.program import Phase
+from sim_fixtures.serve import KNOCK_INTERVAL, PATIENCE, Wish, serve
+from sim_fixtures.tally import ServeSummary, Tally
+
+_PR_SET_TIMERSLACK: Final = 29
+
+
+def open_far_end(udp: str | None, can: str | None) -> FarEnd:
+    """The controller's end of the link a person names.
+
+    Args:
+        udp: "HOST:PORT" of the PC program.
+        can: "INTERFACE:CHANNEL", ":fd" or ":classic" behind it.
+
+    Raises:
+        InputError: neither or both, not of that form, or impossible to open.
+    """
+    if (udp is None) == (can is None):
+        raise InputError(
+            None, "a link has to be named, one of them", remedy="give --udp or --can, not both"
+        )
+    try:
+        return _udp(udp) if udp is not None else _can(can or "")
+    except FarEndError as error:
+        raise InputError(None, str(error)) from error
+
+
+def _udp(text: str) -> FarEnd:
+    host, colon, port = text.rpartition(":")
+    if not (colon and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise InputError(
+            None,
+            f"--udp {text!r} is not an address",
+            remedy="write HOST:PORT, for instance 127.0.0.1:2001",
+        )
+    return UdpFarEnd(host, int(port))
+
+
+def _can(text: str) -> FarEnd:
+    interface, _, rest = text.partition(":")
+    channel, colon, profile = rest.rpartition(":")
+    if profile not in ("fd", "classic") or not colon:
+        channel, profile = rest, "fd"
+    if not (interface and channel):
+        raise InputError(
+            None,
+            f"--can {text!r} is not a bus",
+            remedy="write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic",
+        )
+    # python-can is loaded only where a bus is asked for.
+    from sim_fixtures.can_end import open_far_end as open_can
+
+    return open_can(interface, channel, "classic" if profile == "classic" else "fd")
+
+
+class Buttons:
+    """What the person in front of the cabinet wants, set by signals and by a time limit.
+
+    Attributes:
+        interrupted: whether a signal asked for the end.
+    """
+
+    def __init__(self, duration: float | None = None) -> None:
+        self.interrupted = False
+        self._until = None if duration is None else time.monotonic() + duration
+        self._at_once = False
+        self._drive_on = False
+        self._emergency_stop = False
+
+    def wish(self) -> Wish:
+        """Go on; or end, by a signal or because the time is over; or give up."""
+        if self._at_once:
+            return Wish.GIVE_UP
+        over = self._until is not None and time.monotonic() >= self._until
+        return Wish.END if self.interrupted or over else Wish.GO_ON
+
+    def press(self, signum: int, frame: FrameType | None = None) -> None:
+        """Take a signal: SIGINT or SIGTERM end, the second one at once; SIGUSR1, 2 are buttons."""
+        del frame
+        if signum == signal.SIGUSR1:
+            self._drive_on = True
+        elif signum == signal.SIGUSR2:
+            self._emergency_stop = True
+        else:
+            self._at_once = self.interrupted
+            self.interrupted = True
+
+    def pass_on(self, controller: SimulatedController) -> None:
+        """Press on the controller what was pressed here."""
+        if self._drive_on:
+            self._drive_on = False
+            controller.drive_on()
+        if self._emergency_stop:
+            self._emergency_stop = False
+            controller.emergency_stop()
+
+
+@contextmanager
+def buttons(duration: float | None) -> Iterator[Buttons]:
+    """Signals as buttons, for as long as this lasts; see `Buttons.press`."""
+    pressed = Buttons(duration)
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+    previous = {number: signal.signal(number, pressed.press) for number in signals}
+    try:
+        yield pressed
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def undisturbed(priority: int | None) -> Iterator[None]:
+    """No garbage collection, exact timers, and a real-time priority if one is given.
+
+    Raises:
+        InputError: the system refuses the priority.
+    """
+    if priority is not None:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        except OSError as error:
+            raise InputError(
+                None,
+                f"the system refuses a real-time priority of {priority} ({error.strerror})",
+                remedy="leave --priority out, or raise the limit (ulimit -r) or run as root",
+            ) from error
+    _wake_exactly()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
+
+
+def _wake_exactly() -> None:
+    """Ask not to have this thread's timers batched with others (50 µs by default)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True)
+class Served:
+    """How a session on a real link came out.
+
+    Attributes:
+        summary: counts and times of the last start and what followed it.
+        phase: what the controller was doing at the end.
+        reason: why the session ended or the drive was last lost; "" if neither.
+        intervals: how often all axes have been open.
+        starts: how often the start was begun.
+        foreign: datagrams from elsewhere; 0 where the link cannot tell.
+    """
+
+    summary: ServeSummary
+    phase: Phase
+    reason: str
+    intervals: int
+    starts: int
+    foreign: int
+
+
+def serve_session(
+    build: Callable[[], SimulatedController],
+    far_end: FarEnd,
+    pressed: Buttons,
+    *,
+    faults: FaultyLink | None = None,
+    patience: float = PATIENCE,
+    watch: Callable[[SimulatedController, Tally], None] = lambda *_: None,
+) -> Served:
+    """Serve until a session has ended; a start that the PC breaks off begins anew after a second.
+
+    Args:
+        build: a controller that has just been switched on.
+        far_end: its link.
+        pressed: the buttons.
+        faults: what the link does to packets, counted from each start.
+        patience: seconds that the arm may take to come to rest at the end.
+        watch: called every cycle with the counts so far.
+
+    Raises:
+        InputError: the controller cannot be built so, or the link cannot carry the session.
+        ControllerFault: the simulated arm left the finite numbers.
+    """
+    starts = 0
+    while True:
+        starts += 1
+        controller = _switched_on(build)
+        record = _Observed(controller, pressed, watch)
+        try:
+            summary = serve(
+                controller, far_end, faults=faults, wish=pressed.wish, watch=record.observe,
+                patience=patience,
+            )  # fmt: skip
+        except DriverError as error:
+            raise InputError(None, str(error)) from error
+        except PlantDiverged as error:
+            raise ControllerFault(str(error)) from error
+        if record.started or not summary.ended or pressed.wish() is not Wish.GO_ON:
+            return Served(
+                summary,
+                phase=controller.phase,
+                reason=controller.reason,
+                intervals=record.intervals,
+                starts=starts,
+                foreign=getattr(far_end, "foreign", 0),
+            )
+        _pause(KNOCK_INTERVAL, pressed)
+
+
+def _switched_on(build: Callable[[], SimulatedController]) -> SimulatedController:
+    try:
+        return build()
+    except SettingError as error:
+        raise InputError(None, str(error)) from error
+
+
+class _Observed:
+    """What one start has come to, seen cycle by cycle."""
+
+    def __init__(
+        self,
+        controller: SimulatedController,
+        pressed: Buttons,
+        watch: Callable[[SimulatedController, Tally], None],
+    ) -> None:
+        self.started = False
+        self.intervals = 0
+        self._controller = controller
+        self._pressed = pressed
+        self._watch = watch
+        self._phase = controller.phase
+
+    def observe(self, tally: Tally) -> None:
+        """Note the phase, pass buttons on, show the counts."""
+        phase = self._controller.phase
+        if phase is not self._phase:
+            self._phase = phase
+            self.started = self.started or phase is Phase.DRIVE_OFF
+            self.intervals += phase is Phase.OPEN
+        self._pressed.pass_on(self._controller)
+        self._watch(self._controller, tally)
+
+
+def _pause(seconds: float, pressed: Buttons) -> None:
+    until = time.monotonic() + seconds
+    while time.monotonic() < until and pressed.wish() is Wish.GO_ON:
+        time.sleep(0.05)

@@ -1,0 +1,272 @@
+"""`hil record`: the controller's own program moves the arm, and what is archived identifies it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.packets import DRIVE_ON, INIT_LENGTH
+from drivers.states import State
+from drivers.transports import Lose, SimulatedTransport
+from hil.archive import open_archive
+from hil.campaign import Link, Progress, Stop
+from hil.cell import Cell
+from hil.demo_link import SIMULATE, free_port
+from hil.errors import ControllerFault, InputError
+from hil.identify import identify_archives
+from hil.progress import Silent
+from hil.recording import archive_path, record
+from hil.simulation import controller_settings, own_postures, simulated_controller
+
+NAME = "excitation_000_a1.mcap"
+
+
+def own_motion_link(cell: Cell, *faults: Lose, accept_init: bool = False) -> Link:
+    """A link in virtual time to a controller whose own program moves the arm."""
+    settings = replace(controller_settings(cell), own_motion=own_postures(cell))
+    controller = simulated_controller(cell, settings=settings)
+    transport = SimulatedTransport(controller, faults)
+    return Link.over(transport, cell, controller.finish, accept_init=accept_init)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory, cell: Cell) -> Path:
+    """Forty seconds of the controller's own motion."""
+    path = tmp_path_factory.mktemp("record") / NAME
+    done = record(
+        own_motion_link(cell), cell, path,
+        kind="excitation", stop=Stop(), duration=40.0, durable=False,
+    )  # fmt: skip
+    assert (done.outcome, done.records, done.records_lost) == ("completed", 40_000, 0)
+    return path
+
+
+def test_every_cycle_from_the_first_on_is_archived_and_none_was_commanded(recorded: Path) -> None:
+    archive = open_archive(recorded)
+    assert archive.complete
+    assert archive.outcome is not None
+    assert archive.outcome["records_lost"] == "0"
+    columns = archive.columns
+    assert np.all(np.diff(columns["cycle"]) == 1)
+    assert columns["state"][0] == State.DRIVE_OFF
+    assert columns["status"][-1] == DRIVE_ON
+    assert np.isnan(columns["commanded_position"]).all()
+    assert np.all(columns["interval"] == -1)
+    assert np.all(np.ptp(columns["position"], axis=0) > 0.3)
+
+
+def test_the_archive_says_whose_motion_it_was_and_carries_the_init_packet(recorded: Path) -> None:
+    archive = open_archive(recorded)
+    assert archive.metadata["motion"] == "controller"
+    assert archive.kind == "excitation"
+    assert set(archive.attachments) == {
+        "cell.toml", "robot.urdf", "drive_train.json", "init_packet.bin"
+    }  # fmt: skip
+    assert len(archive.attachments["init_packet.bin"]) == INIT_LENGTH
+
+
+def test_the_recording_alone_gives_the_planted_parameters(recorded: Path) -> None:
+    found = identify_archives([recorded], Silent())
+    assert found.verdict.good, found.verdict.line
+    coverage = found.results.coverage
+    assert coverage is not None
+    # 95 % of 58 parameters are within two standard deviations where the model is the plant's;
+    # what smoothing leaves of the controller's jerk costs some of them.
+    assert coverage.within_3 >= 0.9 * coverage.total
+
+
+def test_recordings_are_numbered_in_a_folder_and_never_overwritten(tmp_path: Path) -> None:
+    first = archive_path(tmp_path / "records", "validation")
+    assert first.name == "validation_000_a1.mcap"
+    first.touch()
+    assert archive_path(tmp_path / "records", "validation").name == "validation_001_a1.mcap"
+    with pytest.raises(InputError, match="exists already"):
+        archive_path(first, "validation")
+    with pytest.raises(InputError, match="name of a validation; add --kind validation"):
+        archive_path(tmp_path / "validation_007_a1.mcap", "excitation")
+
+
+def test_a_file_of_any_name_knows_its_kind(tmp_path: Path, cell: Cell) -> None:
+    path = archive_path(tmp_path / "monday.mcap", "standstill")
+    record(
+        own_motion_link(cell), cell, path,
+        kind="standstill", stop=Stop(), duration=0.2, durable=False,
+    )  # fmt: skip
+    assert open_archive(path).kind == "standstill"
+
+
+def test_the_operator_ends_a_recording_and_that_is_its_proper_end(
+    tmp_path: Path, cell: Cell
+) -> None:
+    stop = Stop()
+
+    def enough(progress: Progress) -> None:
+        stop.requested = progress.cycles >= 500
+
+    done = record(
+        own_motion_link(cell), cell, tmp_path / NAME,
+        kind="excitation", stop=stop, watch=enough, durable=False,
+    )  # fmt: skip
+    assert (done.outcome, done.reason) == ("completed", "ended by the operator")
+    assert done.records == open_archive(tmp_path / NAME).n_samples >= 500
+
+
+def test_a_recording_cut_short_says_so(tmp_path: Path, cell: Cell) -> None:
+    stop = Stop()
+
+    def enough(progress: Progress) -> None:
+        stop.requested = progress.cycles >= 500
+
+    done = record(
+        own_motion_link(cell), cell, tmp_path / NAME,
+        kind="excitation", stop=stop, duration=10.0, watch=enough, durable=False,
+    )  # fmt: skip
+    assert (done.outcome, done.reason) == ("stopped", "ended by the operator")
+
+
+def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> None:
+    link = own_motion_link(cell, Lose(600, "to_pc"))
+    record(link, cell, tmp_path / NAME, kind="excitation", stop=Stop(), duration=1.0, durable=False)
+    archive = open_archive(tmp_path / NAME)
+    steps = np.diff(archive.columns["cycle"])
+    assert sorted(set(steps.tolist())) == [1, 2]
+    assert archive.columns["gap"].sum() == 1
+    assert archive.outcome is not None
+    assert archive.outcome["lost_packets"] == "1"
+
+
+def test_a_controller_of_another_arm_is_not_recorded_unless_its_figures_are_accepted(
+    tmp_path: Path, cell: Cell
+) -> None:
+    wrong = Cell.from_texts(cell.text.replace("k65 = 0.035", "k65 = 0.045"), cell.urdf, cell.path)
+    settings = replace(controller_settings(cell), own_motion=own_postures(cell))
+
+    def link(*, accept_init: bool) -> Link:
+        transport = SimulatedTransport(simulated_controller(cell, settings=settings))
+        return Link.over(transport, wrong, accept_init=accept_init)
+
+    def attempt(*, accept_init: bool) -> None:
+        record(
+            link(accept_init=accept_init), wrong, tmp_path / NAME,
+            kind="excitation", stop=Stop(), duration=0.5, durable=False,
+        )  # fmt: skip
+
+    with pytest.raises(ControllerFault, match=r"k65 of axis 6 .*--accept-init"):
+        attempt(accept_init=False)
+    assert not (tmp_path / NAME).exists()
+
+    attempt(accept_init=True)
+    archive = open_archive(tmp_path / NAME)
+    assert archive.metadata["accepted_init"] == "yes"
+    assert "k65 of axis 6" in archive.metadata["accepted_init.differences"]
+    assert b"k65 = 0.045" in archive.attachments["cell.toml"]
+    assert json.loads(archive.attachments["drive_train.json"])["k65"] == pytest.approx(0.035)
+    # Joint angles in the file are those of the controller's figures.
+    initial = archive.columns["position"][0]
+    assert initial == pytest.approx(cell.initial, abs=1e-4)
+
+
+@contextmanager
+def running(*command: object) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [str(word) for word in command],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    ) as process:  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.fixture
+def on_udp(tmp_path: Path, cell: Cell) -> tuple[Path, int]:
+    """A cell file whose controller is on this computer, and its port."""
+    port = free_port()
+    text = cell.with_link(transport="udp", host="127.0.0.1", port=port, bind="127.0.0.1").text
+    (tmp_path / "cell.toml").write_text(text)
+    (tmp_path / "ns16.urdf").write_text(cell.urdf)
+    return tmp_path / "cell.toml", port
+
+
+HIL = (sys.executable, "-m", "hil")
+
+
+def test_a_recording_over_real_sockets_ends_when_it_is_long_enough(
+    tmp_path: Path, on_udp: tuple[Path, int]
+) -> None:
+    path, port = on_udp
+    own = ("--udp", f"127.0.0.1:{port}", "--own-motion", "--missed", "300")
+    with (
+        running(*SIMULATE, path, *own),
+        running(
+            *HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "1.5", "--json"
+        ) as recorder,
+    ):
+        said, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 0, errors
+    summary = json.loads(said)
+    archive = open_archive(summary["archive"])
+    assert archive.complete
+    assert summary["outcome"] == "completed"
+    assert summary["records_lost"] == 0
+    assert summary["cycles"] == archive.n_samples
+    cycles = archive.columns["cycle"]
+    assert archive.n_samples + archive.columns["gap"][1:].sum() == cycles[-1] - cycles[0] + 1
+    assert np.isnan(archive.columns["commanded_position"]).all()
+
+
+def test_ctrl_c_ends_a_recording_over_real_sockets_with_a_whole_archive(
+    tmp_path: Path, on_udp: tuple[Path, int]
+) -> None:
+    path, port = on_udp
+    archive = tmp_path / "a.mcap"
+    own = ("--udp", f"127.0.0.1:{port}", "--own-motion", "--missed", "300")
+    with (
+        running(*SIMULATE, path, *own),
+        running(*HIL, "record", path, "-o", archive) as recorder,
+    ):
+        deadline = time.monotonic() + 60.0
+        while not (archive.exists() and open_archive(archive).n_samples > 500):
+            assert time.monotonic() < deadline
+            assert recorder.poll() is None, recorder.communicate()
+            time.sleep(0.1)
+        recorder.send_signal(signal.SIGINT)
+        said, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 0, errors
+    assert "ended by the operator" in said
+    assert open_archive(archive).complete
+
+
+def test_a_recording_without_a_controller_ends_with_a_sentence(
+    tmp_path: Path, on_udp: tuple[Path, int]
+) -> None:
+    path, _ = on_udp
+    with running(*HIL, "record", path, "-o", tmp_path / "a.mcap") as recorder:
+        assert recorder.stdout is not None
+        assert "waiting for the controller" in recorder.stdout.readline()
+        recorder.send_signal(signal.SIGINT)
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    assert "nothing was recorded" in errors.replace("\n", " ")
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_simulated_cell_has_no_link_to_record_from(tmp_path: Path, cell: Cell) -> None:
+    (tmp_path / "cell.toml").write_text(cell.text)
+    (tmp_path / "ns16.urdf").write_text(cell.urdf)
+    with running(*HIL, "record", tmp_path / "cell.toml", "-o", tmp_path / "a.mcap") as recorder:
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 2
+    assert "controller.transport" in errors

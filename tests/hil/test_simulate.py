@@ -1,0 +1,441 @@
+"""`hil simulate` and a foreign PC program, two processes with a network between them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from hil.campaign.plan import MotionChecks
+from hil.cell import Cell, CellError
+from hil.cell.text import replaced_value
+from hil.cli import main
+from hil.cli.simulate import simulate
+from hil.cli.simulation_status import WORDS, Status
+from hil.errors import InputError
+from hil.serving import Buttons, open_far_end
+from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
+from sim_fixtures.ns16 import CELL_PATH
+from sim_fixtures.program import Phase
+from sim_fixtures.serve import Wish
+
+FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
+SLOW_MACHINE = ["--missed", "300"]
+"""A test asks what happens, not how fast: pauses of this machine shall not end open mode."""
+
+OFF, DRIVING, CLOSED, ENDED = (f"status {s}, modes {[m] * 6}" for s, m in
+                               ((0, 0), (5, 501), (5, 0), (0, 504)))  # fmt: skip
+
+
+def opened(mode: int = 4) -> str:
+    return f"status 5, modes {[mode] * 6}"
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextmanager
+def running(*command: object) -> Iterator[subprocess.Popen[str]]:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        list(map(str, command)),
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment,
+    )  # fmt: skip
+    watchdog = threading.Timer(40.0, process.kill)  # a reader of its output gets an end of file
+    watchdog.start()
+    try:
+        yield process
+    finally:
+        watchdog.cancel()
+        process.kill()
+        process.communicate()
+
+
+class Forked:
+    """A command of `hil` in a child of this process, which has the imports behind it."""
+
+    def __init__(self, *command: object) -> None:
+        reading, writing = os.pipe()
+        self.process = get_context("fork").Process(
+            target=_be_hil, args=([str(word) for word in command], writing)
+        )
+        self.process.start()
+        os.close(writing)
+        self.stdout = os.fdopen(reading)
+
+    def finish(self, timeout: float) -> str:
+        """The rest of what it says, once it has ended."""
+        said = self.stdout.read()
+        self.process.join(timeout)
+        return said
+
+    def signal(self, number: int) -> None:
+        assert self.process.pid is not None
+        os.kill(self.process.pid, number)
+
+    @property
+    def status(self) -> int | None:
+        return self.process.exitcode
+
+
+def _be_hil(command: list[str], out: int) -> None:
+    os.dup2(out, 1)
+    os.dup2(out, 2)
+    sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+    sys.argv = ["hil", *command]
+    try:
+        main()
+    finally:
+        sys.stdout.flush()
+
+
+@contextmanager
+def hil(*command: object) -> Iterator[Forked]:
+    forked = Forked(*command)
+    watchdog = threading.Timer(40.0, forked.process.kill)  # then its reader gets an end of file
+    watchdog.start()
+    try:
+        yield forked
+    finally:
+        watchdog.cancel()
+        forked.process.kill()
+        forked.process.join(10)
+        forked.stdout.close()
+
+
+def last_json(text: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(text.strip().splitlines()[-1])
+    return found
+
+
+def session(
+    controller: list[str], pc: list[str], until: list[str] | None = None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What both sides say about one whole session; ended by a signal after the states `until`."""
+    port = free_port()
+    command = ["simulate", CELL_PATH, "--udp", f"127.0.0.1:{port}", "--json", *controller]
+    with running(*FOREIGN, "--port", port, *pc) as program:
+        assert program.stdout is not None
+        assert "listening" in program.stdout.readline()
+        with hil(*command) as cabinet:
+            wait_for(until or [], program.stdout)
+            if until:
+                cabinet.signal(signal.SIGTERM)
+            said = cabinet.finish(timeout=30)
+            assert cabinet.status == 0, said
+        heard = program.stdout.read()
+        assert program.wait(timeout=10) == 0, heard
+    return last_json(said), last_json(heard)
+
+
+def wait_for(states: list[str], lines: Iterable[str]) -> None:
+    """Read what the foreign program prints until it has seen these states in this order."""
+    missing = list(states)
+    while missing:
+        line = next(iter(lines), None)
+        assert line is not None, f"never seen: {missing}"
+        if line.strip().split("  ")[1:2] == missing[:1]:
+            missing.pop(0)
+
+
+@pytest.mark.parametrize(
+    ("controller", "pc", "mode"),
+    [
+        (["--cycle", "2"], ["--manner", "lab"], 4),
+        (["--cycle", "1", "--warm-start", "--stagger", "0"], ["--manner", "library"], 4),
+        (["--cycle", "2", "--mode", "5", "--stagger", "1"], ["--manner", "library"], 5),
+        (["--cycle", "1", "--mode", "7"], ["--manner", "lab"], 7),
+    ],
+    ids=["2 ms, cold", "1 ms, warm", "mode 5", "mode 7"],
+)
+def test_a_foreign_program_goes_through_a_whole_session(controller, pc, mode):
+    ours, theirs = session(
+        [*controller, "--intervals", "1", *SLOW_MACHINE],
+        [*pc, "--exit-after", "500", "--sine-period", "250", "--amplitude", "0.3"],
+    )
+    story = theirs["story"]
+    assert theirs["period_ms"] == int(controller[1])
+    if "--warm-start" in controller:
+        assert story[:2] == ["init", OFF]
+    else:
+        assert story[:4] == ["sync", "init", "sync after init", OFF]
+        assert (theirs["seen"]["sync"], theirs["seen"]["sync after init"]) == (9, 2)
+    stages = [OFF, DRIVING, CLOSED, opened(mode), CLOSED, OFF, ENDED]
+    assert [state for state in story if state in stages] == stages
+    assert theirs["seen"]["exit asked"] >= 1
+    assert theirs["moved"] == pytest.approx(0.3, abs=0.05)
+    assert (ours["phase"], ours["intervals"], ours["reason"]) == ("ended", 1, "")
+    assert ours["cycles"] == ours["replies"] + ours["missed"]
+    assert ours["rejected"] == 0
+
+
+def test_axes_open_one_after_the_other_as_asked():
+    _, theirs = session(
+        ["--cycle", "2", "--stagger", "4", "--intervals", "1", *SLOW_MACHINE],
+        ["--exit-after", "50"],
+    )
+    openings = [f"status 5, modes {[4] * k + [0] * (6 - k)}" for k in range(1, 7)]
+    assert [state for state in theirs["story"] if state in openings] == openings
+
+
+def test_505_switches_the_drive_off_and_targets_beside_it_are_ignored():
+    ours, theirs = session(
+        ["--cycle", "2", *SLOW_MACHINE],
+        ["--send-505", "40", "--exit-after", "0", "--wrong-targets"],
+        until=[opened(), OFF],
+    )
+    story = theirs["story"]
+    after = story[story.index(opened()) + 1 :]
+    assert after == [OFF, ENDED]  # and it stays off: nobody pressed the button
+    assert ours["reason"] == "the PC asked for drive off (505)"
+    assert theirs["travel"] < 1.0
+
+
+def test_508_closes_the_axes_and_targets_beside_it_are_ignored():
+    ours, theirs = session(
+        ["--cycle", "2", "--intervals", "1", *SLOW_MACHINE],
+        ["--send-508", "40", "--exit-after", "0", "--wrong-targets"],
+    )
+    story = theirs["story"]
+    assert story[story.index(opened()) + 1] == CLOSED
+    assert ours["reason"] == "the PC reported a following error (508)"
+    assert theirs["travel"] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "after"), [("hold", CLOSED), ("continue", CLOSED), ("drive-off", OFF)]
+)
+def test_missing_replies_end_open_mode(behaviour: str, after: str):
+    ours, theirs = session(
+        ["--cycle", "2", "--intervals", "1", "--missed", "30", "--while-silent", behaviour],
+        ["--miss", "60", "--miss-count", "30", "--exit-after", "0"],
+        until=[opened(), after],
+    )  # fmt: skip
+    story = theirs["story"]
+    later = [state for state in story[story.index(opened()) + 1 :] if "[4" not in state]
+    assert later[0] == after
+    assert theirs["seen"]["kept silent"] >= 20
+    assert ours["reason"] == "no valid reply in 30 cycles of open mode"
+    assert ours["missed"] >= 30
+
+
+def test_the_controller_waits_for_a_program_that_starts_later():
+    port = free_port()
+    with hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{port}", "--cycle", "2",
+                 "--intervals", "1", *SLOW_MACHINE) as cabinet:  # fmt: skip
+        for line in cabinet.stdout:
+            if "starting" in line:
+                break
+        with running(*FOREIGN, "--port", port, "--exit-after", "50") as program:
+            heard, _ = program.communicate(timeout=30)
+        said = cabinet.finish(timeout=30)
+    assert last_json(heard)["seen"]["sync"] == 9
+    assert cabinet.status == 0
+    assert "the session has ended (504)" in said
+
+
+def test_a_signal_ends_the_session_properly_and_buttons_are_signals():
+    port = free_port()
+    with (
+        running(*FOREIGN, "--port", port, "--send-505", "20", "--exit-after", "0") as program,
+        hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{port}", "--cycle", "2",
+                *SLOW_MACHINE) as cabinet,
+    ):  # fmt: skip
+        assert program.stdout is not None
+        wait_for([opened(), OFF], program.stdout)
+        cabinet.signal(signal.SIGUSR1)
+        wait_for([DRIVING], program.stdout)
+        cabinet.signal(signal.SIGUSR2)
+        wait_for([OFF], program.stdout)
+        cabinet.signal(signal.SIGTERM)
+        said = cabinet.finish(timeout=20)
+        assert program.wait(timeout=10) == 0
+    assert cabinet.status == 0
+    assert "emergency stop" in said
+
+
+def test_a_program_that_never_comes_is_told_by_the_exit_status():
+    with hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{free_port()}", "--json",
+             "--duration", "0.5") as cabinet:  # fmt: skip
+        said = last_json(cabinet.finish(timeout=10))
+    assert cabinet.status == 4
+    assert (said["cycles"], said["ended"]) == (0, False)
+
+
+def test_an_interrupt_while_nobody_answers_is_an_interrupt():
+    with hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{free_port()}") as cabinet:
+        for line in cabinet.stdout:
+            if "starting" in line:
+                break
+        cabinet.signal(signal.SIGINT)
+        said = cabinet.finish(timeout=10)
+    assert cabinet.status == 130
+    assert "no PC program answered" in said
+
+
+def test_scripted_faults_strike_over_real_sockets():
+    ours, theirs = session(
+        ["--cycle", "2", *SLOW_MACHINE,
+         "--fault", "lose@60x5", "--fault", "lose@70x4:to_controller", "--fault", "duplicate@80",
+         "--fault", "delay@90:5ms:to_controller", "--fault", "e-stop@400"],
+        ["--exit-after", "0"],
+        until=[opened(), OFF],
+    )  # fmt: skip
+    assert ours["missed"] >= 10
+    assert ours["late"] >= 1
+    assert ours["surplus"] >= 1
+    assert ours["reason"] == "emergency stop"
+    assert [state for state in theirs["story"] if state in (OFF, ENDED)][-2:] == [OFF, ENDED]
+
+
+def test_in_own_motion_the_arm_moves_while_its_axes_are_closed():
+    ours, theirs = session(
+        ["--cycle", "2", "--own-motion", "--own-speed", "1"], [], until=["more than one revolution"]
+    )
+    assert set(theirs["story"]) <= {"sync", "init", "sync after init", OFF, DRIVING, CLOSED, ENDED}
+    assert theirs["travel"] > 1.0
+    assert (ours["intervals"], ours["reason"]) == (0, "")
+
+
+def test_own_postures_are_within_limits_and_clear_on_the_way():
+    cell = Cell.load(CELL_PATH)
+    postures = np.array(own_postures(cell))
+    limits, checker = cell.joint_limits, MotionChecks.of(cell).checker
+    assert len(postures) == 13
+    assert (postures >= limits.lower).all() and (postures <= limits.upper).all()
+    assert np.ptp(postures, axis=0) == pytest.approx(np.ptp(postures, axis=0).clip(0.5))
+    way = np.concatenate([cell.initial[np.newaxis], postures])
+    share = np.linspace(0.0, 1.0, 60)[:, np.newaxis]
+    for start, end in pairwise(way):
+        assert checker.clear(start + share * (end - start)).all()
+    assert postures[-1] == pytest.approx(cell.home)
+
+
+def test_a_cell_of_real_hardware_is_simulated_only_where_asked_for():
+    cell = Cell.load(CELL_PATH)
+    text = replaced_value(cell.text, "controller", "transport", '"udp"')
+    real = Cell.from_texts(text, cell.urdf, cell.path)
+    with pytest.raises(CellError, match="real hardware"):
+        simulated_link(real)
+    assert simulated_link(real, instead_of_hardware=True).session is not None
+    assert simulated_controller(real).period == 0.001
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ([], "give --udp or --can"),
+        (["--udp", "127.0.0.1:2001", "--can", "virtual:0"], "not both"),
+        (["--udp", "127.0.0.1"], "HOST:PORT"),
+        (["--udp", "127.0.0.1:70000"], "HOST:PORT"),
+        (["--udp", "no.such.host.invalid:1"], "no such IPv4 host"),
+        (["--can", "socketcan"], "INTERFACE:CHANNEL"),
+        (["--udp", "127.0.0.1:2001", "--mode", "3"], "open_mode"),
+        (["--udp", "127.0.0.1:2001", "--fault", "lose"], "lose@1200x3"),
+        (["--udp", "127.0.0.1:2001", "--fault", "explode@3"], "explode"),
+        (["--udp", "127.0.0.1:2001", "--fault", "saturate@3:axis=9"], "axes 1..6"),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_anything_is_sent(options, complaint):
+    app = typer.Typer()
+    app.command()(simulate)
+    result = CliRunner().invoke(app, [str(CELL_PATH), *options])
+    assert isinstance(result.exception, InputError)
+    assert complaint in str(result.exception)
+    assert result.exception.exit_code == 2
+
+
+def test_a_bus_is_named_as_python_can_names_it():
+    for text in ("virtual:simulate", "virtual:simulate:fd", "virtual:simulate:classic"):
+        far_end = open_far_end(None, text)
+        assert far_end.receive(0.001) is None
+        far_end.close()
+    with pytest.raises(InputError, match="no-such-bus"):
+        open_far_end(None, "no-such-bus:0")
+
+
+def test_bad_input_is_one_sentence_and_exit_status_2():
+    done = subprocess.run(
+        [sys.executable, "-m", "hil", "simulate", str(CELL_PATH), "--udp", "127.0.0.1"],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "HOST:PORT" in done.stderr
+
+
+def test_the_first_signal_asks_for_the_end_and_the_second_gives_up():
+    buttons = Buttons()
+    assert buttons.wish() is Wish.GO_ON
+    buttons.press(signal.SIGINT)
+    assert buttons.wish() is Wish.END
+    buttons.press(signal.SIGTERM)
+    assert buttons.wish() is Wish.GIVE_UP
+
+
+def test_a_duration_that_is_over_asks_for_the_end_but_is_no_interrupt():
+    buttons = Buttons(duration=0.0)
+    assert buttons.wish() is Wish.END
+    assert not buttons.interrupted
+
+
+def test_every_phase_of_the_controller_has_words():
+    assert set(WORDS) == set(Phase)
+
+
+def test_a_reader_that_has_stopped_reading_costs_lines_not_cycles():
+    reader, writer = os.pipe()
+    status = Status("nowhere", controller_settings(Cell.load(CELL_PATH)), quiet=False,
+                    descriptor=writer)  # fmt: skip
+    try:
+        for _ in range(3000):
+            status.say("x" * 100)  # more than the pipe holds: a plain write would block here
+    finally:
+        os.close(reader)
+    status.say("nobody is there any more")
+    os.close(writer)
+
+
+def test_a_datagram_from_elsewhere_is_no_answer():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        far_end = open_far_end(f"127.0.0.1:{free_port()}", None)
+        stranger.sendto(b"hello", ("127.0.0.1", far_end.source_port))
+        assert far_end.receive(0.2) is None
+        assert (far_end.foreign, far_end.last_foreign) == (
+            1, f"127.0.0.1:{stranger.getsockname()[1]}",
+        )  # fmt: skip
+        far_end.close()
+
+
+def test_a_pc_that_does_not_listen_is_no_error():
+    far_end = open_far_end(f"127.0.0.1:{free_port()}", None)
+    for _ in range(5):
+        far_end.send(b"anybody there?")
+        assert far_end.receive(0.002) is None
+    far_end.close()
+
+
+def test_a_network_that_is_gone_is_noted_and_loses_packets():
+    far_end = open_far_end("255.255.255.255:9", None)  # broadcast is not permitted
+    far_end.send(b"x")
+    assert (far_end.unsent, far_end.trouble) == (1, "Permission denied")
+    far_end.close()
