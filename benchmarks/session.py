@@ -117,16 +117,12 @@ CLOSED = 3
 _NUMBER = struct.Struct("<i")
 
 
-def record() -> list[bytes]:
-    """Init and cyclic packets of a controller whose arm is where it was told to be.
-
-    The last `LOOP` of them may be repeated for ever.
-    """
-    session = new_session(64)
+def init_packet(period_ms: int) -> bytes:
+    """What the controller of these drives announces."""
     drives = drive_train()
-    init = InitPacket.build(
+    return InitPacket.build(
         N,
-        PERIOD_MS,
+        period_ms,
         {
             "following_error": np.full(N, 2.0),
             "current_limit": np.full(N, 20.0),
@@ -135,11 +131,20 @@ def record() -> list[bytes]:
             "kinematic_influence": [0.0, 0.0, 0.0, drives.k54, drives.k64, drives.k65],
         },
     ).encode()
+
+
+def record() -> list[bytes]:
+    """Init and cyclic packets of a controller whose arm is where it was told to be.
+
+    The last `LOOP` of them may be repeated for ever.
+    """
+    session = new_session(64)
+    init = init_packet(PERIOD_MS)
     packets = [init]
     session.reply(init, 0.0)
     session.request(Sinusoid(START))
     axes = CyclicPacket.zeros(1, N).axes
-    axes["d"][:, 0] = axes["d"][:, 2] = drives.motor_revolutions(START)
+    axes["d"][:, 0] = axes["d"][:, 2] = drive_train().motor_revolutions(START)
     axes["d"][:, 4] = 1.0
     number = 10
     for cycle in range(CLOSED + 2 + FADE + LOOP):

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.session import AMPLITUDE, FREQUENCY, N, drive_train
-from drivers import CyclicPacket, InitPacket, Mode
+from benchmarks.session import AMPLITUDE, FREQUENCY, N, drive_train, init_packet
+from drivers import CyclicPacket, Mode
 from drivers.exchange.realtime import RealTimeSettings, enter
 from drivers.exchange.shared_ring import RingReader
 from drivers.motion_source import BoundsName
@@ -152,20 +152,9 @@ class Controller:
 
     def start(self) -> None:
         """Restart with the init packet."""
-        drives = drive_train()
-        init = InitPacket.build(
-            N,
-            PERIOD_MS,
-            {
-                "following_error": np.full(N, 2.0),
-                "current_limit": np.full(N, 20.0),
-                "gear_ratio": drives.gear_ratio,
-                "calibration": drives.calibration,
-                "kinematic_influence": [0.0, 0.0, 0.0, drives.k54, drives.k64, drives.k65],
-            },
-        )
+        init = init_packet(PERIOD_MS)
         for _ in range(100):
-            self.ours.socket.send(init.encode())
+            self.ours.socket.send(init)
             time.sleep(0.01)
             try:
                 self.ours.socket.recv(2048)

@@ -7,4 +7,6 @@ import pytest
 
 # Helpers shared by these tests are modules beside them.
 sys.path.insert(0, str(Path(__file__).parent))
-pytest.register_assert_rewrite("transport_contract", "rig")
+pytest.register_assert_rewrite(
+    "transport_contract", "can_contract", "rig", "judge", "oracle", "session_machine", "arms_bench"
+)
