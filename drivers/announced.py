@@ -14,6 +14,10 @@ from drivers.packets import InitPacket
 
 _RELATIVE: Final = 1e-6
 """The wire rounds to float32, by 6e-8 at most; a cell file has six digits or more."""
+_FACTOR: Final = 2.0
+"""Gear ratios further apart are not of the same kind of arm."""
+_COUPLING: Final = 1.0
+"""Magnitude of a wrist coupling beyond which it is none."""
 _FLOOR: Final = float(np.spacing(np.float32(1.0)))
 """Motor revolutions: what float32 resolves within one, far below an encoder's increment."""
 
@@ -36,23 +40,41 @@ class Announced:
 
 
 def compare(
-    drive_train: DriveTrain, period: float, init: InitPacket, arm: int, accept: bool
+    drive_train: DriveTrain,
+    period: float,
+    init: InitPacket,
+    arm: int,
+    accept: bool,
+    other_axes: frozenset[tuple[int, int]] = frozenset(),
 ) -> Announced:
     """Hold an init packet against what the cell says of the arm.
 
     Motor positions made with a wrong ratio, calibration or coupling send the arm elsewhere, so
     any difference refuses the session, unless the controller's values are accepted on purpose.
-    What it leaves undefined (NaN, or 0 for a ratio), another cycle and an axis that is not open
-    cannot be accepted.
+    So does an axis that is open, of whichever arm, and no joint of the cell: it would be held at
+    targets that nobody watches. What the controller leaves undefined (NaN, or 0 for a ratio) or
+    what is far off, another cycle and a joint that is not open cannot be accepted.
+
+    Args:
+        drive_train: the cell's.
+        period: s, the cell's cycle.
+        init: the controller's init packet.
+        arm: the arm that is moved, from 1.
+        accept: take the controller's word where it may be taken.
+        other_axes: (arm, axis), both from 1, that may be open as well.
     """
     fixed = _timing(period, init) + _axis_map(drive_train.n_joints, init, arm)
+    unknown = _unknown_axes(drive_train.n_joints, init, arm, other_axes)
     values = _values(drive_train, init, arm)
-    differences = (*fixed, *values)
+    differences = (*fixed, *unknown, *values)
     refused = Announced(drive_train, differences, "; ".join(differences) or None, False)
-    if not values or not accept:
+    if not (unknown or values) or not accept:
         return refused
+    theirs = drive_train
     try:
-        theirs = _adopted(drive_train, init, arm)
+        if values:
+            theirs = _adopted(drive_train, init, arm)
+            fixed += _too_far_off(drive_train, theirs)
     except DriveTrainError as error:
         fixed = (*fixed, f"the controller's values cannot be accepted: {error}")
     if fixed:
@@ -77,6 +99,33 @@ def _axis_map(n_joints: int, init: InitPacket, arm: int) -> tuple[str, ...]:
         for axis in range(n_joints)
         if axis not in is_open
     )
+
+
+def _unknown_axes(
+    n_joints: int, init: InitPacket, arm: int, other_axes: frozenset[tuple[int, int]]
+) -> tuple[str, ...]:
+    try:
+        is_open = [(axis.arm, axis.axis + 1) for axis in init.open_axes()]
+    except PacketError:
+        return ()
+    known = other_axes | {(arm, joint + 1) for joint in range(n_joints)}
+    return tuple(
+        f"axis {axis} of arm {of} is open in the controller; the cell does not know it"
+        for of, axis in sorted(is_open)
+        if (of, axis) not in known
+    )
+
+
+def _too_far_off(ours: DriveTrain, theirs: DriveTrain) -> tuple[str, ...]:
+    """What nobody means to accept: the guard's bounds are on the joint side of these values."""
+    share = theirs.gear_ratio / ours.gear_ratio
+    names = [
+        f"gear ratio of axis {axis + 1}"
+        for axis in np.flatnonzero(~((share >= 1.0 / _FACTOR) & (share <= _FACTOR)))
+    ]
+    couplings = (("k54", theirs.k54), ("k64", theirs.k64), ("k65", theirs.k65))
+    names += [name for name, value in couplings if not abs(value) <= _COUPLING]
+    return tuple(f"{name} is too far off to be accepted; correct the cell file" for name in names)
 
 
 def _values(drive_train: DriveTrain, init: InitPacket, arm: int) -> tuple[str, ...]:

@@ -1,8 +1,34 @@
-"""The answer to each cyclic packet of one session, once the state it leads to is known."""
+"""The answer to each cyclic packet of one session, once the state it leads to is known.
+
+In open mode the first set-point is the target received in the packet in which the last wanted axis
+opened, at zero velocity, held against actual position and standstill. D2 is the step of the motor
+from one sent set-point to the next, formed in float64; which of D1..D5 an open mode has is the
+table `drivers.packets.MODE_FIELDS`. A motion requested while the axes are open already begins
+under the same conditions, from the set-point held. While axes are open, moving or not, following
+error and current are watched, and that the controller takes the set-points: the target received
+(D1) is within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent. An
+older one than the last is an answer lost, which is counted and told.
+
+Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave
+open mode, move the arm and come back; one set-point further at full speed would then be a jump.
+Hence, after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the
+set-point sent last, and its velocity (D2) within half the velocity sent last or what counts as
+standstill; an arm that itself stands (D4) is held against the latter too. Corrections of targets
+that the controller generates (modes 2, 7, 8, 9) are refused after such a gap unless they were
+zero. A link may say how old each value is: one that is needed for such a decision, for the first
+set-point, or to be given back to an open axis, and was not sent in this very packet counts as
+unknown and refuses.
+
+After the motion the end is held for `settle_cycles`; the next answer asks for the end of open mode
+(status byte 1), and asks again every `EXIT_RETRY_CYCLES` in case that answer was lost; after
+`EXIT_TIMEOUT` that is a fault. The end is asked for as well where a motion waits that long for the
+last axis to open. Without a requested motion the first set-point is held.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -12,14 +38,21 @@ from drivers.announced import compare
 from drivers.arm_wire import Ages, ArmWire
 from drivers.correction_mode import CorrectionMode
 from drivers.drive_train import DriveTrain
-from drivers.errors import ExitNotGranted, FollowingError, PacketError, RefusalError
+from drivers.errors import (
+    ExitNotGranted,
+    FollowingError,
+    GuardError,
+    PacketError,
+    RefusalError,
+    TargetNotFinite,
+)
 from drivers.guard import Guard
 from drivers.machine import Machine
 from drivers.open_mode import OpenMode, PositionMode
 from drivers.packets import EXIT_FROM_OPEN, InitPacket
 from drivers.reading import Reader, Reading
 from drivers.record import CycleRing
-from drivers.replies import ReplyFrame, Words
+from drivers.replies import D1, ReplyFrame, Words
 from drivers.states import CORRECTION_MODES, HAS_SET_POINTS, Input, State
 
 Array = NDArray[np.float64]
@@ -50,6 +83,8 @@ class Answers:
         arm: its number, from 1.
         mode: the open mode wanted.
         accept: adopt the controller's gear ratios, calibration and coupling where they differ.
+        other_axes: (arm, axis), from 1, that may be open although they are no joints.
+        max_gap: of the set-points sent last the target received may be any of one more.
     """
 
     def __init__(
@@ -59,17 +94,21 @@ class Answers:
         guard: Guard,
         arm: int,
         mode: int,
-        accept: bool = False,
+        accept: bool,
+        other_axes: frozenset[tuple[int, int]],
+        max_gap: int,
     ) -> None:
         self.init = init
-        self.announced = compare(drive_train, guard.period, init, arm, accept)
+        self.announced = compare(drive_train, guard.period, init, arm, accept, other_axes)
         self.unusable = self.announced.unusable
         self.wire: ArmWire | None = None
         self._arm = arm
         self._frame = ReplyFrame(init.n_axes)
         self._open_mode: OpenMode | None = None
         self._asked_at = -1
+        self._told = False
         self._exit_cycles = round(EXIT_TIMEOUT / guard.period)
+        self._axis_of = _axes_by_slot(init)
         if self.unusable is not None:
             self.reader = _reader_without_joints(init, arm, mode)
             return
@@ -77,7 +116,7 @@ class Answers:
         arms = tuple(axis.arm for axis in init.open_axes())
         self.reader = Reader(self.wire.joint_slots, arms, arm, mode)
         kind = CorrectionMode if mode in CORRECTION_MODES else PositionMode
-        self._open_mode = kind(guard, self.wire, self._frame, mode)
+        self._open_mode = kind(guard, self.wire, self._frame, mode, max_gap)
         axes = slice(0, drive_train.n_joints)
         guard.narrow(
             init.following_error[arm - 1, axes].astype(np.float64),
@@ -108,13 +147,16 @@ class Answers:
         self._frame.safe(reading.answer, words)
         status = reading.answer.status
         if state not in HAS_SET_POINTS:
-            return status
+            asked = self._unholdable(machine, reading, words)
+            return status if asked is None else asked
         if self._open_mode is None:
             raise RefusalError(f"this arm cannot be moved: {self.unusable}", machine.cycle)
+        self._require_targets(reading.others, machine.cycle)
         if state is State.EXITING:
             # Left before the last axis opened, no axis has had a set-point but its own target.
             answer = self._open_mode.leaving if machine.in_interval else self._open_mode.opening
             answer(reading, measured, commanded, machine.cycle)
+            machine.note_answers(self._open_mode.lost)
             return self._asking_for_exit(status) if self._exit_due(machine) else status
         if state is State.OPENING:
             self._open_mode.opening(reading, measured, commanded, machine.cycle)
@@ -126,6 +168,37 @@ class Answers:
         machine.take(Input.EXIT)
         self._asked_at = machine.cycle
         return self._asking_for_exit(status)
+
+    def _unholdable(self, machine: Machine, reading: Reading, words: Words) -> bytes | None:
+        """Axes that are open where nothing is moved are answered their target, if that can be.
+
+        Returns:
+            Status bytes once drive-off was asked for and still has to be, else None.
+
+        Raises:
+            GuardError: they cannot be held there; told once, not in each cycle.
+        """
+        try:
+            self._require_targets(reading.answer.held, machine.cycle)
+            if machine.state is State.FREEZING and self._open_mode is not None:
+                self._open_mode.require_holdable(reading.held, reading.held, machine.cycle)
+        except GuardError as error:
+            if not self._told:
+                self._told = True
+                raise
+            return self.refusal(_offending(error), reading, words)
+        self._told = False
+        return None
+
+    def _require_targets(self, slots: Sequence[int], cycle: int) -> None:
+        """What is given back in an open mode has to be a number, whosever axis it is."""
+        if not slots:
+            return
+        values = self._frame.floats[list(slots), D1]
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            arm, axis = self._axis_of.get(slots[bad[0]], (self._arm, slots[bad[0]]))
+            raise TargetNotFinite(arm, axis, float(values[bad[0]]), cycle)
 
     def _given_up(self, machine: Machine) -> bool:
         """Whether nobody waits any longer for the last axis to open."""
@@ -164,6 +237,7 @@ class Answers:
             elif execution is not None and not moving:
                 open_mode.require_start(cycle)
             open_mode.next(execution if moving else None, measured, commanded, cycle)
+            machine.note_answers(open_mode.lost)
         if execution is None:
             return machine.stop_reason is not None
         if not moving:
@@ -194,16 +268,17 @@ class Answers:
         ring.age[row] = 0 if ages is None else ages[self.wire.joint_slots].max(axis=0)
         self.wire.read(words.view(np.float32), ring.measured[row], ages)
 
-    def require_carried_on(self, machine: Machine) -> None:
-        """After a long gap: a motion under way goes on only where the controller carried it on.
+    def require_carried_on(self, machine: Machine, reading: Reading) -> None:
+        """After a long gap open mode goes on only where the controller carried it on.
+
+        Moving, at rest or on the way out: meanwhile it may have left, moved the arm, come back.
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: it did not.
         """
-        execution = machine.execution
-        under_way = machine.state is State.OPEN and not machine.entering
-        if self._open_mode is not None and under_way and execution is not None:
-            self._open_mode.require_carried_on(machine.cycle)
+        in_open = machine.state in (State.OPEN, State.EXITING) and machine.in_interval
+        if self._open_mode is not None and in_open and not machine.entering:
+            self._open_mode.require_carried_on(reading, machine.cycle)
 
     def refusal(self, offending: int | None, reading: Reading, words: Words) -> bytes:
         """Fill the frame with 508 for the offending joint, or with 505 for all."""
@@ -219,7 +294,7 @@ class Answers:
     ) -> bytes:
         """Go to the faulted state and fill the frame accordingly; returns the status bytes."""
         machine.take(Input.REFUSAL)
-        machine.offending = error.joint if isinstance(error, FollowingError) else None
+        machine.offending = _offending(error)
         return self.refusal(machine.offending, reading, words)
 
     def finish(self, number: int, status: bytes) -> bytes:
@@ -230,6 +305,18 @@ class Answers:
         asking = bytearray(status)
         asking[self._arm - 1] = EXIT_FROM_OPEN
         return bytes(asking)
+
+
+def _axes_by_slot(init: InitPacket) -> dict[int, tuple[int, int]]:
+    """Arm, from 1, and axis, from 0, of each slot; empty where the map is impossible."""
+    try:
+        return {axis.slot: (axis.arm, axis.axis) for axis in init.open_axes()}
+    except PacketError:
+        return {}
+
+
+def _offending(error: RefusalError) -> int | None:
+    return error.joint if isinstance(error, FollowingError) else None
 
 
 def _reader_without_joints(init: InitPacket, arm: int, mode: int) -> Reader:

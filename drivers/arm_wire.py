@@ -80,6 +80,11 @@ class ArmWire:
         difference: Array = np.dot(dq, self._to_motor)
         return difference
 
+    def joint_rounding(self, motor: Array) -> Array:
+        """What float32 may make, in rad, of a step between two targets (n,) like these."""
+        rounding: Array = np.spacing(np.abs(motor).astype(np.float32)) @ np.abs(self._to_joint)
+        return rounding
+
     def put(self, frame: Floats, column: int, values: Array) -> None:
         """Put values (n,) into one column of a frame."""
         frame[self._pick, column] = values

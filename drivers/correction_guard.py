@@ -2,8 +2,9 @@
 
 A velocity fed forward and an offset from the controller's target are held to the same three sets
 of bounds as set-points, by their differences from one answer to the next: the differences of a
-velocity are mean accelerations and jerks, those of an offset one order further up. A current has
-only a limit. Nothing is clamped.
+velocity are mean accelerations and jerks, those of an offset one order further up. An offset is
+held to those of a velocity as well, as if the controller added it up cycle by cycle; so is the
+target together with it. A current has a limit and, per cycle, a largest step. Nothing is clamped.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from drivers.checks import report, require, require_finite
 from drivers.errors import (
     AccelerationLimit,
     CommandedCurrentLimit,
+    CommandedCurrentStep,
     CorrectionNotCarriedOn,
     CorrectionNotEnded,
     GuardError,
@@ -52,16 +54,19 @@ class CorrectionGuard:
         second = np.array([0.0, 1.0, -2.0, 1.0])
         third = np.array([-1.0, 3.0, -3.0, 1.0])
         itself = np.array([0.0, 0.0, 0.0, 1.0])
+        as_velocity = np.array([itself, first / T, second / T**2])
+        as_position = np.array([first / T, second / T**2, third / T**3])
         self._differences = (
-            np.array([itself, first / T, second / T**2])
-            if kind == "velocity"
-            else np.array([first / T, second / T**2, third / T**3])
+            as_velocity if kind == "velocity" else np.vstack([as_position, as_velocity / T])
         )
+        self._checks = _CHECKS * (len(self._differences) // 3)
         self._sets = {rank: self._bounds(rank) for rank in RANK.values()}
         self._in_force = BoundsInForce()
         self._history = np.zeros((4, n))
-        self._quantities = np.zeros((3, n))
+        self._quantities = np.zeros((len(self._differences), n))
         self._current = np.zeros(n)
+        self._target = self._offset = self._sent_in = np.zeros(n)
+        self._rise = T / limits.current_rise
         # What rounding leaves of a zero: a millionth of a limit, for an offset of one step.
         step = T if kind == "offset" else 1.0
         self._nothing = RELATIVE_TOLERANCE * limits.velocity * step
@@ -70,7 +75,8 @@ class CorrectionGuard:
         limits = self._guard.limits
         factor_a, factor_j = limits.factors(rank)
         bounds = np.array([limits.velocity, factor_a * limits.acceleration, factor_j * limits.jerk])
-        return bounds * (1.0 + RELATIVE_TOLERANCE)
+        allowed = np.tile(bounds, (len(self._differences) // 3, 1))
+        return allowed * (1.0 + RELATIVE_TOLERANCE)
 
     def begin(self) -> None:
         """Zero was sent."""
@@ -92,7 +98,34 @@ class CorrectionGuard:
         allowed = self._sets[self._in_force.take(bounds)]
         magnitude = np.abs(found)
         if not (magnitude <= allowed).all():
-            report(magnitude, found, allowed, _CHECKS, cycle)
+            report(magnitude, found, allowed, self._checks, cycle)
+
+    def note_target(self, target: Array, offset: Array, sent_in: Array) -> None:
+        """The controller's target (n,) rad, the offset from it, the cycle each joint's is of."""
+        self._target, self._offset, self._sent_in = target, offset, sent_in
+
+    def check_target(
+        self, target: Array, offset: Array, sent_in: Array, rounding: Array, cycle: int
+    ) -> None:
+        """How fast target and offset move the arm; if they pass, they are noted.
+
+        Args:
+            target: (n,) rad, received.
+            offset: (n,) rad, to be sent.
+            sent_in: (n,) cycle in which each target was sent.
+            rounding: (n,) rad, of a step of the target.
+            cycle: for the error.
+
+        Raises:
+            NotFinite, VelocityLimit: too fast, the offset being a position or a step.
+        """
+        T = self._guard.period
+        elapsed = T * np.maximum(sent_in - self._sent_in, 1.0)
+        speed = (target - self._target) / elapsed
+        bound = self._guard.limits.velocity * (1.0 + RELATIVE_TOLERANCE) + rounding / elapsed
+        for step in (offset - self._offset, offset):
+            require(self._every, np.abs(speed + step / T), bound, VelocityLimit, cycle)
+        self.note_target(target, offset, sent_in)
 
     def check_current(self, current: Array, servo: Array | None, cycle: int) -> None:
         """The next current (n,) A; if it passes, it counts as sent.
@@ -103,11 +136,13 @@ class CorrectionGuard:
             cycle: for the error.
 
         Raises:
-            NotFinite, CommandedCurrentLimit: it must not be sent.
+            NotFinite, CommandedCurrentLimit, CommandedCurrentStep: it must not be sent.
         """
         total = current if servo is None else current + servo
         bound = self._guard.current * (1.0 + RELATIVE_TOLERANCE)
         require(self._every, np.abs(total), bound, CommandedCurrentLimit, cycle)
+        step, largest = np.abs(current - self._current), bound * self._rise
+        require(self._every, step, largest, CommandedCurrentStep, cycle)
         self._current[...] = current
 
     def check_position(self, q: Array, cycle: int) -> None:

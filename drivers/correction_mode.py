@@ -35,12 +35,21 @@ class CorrectionMode(OpenMode):
     ====  ==============================  ===================================================
 
     How the controller uses an offset in mode 7 (for one cycle, or summed up) is documented
-    nowhere; the reading above is a guess of ours, to be tried with small offsets first.
+    nowhere. Hence it keeps the bounds under both readings: as a position beside the target, and
+    as a step made anew in every cycle, which allows no more than the way of one cycle at full
+    speed. So does the target with it, of which it is known how fast the controller moves it.
 
     Following error is |D1 - D3| as received: there is no target of ours to compare with.
     """
 
-    def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int) -> None:
+    def __init__(
+        self,
+        guard: Guard,
+        wire: ArmWire,
+        frame: ReplyFrame,
+        mode: int,
+        max_gap: int,  # noqa: ARG002  no target is ours
+    ) -> None:
         super().__init__(guard, wire, frame)
         self._mode = mode
         self._offset = mode == Mode.DELTA_POSITION
@@ -56,6 +65,7 @@ class CorrectionMode(OpenMode):
         self.held = measured[0].copy()
         self._corrections.check_position(self.held, cycle)
         self._corrections.begin()
+        self._corrections.note_target(self.held, self._still, self._sent_in(cycle))
         self._note(self._still, measured, commanded)
 
     def next(
@@ -66,6 +76,7 @@ class CorrectionMode(OpenMode):
         self.held = measured[0].copy()
         if execution is None:
             self._corrections.check_position(self.held, cycle)
+            self._corrections.note_target(self.held, self._still, self._sent_in(cycle))
             self._note(self._still, measured, commanded)
             return
         assert isinstance(execution, CorrectionExecution)
@@ -74,6 +85,9 @@ class CorrectionMode(OpenMode):
         guard = self._corrections
         guard.check_motion(motion, execution.granted, cycle)
         guard.check_position(self.held + motion if self._offset else self.held, cycle)
+        if self._offset:
+            rounding = self._wire.joint_rounding(self._wire.raw[TARGET])
+            guard.check_target(self.held, motion, self._sent_in(cycle), rounding, cycle)
         servo = self._wire.raw[CURRENT] if self._added_to_servo else None
         guard.check_current(current, servo, cycle)
         if execution.finished:
@@ -81,7 +95,11 @@ class CorrectionMode(OpenMode):
         self._write(motion, current)
         self._note(motion, measured, commanded)
 
-    def require_carried_on(self, cycle: int) -> None:
+    def require_carried_on(
+        self,
+        reading: Reading,  # noqa: ARG002  zero is zero in every axis
+        cycle: int,
+    ) -> None:
         """A correction that was not zero may have been kept or dropped: nothing tells."""
         self._corrections.check_after_gap(cycle)
 
@@ -94,6 +112,11 @@ class CorrectionMode(OpenMode):
     ) -> None:
         """Zeros, as the safe answer says."""
         self._check_arm(cycle, where=reading.ready)
+
+    def _sent_in(self, cycle: int) -> Array:
+        """The cycle in which each target received was sent."""
+        age = self._wire.age
+        return self._still + cycle if age is None else cycle - age[TARGET].astype(np.float64)
 
     def _check_arm(self, cycle: int, where: NDArray[np.bool_] | None = None) -> None:
         raw = self._wire.raw

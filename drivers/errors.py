@@ -13,18 +13,21 @@
         ├── SourceFailed     the motion source raised, or gave arrays of the wrong shape
         ├── AxisLeft         an axis is not in the open mode that the motion needs
         ├── ExitNotGranted   the controller does not leave open mode although asked to
+        ├── SessionFailed    something here raised that must not: a defect, with its cause
         └── GuardError       a number outside its bound: joint, value, bound, unit, cycle
             ├── NotFinite
+            │   └── TargetNotFinite    of an axis that is open but no joint of the cell
             ├── PositionLimit, VelocityLimit, AccelerationLimit, JerkLimit
             ├── VelocityMismatch   velocity is not the derivative of the positions
             ├── FollowingError
             ├── CurrentLimit
             │   └── CommandedCurrentLimit
+            │       └── CommandedCurrentStep  changes too much from one answer to the next
             ├── CorrectionNotEnded a correction, or feed-forward, is over but not back at zero
             ├── FirstSetPoint      away from the arm
             │   ├── NotAtStandstill
             │   └── FirstSetPointUnknown  what it is judged by is not of this cycle
-            └── MotionNotCarriedOn the target is elsewhere after a long gap
+            └── MotionNotCarriedOn the target received is none of the set-points sent last
                 ├── MotionHeld     or has been brought to rest
                 │   └── MotionUnknown     or what it is judged by is not of this cycle
                 └── CorrectionNotCarriedOn  or nothing tells whether a correction was kept
@@ -139,6 +142,31 @@ class AxisLeft(RefusalError):
         self.wanted = wanted
 
 
+class SessionFailed(RefusalError):
+    """Something in the session raised that must not: a defect. The cause is chained."""
+
+    def __init__(self, cause: BaseException, cycle: int) -> None:
+        super().__init__(f"the session failed: {in_words(cause)}", cycle)
+
+
+def as_refusal(error: BaseException, cycle: int) -> RefusalError:
+    """The error itself where it is a refusal, else one that says what happened."""
+    if isinstance(error, RefusalError):
+        return error
+    failed = SessionFailed(error, cycle)
+    failed.__cause__ = error
+    return failed
+
+
+def in_words(error: BaseException) -> str:
+    """Kind and message of any error, even one that cannot say what it is."""
+    kind = type(error).__name__
+    try:
+        return f"{kind}: {error}"
+    except BaseException:
+        return f"{kind}, whose message could not be made"
+
+
 class ExitNotGranted(RefusalError):
     """The controller keeps axes in open mode although their end of open mode was asked for.
 
@@ -187,6 +215,20 @@ class NotFinite(GuardError):
     """NaN or infinity where a number must be."""
 
     check = "finiteness"
+
+
+class TargetNotFinite(NotFinite):
+    """An axis that is open, but no joint of the cell, would be answered a target that is no number.
+
+    Attributes:
+        arm: from 1.
+    """
+
+    def __init__(self, arm: int, joint: int, value: float, cycle: int) -> None:
+        super().__init__(joint, value, float("inf"), cycle)
+        message = f"target received of axis {joint + 1} of arm {arm}, which is open, is {value}"
+        self.args = (f"{message} (cycle {cycle})",)
+        self.arm = arm
 
 
 class PositionLimit(GuardError):
@@ -244,6 +286,12 @@ class CommandedCurrentLimit(CurrentLimit):
     check = "commanded current"
 
 
+class CommandedCurrentStep(CommandedCurrentLimit):
+    """A current fed forward, or added to the servo's own, changes too much in one cycle."""
+
+    check = "change of commanded current in one cycle"
+
+
 class CorrectionNotEnded(GuardError):
     """A source says that it is finished while a correction of its, or feed-forward, is not zero."""
 
@@ -272,9 +320,9 @@ class FirstSetPointUnknown(FirstSetPoint):
 
 
 class MotionNotCarriedOn(GuardError):
-    """After a long gap the controller's target is not the set-point sent last."""
+    """The controller's target is none of the set-points sent last: it does not take them."""
 
-    check = "distance, after a gap, between received target and the set-point sent last"
+    check = "distance between received target and the set-points sent last"
     unit = "motor revolutions"
 
 

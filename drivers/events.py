@@ -22,7 +22,8 @@ Outcome = Literal["completed", "stopped", "refused", "lost"]
 class Counters:
     """How many packets had which fate since the session was made.
 
-    `missed` never arrived; `discarded` were dropped by the link, by kind ("foreign", "torn", ...).
+    `missed` never arrived; `discarded` were dropped by the link, by kind ("foreign", "torn", ...);
+    `unanswered` are answers of ours that the controller did not take, see `AnswersLost`.
     """
 
     answered: int = 0
@@ -32,6 +33,7 @@ class Counters:
     ended: int = 0
     missed: int = 0
     refused: int = 0
+    unanswered: int = 0
     discarded: dict[str, int] = field(default_factory=dict)
 
 
@@ -66,6 +68,18 @@ class GapSeen:
     """`missed` packets before the one of `cycle` never arrived."""
 
     missed: int
+    cycle: int
+
+
+@dataclass(frozen=True)
+class AnswersLost:
+    """The target received in `cycle` is older than the set-point sent last: `count` were not taken.
+
+    Seen only in modes 1, 4 and 5, where a joint moves by more than what counts as standstill in
+    each cycle, and where the controller then holds its target rather than carry it on.
+    """
+
+    count: int
     cycle: int
 
 
@@ -133,6 +147,7 @@ Event = (
     InitReceived
     | StateChanged
     | GapSeen
+    | AnswersLost
     | MotionStarted
     | MotionEnded
     | PacketRejected

@@ -1,9 +1,10 @@
 """The life of one requested motion or correction, from request to rest.
 
-A source is foreign code inside the cycle: whatever it raises, any array that is not (n,) numbers,
-and bounds wider than what it was granted become `SourceFailed`. It is granted the bounds of a
-plan; those of an override from the first change of override on, and those of a stop from `stop`
-on. A stop that takes too long is a failure too.
+A source is foreign code inside the cycle: whatever it raises (SystemExit and the like included),
+any array that is not (n,) numbers, and bounds wider than what it was granted become
+`SourceFailed`. It is granted the bounds of a plan; those of an override from the first change of
+override on, and those of a stop from `stop` or the first `hold` on. A stop that takes too long is a
+failure too; a hold may last.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import SourceFailed
+from drivers.errors import SourceFailed, in_words
 from drivers.events import Outcome
+from drivers.guard_limits import RANK
 from drivers.motion_source import (
     BoundsName,
     CorrectionSource,
@@ -23,6 +25,7 @@ from drivers.motion_source import (
     MotionSource,
     OverridableSource,
     is_correction,
+    is_holdable,
     is_motion,
 )
 from drivers.states import CORRECTION_MODES, POSITION_MODES
@@ -96,10 +99,10 @@ class Execution(ABC):
             return
         self.outcome = "stopped"
         self.reason = reason
-        self._granted = (*self._granted, "stop")
+        self._grant("stop")
         try:
             self._source.stop()
-        except Exception as error:
+        except BaseException as error:
             raise _failed("failed to stop", error, cycle) from error
 
     def override(self, fraction: float) -> str | None:
@@ -112,11 +115,41 @@ class Execution(ABC):
             return f"an override of {fraction!r} is not one of 0..1"
         try:
             cast(OverridableSource, self._source).override(float(fraction))
-        except Exception as error:
-            return f"the motion source refused it: {type(error).__name__}: {error}"
-        if "override" not in self._granted:
-            self._granted = (*self._granted, "override")
+        except BaseException as error:
+            return f"the motion source refused it: {in_words(error)}"
+        self._grant("override")
         return None
+
+    def hold(self) -> str | None:
+        """Come to rest on the path until `resume`; says why that cannot be, or None."""
+        if self.outcome == "stopped" or self.finished:
+            return None
+        source: object = self._source
+        if not is_holdable(source):
+            return "held, which this motion cannot: it was stopped instead"
+        self._grant("stop")
+        try:
+            source.hold()
+        except BaseException as error:
+            return f"the motion source failed to hold: {in_words(error)}"
+        return None
+
+    def resume(self) -> str | None:
+        """Go on after a hold; says why that cannot be, or None."""
+        source: object = self._source
+        if not is_holdable(source):
+            return "this motion cannot be held"
+        if self.outcome == "stopped":
+            return "the motion was told to stop"
+        try:
+            source.resume()
+        except BaseException as error:
+            return f"the motion source refused it: {in_words(error)}"
+        return None
+
+    def _grant(self, bounds: BoundsName) -> None:
+        if bounds not in self._granted:
+            self._granted = tuple(sorted((*self._granted, bounds), key=RANK.__getitem__))
 
     def _checked(self, values: object, what: str, cycle: int) -> Array:
         array = np.asarray(values, dtype=np.float64)
@@ -165,7 +198,7 @@ class MotionExecution(Execution):
         try:
             self._source.begin(position.copy())
             self.finished = bool(self._source.finished)
-        except Exception as error:
+        except BaseException as error:
             raise _failed("cannot begin", error, cycle) from error
         self.started = True
 
@@ -186,7 +219,7 @@ class MotionExecution(Execution):
             self.finished = bool(self._source.finished)
         except SourceFailed:
             raise
-        except Exception as error:
+        except BaseException as error:
             raise _failed("failed", error, cycle) from error
         self._count_stopping(cycle)
         # The source may reuse its arrays.
@@ -209,7 +242,7 @@ class MotionExecution(Execution):
             )
         except SourceFailed:
             raise
-        except Exception as error:
+        except BaseException as error:
             raise _failed("failed to feed forward", error, cycle) from error
 
     def _bounds(self, cycle: int) -> BoundsName:
@@ -234,7 +267,7 @@ class CorrectionExecution(Execution):
         try:
             self._source.begin()
             self.finished = bool(self._source.finished)
-        except Exception as error:
+        except BaseException as error:
             raise _failed("cannot begin", error, cycle) from error
         self.started = True
 
@@ -254,7 +287,7 @@ class CorrectionExecution(Execution):
             self.finished = bool(self._source.finished)
         except SourceFailed:
             raise
-        except Exception as error:
+        except BaseException as error:
             raise _failed("failed", error, cycle) from error
         self._count_stopping(cycle)
         return motion.copy(), current.copy()
@@ -275,5 +308,5 @@ def execution_of(
     return None
 
 
-def _failed(what: str, error: Exception, cycle: int) -> SourceFailed:
-    return SourceFailed(f"the motion source {what}: {type(error).__name__}: {error}", cycle)
+def _failed(what: str, error: BaseException, cycle: int) -> SourceFailed:
+    return SourceFailed(f"the motion source {what}: {in_words(error)}", cycle)

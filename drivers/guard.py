@@ -44,7 +44,7 @@ Array = NDArray[np.float64]
 RELATIVE_TOLERANCE: Final = 1e-6
 FIRST_FRACTION: Final = 0.1
 """Share of the following-error threshold allowed between target and arm at the first set-point,
-and between the target and the set-point sent last after a long gap."""
+and between the target and the set-points sent last from then on."""
 
 
 # Rows of the matrix of checked quantities, in the order in which a violation is reported.
@@ -233,9 +233,15 @@ class Guard:
             report(found, found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
 
     def check_after_gap(
-        self, target: Array, velocity: Array, commanded: Array, step: Array, cycle: int
+        self,
+        target: Array,
+        velocity: Array,
+        commanded: Array,
+        step: Array,
+        cycle: int,
+        where: NDArray[np.bool_],
     ) -> None:
-        """The first packet after a long gap, before a motion goes on from the set-point sent last.
+        """The first packet after a long gap, before an axis goes on from the set-point sent last.
 
         A velocity may be off by half the step sent last, or by what counts as standstill. The
         target's is always held against that; the arm's lags behind, so only where it stands.
@@ -246,18 +252,18 @@ class Guard:
             commanded: (n,) D1 of the answer sent last, motor revolutions.
             step: (n,) D2 of the answer sent last, motor revolutions per cycle.
             cycle: for the error.
+            where: (n,) which joints.
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: going on would be a jump.
         """
-        every = self._every
         bound = FIRST_FRACTION * self._threshold
-        require(every, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
+        require(where, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
         standstill = self.limits.standstill
         bound = np.maximum(0.5 * np.abs(step), standstill)
         moving = np.abs(velocity[1]) > standstill
-        for where, found in ((every, velocity[0]), (~moving, velocity[1])):
-            require(where, np.abs(found - step), bound, MotionHeld, cycle)
+        for joints, found in ((where, velocity[0]), (where & ~moving, velocity[1])):
+            require(joints, np.abs(found - step), bound, MotionHeld, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """The next set-point; if it passes, it counts as sent.

@@ -43,6 +43,7 @@ class GuardLimits:
         stop_acceleration: factor on acceleration during hold and stop.
         stop_jerk: factor on jerk during hold and stop.
         standstill: motor revolutions per cycle, see `DEFAULT_STANDSTILL`.
+        current_rise: s that a commanded current takes, at least, from zero to its limit.
 
     Raises:
         ValueError: a shape, sign or order is wrong; names the field.
@@ -60,6 +61,7 @@ class GuardLimits:
     stop_acceleration: float = 2.0
     stop_jerk: float = 3.0
     standstill: float = DEFAULT_STANDSTILL
+    current_rise: float = 0.01
 
     def __post_init__(self) -> None:
         n = np.size(self.lower)
@@ -75,8 +77,9 @@ class GuardLimits:
         ):
             if not plan <= override <= stop:
                 raise ValueError(f"guard limits: factors 1 <= {override} <= {stop} do not hold")
-        if not self.standstill > 0.0:
-            raise ValueError(f"guard limits: standstill {self.standstill} is not positive")
+        for name in ("standstill", "current_rise"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"guard limits: {name} {getattr(self, name)} is not positive")
 
     def _check(self, name: str, n: int, *, positive: bool) -> None:
         array = np.array(getattr(self, name), dtype=np.float64)

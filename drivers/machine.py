@@ -7,7 +7,16 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import AxisLeft, RequestError
-from drivers.events import Event, GapSeen, MotionEnded, MotionStarted, Outcome, StateChanged
+from drivers.events import (
+    AnswersLost,
+    Counters,
+    Event,
+    GapSeen,
+    MotionEnded,
+    MotionStarted,
+    Outcome,
+    StateChanged,
+)
 from drivers.execution import Execution
 from drivers.motion_source import Array
 from drivers.reading import Reading
@@ -31,6 +40,9 @@ _LOSS: Final = {
 class Machine:
     """Walks the state table and says what that does to the motion.
 
+    Args:
+        counters: where missed packets and lost answers are counted.
+
     Attributes:
         state: where the session stands.
         cycle: the controller's cycle, for events.
@@ -44,7 +56,8 @@ class Machine:
         events: since they were last drained.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, counters: Counters) -> None:
+        self.counters = counters
         self.state = State.SYNC
         self.cycle = 0
         self.entered_at = 0
@@ -69,14 +82,13 @@ class Machine:
             reason = "the controller ended the session; make a new one"
         elif self.state is State.FAULTED:
             reason = "the controller has to report its axes closed first"
-        elif self.state is State.EXITING:
+        elif self.state is State.EXITING or self.stop_reason is not None:
             reason = "open mode is being left; wait for closed axes"
         elif unusable is not None:
             reason = unusable
         if reason is not None:
             raise RequestError(self.state.name.lower(), reason)
         self.execution = execution
-        self.stop_reason = None
 
     def stop(self, reason: str) -> None:
         """Leave open mode, after coming to rest; drop a motion that has not begun."""
@@ -85,9 +97,28 @@ class Machine:
         if self.state in (State.OPENING, State.OPEN):
             self.stop_reason = self.stop_reason or reason
 
+    def hold(self) -> None:
+        """Come to rest on the path and wait there; a stop where the source cannot.
+
+        A motion not begun is dropped, as by a stop. Without one nothing changes.
+        """
+        execution = self.execution
+        if execution is None or self.stop_reason is not None:
+            return
+        reason = execution.hold() if execution.started else "held before it began"
+        if reason is not None:
+            self.stop(reason)
+
+    def note_answers(self, lost: int) -> None:
+        """So many of our last answers did not reach the controller, or it did not take them."""
+        if lost:
+            self.counters.unanswered += lost
+            self.events.append(AnswersLost(lost, self.cycle))
+
     def note_gap(self, missed: int, unanswered: int, max_gap: int) -> None:
         """`missed` packets never arrived; `unanswered` above `max_gap` end a motion on its path."""
         if missed:
+            self.counters.missed += missed
             self.events.append(GapSeen(missed, self.cycle))
         if unanswered > max_gap and self.state is State.OPEN and self.execution:
             self.stop(f"{unanswered} packets were missed in a row")

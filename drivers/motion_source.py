@@ -45,7 +45,7 @@ class MotionSource(Protocol):
         """Which set of bounds the set-points keep from now on.
 
         "override" is granted from the first change of override on (`OverridableSource`), "stop"
-        from `stop` on.
+        from `stop`, or the first `hold` (`HoldableSource`), on.
         """
         ...
 
@@ -122,6 +122,21 @@ class OverridableSource(Protocol):
         ...
 
 
+class HoldableSource(Protocol):
+    """A source that can rest on its path and go on from there."""
+
+    def hold(self) -> None:
+        """Come to rest on the path, within the bounds of a stop, and wait; not `finished`.
+
+        A hold may last for ever; `stop` may follow it.
+        """
+        ...
+
+    def resume(self) -> None:
+        """Go on, within the bounds of a stop until the speed is what it was."""
+        ...
+
+
 _OF_MOTIONS: Final = ("begin", "advance", "finished", "bounds", "stop")
 _OF_CORRECTIONS: Final = ("begin", "advance", "finished", "stop")
 
@@ -134,6 +149,11 @@ def is_motion(source: object) -> TypeGuard[MotionSource]:
 def is_correction(source: object) -> TypeGuard[CorrectionSource]:
     """Whether it has what a `CorrectionSource` is asked for and no bounds, as motions have."""
     return _has(source, _OF_CORRECTIONS) and not _has(source, ("bounds",))
+
+
+def is_holdable(source: object) -> TypeGuard[HoldableSource]:
+    """Whether it has what a `HoldableSource` is asked for."""
+    return _has(source, ("hold", "resume"))
 
 
 def _has(source: object, names: Sequence[str]) -> bool:

@@ -17,8 +17,10 @@ from drivers.guard import Guard
 from drivers.packets import Mode
 from drivers.reading import Reading
 from drivers.replies import D1, D2, D4, D5, ReplyFrame
+from drivers.taken import TakenSetPoints
 
 Array = NDArray[np.float64]
+Joints = NDArray[np.bool_]
 
 # Rows of `ArmWire.raw`.
 TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
@@ -33,6 +35,7 @@ class OpenMode(ABC):
 
     Attributes:
         held: (n,) rad, the set-point sent last.
+        lost: answers that the packet read last shows not to have been taken.
     """
 
     def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame) -> None:
@@ -40,7 +43,9 @@ class OpenMode(ABC):
         self._wire = wire
         self._frame = frame
         self._still = np.zeros(guard.limits.n_joints)
+        self._every = np.ones(guard.limits.n_joints, dtype=np.bool_)
         self.held = self._still
+        self.lost = 0
 
     def opening(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
         """Some axes are open: the safe answer holds them, if they can be held.
@@ -48,11 +53,21 @@ class OpenMode(ABC):
         Raises:
             GuardError: they cannot.
         """
-        raw = self._wire.raw
         held = reading.held
-        self._guard.check_hold(raw[TARGET], raw[ACTUAL], held | reading.ready, cycle)
+        self.require_holdable(held, held | reading.ready, cycle)
         commanded[0] = np.where(held, measured[0], np.nan)
         commanded[1] = np.where(held, 0.0, np.nan)
+
+    def require_holdable(self, given: Joints, where: Joints, cycle: int) -> None:
+        """Joints `given` (n,) back the target received, and all of `where` near theirs.
+
+        Raises:
+            FirstSetPointUnknown: the target was sent in an earlier cycle.
+            NotFinite, FollowingError: it is no number, or the arm is elsewhere.
+        """
+        self._require_fresh((TARGET,), FirstSetPointUnknown, cycle, given)
+        raw = self._wire.raw
+        self._guard.check_hold(raw[TARGET], raw[ACTUAL], where, cycle)
 
     @abstractmethod
     def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
@@ -73,8 +88,10 @@ class OpenMode(ABC):
         """
 
     @abstractmethod
-    def require_carried_on(self, cycle: int) -> None:
+    def require_carried_on(self, reading: Reading, cycle: int) -> None:
         """The packet read last, the first after a long gap, against what was sent last.
+
+        Axes that have closed, or did so since the first set-point, do not matter.
 
         Raises:
             NotFinite, MotionNotCarriedOn: going on would be a jump.
@@ -98,20 +115,29 @@ class OpenMode(ABC):
         raw = self._wire.raw
         self._guard.check_start(raw[TARGET], raw[ACTUAL], raw[1:4:2], cycle)
 
-    def _require_fresh(self, rows: tuple[int, ...], error: type[GuardError], cycle: int) -> None:
+    def _require_fresh(
+        self,
+        rows: tuple[int, ...],
+        error: type[GuardError],
+        cycle: int,
+        where: Joints | None = None,
+    ) -> None:
         age = self._wire.age
         if age is None:
             return
-        every = np.ones(len(self._still), dtype=np.bool_)
+        where = self._every if where is None else where
         for row in rows:
-            require(every, age[row].astype(np.float64), self._still, error, cycle)
+            require(where, age[row].astype(np.float64), self._still, error, cycle)
 
 
 class PositionMode(OpenMode):
     """Modes 1, 4 and 5: the PC generates the targets."""
 
-    def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int) -> None:
+    def __init__(
+        self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int, max_gap: int
+    ) -> None:
         super().__init__(guard, wire, frame)
+        self._taken = TakenSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
         self._kept = np.ones(len(self._still), dtype=np.bool_)
@@ -131,6 +157,8 @@ class PositionMode(OpenMode):
             self._feed_forward.begin()
         self.held = position
         self._sent = target
+        self._taken.begin(target)
+        self.lost = 0
         self._kept[...] = True
         self._rest(commanded)
 
@@ -150,6 +178,7 @@ class PositionMode(OpenMode):
         """The motion's next set-point, or the last one where nothing moves."""
         raw = self._wire.raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
+        self._check_taken(cycle)
         if execution is None:
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
@@ -168,6 +197,17 @@ class PositionMode(OpenMode):
             self._write_feed_forward(self._feed_forward, execution, step, cycle)
         self.held = position
         self._sent = motor
+        self._taken.add(motor)
+
+    def _check_taken(self, cycle: int, where: Joints | None = None) -> None:
+        """Whether the controller takes the set-points sent.
+
+        An older target, or answers lost for longer than `max_gap`, would make a leap of the next.
+        """
+        lost = self._taken.check(self._wire.raw[TARGET], cycle, where)
+        age = self._wire.age
+        # The answer to the packet may have been taken all the same if the target is older.
+        self.lost = lost if lost and (age is None or not age[TARGET].any()) else 0
 
     def _write_feed_forward(
         self, guard: CorrectionGuard, execution: MotionExecution, step: Array, cycle: int
@@ -184,20 +224,27 @@ class PositionMode(OpenMode):
         wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
         wire.put(frame, D5, current)
 
-    def require_carried_on(self, cycle: int) -> None:
+    def require_carried_on(self, reading: Reading, cycle: int) -> None:
         """Target and velocity received against the set-point sent last."""
-        self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle)
+        where = self._kept & reading.ready
+        self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle, where)
         raw = self._wire.raw
-        self._guard.check_after_gap(raw[TARGET], raw[1:4:2], self._sent, self._step, cycle)
+        velocity, step = raw[1:4:2], self._step
+        self._guard.check_after_gap(raw[TARGET], velocity, self._sent, step, cycle, where)
 
     def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
         """Axes open all the time keep the last set-point; those open again, their target."""
-        self.opening(reading, measured, commanded, cycle)
-        raw, kept = self._wire.raw, self._kept
+        raw, kept, held = self._wire.raw, self._kept, reading.held
         kept &= reading.ready
+        self.require_holdable(held & ~kept, held | reading.ready, cycle)
+        commanded[0] = np.where(held, measured[0], np.nan)
+        commanded[1] = np.where(held, 0.0, np.nan)
         self._guard.check_feedback(
             raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=kept
         )
+        self._check_taken(cycle, kept)
+        self._taken.add(self._sent)
+        self._step = self._still
         slots = self._wire.joint_slots[kept]
         self._frame.floats[slots, D1] = self._sent[kept]
         self._frame.floats[slots, D2] = 0.0
@@ -205,6 +252,7 @@ class PositionMode(OpenMode):
 
     def _rest(self, commanded: Array) -> None:
         self._step = self._still
+        self._taken.add(self._sent)
         self._wire.write(self._frame.floats, self._sent, self._still)
         commanded[0] = self.held
         commanded[1] = 0.0

@@ -26,6 +26,7 @@ class Reading:
         powered: some wanted axis is in an open mode and the drive is on.
         any_open: some wanted axis is in an open mode.
         strayed: first joint in an open mode that is not the one wanted, or None.
+        others: slots given back their target in an open mode that are no joint of the arm.
     """
 
     input: Input
@@ -37,6 +38,7 @@ class Reading:
     powered: bool
     any_open: bool
     strayed: int | None
+    others: tuple[int, ...]
 
 
 class Reader:
@@ -73,9 +75,11 @@ class Reader:
         is_open = np.isin(wanted, list(OPEN_MODES))
         ready = wanted == self._mode
         strayed = np.flatnonzero(is_open & ~ready)
+        answer = safe_answer(status, modes, self._arms)
+        joints = set(self._slots.tolist())
         return Reading(
             input=read_input(drive_on, modes.tolist(), wanted.tolist(), self._mode),
-            answer=safe_answer(status, modes, self._arms),
+            answer=answer,
             status=status[self._arm - 1],
             modes=wanted,
             ready=ready,
@@ -83,4 +87,5 @@ class Reader:
             powered=drive_on and bool(is_open.any()),
             any_open=bool(is_open.any()),
             strayed=int(strayed[0]) if strayed.size else None,
+            others=tuple(slot for slot in answer.held if slot not in joints),
         )

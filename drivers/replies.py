@@ -57,11 +57,13 @@ class SafeAnswer:
         status: 4 bytes.
         modes: (n,) modes answered.
         mask: (n, 9) all bits set in the words that are given back as received, none elsewhere.
+        held: slots in an open mode with their drive on that are given back their target.
     """
 
     status: bytes
     modes: Words
     mask: Words
+    held: tuple[int, ...]
 
 
 def safe_answer(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeAnswer:
@@ -79,6 +81,7 @@ def safe_answer(status: bytes, modes: Words, arms: Sequence[int] | None) -> Safe
         on = [any(on)] * N_ARMS
     answered = np.zeros(n, np.int32)
     mask = np.zeros((n, WORDS_PER_AXIS), np.int32)
+    held = []
     for slot in range(n):
         mode = int(modes[slot])
         if not on[arms[slot] - 1] and mode not in INCREMENTAL:
@@ -87,10 +90,12 @@ def safe_answer(status: bytes, modes: Words, arms: Sequence[int] | None) -> Safe
         elif mode in _KEPT:
             answered[slot] = mode
             mask[slot, list(_KEPT[mode])] = _ALL_BITS
+            if mode in HOLDABLE:
+                held.append(slot)
     given_back = bytes(
         status[arm - 1] if arm in arms and not on[arm - 1] else 0 for arm in range(1, N_ARMS + 1)
     )
-    return SafeAnswer(given_back, answered, mask)
+    return SafeAnswer(given_back, answered, mask, tuple(held))
 
 
 def words_of(packet: CyclicPacket) -> Words:

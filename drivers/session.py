@@ -16,7 +16,8 @@ opening               some wanted axes open, not all          open axes: target,
 open                  all wanted axes open                    guarded set-points, see below
 exiting               still open, end of open mode asked for  the last set-point, zero velocity
                                                               (modes 1, 4, 5), or zeros
-freezing              mode 500 or 502                         mode 0, zeros; silence may last long
+freezing              mode 500 or 502 in a wanted axis        mode 0, zeros; open axes their target,
+                                                              at zero velocity; silence may last
 faulted               open after a fault, a mode unknown      505 (508 for a following error) while
                       here, or nothing at all                 open and powered; else the safe answer
 ended                 mode 504, answered once                 nothing
@@ -29,31 +30,18 @@ controller has to report closed axes first, and a new motion has to be requested
 Every fresh, well-formed packet gets exactly one answer, a duplicate (the same bytes) the same
 bytes again; stale and malformed ones get none and are counted. Motion advances one period per
 answered packet, whatever was missed; more than `max_gap` missed in a row, stale ones among them,
-bring it to rest on its path, if the controller carried it on. Unanswered, a controller may as well
-have held the last target and so stopped the arm; one set-point further at full speed would then be
-a jump. Hence, after such a gap, the motion is refused unless for each axis the target received
-(D1) is within 10 % of the following-error threshold of the set-point sent last, and its velocity
-(D2) within half the velocity sent last or what counts as standstill; an arm that itself stands
-(D4) is held against the latter too. Corrections of targets that the controller generates (modes 2,
-7, 8, 9) are refused after such a gap unless they were zero. A link may say how old each value is:
-one that is needed for such a decision, or for the first set-point, and was not sent in this very
-packet counts as unknown and refuses the motion.
+bring it to rest on its path, if the controller carried it on. What is watched meanwhile, and when
+open mode is left, stands at the head of `drivers.answers`.
 
-In open mode the first set-point is the target received in the packet in which the last wanted axis
-opened, at zero velocity, held against actual position and standstill. D2 is the step of the motor
-from one sent set-point to the next, formed in float64; which of D1..D5 an open mode has is the
-table `drivers.packets.MODE_FIELDS`. A motion requested while the axes are open already begins
-under the same conditions, from the set-point held. While axes are open, moving or not, following
-error and current are watched. After the motion the end is held for `settle_cycles`; the next
-answer asks for the end of open mode (status byte 1), and asks again every `EXIT_RETRY_CYCLES` in
-case that answer was lost; after `EXIT_TIMEOUT` that is a fault. The end is asked for as well where
-a motion waits that long for the last axis to open. Without a requested motion the first set-point
-is held.
+In every state an axis that is open with its drive on, of whichever arm, is answered by its target
+only if that is a number; if it is none, drive-off is asked for. In a pause a wanted axis that is
+open also has to be near its target.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import Final
 
 import numpy as np
@@ -61,14 +49,8 @@ import numpy as np
 from drivers.answers import Answers
 from drivers.arm_wire import Ages
 from drivers.drive_train import DriveTrain
-from drivers.errors import PacketError, RefusalError, RequestError
-from drivers.events import (
-    Counters,
-    Event,
-    InitReceived,
-    LinkLost,
-    Refused,
-)
+from drivers.errors import PacketError, RefusalError, RequestError, as_refusal
+from drivers.events import Counters, Event, InitReceived, LinkLost, Refused
 from drivers.execution import execution_of
 from drivers.guard import Guard
 from drivers.machine import Machine
@@ -114,7 +96,9 @@ class Session:
         init_timeout: s of silence allowed before the init packet and in a pause.
         silence_timeout: s of silence allowed otherwise.
         accept_init: adopt the controller's gear ratios, calibration and coupling where they
-            differ from the cell's, instead of refusing to move.
+            differ from the cell's but are not far off, and accept further open axes, instead of
+            refusing to move.
+        other_axes: (arm, axis), both from 1, that may be open although the cell has no such joint.
 
     Attributes:
         deadline: when silence becomes a fault, on the clock of `now`. Each packet that is answered
@@ -136,6 +120,7 @@ class Session:
         init_timeout: float = 300.0,
         silence_timeout: float = 1.0,
         accept_init: bool = False,
+        other_axes: Collection[tuple[int, int]] = (),
     ) -> None:
         n = drive_train.n_joints
         if not n == guard.limits.n_joints == ring.n_joints:
@@ -161,7 +146,8 @@ class Session:
         self._init_timeout = init_timeout
         self._silence_timeout = silence_timeout
         self._accept_init = accept_init
-        self._machine = Machine()
+        self._other_axes = frozenset(other_axes)
+        self._machine = Machine(self.counters)
         self._sequence = Sequence()
         self._answers: Answers | None = None
         self._cold_start = False
@@ -231,6 +217,21 @@ class Session:
         if reason is not None:
             raise RequestError(self.state.name.lower(), reason, "change of override")
 
+    def hold(self) -> None:
+        """Rest on the path until `resume`; a motion that cannot, or has not begun, is stopped."""
+        self._machine.hold()
+
+    def resume(self) -> None:
+        """Go on after `hold`.
+
+        Raises:
+            RequestError: there is no motion, it is being stopped, or it cannot hold and resume.
+        """
+        execution = self._machine.execution
+        reason = "no motion was requested" if execution is None else execution.resume()
+        if reason is not None:
+            raise RequestError(self.state.name.lower(), reason, "resumption")
+
     def discarded(self, kind: str, count: int) -> None:
         """The link dropped `count` packets before the session saw them: counted and told."""
         self._tally.discarded(kind, count)
@@ -290,10 +291,16 @@ class Session:
         init = InitPacket.decode(packet)
         self._cold_start = self.state is State.SYNC and self._sequence.last > 0
         self._machine.take(Input.INIT)
-        answers = Answers(
-            init, self._drive_train, self._guard, self._arm, self._mode, self._accept_init
+        self._answers = answers = Answers(
+            init,
+            self._drive_train,
+            self._guard,
+            self._arm,
+            self._mode,
+            self._accept_init,
+            self._other_axes,
+            self._max_gap,
         )
-        self._answers = answers
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self._machine.cycle = 0
         told = answers.announced
@@ -340,8 +347,7 @@ class Session:
         missed = self._sequence.accept(number)
         machine.cycle = self._sequence.cycle
         words = words_of(decoded)
-        self.counters.missed += missed
-        # After a number that was corrupted the controller's own look stale for a while.
+        # After a corrupted number the controller's own look stale for a while.
         unanswered, self._unanswered = missed + self._unanswered, 0
         reading = answers.reader.read(decoded.status, words[:, MODE])
         row = ring.slot
@@ -350,19 +356,20 @@ class Session:
         ring.gap[row] = missed
         ring.cycle[row] = machine.cycle
         answers.record(ring, row, reading, words, ages)
-        refusal = None
+        refusal: RefusalError | None = None
         try:
             machine.note_gap(missed, unanswered, self._max_gap)
             machine.require_axes(reading, self._mode)
             machine.take(reading.input)
             if unanswered > self._max_gap:
-                answers.require_carried_on(machine)
+                answers.require_carried_on(machine, reading)
             measured, commanded = ring.measured[row], ring.commanded[row]
             status = answers.answer(machine, reading, words, measured, commanded)
-        except RefusalError as error:
-            refusal = error
+        except BaseException as error:
+            # Whatever it was, the controller is told to stop, by the answer that is due now.
+            refusal = as_refusal(error, machine.cycle)
             ring.commanded[row] = math.nan
-            status = answers.refuse(machine, error, reading, words)
+            status = answers.refuse(machine, refusal, reading, words)
         machine.in_interval = machine.in_interval and reading.any_open
         ring.interval[row] = machine.interval if machine.in_interval else -1
         ring.state[row] = machine.state

@@ -50,7 +50,7 @@ class Input(IntEnum):
     PAUSE = 7
     """Mode 500 or 502 in a wanted axis: the exchange rests."""
     UNAVAILABLE = 8
-    """A mode that nobody here knows an answer to."""
+    """A mode that nobody here knows an answer to, in any wanted axis."""
     END = 9
     """Mode 504 in every axis."""
     REFUSAL = 10
@@ -76,6 +76,7 @@ CORRECTION_MODES: Final = frozenset(
 """Open modes in which the PC corrects targets that the controller generates."""
 CLOSED_MODES: Final = frozenset({Mode.CLOSED, Mode.CLOSED_MIRRORED})
 PAUSE_MODES: Final = frozenset({Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER})
+_KNOWN: Final = OPEN_MODES | CLOSED_MODES | PAUSE_MODES | {Mode.DRIVING_ON}
 
 
 def read_input(
@@ -95,6 +96,8 @@ def read_input(
         return Input.OFF
     if not wanted_modes:
         return Input.CLOSED
+    if any(m not in _KNOWN for m in wanted_modes):
+        return Input.UNAVAILABLE
     if any(m in PAUSE_MODES for m in wanted_modes):
         return Input.PAUSE
     if all(m == mode for m in wanted_modes):
@@ -103,9 +106,7 @@ def read_input(
         return Input.PARTLY_OPEN
     if all(m in CLOSED_MODES for m in wanted_modes):
         return Input.CLOSED
-    if all(m in CLOSED_MODES or m == Mode.DRIVING_ON for m in wanted_modes):
-        return Input.DRIVING_ON
-    return Input.UNAVAILABLE
+    return Input.DRIVING_ON
 
 
 _ANY: Final[Mapping[Input, State]] = {
@@ -153,15 +154,14 @@ HAS_SET_POINTS: Final = frozenset({State.OPENING, State.OPEN, State.EXITING})
 """States in which open axes are given set-points."""
 
 _BEFORE_THE_DRIVE: Final = frozenset({State.INIT, State.DRIVE_OFF})
-_WAITING: Final = frozenset({State.CLOSED, State.FREEZING})
 
 
 def keeps_request(before: State, after: State) -> bool:
     """Whether a motion that was requested but has not begun survives this step.
 
     It waits for the controller to start, for the drive and for open mode; it does not survive a
-    restart, a fault, a drive that was on and goes off (or is switched on again, its going off
-    having been missed), or open mode going away by more than closing again.
+    restart, a fault, a pause that begins, a drive that was on and goes off (or is switched on
+    again, its going off having been missed), or an opening that is given up.
     """
     if after in (State.SYNC, State.INIT):
         return before in (State.SYNC, State.INIT)
@@ -169,6 +169,8 @@ def keeps_request(before: State, after: State) -> bool:
         return before in _BEFORE_THE_DRIVE
     if after is State.DRIVING_ON:
         return before in _BEFORE_THE_DRIVE or before is State.DRIVING_ON
-    if after in _WAITING:
-        return before not in HAS_SET_POINTS or after is State.CLOSED
+    if after is State.CLOSED:
+        return before not in HAS_SET_POINTS
+    if after is State.FREEZING:
+        return before is State.FREEZING
     return after in (State.OPENING, State.OPEN)

@@ -58,7 +58,15 @@ class Swell:
         self.bump = self.bump[: self.row + 1] * (1.0 - self.row / len(self.bump))
 
 
-def run(source: Any, *, mode: int = 4, arm: int = 1, period: float = 0.001, **settings: Any):
+def run(
+    source: Any,
+    *,
+    mode: int = 4,
+    arm: int = 1,
+    period: float = 0.001,
+    others=frozenset(),
+    **settings,
+):
     table = {name: np.array(value) for name, value in small_cell.TABLE.items()}
     limits = GuardLimits(
         LIMITS.lower, LIMITS.upper, LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk,
@@ -66,13 +74,15 @@ def run(source: Any, *, mode: int = 4, arm: int = 1, period: float = 0.001, **se
     )  # fmt: skip
     ring = CycleRing(N, 8192)
     session = Session(
-        DriveTrain(**table), Guard(limits, period), ring, mode=mode, arm=arm, settle_cycles=10
-    )
+        DriveTrain(**table), Guard(limits, period), ring, mode=mode, arm=arm, settle_cycles=10,
+        other_axes=others,
+    )  # fmt: skip
     controller = small_cell.controller(
         open_mode=mode, arm=arm, period=period, open_intervals=1, **settings
     )
     session.request(source)
-    exchange(SimulatedTransport(controller), session, until=lambda: False)
+    link = SimulatedTransport(controller)
+    exchange(link, session, until=lambda: link.cycle > 20_000)
     events = session.events()
     refusals = [event.error for event in events if isinstance(event, Refused)]
     ends = [event for event in events if isinstance(event, MotionEnded)]
@@ -103,7 +113,7 @@ def test_the_modes_in_which_the_pc_makes_the_targets(mode: int, period: float) -
     ("mode", "source"),
     [
         (2, Swell(motion=0.2, current=0.3)),
-        (7, Swell(motion=0.02)),
+        (7, Swell(motion=0.001)),
         (8, Swell(motion=0.2)),
         (9, Swell(current=0.3)),
     ],
@@ -129,9 +139,12 @@ def test_the_modes_in_which_the_pc_corrects_end_where_they_began(mode: int, sour
 def test_any_arm_in_any_slots_moves_and_no_other(
     arm: int, slots: Any, foreign: int, foreign_open: bool
 ) -> None:
+    arms = [other for other in range(1, 5) if other != arm]
+    others = frozenset((arms[axis // 10], axis % 10 + 1) for axis in range(foreign))
     controller, _ = run(
-        move(), arm=arm, slots=slots, foreign_axes=foreign, foreign_open=foreign_open
-    )
+        move(), arm=arm, slots=slots, foreign_axes=foreign, foreign_open=foreign_open,
+        others=others,
+    )  # fmt: skip
     assert_moved(controller)
     np.testing.assert_array_equal(controller.foreign_targets, np.arange(1.0, 1.0 + foreign) / 4.0)
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from drivers.exchange.control import ArchiveState, ControlBlock
+from drivers.exchange.control import ArchiveState, ControlBlock, Ended
 from drivers.exchange.errors import ExchangeError
 from drivers.exchange.event_log import EventReader, EventWriter
 from drivers.exchange.loop import exchange
 from drivers.exchange.notices import (
+    EventsLost,
     ExchangeEnded,
     ExchangeEvent,
     ExchangeFailed,
     ExchangeStarted,
     Leaving,
     OverrideRefused,
+    ResumeRefused,
 )
 from drivers.exchange.process import ExchangeProcess, ExchangeStatus
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
@@ -22,8 +24,10 @@ from drivers.exchange.shared_ring import RingReader, SharedCycleRing
 __all__ = [
     "ArchiveState",
     "ControlBlock",
+    "Ended",
     "EventReader",
     "EventWriter",
+    "EventsLost",
     "ExchangeEnded",
     "ExchangeError",
     "ExchangeEvent",
@@ -36,6 +40,7 @@ __all__ = [
     "OverrideRefused",
     "RealTimeReport",
     "RealTimeSettings",
+    "ResumeRefused",
     "RingReader",
     "SharedCycleRing",
     "exchange",

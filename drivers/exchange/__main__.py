@@ -49,6 +49,7 @@ def main(arguments: Sequence[str]) -> int:
         ring = SharedCycleRing.attach(ring_fd, settings.drive_train.n_joints)
         guard = Guard(settings.guard_limits, settings.period)
         session = Session(settings.drive_train, guard, ring, **settings.session)
+        max_late = settings.late_allowed
         transport = settings.transport.open()
         control = ControlBlock(control_fd)
         serving = Serving(
@@ -70,7 +71,7 @@ def main(arguments: Sequence[str]) -> int:
     notes = tuple(getattr(transport, "notes", ()))
     serving.say(ExchangeStarted(os.getpid(), report, notes))
     channel.send(pickle.dumps((report, notes)))
-    status = _serve(transport, session, serving)
+    status = _serve(transport, session, serving, max_late)
     control.finished = int(status == 0)
     return status
 
@@ -88,9 +89,9 @@ class _Flag:
         return self._set
 
 
-def _serve(transport: Transport, session: Session, serving: Serving) -> int:
+def _serve(transport: Transport, session: Session, serving: Serving, max_late: int) -> int:
     try:
-        exchange(transport, session, until=serving)
+        exchange(transport, session, until=serving, max_late=max_late)
         serving.conclude()
     except Exception:
         traceback.print_exc()

@@ -24,6 +24,16 @@ class ArchiveState(IntEnum):
     FAILED = 2
 
 
+class Ended(IntEnum):
+    """How the last motion ended; the names are those of `drivers.events.Outcome`."""
+
+    NONE = 0
+    COMPLETED = 1
+    STOPPED = 2
+    REFUSED = 3
+    LOST = 4
+
+
 class _Whole:
     """An integer field."""
 
@@ -73,6 +83,8 @@ class ControlBlock:
         override_count: raised by one for each override asked for, after it was written.
         finish: 1 when the exchange is to leave open mode and end.
         program_id: of the program to be taken, raised for each; any other is not taken any more.
+        held: 1 while the motion is to rest on its path, 0 when it is to go on.
+        hold_count: raised by one each time, after `held` was written.
         archive_heartbeat: s.
         archive_state: an `ArchiveState`.
         exchange_heartbeat: s.
@@ -82,7 +94,10 @@ class ControlBlock:
         program_accepted: id of the program accepted last.
         program_refused: id of the program refused last.
         pickup_us: microseconds the last program took to be read and requested.
-        ended_count: motions that have ended.
+        ended_count: motions that have ended, raised after the two that follow were written; a
+            second witness, should the event get lost.
+        ended_outcome: of the last of them, an `Ended`.
+        ended_interval: of its records, -1 if it never saw open mode.
         overflow: records overwritten before the archive had them.
         answered: packets, as `drivers.events.Counters` has it; so are the ones that follow.
         missed: packets that never arrived.
@@ -90,9 +105,13 @@ class ControlBlock:
         stale: packets that came too late.
         malformed: packets that were none.
         foreign: packets from elsewhere.
-        late: packets that waited here too long to be answered.
+        late: packets whose answer did not leave within a cycle of their arrival: left out for a
+            newer one, or answered late.
+        answered_late: those of them that were answered all the same.
+        unanswered: answers of ours that the controller did not take.
         refused: set-points refused.
-        worst_turnaround_us: microseconds from a packet's arrival here to its answer's departure.
+        worst_turnaround_us: microseconds from a packet's arrival (in the kernel, where the link
+            can say) to the departure of its answer.
         finished: 1 when the exchange has ended properly.
     """
 
@@ -102,6 +121,8 @@ class ControlBlock:
     finish = _Whole(3)
     program_id = _Whole(4)
     override_count = _Whole(5)
+    held = _Whole(6)
+    hold_count = _Whole(7)
 
     archive_heartbeat = _Real(8)
     archive_state = _Whole(9)
@@ -125,6 +146,10 @@ class ControlBlock:
     refused = _Whole(32)
     worst_turnaround_us = _Real(33)
     finished = _Whole(34)
+    answered_late = _Whole(35)
+    unanswered = _Whole(36)
+    ended_outcome = _Whole(37)
+    ended_interval = _Whole(38)
 
     def __init__(self, fd: int) -> None:
         whole = memoryview(memory.attach(fd)).cast("B")

@@ -13,7 +13,7 @@ import zlib
 from typing import Final
 
 from drivers.exchange import memory
-from drivers.exchange.notices import ExchangeEvent
+from drivers.exchange.notices import EventsLost, ExchangeEvent
 
 CAPACITY: Final = 4 << 20
 """Bytes: some hundred refusals with their flight recorders, or 50 000 small events."""
@@ -76,6 +76,8 @@ class EventWriter(_Log):
 class EventReader(_Log):
     """A reader's end, from the oldest event still there.
 
+    Where events are missing, `EventsLost` stands in their place.
+
     Attributes:
         lost: events overwritten before this reader had them.
     """
@@ -102,10 +104,20 @@ class EventReader(_Log):
             at += _FRAME.size
             body = copy[at - begin : at - begin + length]
             at += length
-            self.lost += index - (index if self._expected is None else self._expected)
+            missing = index - (index if self._expected is None else self._expected)
             self._expected = index + 1
+            if missing:
+                self._miss(missing, events)
             if zlib.crc32(body) == checksum:
                 events.append(pickle.loads(body))
             else:
-                self.lost += 1
+                self._miss(1, events)
         return events
+
+    def _miss(self, count: int, events: list[ExchangeEvent]) -> None:
+        self.lost += count
+        last = events[-1] if events else None
+        if isinstance(last, EventsLost):
+            events[-1] = EventsLost(last.count + count)
+        else:
+            events.append(EventsLost(count))

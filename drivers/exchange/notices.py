@@ -32,6 +32,20 @@ class OverrideRefused:
 
 
 @dataclass(frozen=True)
+class ResumeRefused:
+    """The motion cannot be gone on with, for the reason given."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class EventsLost:
+    """So many events were overwritten before this reader had them; the reader itself says so."""
+
+    count: int
+
+
+@dataclass(frozen=True)
 class Leaving:
     """No motion is accepted any more; what goes on is brought to rest and open mode left."""
 
@@ -55,5 +69,14 @@ class ExchangeFailed:
     trace: str
 
 
-ExchangeEvent = Event | ExchangeStarted | OverrideRefused | Leaving | ExchangeEnded | ExchangeFailed
+ExchangeEvent = (
+    Event
+    | ExchangeStarted
+    | OverrideRefused
+    | ResumeRefused
+    | EventsLost
+    | Leaving
+    | ExchangeEnded
+    | ExchangeFailed
+)
 """Everything in an event log."""

@@ -35,7 +35,10 @@ _BEAT: Final = 0.1
 
 @dataclass(frozen=True)
 class ExchangeStatus:
-    """The exchange's fields of the control block, at one moment; see `ControlBlock`."""
+    """The exchange's fields of the control block, at one moment; see `ControlBlock`.
+
+    `ended_outcome` is a `drivers.events.Outcome`, or "none".
+    """
 
     state: State
     cycle: int
@@ -45,6 +48,8 @@ class ExchangeStatus:
     program_refused: int
     pickup_us: float
     ended_count: int
+    ended_outcome: str
+    ended_interval: int
     overflow: int
     answered: int
     missed: int
@@ -53,6 +58,8 @@ class ExchangeStatus:
     malformed: int
     foreign: int
     late: int
+    answered_late: int
+    unanswered: int
     refused: int
     worst_turnaround_us: float
     finished: bool
@@ -163,6 +170,21 @@ class ExchangeProcess:
         self._control.override = fraction
         self._control.override_count += 1
 
+    def hold(self) -> None:
+        """Ask the motion going on to rest on its path until `resume`; one that cannot is stopped.
+
+        A motion that has not begun is dropped.
+        """
+        self._hold(1)
+
+    def resume(self) -> None:
+        """Ask it to go on; where it cannot, `ResumeRefused` is among the events."""
+        self._hold(0)
+
+    def _hold(self, held: int) -> None:
+        self._control.held = held
+        self._control.hold_count += 1
+
     def finish(self) -> None:
         """Ask it to leave open mode and to end when the axes have been closed for a second."""
         self._control.finish = 1
@@ -176,6 +198,7 @@ class ExchangeProcess:
         block = self._control
         return ExchangeStatus(
             state=State(block.state),
+            ended_outcome=control.Ended(block.ended_outcome).name.lower(),
             heartbeat_age=time.monotonic() - block.exchange_heartbeat,
             finished=bool(block.finished),
             **{name: getattr(block, name) for name in _COPIED},
@@ -247,7 +270,7 @@ class ExchangeProcess:
 _COPIED: Final = tuple(
     name
     for name in ExchangeStatus.__dataclass_fields__
-    if name not in ("state", "heartbeat_age", "finished")
+    if name not in ("state", "ended_outcome", "heartbeat_age", "finished")
 )
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

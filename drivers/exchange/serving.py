@@ -9,11 +9,12 @@ import time
 from typing import Final, Protocol
 
 from drivers.errors import DriverError, RequestError
-from drivers.events import MotionEnded
-from drivers.exchange.control import STALE, ArchiveState, ControlBlock
+from drivers.events import Event, MotionEnded
+from drivers.exchange.control import STALE, ArchiveState, ControlBlock, Ended
+from drivers.exchange.digest import Digest
 from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import Inbox
-from drivers.exchange.notices import ExchangeEvent, Leaving, OverrideRefused
+from drivers.exchange.notices import ExchangeEvent, Leaving, OverrideRefused, ResumeRefused
 from drivers.exchange.shared_ring import SharedCycleRing
 from drivers.session import Session
 from drivers.states import State
@@ -25,7 +26,12 @@ FINISH_LINGER: Final = 1.0
 """s that packets are answered, after the axes were closed, when the supervisor wants to end."""
 _SLOW_EVERY: Final = 32
 """Packets between two looks at what need not be looked at in each cycle."""
-_MAY_BE_OPEN: Final = frozenset({State.OPENING, State.OPEN, State.EXITING, State.FAULTED})
+LONGEST_LINGER: Final = 10.0
+"""s after the axes were closed first, from which on a controller that opens them again and again
+does not put off the end any more."""
+_MAY_BE_OPEN: Final = frozenset(
+    {State.OPENING, State.OPEN, State.EXITING, State.FREEZING, State.FAULTED}
+)
 
 
 class Terminated(Protocol):
@@ -65,13 +71,16 @@ class Serving:
         self._rows = ring.written
         self._worst = 0.0
         self._overrides = control.override_count
+        self._holds = control.hold_count
         self._stops = control.stop_count
         self._linger = ORPHAN_LINGER
         self._calls = 0
         self._answered = 0
         self._heard = self._began = time.monotonic()
         self._closed_since = math.inf
+        self._closed_first = math.inf
         self._open = False
+        self._digest = Digest()
 
     def __call__(self) -> bool:
         """Whether the exchange is to end."""
@@ -105,6 +114,9 @@ class Serving:
         if control.override_count != self._overrides:
             self._overrides = control.override_count
             self._change_override(control.override)
+        if control.hold_count != self._holds:
+            self._holds = control.hold_count
+            self._change_hold(bool(control.held))
         if control.program_id != self._inbox.taken:
             self._take_program(now)
         if session.requested and self._needs_archive:
@@ -141,6 +153,15 @@ class Serving:
         except DriverError as error:
             self.say(OverrideRefused(fraction, str(error)))
 
+    def _change_hold(self, held: bool) -> None:
+        if held:
+            self._session.hold()
+            return
+        try:
+            self._session.resume()
+        except DriverError as error:
+            self.say(ResumeRefused(str(error)))
+
     def _take_program(self, now: float) -> None:
         """Read the program that was handed over, request it, and say what became of it."""
         name = self._session.state.name.lower()
@@ -171,10 +192,8 @@ class Serving:
     def _report(self, now: float) -> None:
         control, session = self._control, self._session
         control.exchange_heartbeat = now
-        for event in session.events():
-            self._events.write(event)
-            if isinstance(event, MotionEnded):
-                control.ended_count += 1
+        for event in self._digest.take(session.events(), now):
+            self._put(event)
         control.state = session.state
         control.cycle = int(self._ring.cycle[(self._rows - 1) % self._ring.capacity])
         control.interval = session.interval
@@ -184,11 +203,20 @@ class Serving:
             self._answered = session.counters.answered
             self._heard = now
         self._open = session.state in _MAY_BE_OPEN and now - self._heard < FINISH_LINGER
-        if not self._open:
-            self._closed_since = min(self._closed_since, now)
-        elif not self.reason:
-            # Once the end is wanted, a controller that opens again and again must not put it off.
+        if self._open:
             self._closed_since = math.inf
+        else:
+            self._closed_since = min(self._closed_since, now)
+            if self.reason:
+                self._closed_first = min(self._closed_first, now)
+
+    def _put(self, event: Event) -> None:
+        self._events.write(event)
+        if isinstance(event, MotionEnded):
+            # The count comes last: who sees it can read the others.
+            self._control.ended_outcome = Ended[event.outcome.upper()]
+            self._control.ended_interval = event.interval
+            self._control.ended_count += 1
 
     def _report_counters(self) -> None:
         control, counters = self._control, self._session.counters
@@ -200,16 +228,23 @@ class Serving:
         control.stale = counters.stale
         control.malformed = counters.malformed + discarded.get("malformed", 0)
         control.foreign = discarded.get("foreign", 0)
-        control.late = discarded.get("late", 0)
+        control.answered_late = discarded.get("answered late", 0)
+        control.late = discarded.get("late", 0) + control.answered_late
+        control.unanswered = counters.unanswered
         control.refused = counters.refused
         control.worst_turnaround_us = 1e6 * self._worst
 
     def _over(self, now: float) -> bool:
-        return not self._open and now - self._closed_since >= self._linger
+        if self._open:
+            return False
+        lingered = now - self._closed_since >= self._linger
+        return lingered or now - self._closed_first >= LONGEST_LINGER
 
     def conclude(self) -> None:
         """Put out what happened last."""
         self._report(time.monotonic())
+        for event in self._digest.rest():
+            self._put(event)
         self._report_counters()
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.drive_train import DriveTrain
+from drivers.exchange.punctuality import MAX_LATE
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportSpec
@@ -28,6 +29,8 @@ class ExchangeSettings:
             are read quickly.
         needs_archive: whether a motion is accepted and goes on only while the archive process
             lives and has an archive ready.
+        max_late: answers in a row that may leave too late in open mode without stopping a motion;
+            None takes the session's `max_gap`.
     """
 
     transport: TransportSpec
@@ -39,3 +42,12 @@ class ExchangeSettings:
     ring_capacity: int = 20_000
     preload: tuple[str, ...] = ()
     needs_archive: bool = True
+    max_late: int | None = None
+
+    @property
+    def late_allowed(self) -> int:
+        """`max_late`, or what stands for it."""
+        if self.max_late is not None:
+            return self.max_late
+        allowed: int = self.session.get("max_gap", MAX_LATE)
+        return allowed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,11 +71,24 @@ class Transport(Protocol):
         ...
 
     def forget_peer(self) -> None:
-        """The session was lost: its next packet may come from elsewhere at the same address."""
+        """There is no session: its next packet may come from elsewhere at the same address.
+
+        Called after each packet and each wait for as long as that is so.
+        """
         ...
 
     def close(self) -> None:
         """Give the link up. Closing twice changes nothing."""
+        ...
+
+
+@runtime_checkable
+class Stamped(Protocol):
+    """A transport that knows how long a packet lay in a queue before it was received."""
+
+    @property
+    def arrived(self) -> float | None:
+        """When the packet received last arrived, s on the clock of `now`; None if unknown."""
         ...
 
 

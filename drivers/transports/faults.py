@@ -17,9 +17,13 @@ OVERTAKEN_BY: Final = 1.25
 """Cycles by which a packet is held up that the next one is to overtake."""
 
 
+MOST_CYCLES: Final = 1_000_000_000
+"""Largest cycle and count of a fault: more than eleven days at 1 ms."""
+
+
 @dataclass(frozen=True)
-class Lose:
-    """The packets of `count` cycles from `cycle` on never arrive."""
+class _Packets:
+    """The packets of `count` cycles from `cycle` on, of one direction."""
 
     cycle: int
     direction: Direction = "to_pc"
@@ -27,6 +31,11 @@ class Lose:
 
     def __post_init__(self) -> None:
         _require_cycles(self, self.cycle, self.count)
+
+
+@dataclass(frozen=True)
+class Lose(_Packets):
+    """The packets of `count` cycles from `cycle` on never arrive."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +58,8 @@ class Delay:
 
 
 @dataclass(frozen=True)
-class Duplicate:
+class Duplicate(_Packets):
     """The packets of `count` cycles from `cycle` on arrive twice."""
-
-    cycle: int
-    direction: Direction = "to_pc"
-    count: int = 1
-
-    def __post_init__(self) -> None:
-        _require_cycles(self, self.cycle, self.count)
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,9 @@ def _require_cycles(fault: object, cycle: int, count: int) -> None:
         raise ValueError(f"{name}: cycle {cycle} is negative")
     if count < 1:
         raise ValueError(f"{name}: count {count} is not positive")
+    for what, value in (("cycle", cycle), ("count", count)):
+        if value > MOST_CYCLES:
+            raise ValueError(f"{name}: {what} is more than {MOST_CYCLES}")
 
 
 class FaultyLink:
@@ -118,10 +123,13 @@ class FaultyLink:
 
     def __init__(self, faults: Sequence[Fault], period: float) -> None:
         self._period = period
-        self._planned: dict[tuple[int, Direction], list[Fault]] = {}
+        self._planned: dict[Direction, list[tuple[range, Fault]]] = {
+            "to_pc": [],
+            "to_controller": [],
+        }
         for fault in faults:
-            for cycle in range(fault.cycle, fault.cycle + getattr(fault, "count", 1)):
-                self._planned.setdefault((cycle, fault.direction), []).append(fault)
+            cycles = range(fault.cycle, fault.cycle + getattr(fault, "count", 1))
+            self._planned[fault.direction].append((cycles, fault))
 
     def carry(self, cycle: int, direction: Direction, packet: bytes) -> list[tuple[float, bytes]]:
         """The deliveries of the packet sent in `cycle`: delay in s, and bytes.
@@ -130,11 +138,10 @@ class FaultyLink:
         """
         if not packet:
             return []
-        planned = self._planned.get((cycle, direction))
-        if planned is None:
-            return [(0.0, packet)]
         delay, copies = 0.0, 1
-        for fault in planned:
+        for cycles, fault in self._planned[direction]:
+            if cycle not in cycles:
+                continue
             match fault:
                 case Lose():
                     return []

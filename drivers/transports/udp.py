@@ -1,7 +1,8 @@
 """The link over UDP/IPv4: the PC serves, the controller sends first and sets the pace.
 
-One datagram is one packet. A cycle costs two system calls, one `recvfrom` and one `sendto`: the
-kernel keeps the time-out of the first, so that nothing has to be asked before it.
+One datagram is one packet. A cycle costs two system calls, one `recvmsg` and one `sendto`: the
+kernel keeps the time-out of the first, so that nothing has to be asked before it, and says with
+each datagram when it arrived.
 """
 
 from __future__ import annotations
@@ -31,10 +32,16 @@ BUSY_POLL: Final = 50
 """Microseconds the kernel may poll the network device before it sleeps."""
 _SHORTEST_PLAUSIBLE: Final = cyclic_length(1)
 # Numbers of asm-generic/socket.h that the socket module does not name.
+_SO_TIMESTAMPNS: Final = 35
 _SO_BUSY_POLL: Final = 46
 _SO_MEMINFO: Final = 55
 _MEMINFO: Final = struct.Struct("=9I")
 _TIMEVAL: Final = struct.Struct("@qq")
+_TIMESPEC: Final = struct.Struct("@qq")
+_CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
+_LONGEST_STAY: Final = 10.0
+"""s in the kernel's queue; a datagram that seems to have been there for longer was not: the
+system's clock was set meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,8 @@ class UdpTransport:
     """A bound port that listens to one host.
 
     The first datagram of a plausible length from that host, at the beginning and after
-    `forget_peer`, decides the port that is listened to from then on. Datagrams from any other
+    `forget_peer`, decides the port that is listened to from then on; whoever finds that it was
+    none of a controller calls `forget_peer` again. Datagrams from any other
     address are counted as "foreign" and get no answer; what is longer than 1500 bytes is counted
     as "malformed"; what the kernel dropped because its queue was full, as "overrun".
 
@@ -76,6 +84,8 @@ class UdpTransport:
     Attributes:
         address: host and port bound.
         notes: socket options that the system refused, in words. None of them is needed.
+        arrived: when the kernel had the datagram received last, on the clock of `now`; None where
+            it does not say.
 
     Raises:
         TransportError: address unknown, port taken, or not permitted.
@@ -87,7 +97,8 @@ class UdpTransport:
         self.address: tuple[str, int] = self._socket.getsockname()
         self.notes = _set_options(self._socket)
         self._timeout = -1.0
-        self._receive = self._socket.recvfrom
+        self.arrived: float | None = None
+        self._receive = self._socket.recvmsg
         self._send = self._socket.sendto
         self._peer: tuple[str, int] | None = None
         self._rejected: dict[str, int] = {}
@@ -114,7 +125,7 @@ class UdpTransport:
         while True:
             flags = 0 if timeout == self._timeout else self._have_patience(timeout)
             try:
-                packet, sender = self._receive(LONGEST + 1, flags)
+                packet, told, _, sender = self._receive(LONGEST + 1, _CONTROL_SPACE, flags)
             except BlockingIOError:
                 pass
             except OSError as error:
@@ -123,6 +134,7 @@ class UdpTransport:
                 if (sender == self._peer and len(packet) <= LONGEST) or self._accepts(
                     packet, sender
                 ):
+                    self.arrived = _arrival(told)
                     return packet
             # Strangers do not lengthen the wait, and the kernel, which counts in scheduler ticks,
             # may have ended it a tick early.
@@ -243,19 +255,30 @@ _BIND_FAILURES: Final = {
 
 
 def _set_options(udp: socket.socket) -> tuple[str, ...]:
-    """Priority on the way out and polling on the way in; returns what was refused, in words."""
+    """Priority on the way out, polling and times on the way in; what was refused, in words."""
     notes = []
     for name, level, option, value in (
         # IP_TOS comes first because it sets a priority of its own.
         ("IP_TOS", socket.IPPROTO_IP, socket.IP_TOS, TYPE_OF_SERVICE),
         ("SO_PRIORITY", socket.SOL_SOCKET, socket.SO_PRIORITY, PRIORITY),
         ("SO_BUSY_POLL", socket.SOL_SOCKET, _SO_BUSY_POLL, BUSY_POLL),
+        ("SO_TIMESTAMPNS", socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1),
     ):
         try:
             udp.setsockopt(level, option, value)
         except OSError as error:
             notes.append(f"{name} = {value} was refused ({error.strerror})")
     return tuple(notes)
+
+
+def _arrival(told: list[tuple[int, int, bytes]]) -> float | None:
+    """The kernel's time of arrival, which is that of the wall clock, on the monotonic clock."""
+    if not told:
+        return None
+    seconds, nanoseconds = _TIMESPEC.unpack(told[0][2])
+    stayed = time.time() - seconds - 1e-9 * nanoseconds
+    now = time.monotonic()
+    return now - stayed if 0.0 <= stayed < _LONGEST_STAY else now
 
 
 def _dropped(udp: socket.socket) -> int:

@@ -70,6 +70,7 @@ class Bench:
             self.ring,
             arm=self.arm,
             settle_cycles=self.settle_cycles,
+            other_axes={(arm, axis + 1) for arm, axis in self.slots},
         )
         rng = np.random.default_rng(len(self.slots))
         self.q = np.linspace(-0.5, 0.5, self.n)

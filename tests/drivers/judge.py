@@ -135,6 +135,7 @@ class Conduct:
     barrier: bool = True
     sent: list[np.ndarray] = field(default_factory=list)
     motor: np.ndarray | None = None
+    motors: list[np.ndarray] = field(default_factory=list)
     exiting: bool = False
     kept: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     tally: dict[str, int] = field(default_factory=dict)
@@ -154,17 +155,21 @@ class Conduct:
         safe = oracle.safe_answer(received, self.arms)
         on = received.status[self.arm - 1] == oracle.DRIVE_ON
         modes = [received.axes[slot].mode for slot in self.slots]
-        self._status(answer, safe, in_open_mode=on and any(m in oracle.OPEN for m in modes))
+        is_open = on and any(mode in oracle.OPEN for mode in modes)
+        self._status(answer, safe, in_open_mode=is_open)
+        lost_target = oracle.lost_target(received, self.arms)
+        if lost_target:
+            assert oracle.drive_off(answer), "held at what is no number"
+            self._count("no target")
         if not self.usable:
             self._unusable(received, answer, safe, record)
             return
-        is_open = on and any(mode in oracle.OPEN for mode in modes)
         ready = [on and mode == self.mode for mode in modes]
         commanded = record["commanded_position"], record["commanded_velocity"]
         paused = on and any(mode in (500, 502) for mode in modes)
         if not is_open and not paused:
             self._note(on, modes)
-        if is_open and self._refused(answer):
+        if (is_open or lost_target) and self._refused(answer):
             self._refusal(answer, safe)
             assert np.isnan(commanded).all(), "a refused set-point was recorded as sent"
             self.interrupted()
@@ -204,8 +209,8 @@ class Conduct:
         axes = [a for a, arm in zip(received.axes, self.arms, strict=True) if arm == self.arm]
         on = received.status[self.arm - 1] == oracle.DRIVE_ON
         if answer != safe:
-            assert on
-            assert any(axis.mode in oracle.OPEN for axis in axes)
+            is_open = on and any(axis.mode in oracle.OPEN for axis in axes)
+            assert is_open or oracle.lost_target(received, self.arms)
             self._refusal(answer, safe)
         assert np.isnan(record["commanded_position"]).all()
         self.interrupted()
@@ -240,7 +245,7 @@ class Conduct:
 
     def _refusal(self, answer: oracle.Packet, safe: oracle.Packet) -> None:
         modes = [axis.mode for axis in answer.axes]
-        drive_off = all(mode == oracle.DRIVE_OFF_REQUEST for mode in modes)
+        drive_off = oracle.drive_off(answer)
         reported = [k for k, mode in enumerate(modes) if mode in REFUSALS]
         assert drive_off or (len(reported) == 1 and reported[0] in self.slots), modes
         for slot, (ours, theirs) in enumerate(zip(answer.axes, safe.axes, strict=True)):
@@ -309,6 +314,8 @@ class Conduct:
             self.sent = [q, q, q, q]
         else:
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
+            nearest = np.abs(np.array(self.motors) - r[0]).min(axis=0)
+            assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
             low, high = np.float32(motor - rounding), np.float32(motor + rounding)
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
             step = motor - self.motor
@@ -325,6 +332,7 @@ class Conduct:
         assert (q <= self.limits.upper + 2e-6 * span).all(), "position"
         if self.mode == 1:
             self._beside(a)
+        self.motors = [*([] if self.motor is None else self.motors), motor][-3:]
         self.motor = motor
         del self.sent[:-3]
 

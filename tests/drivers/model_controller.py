@@ -12,6 +12,7 @@ N = 6
 # Two slots of axes that are not the cell's: axis 7 of the same arm, axis 1 of arm 2.
 AXES = ((1, 2), (1, 0), (2, 0), (1, 5), (1, 3), (1, 6), (1, 1), (1, 4))
 ARMS = tuple(arm for arm, _ in AXES)
+OTHER_AXES = {(1, 7), (2, 1)}
 SLOTS = tuple(AXES.index((1, joint)) for joint in range(N))
 
 

@@ -6,6 +6,7 @@ second time, on raw 4-byte words, so that NaN and signed zeros are compared bit 
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import NamedTuple
 
@@ -96,6 +97,20 @@ def safe_answer(received: Packet, arms: tuple[int, ...]) -> Packet:
         safe_axis(axis, on[arm - 1]) for axis, arm in zip(received.axes, arms, strict=True)
     )
     return Packet(answer_number(received.number), status, ZERO, axes)
+
+
+def lost_target(received: Packet, arms: tuple[int, ...]) -> bool:
+    """An axis open with its drive on, of whichever arm, has a target that is no number."""
+    return any(
+        axis.mode in HOLDS_A_POSITION
+        and received.status[arm - 1] == DRIVE_ON
+        and not math.isfinite(axis.floats[0])
+        for axis, arm in zip(received.axes, arms, strict=True)
+    )
+
+
+def drive_off(answer: Packet) -> bool:
+    return all(axis.mode == DRIVE_OFF_REQUEST for axis in answer.axes)
 
 
 def echo(data: bytes) -> bytes:

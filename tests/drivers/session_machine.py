@@ -24,6 +24,7 @@ from model_controller import (
     AXES,
     GOOD_INIT,
     OTHER_ARM,
+    OTHER_AXES,
     PERIOD,
     SLOTS,
     Controller,
@@ -71,6 +72,7 @@ class SessionMachine(RuleBasedStateMachine):
             self.ring,
             mode=mode,
             max_gap=MAX_GAP,
+            other_axes=OTHER_AXES,
             settle_cycles=settle,
         )
         self.controller = Controller()

@@ -61,7 +61,7 @@ def test_slow_values_are_not_known_before_their_first_turn(run):
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_motion_survives_lost_cycles(profile):
-    run = Run(profile, lost=range(60, 2000, 7))
+    run = Run(profile, lost=range(60, 2000, 7), missed_replies=5)
     (ended,) = run.seen(MotionEnded)
     assert ended.outcome == "completed", ended.reason
     assert len(run.seen(GapSeen)) > 10
@@ -80,7 +80,7 @@ def test_a_whole_session_over_two_serial_adapters(profile):
     options = {"sleep_after_open": 0.0}
     ends = (
         CanSpec("slcan", bus.ports[0], profile, period=PERIOD, options=options).open(),
-        open_far_end("slcan", bus.ports[1], profile, options=options),
+        open_far_end("slcan", bus.ports[1], profile, period=PERIOD, options=options),
     )
     run = Run(profile, ends=ends, cycles=250, missed_replies=50)
     bus.close()

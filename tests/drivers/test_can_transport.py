@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import os
 import pickle
@@ -67,7 +68,7 @@ class TestUdpMulticast(CanContract):
     def link(self, profile):
         channel = f"{GROUP}/{next(_ports)}"
         near = CanSpec("udp_multicast", channel, profile, period=0.002).open()
-        far = open_far_end("udp_multicast", channel, profile)
+        far = open_far_end("udp_multicast", channel, profile, period=0.002)
         yield near, Far(far)
         near.close()
         far.close()
@@ -81,7 +82,7 @@ class TestSlcan(CanContract):
         bus = SlcanBus()
         options = {"sleep_after_open": 0.0}
         near = CanSpec("slcan", bus.ports[0], profile, period=0.002, options=options).open()
-        far = open_far_end("slcan", bus.ports[1], profile, options=options)
+        far = open_far_end("slcan", bus.ports[1], profile, period=0.002, options=options)
         far.receive(0.0)
         yield near, Far(far)
         near.close()
@@ -298,7 +299,46 @@ def test_a_bus_that_is_not_there_is_named_with_its_remedy():
     with pytest.raises(TransportError, match="python-can"):
         CanSpec("no-such-interface", "0", period=0.001).open()
     with pytest.raises(FarEndError, match="vcan77"):
-        open_far_end("socketcan", "vcan77")
+        open_far_end("socketcan", "vcan77", period=0.002)
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel"), [("udp_multicast", "nonsense"), ("slcan", "/dev/no-such-port")]
+)
+def test_of_a_bus_that_cannot_be_opened_python_can_has_nothing_left_to_say(
+    interface, channel, caplog
+):
+    with pytest.raises(TransportError, match=channel) as caught:
+        CanSpec(interface, channel, period=0.002).open()
+    del caught
+    gc.collect()
+    assert caplog.messages == []
+
+
+def test_an_adapter_that_refuses_the_bit_rate_is_let_go(monkeypatch, caplog):
+    def refuse(*_):
+        raise ValueError("no such rate")
+
+    monkeypatch.setattr(can.interfaces.slcan.slcanBus, "set_bitrate", refuse)
+    bus = SlcanBus()
+    options = {"sleep_after_open": 0.0}
+    with pytest.raises(TransportError, match="no such rate") as caught:
+        CanSpec("slcan", bus.ports[0], period=0.002, options=options).open()
+    del caught
+    gc.collect()
+    bus.close()
+    assert caplog.messages == []
+
+
+def test_the_controllers_end_is_checked_before_the_bus_is_opened():
+    with pytest.raises(FarEndError, match=r"135\.0 % of a cycle of 1 ms") as caught:
+        open_far_end("virtual", "0", "classic", period=0.001)
+    assert isinstance(caught.value.__cause__, CanBusLoadError)
+    with pytest.raises(FarEndError, match="mode 8") as caught:
+        open_far_end("virtual", "0", period=0.002, mode=8)
+    assert isinstance(caught.value.__cause__, CanModeError)
+    with pytest.raises(FarEndError, match="7 axes"):
+        open_far_end("virtual", "0", period=0.002, n_axes=7)
 
 
 def test_a_description_is_checked_before_the_bus_is_opened():

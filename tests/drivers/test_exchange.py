@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rig import PERIOD, START, Cruise, N, Rig, smooth_move
 
 from drivers import (
@@ -20,6 +22,7 @@ from drivers import (
     TransportClosed,
     exchange,
 )
+from drivers.exchange.intake import MOST_KINDS
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 
@@ -240,12 +243,85 @@ class TestHeldUp:
         assert rig.session.counters.discarded == {"late": 5}
         assert source.stops == 1 or rig.session.state is State.FAULTED
 
-    def test_with_closed_axes_every_packet_is_answered(self):
+    @pytest.mark.parametrize("waiting", [65, 200, 1000])
+    def test_of_a_pile_of_any_height_only_the_newest_is_answered(self, waiting):
+        rig, source = self.moving()
+        on_time = rig.packet()
+        advances = source.advances
+        sent = self.serve(rig, on_time, [rig.packet() for _ in range(waiting)])
+        assert len(sent) == 2
+        assert sent[1][:4] == (rig.number + 1).to_bytes(4, "little")
+        assert source.advances <= advances + 2
+        assert rig.session.counters.discarded == {"late": waiting - 1}
+
+    def test_with_closed_axes_too(self):
         rig = Rig()
         rig.close()
         on_time = rig.packet()
         late = [rig.packet() for _ in range(4)]
-        assert len(self.serve(rig, on_time, late)) == 5
+        assert len(self.serve(rig, on_time, late)) == 2
+        assert rig.session.counters.discarded == {"late": 3}
+
+    def test_packets_that_come_bunched_do_not_make_the_motion_run_ahead(self):
+        rig, source = self.moving()
+        packets = [rig.packet() for _ in range(9)]
+        # One on time, eight together that were held up on their way.
+        times = [rig.now + PERIOD, *(rig.now + (9.0 + 0.01 * k) * PERIOD for k in range(8))]
+        link = Bunched(zip(times, packets, strict=True))
+        advances = source.advances
+        exchange(link, rig.session, until=lambda: False)
+        assert source.advances <= advances + 3
+        assert link.sent[-1][:4] == (rig.number + 1).to_bytes(4, "little")
+
+    def test_axes_that_open_within_the_pile_do_not_run_ahead(self):
+        rig = Rig()
+        source = Cruise()
+        rig.session.request(source)
+        rig.close()
+        on_time = rig.packet()
+        late = [rig.packet() for _ in range(3)]
+        rig.modes = Mode.POSITION
+        late += [rig.packet() for _ in range(100)]
+        assert len(self.serve(rig, on_time, late)) == 3
+        assert source.advances <= 1
+
+    def test_axes_that_closed_and_opened_within_the_pile_are_seen_to_have_closed(self):
+        rig, source = self.moving()
+        on_time = rig.packet()
+        late = []
+        for modes in (Mode.POSITION, Mode.CLOSED, Mode.POSITION):
+            rig.modes = modes
+            late += [rig.packet() for _ in range(5)]
+        advances = source.advances
+        assert len(self.serve(rig, on_time, late)) == 3
+        assert source.advances <= advances + 1
+        states = [e.after for e in rig.session.events() if isinstance(e, StateChanged)]
+        assert State.CLOSED in states
+
+    def test_strange_numbers_and_garbage_do_not_break_a_pile_up(self):
+        rig, source = self.moving()
+        on_time = rig.packet()
+        late = []
+        for _ in range(100):
+            late += [rig.packet(), b"garbage", b"\x7f" * 228]
+        advances = source.advances
+        sent = self.serve(rig, on_time, late)
+        assert len(sent) == 2
+        assert source.advances <= advances + 2
+
+    @given(st.lists(st.integers(0, 255), max_size=400))
+    def test_whatever_waits_few_are_answered(self, statuses):
+        packets = [
+            number.to_bytes(4, "little") + bytes([status, 0, 0, 0]) + bytes(220)
+            for number, status in enumerate(statuses)
+        ]
+        session = Mute()
+        link = Piled([packets])
+        exchange(link, session, until=lambda: False)
+        assert len(link.sent) <= MOST_KINDS
+        if packets:
+            assert link.sent[-1] == packets[-1]
+        assert len(link.sent) + session.counted.get("late", 0) == len(packets)
 
     def test_an_init_packet_among_them_is_never_left_out(self):
         rig, _ = self.moving()
@@ -273,9 +349,175 @@ class TestHeldUp:
         exchange(link, rig.session, until=lambda: False)
         assert ages == [1, 2, 3, 4]
 
-    def test_a_duplicate_is_answered_as_one(self):
+    def test_a_packet_and_its_duplicate_get_one_answer(self):
         rig, _ = self.moving()
         on_time, late = rig.packet(), rig.packet()
-        sent = self.serve(rig, on_time, [late, late])
-        assert sent[1] == sent[2]
+        assert len(self.serve(rig, on_time, [late, late])) == 2
         assert rig.session.counters.discarded == {}
+
+
+class Bunched(Piled):
+    """A link that knows when its packets arrived; time is that of the last, or a little more."""
+
+    def __init__(self, script):
+        super().__init__([])
+        self.script = list(script)
+        self.arrived = None
+
+    def receive(self, timeout):
+        if not self.script:
+            if timeout > 0.0:
+                raise TransportClosed("the script is at its end")
+            return None
+        if timeout <= 0.0 and self.script[0][0] > self.now + 0.1 * PERIOD:
+            return None
+        self.arrived, packet = self.script.pop(0)
+        self.now = max(self.now, self.arrived)
+        return packet
+
+
+class Mute:
+    """A session that answers everything with itself, a cycle of 2 ms."""
+
+    state = State.OPEN
+    period = PERIOD
+    deadline = 1e9
+
+    def __init__(self):
+        self.counted = {}
+        self.stops = []
+
+    def reply(self, packet, now, ages):
+        return packet
+
+    def discarded(self, kind, count):
+        self.counted[kind] = self.counted.get(kind, 0) + count
+
+    def tick(self, now):
+        pass
+
+    def stop(self, reason):
+        self.stops.append(reason)
+
+
+class Paced:
+    """A link whose packets arrive each period, whatever happens, and are answered at a cost.
+
+    With `patient`, the controller does not begin a cycle before it has the answer to the last.
+    """
+
+    ages = None
+    _patient = False
+
+    def __init__(self, costs, *, patient=False, stamped=True):
+        self.now = 0.0
+        self.due = PERIOD
+        self.costs = list(costs)
+        self.number = 0
+        self.patient = patient
+        self.answered = []
+        if stamped:
+            self.arrived = None
+
+    def receive(self, timeout):
+        if not self.costs:
+            raise TransportClosed("the script is at its end")
+        if self.due > self.now + timeout:
+            self.now += timeout
+            return None
+        if hasattr(self, "arrived"):
+            self.arrived = self.due
+        self.now = max(self.now, self.due)
+        self.due += PERIOD
+        self.number += 1
+        return self.number.to_bytes(4, "little") + bytes(224)
+
+    def reply(self, packet, now, ages):
+        self.now += self.costs.pop(0) * PERIOD
+        return packet
+
+    def send(self, packet):
+        self.answered.append(int.from_bytes(packet[:4], "little"))
+        if self.patient:
+            self.due = max(self.due, self.now + 0.2 * PERIOD)
+
+    def rejected(self):
+        return {}
+
+    def forget_peer(self):
+        pass
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("stamped", [True, False], ids=["stamped", "unstamped"])
+class TestLateness:
+    def run(self, costs, *, state=State.OPEN, stamped=True, patient=False, max_late=2):
+        link, session = Paced(costs, patient=patient, stamped=stamped), Mute()
+        session.state = state
+        session.reply = link.reply
+        exchange(link, session, until=lambda: False, max_late=max_late)
+        return link, session
+
+    @pytest.mark.parametrize("cost", [0.1, 0.9, 0.99])
+    def test_answers_within_their_cycle_are_not_late(self, cost, stamped):
+        link, session = self.run([cost] * 50, stamped=stamped)
+        assert session.counted.get("answered late", 0) == 0
+        assert link.answered == list(range(1, 51))
+        assert session.stops == []
+
+    @pytest.mark.parametrize("cost", [1.05, 1.1, 1.3, 1.49, 1.6, 3.5])
+    def test_an_overload_however_slight_is_seen_and_stops_the_motion(self, cost, stamped):
+        link, session = self.run([cost] * 50, stamped=stamped)
+        assert session.counted["answered late"] >= 49
+        assert session.stops[0] == "3 answers in a row left too late"
+        # And the answers do not fall behind: each is to what came within the last cycle.
+        assert link.answered[-1] >= 49 * cost - 1
+
+    @pytest.mark.parametrize("state", [State.CLOSED, State.DRIVING_ON, State.EXITING])
+    def test_it_is_counted_in_every_state(self, state, stamped):
+        _, session = self.run([1.2] * 50, state=state, stamped=stamped)
+        assert session.counted["answered late"] >= 49
+        assert session.stops == []
+
+    def test_as_many_as_are_borne_stop_nothing(self, stamped):
+        _, session = self.run([1.2, 1.2, 0.1, 0.1] * 10, stamped=stamped)
+        assert session.counted["answered late"] >= 20
+        assert session.stops == []
+
+    def test_a_controller_that_waits_for_its_answers_is_not_stopped(self, stamped):
+        _, session = self.run([1.5] * 50, patient=True, stamped=stamped)
+        assert session.stops == []
+
+
+class Anywhere(Piled):
+    """A link that says how often it was told to listen to all ports."""
+
+    def __init__(self, batches):
+        super().__init__(batches)
+        self.forgotten = []
+
+    def forget_peer(self):
+        self.forgotten.append(len(self.sent))
+
+
+class TestWhoIsListenedTo:
+    def test_before_the_init_packet_nobody_in_particular(self):
+        rig = Rig()
+        sync = (1).to_bytes(4, "little") + bytes(728)
+        rig.number = 12
+        link = Anywhere([[b"\xff" * 60], [sync], [rig.init.encode()], [rig.packet()]])
+        exchange(link, rig.session, until=lambda: False)
+        assert link.forgotten == [0, 1]
+        assert len(link.sent) == 3
+
+    def test_a_lost_session_goes_on_with_whoever_gets_an_answer(self):
+        rig = Rig()
+        rig.close()
+        rig.session.tick(rig.now + 2.0)
+        link = Anywhere([[b"\xff" * 60], [rig.packet()], [rig.packet()]])
+        link.now = rig.now + 2.0
+        exchange(link, rig.session, until=lambda: False)
+        assert link.forgotten == [0]
+        assert len(link.sent) == 2

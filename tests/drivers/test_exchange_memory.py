@@ -7,6 +7,7 @@ import mmap
 import os
 import pickle
 import struct
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,11 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rig import Cruise, N, still
 
-from drivers import GapSeen, StateChanged
-from drivers.events import PacketRejected
+from drivers import GapSeen, MotionEnded, StateChanged
+from drivers.events import AnswersLost, Outcome, PacketRejected
 from drivers.exchange import (
     ControlBlock,
+    Ended,
     EventReader,
+    EventsLost,
     EventWriter,
     RingReader,
     SharedCycleRing,
@@ -26,6 +29,7 @@ from drivers.exchange import (
     event_log,
     program,
 )
+from drivers.exchange.digest import Digest
 from drivers.record import CycleRing, cycle_dtype
 from drivers.states import State
 
@@ -154,14 +158,17 @@ class TestEventLog:
     def test_every_event_is_read_in_order_or_counted_as_lost(self, steps, capacity):
         fd = event_log.create(capacity)
         writer, reader = EventWriter(fd), EventReader(fd)
-        written, seen = 0, []
+        written, seen, told = 0, [], 0
         for count in steps:
             for cycle in range(written, written + count):
                 writer.write(PacketRejected("x" * (cycle % 30), cycle))
             written += count
-            seen += [event.count for event in reader.drain()]
+            events = reader.drain()
+            seen += [event.count for event in events if isinstance(event, PacketRejected)]
+            told += sum(event.count for event in events if isinstance(event, EventsLost))
         assert seen == sorted(set(seen))
         assert len(seen) + reader.lost == written
+        assert told == reader.lost
         os.close(fd)
 
     def test_a_torn_frame_is_lost_and_not_believed(self):
@@ -171,7 +178,7 @@ class TestEventLog:
             writer.write(event)
         length = struct.unpack("<I", os.pread(fd, 4, 256))[0]
         os.pwrite(fd, b"\xff", 256 + 16 + length // 2)
-        assert reader.drain() == gaps([2, 3])
+        assert reader.drain() == [EventsLost(1), *gaps([2, 3])]
         assert reader.lost == 1
 
     def test_frames_given_up_while_they_are_copied_are_not_given_out(self):
@@ -188,7 +195,8 @@ class TestEventLog:
             return copy(position, count)
 
         reader._get = overtaken
-        seen = reader.drain() + reader.drain()
+        lost, *seen = reader.drain() + reader.drain()
+        assert lost == EventsLost(reader.lost)
         assert seen == gaps(range(6 - len(seen), 6))
         assert 0 < len(seen) < 5
         assert len(seen) + reader.lost == 5
@@ -197,6 +205,42 @@ class TestEventLog:
         writer = EventWriter(event_log.create(100))
         with pytest.raises(ValueError, match="an event of"):
             writer.write(PacketRejected("x" * 200, 1))
+
+
+class TestDigest:
+    @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=200))
+    def test_nothing_is_lost_and_little_is_told(self, steps):
+        digest, told, now, rejected, missed = Digest(), [], 0.0, 0, 0
+        for count, kind in steps:
+            events = [PacketRejected(f"kind {kind}", count), GapSeen(count, round(now * 1000))]
+            rejected += count
+            missed += count
+            told += [(now, event) for event in digest.take(events, now)]
+            now += 0.001
+        told += [(now, event) for event in digest.rest()]
+        assert sum(e.count for _, e in told if isinstance(e, PacketRejected)) == rejected
+        assert sum(e.missed for _, e in told if isinstance(e, GapSeen)) == missed
+        assert len(told) <= 5 * (now / 0.1 + 2)
+
+    def test_the_first_of_a_sort_is_told_at_once_and_the_rest_when_the_time_is_over(self):
+        digest = Digest()
+        assert digest.take([GapSeen(1, 7)], 0.0) == [GapSeen(1, 7)]
+        assert digest.take([GapSeen(2, 9), AnswersLost(1, 9)], 0.01) == [AnswersLost(1, 9)]
+        assert digest.take([GapSeen(1, 12), AnswersLost(2, 12)], 0.05) == []
+        assert digest.take([], 0.099) == []
+        assert digest.take([], 0.1) == [GapSeen(3, 12)]
+        assert digest.take([], 0.11) == [AnswersLost(2, 12)]
+        assert digest.take([], 1.0) == digest.rest() == []
+
+    def test_the_end_of_a_motion_comes_after_what_led_to_it(self):
+        digest = Digest()
+        digest.take([GapSeen(1, 7)], 0.0)
+        ended = MotionEnded("stopped", "5 packets were missed in a row", 0, 9)
+        assert digest.take([GapSeen(5, 9), ended], 0.01) == [GapSeen(5, 9), ended]
+
+    def test_everything_else_passes_in_order(self):
+        changed = [StateChanged(State.OPEN, State.EXITING, k) for k in range(50)]
+        assert Digest().take(changed, 0.0) == changed
 
 
 class TestControlBlock:
@@ -218,6 +262,10 @@ class TestControlBlock:
     def test_memory_of_something_else_is_refused(self):
         with pytest.raises(ValueError, match="not a control block"):
             ControlBlock(SharedCycleRing.create(N, 10).fd)
+
+    def test_the_names_of_the_ends_are_those_of_the_events(self):
+        names = {ended.name.lower() for ended in Ended if ended is not Ended.NONE}
+        assert names == set(get_args(Outcome))
 
 
 class TestProgram:

@@ -38,6 +38,8 @@ EXAMPLES = {
     SourceFailed: SourceFailed("row 3", 4),
     AxisLeft: AxisLeft(2, 0, 4, 99),
     ExitNotGranted: ExitNotGranted(5000, 6000),
+    errors.SessionFailed: errors.SessionFailed(ValueError("why"), 7),
+    errors.TargetNotFinite: errors.TargetNotFinite(2, 6, float("inf"), 8),
 }
 
 
@@ -105,6 +107,7 @@ EVENTS = {
     events.InitReceived: events.InitReceived(init_packet(), "why not", ("a", "b"), True),
     events.StateChanged: events.StateChanged(State.CLOSED, State.OPEN, 5),
     events.GapSeen: events.GapSeen(2, 9),
+    events.AnswersLost: events.AnswersLost(1, 9),
     events.MotionStarted: events.MotionStarted(0, 10),
     events.MotionEnded: events.MotionEnded("lost", "the drive went off", 0, 20),
     events.PacketRejected: events.PacketRejected("foreign", 3),
@@ -126,6 +129,10 @@ def test_events_of_a_real_session():
     rig, _ = moving()
     rig.send(b"rubbish")
     rig.miss(1)
+    before = rig.axes["d"].copy()
+    rig.cycle()
+    rig.axes["d"][:] = before  # the answer was lost
+    rig.cycle()
     rig.axes["d"][0, 4] = 99.0
     rig.cycle()
     rig.session.tick(rig.now + 5.0)

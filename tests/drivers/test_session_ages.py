@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import Cruise, N, Rig, assert_refused, init_packet, moving, smooth_move, still
+from rig import (
+    Cruise,
+    N,
+    Rig,
+    all_drive_off,
+    assert_refused,
+    init_packet,
+    moving,
+    smooth_move,
+    still,
+)
 
-from drivers import MotionHeld, State
+from drivers import Mode, MotionHeld, State
 from drivers.errors import FirstSetPointUnknown, MotionUnknown
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
@@ -38,7 +48,8 @@ class TestRecords:
         axes_map = np.full((4, 10), 0xFF)
         axes_map[0, :N] = [6, 5, 4, 2, 1, 0]
         axes_map[1, 0] = 3
-        rig = Rig(init=init_packet(n_axes=7, open_axes_map=axes_map), slots=axes_map[0, :N])
+        init = init_packet(n_axes=7, open_axes_map=axes_map)
+        rig = Rig(init=init, slots=axes_map[0, :N], other_axes={(2, 1)})
         rig.ages = fresh(7)
         rig.ages[3] = 50
         rig.ages[6, 0] = 2
@@ -117,13 +128,56 @@ class TestLongGaps:
         rig, source, _ = self.after(2, D2, 60)
         assert (rig.state, source.stops) == (State.OPEN, 0)
 
-    def test_a_motion_not_yet_requested_is_not_concerned(self):
+    @pytest.mark.parametrize("leaving", [False, True])
+    def test_nor_of_an_arm_that_is_held(self, leaving):
         rig = Rig()
         rig.open()
+        if leaving:
+            rig.session.stop()
+            rig.cycle()
+            assert rig.state is State.EXITING
         rig.ages = fresh() + np.uint16(3)
-        rig.miss(10)
         rig.cycle()
-        assert rig.state is State.OPEN
+        rig.miss(10)
+        assert all_drive_off(rig.cycle())
+        assert type(rig.refusal) is MotionUnknown
+
+
+class TestTargetsGivenBack:
+    def opening(self) -> Rig:
+        rig = Rig()
+        rig.ages = fresh()
+        rig.close()
+        rig.axes["mode"][2] = Mode.POSITION
+        rig.cycle()
+        assert rig.state is State.OPENING
+        return rig
+
+    def test_one_of_an_earlier_cycle_is_not_given_to_an_axis_that_opens(self):
+        rig = self.opening()
+        rig.ages[4, D1] = 1
+        rig.cycle()
+        assert rig.state is State.OPENING, "axis 5 is closed"
+        rig.ages[2, D1] = 1
+        assert all_drive_off(rig.cycle())
+        error = rig.refusal
+        assert type(error) is FirstSetPointUnknown
+        assert (error.joint, error.value) == (2, 1.0)
+
+    def test_nor_to_one_that_opens_again_on_the_way_out(self):
+        rig = Rig()
+        rig.ages = fresh()
+        rig.open()
+        rig.session.stop()
+        rig.cycle()
+        rig.axes["mode"][2] = Mode.CLOSED
+        rig.cycle()
+        rig.ages[:, D1] = 1
+        rig.cycle()
+        assert rig.state is State.EXITING, "axes still open are given the last set-point"
+        rig.axes["mode"][2] = Mode.POSITION
+        assert all_drive_off(rig.cycle())
+        assert type(rig.refusal) is FirstSetPointUnknown
 
 
 def test_a_motion_under_changing_ages_is_the_same_motion():

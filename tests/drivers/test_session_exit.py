@@ -11,6 +11,7 @@ from drivers import (
     FirstSetPoint,
     FollowingError,
     Mode,
+    MotionNotCarriedOn,
     NotAtStandstill,
     NotFinite,
     RequestError,
@@ -107,6 +108,15 @@ class TestWatchedWhileLeaving:
         rig.axes["d"][3, [0, 2]] += 2.01
         assert rig.cycle().axes["mode"].tolist() == [4, 4, 4, 508, 4, 4]
 
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_a_target_that_is_not_the_one_given(self, sign):
+        rig = exiting()
+        rig.axes["d"][3, [0, 2]] += sign * 0.19
+        rig.cycle()
+        assert rig.state is State.EXITING
+        rig.axes["d"][3, [0, 2]] += sign * 0.21
+        assert assert_refused(rig, rig.cycle(), MotionNotCarriedOn).joint == 3
+
     def test_current_of_an_axis_still_open(self):
         rig = exiting()
         rig.axes["d"][3, 4] = 20.1
@@ -157,14 +167,29 @@ class TestRequestWhileHeldOpen:
         assert rig.state is State.OPEN
         rig = self.held()
         rig.axes["d"][4, columns] += 0.21
-        rig.cycle()
-        assert rig.state is State.OPEN
-        # The arm of the rig is where it was told to be, unless it is moved again.
-        rig.axes["d"][4, columns] += 0.21
         source, answer = self.begin(rig)
         error = assert_refused(rig, answer, FirstSetPoint)
         assert (error.joint, error.bound) == (4, pytest.approx(0.2))
         assert source.advances == 0
+
+    @pytest.mark.parametrize("columns", [[0], [0, 2]], ids=["target", "both"])
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_a_target_that_wanders_off_is_noticed_without_a_motion_too(self, columns, sign):
+        rig = self.held()
+        rig.axes["d"][4, columns] += sign * 0.19
+        rig.cycle()
+        assert rig.state is State.OPEN
+        rig.axes["d"][4, columns] += sign * 0.21
+        assert all_drive_off(rig.cycle())
+        error = rig.refusal
+        assert type(error) is MotionNotCarriedOn
+        assert (error.joint, error.bound) == (4, pytest.approx(0.2))
+
+    def test_an_arm_that_sags_is_the_controllers_to_hold(self):
+        rig = self.held()
+        rig.axes["d"][4, 2] += 0.21
+        rig.cycle()
+        assert rig.state is State.OPEN
 
     @pytest.mark.parametrize("column", [1, 3])
     def test_not_if_it_does_not_stand(self, column):

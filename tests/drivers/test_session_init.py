@@ -217,6 +217,32 @@ class TestAcceptedInit:
         with pytest.raises(RequestError, match="cannot be accepted"):
             rig.session.request(still(3))
 
+    @pytest.mark.parametrize(
+        ("field", "axis", "value", "name"),
+        [
+            ("gear_ratio", 2, 111.5, "gear ratio of axis 3"),
+            ("gear_ratio", 2, -220.1, "gear ratio of axis 3"),
+            ("gear_ratio", 2, -54.9, "gear ratio of axis 3"),
+            ("gear_ratio", 2, -1e38, "gear ratio of axis 3"),
+            ("kinematic_influence", 3, 1.01, "k54"),
+            ("kinematic_influence", 4, -1.01, "k64"),
+            ("kinematic_influence", 5, 1e9, "k65"),
+        ],
+    )
+    def test_what_is_far_off_cannot_be_accepted(self, field, axis, value, name):
+        rig = self.other(**{field: (axis, value)})
+        rig.start()
+        event = rig.seen(InitReceived)[0]
+        assert event.unusable == f"{name} is too far off to be accepted; correct the cell file"
+        assert not event.adopted
+        assert rig.session.drive_train is rig.train
+
+    @pytest.mark.parametrize("value", [-219.9, -55.1])
+    def test_what_is_within_a_factor_of_two_can(self, value):
+        rig = self.other(gear_ratio=(2, value))
+        rig.start()
+        assert rig.seen(InitReceived)[0].adopted
+
     def test_nor_can_another_cycle_or_an_axis_that_is_closed(self):
         init = init_packet(sample_time=1)
         init.record["gear_ratio"][0, 0, 2] = -111.5
@@ -253,3 +279,42 @@ class TestAcceptedInit:
         event = rig.seen(InitReceived)[0]
         assert not event.adopted
         assert event.unusable == event.differences[0]
+
+
+class TestOtherAxes:
+    """Open in the controller, but no joint of the cell: they would be held, and nobody watches."""
+
+    def extra(self, arm: int, axis: int, **options) -> Rig:
+        table = np.full((4, 10), 0xFF)
+        table[0, :N] = range(N)
+        table[arm - 1, axis - 1] = N
+        return Rig(init=init_packet(n_axes=N + 1, open_axes_map=table), **options)
+
+    @pytest.mark.parametrize(("arm", "axis"), [(1, 7), (2, 1), (4, 10)])
+    def test_one_nobody_named_refuses_the_session(self, arm, axis):
+        rig = self.extra(arm, axis)
+        rig.start()
+        event = rig.seen(InitReceived)[0]
+        told = f"axis {axis} of arm {arm} is open in the controller; the cell does not know it"
+        assert event.differences == (told,)
+        assert event.unusable == told
+        with pytest.raises(RequestError, match="does not know"):
+            rig.session.request(still(3))
+
+    @pytest.mark.parametrize(("arm", "axis"), [(1, 7), (2, 1)])
+    @pytest.mark.parametrize("accept", [False, True])
+    def test_named_or_accepted_it_is_held_beside_the_motion(self, arm, axis, accept):
+        options = {"accept_init": True} if accept else {"other_axes": {(arm, axis)}}
+        rig = self.extra(arm, axis, **options)
+        rig.session.request(still(3))
+        rig.open()
+        event = rig.seen(InitReceived)[0]
+        assert (event.unusable, len(event.differences)) == (None, int(accept))
+        assert rig.session.drive_train is rig.train
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    def test_another_one_named_does_not_help(self):
+        rig = self.extra(1, 7, other_axes={(1, 8), (2, 7)})
+        rig.start()
+        assert "axis 7 of arm 1" in rig.seen(InitReceived)[0].unusable

@@ -133,7 +133,22 @@ class TestLostMotion:
         assert rig.ended.outcome == "lost"
         assert rig.ended.interval == -1
 
-    @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.DRIVING_ON, Mode.PAUSE_BY_CONTROLLER])
+    @pytest.mark.parametrize("pause", [Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER])
+    def test_a_waiting_motion_is_lost_by_a_pause(self, pause):
+        rig = Rig()
+        rig.close()
+        rig.session.request(still(3))
+        rig.modes = pause
+        rig.cycle()
+        assert (rig.ended.outcome, rig.ended.interval) == ("lost", -1)
+        assert rig.ended.reason == "the controller paused the exchange"
+        rig.session.request(still(3))
+        rig.cycle(3)
+        rig.open()
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.DRIVING_ON])
     def test_a_waiting_motion_is_lost_when_the_drive_goes_off(self, mode):
         rig = Rig()
         source = Cruise()

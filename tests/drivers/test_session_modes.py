@@ -37,6 +37,7 @@ from drivers import (
 )
 from drivers.errors import (
     CommandedCurrentLimit,
+    CommandedCurrentStep,
     CorrectionNotCarriedOn,
     CorrectionNotEnded,
 )
@@ -48,13 +49,14 @@ HEIGHT = np.array([0.01, -0.005, 0.02, 0.01, -0.01, 0.005])
 AMPERES = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 0.25])
 MOVED = (2, 7, 8)
 CURRENTS = (2, 9)
+AT_ONCE = limits(current_rise=1e-3)
 WIDE = {"jerk": np.full(N, 1e12), "acceleration": np.full(N, 1e9)}
 
 
 def correction(mode: int, cycles: int = 400) -> Correction:
     """A smooth one with all that the mode has fields for."""
     return Correction(
-        bump(HEIGHT, cycles) if mode in MOVED else None,
+        bump(HEIGHT * (0.1 if mode == 7 else 1.0), cycles) if mode in MOVED else None,
         bump(AMPERES, cycles) if mode in CURRENTS else None,
     )
 
@@ -202,7 +204,8 @@ class TestPositionWithFeedForward:
         rows[3, 5] = sign * 7.5
         rows[4, 5] = sign * 7.51
         small = init_packet(arm_1={"current_limit": [20, 20, 20, 20, 20, 7.5]})
-        rig = begun(1, WithFeedForward(np.tile(START, (10, 1)), current=rows), init=small)
+        source = WithFeedForward(np.tile(START, (10, 1)), current=rows)
+        rig = begun(1, source, init=small, guard_limits=AT_ONCE)
         assert rig.cycle(3).axes["d"][5, 4] == np.float32(sign * 7.5)
         error = assert_refused(rig, rig.cycle(), CommandedCurrentLimit)
         assert (error.joint, error.bound, error.unit) == (5, pytest.approx(7.5, rel=1e-5), "A")
@@ -301,8 +304,9 @@ class TestCorrections:
         error = assert_refused(rig, rig.cycle(11), SourceFailed)
         assert "no field" in str(error)
 
-    @pytest.mark.parametrize("mode", [2, 8])
-    def test_velocity_and_its_differences_have_bounds(self, mode):
+    @pytest.mark.parametrize(("mode", "step"), [(2, 1.0), (8, 1.0), (7, PERIOD)])
+    def test_velocity_and_its_differences_have_bounds(self, mode, step):
+        """So has an offset, which may be a step that the controller makes in each cycle."""
         t = PERIOD * np.arange(1, 400)[:, None]
         one = np.array([0, 0, 1.0, 0, 0, 0])
         slow = limits(**(WIDE | {"velocity": np.full(N, 0.5)}))
@@ -313,7 +317,7 @@ class TestCorrections:
         ]
         for rows, bounds, kind in cases:
             for scale, refused in ((0.999, False), (1.001, True)):
-                rig = begun(mode, Correction(scale * rows * one), guard_limits=bounds)
+                rig = begun(mode, Correction(scale * step * rows * one), guard_limits=bounds)
                 for _ in range(60):
                     answer = rig.cycle()
                     if all_drive_off(answer):
@@ -322,35 +326,75 @@ class TestCorrections:
                 if refused:
                     assert assert_refused(rig, answer, kind).joint == 2
 
-    def test_an_offset_has_the_bounds_of_set_points(self):
-        t = PERIOD * np.arange(1, 400)[:, None]
-        one = np.array([0, 0, 1.0, 0, 0, 0])
-        cases = [
-            (100.5 * t**3 / 6, limits(acceleration=np.full(N, 1e9)), JerkLimit),
-            (8.01 * t**2 / 2, limits(jerk=np.full(N, 1e12)), AccelerationLimit),
-            (2.01 * t, limits(**WIDE), VelocityLimit),
-        ]
-        for rows, bounds, kind in cases:
-            rig = begun(7, Correction(0.99 * rows * one), guard_limits=bounds)
-            rig.cycle(30)
-            assert rig.state is State.OPEN
-            rig = begun(7, Correction(rows * one), guard_limits=bounds)
-            for _ in range(30):
+    @pytest.mark.parametrize("sign", [-1.0, 1.0])
+    @pytest.mark.parametrize("missed", [0, 2])
+    def test_an_offset_and_the_controllers_own_speed_together_have_bounds(self, sign, missed):
+        def after(own: float, offset: float):
+            rows = np.zeros((20, N))
+            rows[10:, 2] = sign * offset
+            rig = begun(7, Correction(rows), guard_limits=limits(**WIDE))
+            for cycle in range(11):
+                rig.miss(missed)
+                step = sign * own * PERIOD * (missed + 1)
+                motor = rig.train.motor_from_joint[:, 2] * step / (2 * np.pi)
+                rig.axes["d"][:, 0] += motor
+                rig.axes["d"][:, 2] += motor
                 answer = rig.cycle()
-                if all_drive_off(answer):
-                    break
-            assert assert_refused(rig, answer, kind).joint == 2
+                assert cycle == 10 or rig.state is State.OPEN, rig.refusal
+            return rig, answer
+
+        rig, _ = after(1.0, 0.95 * PERIOD)
+        assert rig.state is State.OPEN
+        rig, answer = after(1.0, 1.05 * PERIOD)
+        error = assert_refused(rig, answer, VelocityLimit)
+        assert (error.joint, error.value) == (2, pytest.approx(2.05, rel=1e-2))
+
+    def test_an_offset_of_more_than_one_cycles_way_is_refused_however_slowly_it_grows(self):
+        rows = np.linspace(0.0, 1.0, 3001)[1:, None] ** 2 * 2.2 * PERIOD * np.eye(N)[3]
+        rig = begun(7, Correction(rows))
+        for _ in range(3000):
+            if all_drive_off(answer := rig.cycle()):
+                break
+        assert assert_refused(rig, answer, VelocityLimit).joint == 3
+        sent = rows[rows[:, 3] <= 2.0 * PERIOD * (1 + 1e-6)]
+        assert len(sent) == pytest.approx(rig.records[-1]["cycle"], abs=4)
+
+    @pytest.mark.parametrize("mode", [1, 2, 9])
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_a_current_that_jumps_is_refused(self, mode, sign):
+        def after(step: float):
+            rows = np.zeros((10, N))
+            # 20 A in 10 ms are 4 A in 2 ms.
+            rows[3:, 1] = sign * 3.0
+            rows[4:, 1] = sign * (3.0 - step)
+            source = Correction(current=rows)
+            if mode == 1:
+                source = WithFeedForward(
+                    np.tile(START, (11, 1)), current=np.vstack((rows[:1], rows))
+                )
+            rig = begun(mode, source)
+            rig.cycle(4)
+            assert rig.state is State.OPEN
+            return rig, rig.cycle()
+
+        rig, _ = after(3.99)
+        assert rig.state is State.OPEN
+        rig, answer = after(4.01)
+        error = assert_refused(rig, answer, CommandedCurrentStep)
+        assert (error.joint, error.value, error.unit) == (1, pytest.approx(4.01), "A")
+        assert error.bound == pytest.approx(4.0, rel=1e-5)
+        assert "change of commanded current in one cycle" in str(error)
 
     def test_target_and_offset_together_stay_inside_the_range(self):
-        tight = limits(upper=START + 0.005, lower=START - 0.005)
+        tight = limits(upper=START + 0.0005, lower=START - 0.0005)
         rig = begun(7, correction(7), guard_limits=tight)
         for _ in range(400):
             if all_drive_off(answer := rig.cycle()):
                 break
         error = assert_refused(rig, answer, PositionLimit)
-        # The first joint of those that go furthest beyond: 10 and 20 thousandths.
+        # The first joint of those that go furthest beyond: 1 and 2 thousandths.
         assert error.joint == 2
-        assert error.bound == pytest.approx(START[2] + 0.005)
+        assert error.bound == pytest.approx(START[2] + 0.0005)
         assert error.value > error.bound
 
     @pytest.mark.parametrize("mode", [2, 8, 9])
@@ -362,14 +406,14 @@ class TestCorrections:
     @pytest.mark.parametrize("sign", [-1, 1])
     def test_in_mode_9_the_servos_current_and_ours_together_are_limited(self, sign):
         rows = np.full((400, N), sign * 5.0)
-        rig = begun(9, Correction(current=rows))
+        rig = begun(9, Correction(current=rows), guard_limits=AT_ONCE)
         rig.axes["d"][:, 4] = sign * 15.0
         rig.cycle()
         assert rig.state is State.OPEN
         rig.axes["d"][4, 4] = sign * 15.01
         error = assert_refused(rig, rig.cycle(), CommandedCurrentLimit)
         assert (error.joint, error.value) == (4, pytest.approx(20.01))
-        rig = begun(9, Correction(current=rows))
+        rig = begun(9, Correction(current=rows), guard_limits=AT_ONCE)
         rig.axes["d"][:, 4] = -sign * 19.9
         rig.cycle()
         assert rig.state is State.OPEN
@@ -378,7 +422,7 @@ class TestCorrections:
     def test_in_mode_2_the_current_fed_forward_is_limited_by_itself(self, sign):
         rows = np.full((400, N), sign * 20.0)
         rows[1, 3] = sign * 20.01
-        rig = begun(2, Correction(current=rows))
+        rig = begun(2, Correction(current=rows), guard_limits=AT_ONCE)
         rig.axes["d"][:, 4] = sign * 15.0
         rig.cycle()
         assert rig.state is State.OPEN
@@ -470,7 +514,8 @@ class TestCorrections:
         for name in ("gear_ratio", "calibration", "kinematic_influence", "current_limit"):
             init.record[name][0, 1] = init.record[name][0, 0]
         init.record["following_error"] = 2.0
-        rig = Rig(mode=8, init=init, slots=axes_map[1, :N].astype(int), arm=2)
+        slots = axes_map[1, :N].astype(int)
+        rig = Rig(mode=8, init=init, slots=slots, arm=2, other_axes={(1, 1)})
         rig.status = 0
         source = correction(8)
         rig.session.request(source)

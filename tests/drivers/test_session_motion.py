@@ -236,7 +236,7 @@ class TestFromRequestToRest:
             init.record[name][0, 0] = np.nan  # of axes that are nothing to us
         init.record["following_error"][0, 1] = 2.0
         init.record["current_limit"][0, 1] = 20.0
-        rig = Rig(init=init, slots=np.array([6, 5, 4, 2, 1, 0]), arm=2)
+        rig = Rig(init=init, slots=np.array([6, 5, 4, 2, 1, 0]), arm=2, other_axes={(1, 1)})
         rig.start()
         self_status = bytes([5, 5, 0, 0])
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import deque
+from time import perf_counter
 
 import pytest
 from hypothesis import given
@@ -151,6 +152,16 @@ class TestFaults:
         assert transport.now == pytest.approx(0.1)
         assert transport.receive(0.1)[0] == 60
 
+    def test_a_fault_of_a_thousand_million_cycles_costs_no_more_than_one(self):
+        began = perf_counter()
+        link = FaultyLink([Lose(1, count=1_000_000_000)], 0.001)
+        assert link.carry(0, "to_pc", b"x") == [(0.0, b"x")]
+        for cycle in (1, 2, 1_000_000_000):
+            assert link.carry(cycle, "to_pc", b"x") == []
+            assert link.carry(cycle, "to_controller", b"x") == [(0.0, b"x")]
+        assert link.carry(1_000_000_001, "to_pc", b"x") == [(0.0, b"x")]
+        assert perf_counter() - began < 1.0
+
     def test_duplicated(self):
         peer = Script(packets(3))
         transport = SimulatedTransport(peer, [Duplicate(1)])
@@ -191,6 +202,8 @@ class TestFaults:
             (lambda: Reorder(-1), "Reorder"),
             (lambda: Corrupt(0, 0, 0), "Corrupt"),
             (lambda: Corrupt(0, -1), "Corrupt"),
+            (lambda: Lose(1_000_000_001), "Lose: cycle is more than"),
+            (lambda: Duplicate(0, count=10**20), "Duplicate: count is more than"),
             (lambda: Delay(0), "Delay"),
             (lambda: Delay(0, seconds=-1.0), "Delay"),
             (lambda: Delay(0, seconds=float("nan")), "Delay"),

@@ -101,8 +101,10 @@ class TestReading:
             ([4, 5, 4], Input.PARTLY_OPEN),
             ([5, 5, 5], Input.PARTLY_OPEN),
             ([4, 501, 4], Input.PARTLY_OPEN),
-            ([4, 504, 4], Input.PARTLY_OPEN),
-            ([4, 999, 4], Input.PARTLY_OPEN),
+            ([4, 504, 4], Input.UNAVAILABLE),
+            ([4, 999, 4], Input.UNAVAILABLE),
+            ([4, 4, 3], Input.UNAVAILABLE),
+            ([502, 3, 4], Input.UNAVAILABLE),
             ([502, 502, 502], Input.PAUSE),
             ([4, 500, 4], Input.PAUSE),
             ([504, 504, 504], Input.END),
@@ -148,8 +150,15 @@ class TestWaitingRequests:
         assert not keeps_request(before, State.FAULTED)
         assert not keeps_request(before, State.ENDED)
 
-    def test_survive_axes_closing_again(self):
-        assert keeps_request(State.OPENING, State.CLOSED)
+    def test_do_not_survive_an_opening_that_is_given_up(self):
+        assert not keeps_request(State.OPENING, State.CLOSED)
+
+    @pytest.mark.parametrize("before", [s for s in RUNNING if s is not State.FREEZING])
+    def test_do_not_survive_a_pause_that_begins(self, before):
+        assert not keeps_request(before, State.FREEZING)
+
+    def test_made_in_a_pause_wait_for_its_end(self):
+        assert keeps_request(State.FREEZING, State.FREEZING)
 
     def test_survive_the_first_init_but_no_later_one(self):
         assert keeps_request(State.SYNC, State.INIT)

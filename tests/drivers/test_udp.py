@@ -23,6 +23,7 @@ from drivers import (
     exchange,
 )
 from drivers.transports import TransportError, UdpSpec, UdpTransport
+from drivers.transports.base import Stamped
 
 HOST = "127.0.0.1"
 STRANGER = "127.0.0.2"
@@ -184,6 +185,52 @@ class TestWaiting:
         assert near.rejected() == {}
 
 
+class TestArrival:
+    def test_it_is_when_the_kernel_had_the_datagram(self, near, controller):
+        before = time.monotonic()
+        controller.send(bytes(48))
+        sent = time.monotonic()
+        time.sleep(0.05)
+        assert near.receive(PATIENCE) is not None
+        assert before - 1e-5 <= near.arrived <= sent + 1e-5
+        assert isinstance(near, Stamped)
+
+    def test_arrivals_go_forward(self, near, controller):
+        arrivals = []
+        for _ in range(50):
+            controller.send(bytes(48))
+            near.receive(PATIENCE)
+            arrivals.append(near.arrived)
+            assert near.arrived <= near.now
+        assert arrivals == sorted(arrivals)
+
+    @pytest.mark.parametrize("step", [-3600.0, 3600.0])
+    def test_a_wall_clock_set_meanwhile_makes_no_packet_old(self, near, controller, step):
+        controller.send(bytes(48))
+        wall = time.time
+        with patch("time.time", lambda: wall() + step):
+            near.receive(PATIENCE)
+        assert near.now - 0.05 < near.arrived <= near.now
+
+    def test_without_times_from_the_kernel_it_is_unknown(self):
+        option = socket.socket.setsockopt
+
+        def refuse(self, level, name, value):
+            if name == 35:
+                raise PermissionError(1, "not permitted")
+            option(self, level, name, value)
+
+        with patch("socket.socket.setsockopt", refuse):
+            near = UdpTransport(HOST, 0, HOST)
+        far = Controller(near.address[1])
+        far.send(bytes(48))
+        assert near.receive(PATIENCE) == bytes(48)
+        assert near.arrived is None
+        assert any("SO_TIMESTAMPNS" in note for note in near.notes)
+        near.close()
+        far.close()
+
+
 class TestOpening:
     def test_a_port_in_use_is_named_with_the_remedy(self, near):
         port = near.address[1]
@@ -222,7 +269,7 @@ class TestOpening:
         with patch("socket.socket.setsockopt", side_effect=PermissionError(1, "not permitted")):
             transport = UdpTransport(HOST, 0)
         transport.close()
-        assert len(transport.notes) == 3
+        assert len(transport.notes) == 4
         assert any("SO_PRIORITY" in note for note in transport.notes)
 
     def test_the_description_and_its_error_pickle(self):
@@ -273,7 +320,7 @@ class TestSession:
         sent = [init_packet().encode(), first, first, third, second, third[:100], self.packet(14)]
         for packet in sent:
             controller.send(packet)
-        self.serve(near, session, len(sent))
+            self.serve(near, session, 1)
         for _ in range(5):
             controller.wait()
         assert controller.heard_nothing()
@@ -304,6 +351,52 @@ class TestSession:
         another.send(init_packet().encode())
         self.serve(near, session, 1)
         another.wait()
+        assert session.state is State.INIT
+
+    def test_a_stray_datagram_does_not_lock_the_controller_out(
+        self, near, controller, another, session
+    ):
+        another.send(b"\xff" * 60)
+        self.serve(near, session, 1)
+        controller.send(init_packet().encode())
+        self.serve(near, session, 1)
+        controller.wait()
+        assert session.state is State.INIT
+        another.send(init_packet().encode())
+        assert near.receive(0.02) is None, "now the session has its port"
+
+    def test_nor_does_it_after_a_loss(self, near, controller, another):
+        session = Session(drive_train(), Guard(limits(), 0.002), CycleRing(N), silence_timeout=0.15)
+        controller.send(init_packet().encode())
+        self.serve(near, session, 1)
+        controller.wait()
+        exchange(near, session, until=lambda: session.state is State.FAULTED)
+        another.send(b"\xff" * 60)
+        self.serve(near, session, 1)
+        controller.send(init_packet().encode())
+        self.serve(near, session, 1)
+        controller.wait()
+        assert session.state is State.INIT
+
+    def test_a_flood_before_the_init_packet_does_not_keep_it_out(
+        self, near, controller, another, session
+    ):
+        end = time.monotonic() + 5.0
+
+        def flood(packet):
+            for _ in range(20):
+                another.send(packet)
+
+        for packet in (b"\xff" * 228, bytes(228), (1).to_bytes(4, "little") + bytes(728)):
+            flood(packet)
+        controller.send(init_packet().encode())
+        flood(b"\xff" * 228)
+        exchange(
+            near,
+            session,
+            until=lambda: session.state is State.INIT or time.monotonic() > end,
+        )
+        controller.wait()
         assert session.state is State.INIT
 
     def test_a_lost_session_may_go_on_from_another_port(self, near, controller, another, session):

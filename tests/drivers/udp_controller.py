@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import socket
 import time
 
@@ -58,23 +59,40 @@ class UdpController:
 
     def cycle(self, count: int = 1) -> None:
         for _ in range(count):
-            self.beat()
             begin = time.monotonic()
-            self.number = next_number(self.number)
-            self.axes["mode"] = Mode.POSITION if self.open else Mode.CLOSED
-            status = bytes([DRIVE_ON * self.drive, 0, 0, 0])
-            packet = CyclicPacket(self.number, status, bytes(4), self.axes).encode()
             try:
-                self.socket.send(packet)
-                self._obey(self.socket.recv(2048))
+                self.post()
+                self.receive()
             except (TimeoutError, ConnectionError):
                 self.unanswered += 1
             if self.cycle_time:
                 time.sleep(max(0.0, begin + self.cycle_time - time.monotonic()))
 
+    def post(self) -> None:
+        """Begin the next cycle."""
+        self.beat()
+        self.number = next_number(self.number)
+        self.axes["mode"] = Mode.POSITION if self.open else Mode.CLOSED
+        status = bytes([DRIVE_ON * self.drive, 0, 0, 0])
+        self.socket.send(CyclicPacket(self.number, status, bytes(4), self.axes).encode())
+
+    def receive(self) -> None:
+        """Wait for the answer to the cycle begun last, and follow it."""
+        reply = self.socket.recv(2048)
+        assert CyclicPacket.decode(reply, N).number == next_number(self.number)
+        self._obey(reply)
+
+    def take_what_came(self) -> None:
+        """Follow the answers that are there, to whichever cycle they are."""
+        while not self.quiet(0.0):
+            self._obey(self.socket.recv(2048))
+
+    def quiet(self, seconds: float) -> bool:
+        """Whether no answer comes within that time."""
+        return not select.select([self.socket], [], [], seconds)[0]
+
     def _obey(self, reply: bytes) -> None:
         answer = CyclicPacket.decode(reply, N)
-        assert answer.number == next_number(self.number)
         if (answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).any():
             self.drive_offs += 1
             self.drive = self.open = False

@@ -15,7 +15,15 @@ from typing import Any, Final
 
 import numpy as np
 import small_cell
-from laws import LIMITS, PERIOD, TOLERATED, broken_in_records, broken_on_the_wire
+from laws import (
+    LIMITS,
+    MAX_GAP,
+    PERIOD,
+    SESSION_THRESHOLD,
+    TOLERATED,
+    broken_in_records,
+    broken_on_the_wire,
+)
 from numpy.typing import NDArray
 
 from drivers import (
@@ -131,14 +139,14 @@ def session(current_share: float = 1.0) -> Session:
         velocity=LIMITS.velocity,
         acceleration=LIMITS.acceleration,
         jerk=LIMITS.jerk,
-        # narrower than the controller's own, so that the session is the first to notice
-        following_error=np.full(N, 0.6 * small_cell.FOLLOWING_ERROR),
+        following_error=np.full(N, SESSION_THRESHOLD),
         current=current_share * table["current_limit"],
     )
     return Session(
         DriveTrain(**table),
         Guard(guard, PERIOD),
         CycleRing(N, 8192),
+        max_gap=MAX_GAP,
         settle_cycles=10,
         silence_timeout=SILENCE,
     )
@@ -266,6 +274,8 @@ class Run:
                 return "silence"
             if not self.requested_first and _leaves_open(event):
                 return "closed"
+        if not self.requested_first and any(map(_unknown_mode, self.events)):
+            return "505: mode"
         return "waits" if self.session.requested else "open"
 
     def _asked_for(self) -> str:
@@ -325,6 +335,12 @@ class Run:
 def _leaves_open(event: Any) -> bool:
     by_itself = isinstance(event, StateChanged) and event.after is not State.FAULTED
     return by_itself and event.before is State.OPEN
+
+
+def _unknown_mode(event: Any) -> bool:
+    """Where no set-point was refused: that comes first."""
+    faulted = isinstance(event, StateChanged) and event.after is State.FAULTED
+    return faulted and event.before is State.OPEN
 
 
 def controller(while_silent: str, **changes: Any) -> SimulatedController:

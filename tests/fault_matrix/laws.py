@@ -28,6 +28,11 @@ LIMITS: Final = JointLimits(
 )
 TOLERATED: Final = 4
 """Answers missing in a row that the controller puts up with; the next one ends open mode."""
+MAX_GAP: Final = 2
+"""Of the session, by default."""
+SESSION_THRESHOLD: Final = 0.6 * small_cell.FOLLOWING_ERROR
+"""Narrower than the controller's own, so that the session is the first to notice."""
+_ALLOWANCE: Final = 0.1 * SESSION_THRESHOLD
 _STOP_FACTORS: Final = (1.0, 2.0, 3.0)
 _ASKS: Final = {Mode.DRIVE_OFF_REQUEST, Mode.FOLLOWING_ERROR}
 _OPEN: Final = [Mode.POSITION] * N
@@ -64,8 +69,9 @@ def _broken_in_answer(packet: bytes, reply: bytes) -> Iterator[str]:
     ours, theirs = answer.axes["d"], received.axes["d"]
     if powered and modes == _OPEN:
         ahead = float(np.abs(ours[:, 0] - theirs[:, 0]).max())
-        # at most one step further than where the controller would be had it carried everything on
-        if not ahead <= (TOLERATED + 1) * 1.01 * _FASTEST:
+        # Every target is one of the last MAX_GAP + 1 set-points, give or take a tenth of the
+        # threshold, and the answer is the next of them.
+        if not ahead <= (MAX_GAP + 1) * 1.01 * _FASTEST + _ALLOWANCE:
             yield f"a set-point {ahead} motor revolutions from the controller's target"
         return
     for axis in range(N):

@@ -4,6 +4,7 @@
     stopped           it came to rest on its path, and open mode was left
     lost: why         it ended because drive, open mode or link went away; nothing moves after that
     505 X, 508 X      error X was raised: all axes are asked to drive off, or one is reported
+    505: mode         a mode that nobody knows was reported, and drive-off asked for
     waits             it has not begun and waits for the drive, or for axes to open
     open, closed      no motion was requested: open mode went on, or was ended by the controller
     silence           no motion was requested: the link counts as lost
@@ -42,7 +43,7 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "sync": "completed",
         "init packet": "no start",
         "init .. closed": "completed (5)",
-        "opening": "completed (5) / completed (5) / lost: drive off (5)",
+        "opening": "lost: closed (5) / lost: closed (5) / lost: drive off (5)",
         "open at rest": "closed (5)",
         "moving": "lost: closed (5) / lost: closed (5) / lost: drive off (5)",
         "exiting": "completed (5)",
@@ -129,7 +130,7 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "sync": "completed",
         "init packet": "no start",
         "init .. closed": "completed (many)",
-        "opening": "completed (many) / completed (many) / lost: drive off (many)",
+        "opening": "lost: closed (many) / lost: closed (many) / lost: drive off (many)",
         "open at rest": "closed (many)",
         "moving": "lost: closed (many) / lost: closed (many) / lost: drive off (many)",
         "exiting": "completed (many)",
@@ -154,7 +155,7 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "init packet": "no start",
         "init .. drive off": "completed",
         "driving on .. opening": "lost: mode",
-        "open at rest": "closed",
+        "open at rest": "505: mode",
         "moving": "505 AxisLeft",
         "exiting": "completed",
     },
@@ -174,7 +175,8 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "moving .. exiting": "completed",
     },
     "answer's status corrupted": {
-        "sync .. opening": "completed",
+        "sync .. closed": "completed",
+        "opening": "lost: closed",
         "open at rest": "closed",
         "moving": "lost: closed",
         "exiting": "completed",
@@ -242,15 +244,15 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "exiting": "completed",
     },
     "pause 502": {
-        "sync .. closed": "completed",
-        "opening": "lost: pause",
+        "sync .. driving on": "completed",
+        "closed .. opening": "lost: pause",
         "open at rest": "closed",
         "moving": "lost: pause",
         "exiting": "completed",
     },
     "pause 500": {
-        "sync .. closed": "completed",
-        "opening": "lost: pause",
+        "sync .. driving on": "completed",
+        "closed .. opening": "lost: pause",
         "open at rest": "closed",
         "moving": "lost: pause",
         "exiting": "completed",

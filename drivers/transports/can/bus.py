@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import traceback
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -41,6 +42,7 @@ def open_bus(
             fast = rates.data_bitrate if rates.profile == "fd" else None
             bus.set_bitrate(rates.bitrate, fast)  # type: ignore[attr-defined]
     except (can.CanError, OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
+        _dispose_of_half_made(error)
         remedy = _REMEDIES.get(interface, "see python-can's documentation of this interface")
         wanted = f"bitrate {rates.bitrate}"
         if rates.profile == "fd":
@@ -48,6 +50,16 @@ def open_bus(
         remedy = remedy.format(channel=channel, rates=wanted)
         raise TransportError(link, str(error) or type(error).__name__, remedy) from error
     return bus
+
+
+def _dispose_of_half_made(error: BaseException) -> None:
+    """Shut down what python-can had begun to open; left to the collector it complains on stderr."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        for value in list(frame.f_locals.values()):
+            if isinstance(value, can.BusABC):
+                # It may lack any of its parts: all that counts is that it was tried.
+                with contextlib.suppress(Exception):
+                    value.shutdown()
 
 
 def _arguments(interface: str, channel: str, rates: BusRates) -> dict[str, Any]:

@@ -1,0 +1,224 @@
+"""A motion that is held on its path and goes on, and what a source may do wrong with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rig import PERIOD, START, Cruise, N, Rig, all_drive_off, limits, moving, smooth_move
+
+from drivers import RequestError, SourceFailed, State
+from planner import JointLimits, TrajectoryPlayer, plan
+
+WAY = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
+
+
+def player(start=START) -> TrajectoryPlayer:
+    bounds = limits()
+    of_joints = JointLimits(
+        bounds.lower, bounds.upper, bounds.velocity, bounds.acceleration, bounds.jerk
+    )
+    path = plan(np.vstack((start, start + WAY)), of_joints, fly=0.0)
+    return TrajectoryPlayer(path, PERIOD, of_joints)
+
+
+def playing(cycles: int = 60) -> Rig:
+    rig = Rig()
+    rig.session.request(player())
+    rig.open()
+    rig.cycle(cycles)
+    assert rig.state is State.OPEN
+    return rig
+
+
+def at_rest(rig: Rig) -> bool:
+    return not rig.records[-1]["commanded_velocity"].any()
+
+
+class TestHold:
+    def test_the_arm_rests_for_as_long_as_it_takes_and_goes_on_to_the_end(self):
+        rig = playing()
+        assert not at_rest(rig)
+        rig.session.hold()
+        rig.cycle(300)
+        assert at_rest(rig)
+        # Longer than a stop may take, which is 10 s.
+        rig.cycle(6000)
+        assert (rig.state, rig.exits_asked) == (State.OPEN, 0)
+        assert at_rest(rig)
+        rig.session.resume()
+        rig.cycle(20)
+        assert not at_rest(rig)
+        rig.run()
+        assert rig.ended.outcome == "completed"
+        end = rig.train.joint_position(rig.axes["d"][:, 0])
+        np.testing.assert_allclose(end, START + WAY, atol=1e-6)
+
+    @pytest.mark.parametrize("cycles", [3, 300])
+    def test_a_stop_ends_a_hold(self, cycles):
+        rig = playing()
+        rig.session.hold()
+        rig.cycle(cycles)
+        rig.session.stop()
+        rig.run()
+        assert rig.ended.outcome == "stopped"
+
+    def test_a_hold_may_be_changed_of_ones_mind_about(self):
+        rig = playing()
+        for cycles in (5, 1, 40, 2):
+            rig.session.hold()
+            rig.cycle(cycles)
+            rig.session.resume()
+            rig.cycle(cycles)
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    def test_an_override_after_a_hold_does_not_take_its_bounds_back(self):
+        rig = playing()
+        rig.session.hold()
+        rig.cycle(10)
+        rig.session.override(0.5)
+        rig.session.resume()
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    def test_one_that_cannot_hold_is_stopped_on_its_path(self):
+        rig, source = moving()
+        rig.session.hold()
+        rig.run()
+        assert source.stops == 1
+        assert rig.ended.outcome == "stopped"
+        assert "cannot" in rig.ended.reason
+
+    def test_one_that_fails_to_hold_is_stopped(self):
+        def fails(self):
+            raise SystemExit("no")
+
+        rig = Rig()
+        source = type("Odd", (Cruise,), {"hold": fails, "resume": fails})()
+        rig.session.request(source)
+        rig.open()
+        rig.cycle(300)
+        with pytest.raises(RequestError, match="SystemExit: no"):
+            rig.session.resume()
+        rig.session.hold()
+        rig.run()
+        assert (rig.ended.outcome, source.stops) == ("stopped", 1)
+        assert "failed to hold: SystemExit: no" in rig.ended.reason
+
+    def test_one_that_has_not_begun_is_dropped(self):
+        rig = Rig()
+        rig.close()
+        rig.session.request(player())
+        rig.session.hold()
+        rig.cycle()
+        assert (rig.ended.outcome, rig.ended.interval) == ("stopped", -1)
+
+    def test_without_a_motion_nothing_changes(self):
+        rig = Rig()
+        rig.open()
+        rig.session.hold()
+        rig.cycle(10)
+        assert (rig.state, rig.exits_asked) == (State.OPEN, 0)
+
+
+class TestResume:
+    def test_needs_a_motion(self):
+        rig = Rig()
+        with pytest.raises(RequestError, match="no motion was requested"):
+            rig.session.resume()
+
+    def test_that_can(self):
+        rig, _ = moving()
+        with pytest.raises(RequestError, match="cannot be held"):
+            rig.session.resume()
+
+    def test_and_is_not_being_stopped(self):
+        rig = playing()
+        rig.session.hold()
+        rig.cycle(5)
+        rig.session.stop()
+        rig.cycle(1)
+        with pytest.raises(RequestError, match="told to stop"):
+            rig.session.resume()
+
+
+class Unspeakable(BaseException):
+    def __str__(self):
+        raise KeyboardInterrupt
+
+
+class TestSourcesThatRaiseAnything:
+    @pytest.mark.parametrize("kind", [SystemExit, KeyboardInterrupt, GeneratorExit, Unspeakable])
+    @pytest.mark.parametrize("where", ["begin", "advance", "stop", "finished", "bounds"])
+    def test_become_refusals(self, kind, where):
+        def fails(self, *_):
+            raise kind
+
+        named = property(fails) if where in ("finished", "bounds") else fails
+        source = type("Odd", (Cruise,), {where: named, "__init__": lambda self: None})
+        for name, value in vars(Cruise()).items():
+            if name != where:
+                setattr(source, name, value)
+        rig = Rig()
+        rig.session.request(source())
+        answer = rig.open()
+        if where == "stop":
+            rig.cycle(50)
+            rig.session.stop()
+        if where != "begin" and where != "finished":
+            answer = rig.cycle()
+        assert all_drive_off(answer)
+        assert type(rig.refusal) is SourceFailed
+        assert kind.__name__ in str(rig.refusal)
+
+    def test_an_override_that_raises_anything_is_a_request_refused(self):
+        def fails(self, fraction):
+            raise Unspeakable
+
+        rig = Rig()
+        rig.session.request(type("Odd", (Cruise,), {"override": fails})())
+        rig.open()
+        rig.cycle(5)
+        with pytest.raises(RequestError, match="Unspeakable, whose message"):
+            rig.session.override(0.5)
+        rig.cycle(5)
+        assert rig.state is State.OPEN
+
+
+def test_a_defect_of_our_own_asks_for_drive_off_too(monkeypatch):
+    rig, _ = moving()
+
+    def fails(*_, **__):
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(rig.guard, "check_set_point", fails)
+    assert all_drive_off(rig.cycle())
+    assert "the session failed: MemoryError: no room" in str(rig.refusal)
+    assert rig.ended.outcome == "refused"
+    assert all_drive_off(rig.cycle())
+
+
+class TestRequestAfterAStop:
+    def test_none_is_taken_before_open_mode_was_left(self):
+        rig = Rig()
+        rig.open()
+        rig.session.stop()
+        with pytest.raises(RequestError, match="being left"):
+            rig.session.request(smooth_move(WAY, 300))
+        rig.cycle()
+        assert (rig.state, rig.exits_asked) == (State.EXITING, 1)
+        rig.close()
+        rig.exits_asked = 0
+        rig.session.request(smooth_move(WAY, 300))
+        rig.open()
+        rig.run()
+        assert rig.ended.outcome == "completed"
+
+    def test_nor_while_axes_open(self):
+        rig = Rig()
+        rig.close()
+        rig.axes["mode"][: N - 1] = 4
+        rig.cycle()
+        rig.session.stop()
+        with pytest.raises(RequestError, match="being left"):
+            rig.session.request(smooth_move(WAY, 300))

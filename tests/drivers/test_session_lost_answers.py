@@ -1,0 +1,161 @@
+"""Answers that the controller does not take show only in the target that it reports."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rig import START, Cruise, N, Rig, assert_refused, limits, still
+
+from drivers import MotionNotCarriedOn, State
+from drivers.events import AnswersLost
+
+STEP = 1.9 * 0.002 * 120.0 / (2.0 * np.pi)
+"""Motor revolutions per cycle of joint 1 at full speed."""
+
+
+class Fast(Cruise):
+    SPEED = 1.9
+    RAMP = 1.0
+
+
+def at_speed(cycles: int = 600, **options) -> Rig:
+    wide = limits(lower=np.full(N, -6.0), upper=np.full(N, 6.0))
+    rig = Rig(guard_limits=wide, **options)
+    rig.session.request(Fast())
+    rig.open()
+    rig.cycle(cycles)
+    assert rig.state is State.OPEN
+    return rig
+
+
+def lose(rig: Rig, count: int):
+    """Cycles whose answers never reach the controller, which holds its target."""
+    take, rig._obey = rig._obey, lambda answer: rig.axes["d"].__setitem__((slice(None), [1, 3]), 0)
+    answer = rig.cycle(count)
+    rig._obey = take
+    return answer
+
+
+@pytest.mark.parametrize("max_gap", [0, 2, 5])
+def test_no_set_point_is_further_from_the_target_than_those_allowed(max_gap):
+    rig = at_speed(max_gap=max_gap)
+    target = rig.axes["d"][0, 0]
+    for _ in range(40):
+        answer = lose(rig, 1)
+        if rig.state is State.FAULTED:
+            break
+        assert abs(answer.axes["d"][0, 0] - target) <= 0.2 + (max_gap + 1) * STEP + 1e-5
+    error = assert_refused(rig, answer, MotionNotCarriedOn)
+    assert (error.joint, error.bound) == (0, pytest.approx(0.2))
+    assert error.value == pytest.approx(3 * STEP, rel=1e-3), "one step less and it is within 0.2"
+    assert "set-points sent last" in str(error)
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_a_few_are_counted_and_told_and_the_motion_goes_on(lost):
+    rig = at_speed()
+    before = rig.records[-1]["cycle"]
+    lose(rig, lost)
+    rig.cycle(10)
+    assert rig.state is State.OPEN
+    events = rig.seen(AnswersLost)
+    assert sum(event.count for event in events) == lost
+    assert rig.session.counters.unanswered == lost
+    # The packet in which it shows is the one after the answer that was lost.
+    assert events[0].cycle == before + 2
+    rig.session.stop()
+    rig.run()
+    assert rig.ended.outcome == "stopped"
+
+
+def test_one_now_and_then_is_counted_each_time():
+    rig = at_speed()
+    for _ in range(5):
+        lose(rig, 1)
+        rig.cycle(3)
+    assert rig.session.counters.unanswered == 5
+    assert [event.count for event in rig.seen(AnswersLost)] == [1] * 5
+
+
+def test_a_controller_that_reports_its_target_a_cycle_late_is_told_of_once():
+    rig = at_speed(0)
+    take, late = rig._obey, [rig.axes["d"].copy()]
+
+    def obey(answer):
+        take(answer)
+        late.append(rig.axes["d"].copy())
+        rig.axes["d"][:] = late[-2]
+
+    rig._obey = obey
+    rig.cycle(600)
+    assert rig.state is State.OPEN
+    assert rig.session.counters.unanswered == 1
+
+
+def test_a_controller_that_takes_all_has_none_lost():
+    rig = at_speed()
+    rig.session.stop()
+    rig.run()
+    assert not rig.seen(AnswersLost)
+    assert rig.session.counters.unanswered == 0
+
+
+def test_values_of_an_earlier_cycle_are_no_lost_answers():
+    rig = at_speed()
+    rig.ages = np.ones((N, 8), np.uint16)
+    lose(rig, 1)
+    rig.cycle(1)
+    assert rig.session.counters.unanswered == 0
+
+
+def test_a_target_that_jumps_ahead_is_not_taken_for_ours():
+    rig = at_speed()
+    rig.axes["d"][0, [0, 2]] += 0.25
+    assert_refused(rig, rig.cycle(), MotionNotCarriedOn)
+
+
+class TestAfterAGapWithoutAMotion:
+    """Meanwhile the controller may have left open mode, moved the arm, and come back."""
+
+    def held(self, leaving: bool) -> Rig:
+        rig = Rig()
+        rig.open()
+        rig.cycle(20)
+        if leaving:
+            rig.session.stop()
+            rig.cycle()
+        rig.miss(400)
+        return rig
+
+    @pytest.mark.parametrize("leaving", [False, True])
+    def test_an_arm_that_is_elsewhere_is_not_pulled_back(self, leaving):
+        rig = self.held(leaving)
+        rig.axes["d"][0, [0, 2]] += 1.9
+        answer = rig.cycle()
+        assert (answer.axes["mode"] == 505).all()
+        assert type(rig.refusal) is MotionNotCarriedOn
+        assert rig.refusal.value == pytest.approx(1.9)
+
+    @pytest.mark.parametrize("leaving", [False, True])
+    def test_one_whose_target_moves_is_let_go(self, leaving):
+        rig = self.held(leaving)
+        rig.axes["d"][0, 1] = 0.001
+        assert (rig.cycle().axes["mode"] == 505).all()
+
+    @pytest.mark.parametrize("leaving", [False, True])
+    def test_one_where_it_was_is_held_on(self, leaving):
+        rig = self.held(leaving)
+        rig.cycle(5)
+        assert rig.state is (State.EXITING if leaving else State.OPEN)
+
+    def test_an_axis_that_has_closed_is_not_asked_for(self):
+        rig = Rig()
+        rig.session.request(still(2, START))
+        rig.open()
+        rig.cycle(6)
+        assert rig.state is State.EXITING
+        rig.miss(10)
+        rig.axes["mode"][0] = 0
+        rig.axes["d"][0] = 3.0
+        rig.cycle()
+        assert rig.state is State.EXITING
