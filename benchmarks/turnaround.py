@@ -47,7 +47,7 @@ from benchmarks.turnaround_ends import (
     echo,
     spin,
 )
-from drivers import GuardLimits
+from drivers import GuardLimits, MotionEnded
 from drivers.exchange import ExchangeProcess, ExchangeSettings, RealTimeSettings
 from drivers.transports import UdpSpec
 
@@ -75,8 +75,8 @@ def limits() -> GuardLimits:
 
 
 def exchange_settings(port: int, realtime: RealTimeSettings) -> ExchangeSettings:
-    """A session that bears the pauses while the floor is measured, and any stall."""
-    session = {"silence_timeout": 3600.0, "max_gap": 1_000_000}
+    """A session that bears the pauses while the floor is measured, and stalls of 50 cycles."""
+    session = {"silence_timeout": 3600.0, "max_gap": 50}
     return ExchangeSettings(
         UdpSpec(HOST, port, HOST),
         drive_train(),
@@ -86,6 +86,7 @@ def exchange_settings(port: int, realtime: RealTimeSettings) -> ExchangeSettings
         realtime=realtime,
         needs_archive=False,
         preload=("benchmarks.turnaround_ends",),
+        max_late=1_000_000,
     )
 
 
@@ -144,18 +145,19 @@ def measure(cycles: int, blocks: int, folder: Path) -> dict[str, Any]:
     with np.load(arrivals) as file:
         times |= {f"exchange_{name}": array for name, array in file.items()}
     log = exchange.log
+    told = [event for event in exchange.events() if isinstance(event, MotionEnded)]
     exchange.close()
     if times["trouble"] or ended != 0:
-        raise SystemExit(f"the run failed: {times['trouble']} {ended} {log}")
+        raise SystemExit(f"the run failed: {times['trouble']} {ended} {log} {told}")
     times |= {"status": status, "realtime": exchange.realtime, "steal": steal_ticks() - stolen}
     return times
 
 
 def trip(times: dict[str, Any], end: str) -> Array:
-    """From request to answer, s, of every measured cycle; infinite where none ever came."""
+    """From request to answer, s, of every measured cycle; NaN where no answer ever came."""
     skipped = WARM_UP + (CLOSED_CYCLES if end == "ours" else 0)
-    taken = (times[f"{end}_received"] - times[f"{end}_sent"])[skipped:]
-    return np.where(np.isnan(taken), np.inf, taken)
+    taken: Array = (times[f"{end}_received"] - times[f"{end}_sent"])[skipped:]
+    return taken
 
 
 def accounts(times: dict[str, Any]) -> list[dict[str, Any]]:
@@ -167,18 +169,18 @@ def accounts(times: dict[str, Any]) -> list[dict[str, Any]]:
     inside = (cycle >= 1) & (cycle <= len(arrival))
     arrival[cycle[inside] - 1] = times["exchange_arrival"][inside]
     rows = []
-    for index in np.flatnonzero(taken > PERIOD):
+    for index in np.flatnonzero(~(taken <= PERIOD)):
         at = int(index) + first
         to_exchange = float(arrival[at] - times["ours_sent"][at])
         answered = float(times["ours_received"][at] - arrival[at])
         if np.isnan(to_exchange):
             what = "the exchange was held up and left it unanswered for a later one"
         elif to_exchange > 0.5 * PERIOD:
-            what = "the exchange was held up before it received"
+            what = "the network or the controller was held up before the packet was here"
         elif np.isnan(answered):
             what = "the answer was lost"
         else:
-            what = "the exchange, or the controller waiting for it, was held up after it received"
+            what = "the exchange, or the controller waiting for it, was held up"
         rows.append(
             {
                 "cycle": int(index),
@@ -191,24 +193,38 @@ def accounts(times: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
+def figures(taken: Array) -> dict[str, Any]:
+    """Percentiles of the times taken, s, of the cycles that were answered.
+
+    Beside them is what they do not cover: `never_answered`, part of `missed`, which is every cycle
+    that had no answer within its period.
+    """
+    came = taken[np.isfinite(taken)]
+    result: dict[str, Any] = {}
+    for name, share in (("p50_us", 50.0), ("p99_us", 99.0), ("p999_us", 99.9), ("max_us", 100)):
+        result[name] = _us(float(np.percentile(came, share))) if len(came) else None
+    result["answered"] = len(came)
+    result["never_answered"] = len(taken) - len(came)
+    result["missed"] = int((~(taken <= PERIOD)).sum())
+    return result
+
+
 def _us(seconds: float) -> float | None:
     return round(1e6 * seconds, 1) if np.isfinite(seconds) else None
 
 
 def summary(times: dict[str, Any]) -> dict[str, Any]:
-    """The figures of one run."""
+    """The figures of one run; percentiles are those of the answers that came, see `figures`."""
     result: dict[str, Any] = {}
     for end, prefix, late in (("ours", "", "missed"), ("floor", "floor_", "floor_late")):
-        taken = trip(times, end)
-        in_time = np.where(np.isfinite(taken), taken, taken[np.isfinite(taken)].max())
-        for name, share in (("p50_us", 50.0), ("p99_us", 99.0), ("p999_us", 99.9), ("max_us", 100)):
-            result[prefix + name] = _us(float(np.percentile(in_time, share)))
-        result[late] = int((taken > PERIOD).sum())
+        for name, value in figures(trip(times, end)).items():
+            result[late if name == "missed" else prefix + name] = value
     status = times["status"]
     result |= {
         "cycles": len(trip(times, "ours")),
         "controller_late": int((times["ours_woke_late"] > PERIOD).sum()),
-        "left_unanswered": status.late,
+        "left_out": status.late - status.answered_late,
+        "answered_late": status.answered_late,
         "worst_turnaround_us": round(status.worst_turnaround_us, 1),
         "pickup_us": round(status.pickup_us, 1),
         "records_lost": int(times["exchange_overflow"]),

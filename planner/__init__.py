@@ -1,13 +1,17 @@
 """Via points to motion, as an industrial controller's joint interpolator runs it.
 
-`plan` turns via points into a `PiecewiseCubic`; `TrajectoryPlayer` gives it out one set-point
-per controller cycle and stops it on its path.
+`plan` turns via points into a `PiecewiseCubic`, `plan_moves` does it move by move with overrides,
+`Interpolator` step by step while targets arrive. `TrajectoryPlayer` gives a motion out one
+set-point per controller cycle, at an override that may change, and stops it on its path.
 """
 
 from __future__ import annotations
 
+from planner.batch import PlanningPool, plan_many
+from planner.commands import FlyDistance, FlyPercent, Move, Overrides, Stop
 from planner.errors import (
     InvalidLimits,
+    InvalidPlanFile,
     InvalidSetting,
     InvalidTrajectory,
     InvalidViaPoints,
@@ -15,32 +19,67 @@ from planner.errors import (
     NonFiniteViaPoint,
     NotBegun,
     NotSmooth,
+    PlannerCrashed,
     PlannerError,
+    PlannerNotStarted,
     PlanningError,
+    PlanningTimedOut,
     StartMismatch,
     TooFewViaPoints,
+    UnsupportedSolver,
     ViaPointOutOfLimits,
     WrongShape,
 )
+from planner.fourier import FourierSeries, harmonic_bounds
+from planner.interpolator import Interpolator
+from planner.isolation import PlanningChild, close_child, in_child, plan_in_child
 from planner.limits import JointLimits
+from planner.motion_csv import from_csv, to_csv
+from planner.motion_plan import MotionPlan, TargetPassage
+from planner.moves import plan_moves
 from planner.piecewise_cubic import Extrema, PiecewiseCubic
 from planner.plan import plan
+from planner.plan_file import PlanFile
 from planner.player import TrajectoryPlayer
+from planner.sampled import SampledTrajectory
 from planner.trajectory import Trajectory
-from planner.verify import check_limits
+from planner.verify import check_limits, check_rest
 
 __all__ = [
     "plan",
+    "plan_moves",
+    "Move",
+    "FlyPercent",
+    "FlyDistance",
+    "Stop",
+    "Overrides",
+    "MotionPlan",
+    "TargetPassage",
+    "plan_many",
+    "PlanningPool",
+    "plan_in_child",
+    "in_child",
+    "close_child",
+    "PlanningChild",
     "check_limits",
+    "check_rest",
     "JointLimits",
     "Trajectory",
     "PiecewiseCubic",
     "Extrema",
+    "FourierSeries",
+    "harmonic_bounds",
+    "SampledTrajectory",
     "TrajectoryPlayer",
+    "Interpolator",
+    "PlanFile",
+    "to_csv",
+    "from_csv",
     "PlannerError",
     "InvalidLimits",
     "InvalidSetting",
     "InvalidTrajectory",
+    "InvalidPlanFile",
     "InvalidViaPoints",
     "WrongShape",
     "TooFewViaPoints",
@@ -49,6 +88,10 @@ __all__ = [
     "PlanningError",
     "LimitExceeded",
     "NotSmooth",
+    "UnsupportedSolver",
+    "PlannerCrashed",
+    "PlannerNotStarted",
+    "PlanningTimedOut",
     "StartMismatch",
     "NotBegun",
 ]

@@ -14,6 +14,11 @@
      ├─ PlanningError
      │   ├─ LimitExceeded       the finished plan would break a limit
      │   └─ NotSmooth           the finished plan would jump
+     ├─ UnsupportedSolver       the installed ruckig is not of the series measured
+     ├─ InvalidPlanFile         a plan file or motion table that cannot be what it says
+     ├─ PlannerCrashed          the process that planned died on this input
+     ├─ PlannerNotStarted       it died before it could be asked
+     ├─ PlanningTimedOut        it gave no answer in time
      ├─ StartMismatch           the arm is not where the motion begins
      └─ NotBegun                a player was asked to advance before it was begun
 
@@ -129,6 +134,18 @@ class NotSmooth(PlanningError):
         )
 
 
+class UnsupportedSolver(PlannerError, RuntimeError):
+    """The installed corner solver is not of the series whose margins were measured."""
+
+    def __init__(self, version: str, series: str) -> None:
+        self.version = version
+        self.series = series
+        super().__init__(
+            f"ruckig {version} is installed; corners are planned with {series}.x only, whose "
+            "behaviour near its limits is known"
+        )
+
+
 class StartMismatch(PlannerError):
     """The arm is too far from where the motion begins [rad]."""
 
@@ -148,3 +165,34 @@ class NotBegun(PlannerError, RuntimeError):
 
     def __init__(self) -> None:
         super().__init__("advance() before begin(): the motion does not know where the arm is")
+
+
+class PlannerCrashed(PlannerError, RuntimeError):
+    """The process that planned died; nothing was planned, and this process lives on."""
+
+    def __init__(self, status: int) -> None:
+        self.status = status
+        super().__init__(
+            "the planning process "
+            + (f"was killed by signal {-status}" if status < 0 else f"ended with status {status}")
+        )
+
+
+class PlannerNotStarted(PlannerError, RuntimeError):
+    """A planning process died before it could be asked anything; it writes why to stderr."""
+
+    def __init__(self, status: int) -> None:
+        self.status = status
+        super().__init__(f"a planning process could not be started (status {status})")
+
+
+class PlanningTimedOut(PlannerError, TimeoutError):
+    """Planning took longer than allowed [s]; its process was ended."""
+
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
+        super().__init__(f"no plan within {timeout:g} s; the planning process was ended")
+
+
+class InvalidPlanFile(PlannerError, ValueError):
+    """A stored plan that cannot be read, or is not the plan of the moves it lists."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, isfinite
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -10,7 +10,10 @@ import numpy as np
 from planner.arrays import Array
 from planner.errors import InvalidSetting, NotBegun, StartMismatch
 from planner.limits import JointLimits
-from planner.stop import slowing_bounds, stop_law
+from planner.path_reader import PathReader
+from planner.piecewise_cubic import PiecewiseCubic
+from planner.stop import slowing_bounds, within
+from planner.time_law import RateBounds, TimeLaw, admits
 from planner.trajectory import Trajectory
 
 # A last period this much shorter than the others is rounding, not motion.
@@ -23,29 +26,45 @@ class _SetPoints(NamedTuple):
     position: Array
     velocity: Array
 
-    def none(self) -> _SetPoints:
-        return _SetPoints(self.position[:0], self.velocity[:0])
-
 
 class TrajectoryPlayer:
     """Play a trajectory one period per call, whatever the clock says.
 
     Motion time advances only in `advance`, so a late or missing call delays the motion and
-    never makes it jump. The table of set-points is made before the motion begins. `stop` swaps
-    what is left of it for the same path run ever more slowly, until it rests. At the end the
-    last set-point is the last position with zero velocity, however often it is asked for.
+    never makes it jump. At full rate the set-points come from a table made before the motion
+    begins. Once the rate was changed, the same path is read at the motion time that has come,
+    for the table's rows lie elsewhere. At the end the last set-point is the last position with
+    zero velocity, however often it is asked for.
+
+    =============  ===========================================  ==============================
+    asked for      the rate goes                                within the bounds
+    =============  ===========================================  ==============================
+    `override`     to this fraction                             of an override
+    `hold`         to 0, until `resume`                         of a stop
+    `resume`       to the fraction of the override              of a stop
+    `stop`         to 0, where the motion ends; so `cancel`     of a stop
+    =============  ===========================================  ==============================
+
+    Each may be asked for between any two cycles, also while the rate still changes. An override
+    asked for during a hold takes effect with `resume`. One asked for while a resumed motion is
+    still gathering speed changes the target at once; it goes on within the bounds of a stop if
+    those of an override no longer suffice. As long as the arm is at rest at the start of the
+    motion, every rate is taken up at once.
 
     Args:
         trajectory: What to play, keeping `limits`.
         period: Time between two set-points [s].
-        limits: The limits the trajectory was planned for; what a stop may use is their multiple.
-        stop_acceleration: Largest acceleration during a stop, as a multiple (> 1) of the limits.
-        stop_jerk: Largest jerk during a stop, as a multiple (> 1) of the limits.
+        limits: The limits the trajectory was planned for; the bounds are their multiples.
+        override_acceleration: Largest acceleration while an override changes, as a multiple (> 1)
+            of the limits.
+        override_jerk: Largest jerk while an override changes, likewise.
+        stop_acceleration: Largest acceleration during a stop, likewise; not below the override's.
+        stop_jerk: Largest jerk during a stop, likewise; not below the override's.
         start_tolerance: How far [rad] each joint may be from where the trajectory begins.
 
     Raises:
-        InvalidSetting: a period or tolerance or stop factor outside its range, or limits of
-            another number of joints.
+        InvalidSetting: a period or tolerance or factor outside its range, or limits of another
+            number of joints.
     """
 
     def __init__(
@@ -54,37 +73,55 @@ class TrajectoryPlayer:
         period: float,
         limits: JointLimits,
         *,
+        override_acceleration: float = 1.3,
+        override_jerk: float = 1.7,
         stop_acceleration: float = 2.0,
         stop_jerk: float = 3.0,
         start_tolerance: float = 1e-3,
     ) -> None:
-        for name, value, valid, allowed in (
-            ("period", period, "a time above 0 s", period > 0.0),
-            ("stop_acceleration", stop_acceleration, "above 1", stop_acceleration > 1.0),
-            ("stop_jerk", stop_jerk, "above 1", stop_jerk > 1.0),
-            ("start_tolerance", start_tolerance, "0 rad or more", start_tolerance >= 0.0),
-            (
-                "limits",
-                f"those of {limits.n_joints} joints",
-                f"those of {trajectory.n_joints}",
-                limits.n_joints == trajectory.n_joints,
-            ),
+        _check("period", period, "a time above 0 s", period > 0.0)
+        for name, override, stop in (
+            ("acceleration", override_acceleration, stop_acceleration),
+            ("jerk", override_jerk, stop_jerk),
         ):
-            if not (allowed and (isinstance(value, str) or np.isfinite(value))):
-                raise InvalidSetting(name, value, valid)
-        self._trajectory = trajectory
+            _check(f"override_{name}", override, "above 1", override > 1.0)
+            _check(f"stop_{name}", stop, "above 1", stop > 1.0)
+            least = f"at least override_{name} = {override}"
+            _check(f"stop_{name}", stop, least, stop >= override)
+        _check("start_tolerance", start_tolerance, "0 rad or more", start_tolerance >= 0.0)
+        if limits.n_joints != trajectory.n_joints:
+            raise InvalidSetting(
+                "limits", f"those of {limits.n_joints} joints", f"those of {trajectory.n_joints}"
+            )
         self._period = period
-        self._slowing = slowing_bounds(limits, stop_acceleration, stop_jerk)
         self._tolerance = start_tolerance
-        times = period * np.arange(1 + self._cycles(trajectory.duration), dtype=np.float64)
-        self._start: Array = trajectory.sample(times[:1])[0][0]
+        extrema = trajectory.extrema() if isinstance(trajectory, PiecewiseCubic) else None
+        stopping = slowing_bounds(limits, stop_acceleration, stop_jerk, extrema)
+        overriding = slowing_bounds(limits, override_acceleration, override_jerk, extrema)
+        self._allowed: dict[Literal["override", "stop"], RateBounds] = {
+            "override": within(overriding, stopping),
+            "stop": stopping,
+        }
+        self._table = _tabulate(trajectory, period)
+        # The end of the motion, but for a last period that is no more than rounding.
+        self._end = trajectory.duration - _ROUNDING * period
+        self._path = PathReader(trajectory)
+        self._start: Array = trajectory.sample(np.zeros(1))[0][0]
         self._rest: Array = np.zeros_like(self._start)
-        self._plan = self._tabulate(times[1:], np.ones((len(times) - 1, 1)))
-        self._table = self._plan
-        self._last = self._start
-        self._given = 0
+        self._offset = self._rest
+        self._law = TimeLaw(period)
+        self._tabled = True
+        self._override = 1.0
         self._begun = False
-        self._stopping = False
+        self._rewind()
+
+    def _rewind(self) -> None:
+        self._last = self._start + self._offset
+        self._given = 0
+        self._finished = self._held = self._stopping = False
+        self._bounds: Literal["plan", "override", "stop"] = "plan"
+        self._ramp: Literal["override", "stop"] = "override"
+        self._take_up(self._override)
 
     @property
     def start(self) -> Array:
@@ -94,18 +131,33 @@ class TrajectoryPlayer:
     @property
     def finished(self) -> bool:
         """Whether the last set-point was given: the motion, or its stop, is over."""
-        return self._given >= len(self._table.position)
+        return self._finished
 
     @property
     def bounds(self) -> Literal["plan", "override", "stop"]:
-        """Which bounds the set-points keep: the plan's, or from `stop` on those of a stop."""
-        return "stop" if self._stopping else "plan"
+        """Which bounds the set-point given last keeps, or the next one if that is more.
+
+        Those of the plan at any constant rate, those of what was asked for while the rate
+        changes, and from `stop` on those of a stop for good.
+        """
+        return self._bounds
+
+    @property
+    def rate(self) -> float:
+        """How fast motion time runs, from 0 (at rest) to 1 (as planned)."""
+        return self._law.rate
+
+    @property
+    def motion_time(self) -> float:
+        """Time in the trajectory [s] of the set-point given last."""
+        return self._given * self._period if self._tabled else self._law.motion_time
 
     def begin(self, position: Array) -> None:
         """Take up the motion, from its beginning, at the set-point the arm really starts from.
 
         The small difference to the planned start stays for the whole motion: a set-point that
-        was rounded on its way must not become a jerk.
+        was rounded on its way must not become a jerk. What was held or stopped before is not
+        any more; an override stays as it was asked for.
 
         Args:
             position: First set-point (n,) [rad], at rest.
@@ -120,48 +172,116 @@ class TrajectoryPlayer:
             raise StartMismatch(
                 joint, float(position[joint]), float(self._start[joint]), self._tolerance
             )
-        self._offset = offset
         # The table stays as it is: to copy it would cost the cycle of the first set-point.
-        self._table = self._plan
-        self._last = self._start + offset
-        self._given = 0
+        self._offset = offset
         self._begun = True
-        self._stopping = False
+        self._rewind()
 
     def advance(self) -> tuple[Array, Array]:
         """Return the next set-point: position (n,) [rad] and velocity (n,) [rad/s]."""
         if not self._begun:
             raise NotBegun
-        row = self._given
-        if self.finished:
+        if self._finished:
             return self._last, self._rest
+        if not self._tabled:
+            return self._advance_beside_the_table()
+        row = self._given
         self._given = row + 1
+        self._finished = self._given >= len(self._table.position)
         self._last = self._table.position[row] + self._offset
         return self._last, self._table.velocity[row]
 
+    def _advance_beside_the_table(self) -> tuple[Array, Array]:
+        law = self._law
+        if law.settled:
+            self._bounds = "plan"
+            if law.rate == 0.0:
+                return self._last, self._rest
+        law.advance()
+        if law.motion_time >= self._end:
+            self._finished = True
+            self._last = self._table.position[-1] + self._offset
+            return self._last, self._rest
+        position, velocity = self._path.read(law.motion_time)
+        self._finished = self._stopping and law.settled
+        self._last = position + self._offset
+        return self._last, velocity * law.rate
+
+    def override(self, fraction: float) -> None:
+        """Go on at this fraction, 0 to 1, of the planned speed.
+
+        Raises:
+            InvalidSetting: any other number.
+        """
+        _check("override", fraction, "a number from 0 to 1", 0.0 <= fraction <= 1.0)
+        self._override = float(fraction)
+        if self._finished or self._stopping or self._held:
+            return
+        law = self._law
+        # Only what wider bounds began can be too abrupt; asked in a ramp of the same bounds,
+        # rounding alone would decide.
+        abrupt = self._ramp == "stop" and not (
+            law.settled or admits(self._allowed["override"], law.rate, law.slope)
+        )
+        self._aim(self._override, "stop" if abrupt else "override")
+
+    def hold(self) -> None:
+        """Come to rest on the path and wait there, starting now."""
+        if self._finished or self._stopping or self._held:
+            return
+        self._held = True
+        self._aim(0.0, "stop")
+
+    def resume(self) -> None:
+        """Go on after a hold, or in the middle of it."""
+        if self._finished or not self._held:
+            return
+        self._held = False
+        self._aim(self._override, "stop")
+
     def stop(self) -> None:
         """Come to rest on the path, starting now; once stopping or finished, do nothing."""
-        if self.finished or self._stopping:
+        if self._finished or self._stopping:
             return
-        self._stopping = True
-        played, self._given = self._given, 0
-        if played == 0:  # still at rest at the start
-            self._table = self._table.none()
+        self._held, self._stopping = False, True
+        self._aim(0.0, "stop")
+        self._bounds = "stop"
+        self._finished = self._law.settled
+
+    def cancel(self) -> None:
+        """Give the motion up: come to rest on the path, from where it cannot be resumed."""
+        self.stop()
+
+    def _aim(self, target: float, ramp: Literal["override", "stop"]) -> None:
+        """Let the rate go to a target within the bounds of an override or a stop."""
+        if self.motion_time == 0.0:
+            self._take_up(target)
             return
-        law = stop_law(self._slowing)
-        times = self._period * np.arange(1, 1 + self._cycles(law.duration), dtype=np.float64)
-        gone_on, rate, _ = law.sample(times)
-        motion_time = played * self._period + gone_on[:, 0]
-        # The path may end before the time law does; what follows is rest.
-        rows = 1 + int(np.searchsorted(motion_time[:-1], self._trajectory.duration))
-        self._table = self._tabulate(motion_time[:rows], rate[:rows])
+        if self._tabled:
+            if target == 1.0:
+                return
+            self._law.restart(self.motion_time, 1.0)
+            self._tabled = False
+        self._law.aim(target, self._allowed[ramp])
+        self._ramp = ramp
+        if not self._law.settled:
+            self._bounds = ramp
 
-    def _cycles(self, duration: float) -> int:
-        return max(1, ceil(duration / self._period - _ROUNDING))
+    def _take_up(self, rate: float) -> None:
+        """Run at a rate from the start: nothing moves there yet that could move abruptly."""
+        self._law.restart(0.0, rate)
+        self._tabled = rate == 1.0
 
-    def _tabulate(self, motion_time: Array, rate: Array) -> _SetPoints:
-        """Return the set-points at motion times (m,), which pass at a rate (m, 1)."""
-        position, velocity, _ = self._trajectory.sample(motion_time)
-        velocity = np.ascontiguousarray(velocity * rate)
-        velocity[-1] = 0.0  # the last one is rest by definition, not to the last digit
-        return _SetPoints(np.ascontiguousarray(position), velocity)
+
+def _check(name: str, value: float, valid: str, allowed: bool) -> None:
+    if not (allowed and isfinite(value)):
+        raise InvalidSetting(name, value, valid)
+
+
+def _tabulate(trajectory: Trajectory, period: float) -> _SetPoints:
+    """Return the set-points of a trajectory at full rate, from one period after its start."""
+    cycles = max(1, ceil(trajectory.duration / period - _ROUNDING))
+    position, velocity, _ = trajectory.sample(period * np.arange(1, 1 + cycles, dtype=np.float64))
+    velocity = np.ascontiguousarray(velocity)
+    velocity[-1] = 0.0  # the last one is rest by definition, not to the last digit
+    return _SetPoints(np.ascontiguousarray(position), velocity)

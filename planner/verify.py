@@ -2,27 +2,38 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from planner.arrays import Array
+from planner.bounds import Bounds
 from planner.errors import LimitExceeded, NotSmooth
-from planner.limits import JointLimits
-from planner.piecewise_cubic import PiecewiseCubic
+from planner.piecewise_cubic import Extrema, PiecewiseCubic
+from planner.trajectory import Trajectory
 
 # Rounding, not licence: a position may leave its range by this share of the range's size, and
 # neighbouring pieces may differ by this share of the limit of the quantity.
-_POSITION_ROUNDING = 1e-12
-_RATE_ROUNDING = 1e-9
+POSITION_ROUNDING = 1e-12
+RATE_ROUNDING = 1e-9
 
 
-def check_limits(trajectory: PiecewiseCubic, limits: JointLimits) -> None:
+class Bounded(Protocol):
+    """A motion that knows how far it goes."""
+
+    def extrema(self) -> Extrema:
+        """Return bounds of its extremes over all time, rigorous ones."""
+        ...
+
+
+def check_limits(trajectory: Bounded, limits: Bounds) -> None:
     """Refuse a trajectory that breaks a limit anywhere, analytically.
 
     Raises:
         LimitExceeded: naming the first offending quantity, its worst joint, value and bound.
     """
     extrema = trajectory.extrema()
-    slack = _POSITION_ROUNDING * _size(limits)
+    slack = POSITION_ROUNDING * _size(limits)
     for quantity, value, bound, excess in (
         ("position", extrema.lower, limits.lower, limits.lower - extrema.lower - slack),
         ("position", extrema.upper, limits.upper, extrema.upper - limits.upper - slack),
@@ -40,7 +51,7 @@ def check_limits(trajectory: PiecewiseCubic, limits: JointLimits) -> None:
             raise LimitExceeded(quantity, joint, float(value[joint]), float(bound[joint]))
 
 
-def check_smooth(trajectory: PiecewiseCubic, limits: JointLimits) -> None:
+def check_smooth(trajectory: PiecewiseCubic, limits: Bounds) -> None:
     """Refuse a trajectory that is not C2, or not at rest at both ends.
 
     Raises:
@@ -62,19 +73,39 @@ def check_smooth(trajectory: PiecewiseCubic, limits: JointLimits) -> None:
             )
 
 
-def jump_rounding(limits: JointLimits, duration: float) -> Array:
+def check_rest(trajectory: Trajectory, limits: Bounds) -> None:
+    """Refuse a trajectory of any kind that is not at rest at both ends.
+
+    Raises:
+        NotSmooth: naming the quantity, joint, time and what is left of velocity or acceleration.
+    """
+    scale = jump_rounding(limits, trajectory.duration)[:, 1:]
+    times = np.array([0.0, trajectory.duration])
+    _, *rates = trajectory.sample(times)
+    left = np.abs(np.stack(rates, axis=2))  # (2, n, 2)
+    if not np.all(left <= scale):  # written so that NaN is refused too
+        end, joint, which = np.unravel_index(int(np.argmax(left / scale)), left.shape)
+        raise NotSmooth(
+            ("velocity", "acceleration")[which],
+            int(joint),
+            float(times[end]),
+            float(left[end, joint, which]),
+        )
+
+
+def jump_rounding(limits: Bounds, duration: float) -> Array:
     """Return the jumps of position, velocity, acceleration that count as rounding, (n, 3)."""
     # A knot is told no finer than the clock allows: late in a long motion that shows.
     tick = 4.0 * np.spacing(duration)
     return np.stack(
         (
-            _POSITION_ROUNDING * _size(limits) + tick * limits.velocity,
-            _RATE_ROUNDING * limits.velocity + tick * limits.acceleration,
-            _RATE_ROUNDING * limits.acceleration + tick * limits.jerk,
+            POSITION_ROUNDING * _size(limits) + tick * limits.velocity,
+            RATE_ROUNDING * limits.velocity + tick * limits.acceleration,
+            RATE_ROUNDING * limits.acceleration + tick * limits.jerk,
         ),
         axis=1,
     )
 
 
-def _size(limits: JointLimits) -> Array:
+def _size(limits: Bounds) -> Array:
     return np.maximum(np.abs(limits.lower), np.abs(limits.upper))

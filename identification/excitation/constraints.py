@@ -15,12 +15,13 @@ from identification.motion import Motion
 from planner import JointLimits, LimitExceeded, PiecewiseCubic, check_limits
 
 Array = NDArray[np.float64]
-Kind = Literal["joint limit", "duration", "collision", "torque", "current"]
+Kind = Literal["planning", "joint limit", "duration", "collision", "torque", "current"]
 
 SAMPLE_PERIOD = 0.008
 """s; motions are looked at this often. A fast arm's tip moves some 4 cm meanwhile."""
 
 _UNITS: dict[Kind, str] = {
+    "planning": "",
     "joint limit": "",
     "duration": " s",
     "collision": " m",

@@ -34,7 +34,14 @@ from identification.excitation.criteria import (
 from identification.excitation.errors import DesignError, NoFeasibleMotionError
 from identification.factor import Factor
 from identification.model import RobotModel
-from planner import JointLimits, PiecewiseCubic, plan
+from planner import (
+    JointLimits,
+    PiecewiseCubic,
+    PlannerCrashed,
+    PlanningError,
+    PlanningTimedOut,
+    plan_in_child,
+)
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -298,7 +305,12 @@ class _Draw:
         via_points = self._via_points(random)
         if via_points is None:
             return None
-        trajectory = plan(via_points, self._limits, speed=speed, fly=self._fly)
+        try:
+            # The solver can take its process with it; that individual is infeasible, no more.
+            trajectory = plan_in_child(via_points, self._limits, speed=speed, fly=self._fly)
+        except (PlannerCrashed, PlanningError, PlanningTimedOut) as error:
+            self._reject([Violation("planning", f"the motion ({error})", 1.0, 0.0, None)])
+            return None
         violations = self._wrong_duration(trajectory.duration)
         if not violations:
             check = check_motion(

@@ -22,7 +22,7 @@ from identification.excitation import (
 )
 from identification.excitation.collision import joint_poses
 from identification.excitation.constraints import sampled
-from planner import JointLimits, plan
+from planner import JointLimits, PlannerCrashed, plan
 from sim_fixtures.ns16 import load_truth, urdf_text
 
 DEG = np.pi / 180.0
@@ -164,6 +164,22 @@ def test_motions_that_ask_for_too_much_current_are_counted_and_not_chosen(
     modest = random_search(model, limits, candidates=20, **search)
     assert 0 < modest.rejected["current"] < 20
     assert check_motion(modest.trajectory, limits, currents=currents).ok
+
+
+def test_a_motion_whose_planning_kills_its_process_is_infeasible_and_no_more(
+    model, limits, checker, monkeypatch
+):
+    calls = []
+
+    def crash_twice(*args, **kwargs):
+        calls.append(1)
+        if len(calls) <= 2:
+            raise PlannerCrashed(-11)
+        return plan(*args, **kwargs)
+
+    monkeypatch.setattr("identification.excitation.design.plan_in_child", crash_twice)
+    chosen = random_search(model, limits, candidates=5, home=HOME, seed=3, checker=checker)
+    assert chosen.rejected["planning"] == 2
 
 
 def test_when_nothing_is_feasible_the_error_says_what_forbids_it_where_and_by_how_much(

@@ -1,11 +1,19 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+import ruckig
+from hypothesis import given
+from hypothesis import strategies as st
 
 from planner import JointLimits
-from planner.corners import STOP, fly_by, join
+from planner.corners import STOP, Solver, fly_by, fly_within, join, ranked
+from planner.errors import UnsupportedSolver
+from planner.passing import passing
 from planner.segments import StraightSegment
+from planner.solver import is_supported
 
 CUT = {"velocity": 0.99, "acceleration": 0.98, "jerk": 0.98}
 
@@ -23,9 +31,9 @@ def test_a_join_begins_and_ends_exactly_in_the_states_it_joins(six_axis_limits, 
     # The solver by itself is content with 1e-8 rad, which millisecond samples turn into jerk.
     for seed in range(20):
         before, after = corner(random_points(seed, 3), six_axis_limits)
-        start = before.state(before.duration - fly * before.ramp)
-        end = after.state(fly * after.ramp)
-        joined = join(start, end, six_axis_limits)
+        start = before.state(before.duration - fly * before.slowing_down)
+        end = after.state(fly * after.speeding_up)
+        joined = join(start, end, six_axis_limits, fly * (before.slowing_down + after.speeding_up))
         assert joined is not None
         ends = np.array([table[-1] for table in joined.ends()])
         starts = np.array([table[0, :3] for table in joined.coefficients])
@@ -46,7 +54,25 @@ def test_states_near_the_limits_never_reach_the_solver(
     states = np.zeros((2, 6, 3))
     bound = (six_axis_limits.velocity, six_axis_limits.acceleration)[quantity - 1]
     states[which, 3, quantity] = -0.995 * bound[3]
-    assert join(*states, six_axis_limits) is None
+    assert join(*states, six_axis_limits, 0.4) is None
+
+
+@pytest.mark.parametrize("kind", ["RuckigError", "ValueError"])
+def test_whatever_the_solver_raises_the_motion_stops_instead(
+    six_axis_limits, random_points, monkeypatch, kind
+):
+    # A number of an error that its Python face does not know is a ValueError.
+    error = ruckig.RuckigError if kind == "RuckigError" else ValueError
+
+    class Refuses:
+        def __init__(self, n_joints):
+            assert n_joints == 6
+
+        def calculate(self, *_):
+            raise error("-101 is not a valid Result")
+
+    monkeypatch.setattr("planner.corners.ruckig.Ruckig", Refuses)
+    assert fly_by(*corner(random_points(4, 3), six_axis_limits), six_axis_limits, 0.5) is STOP
 
 
 def test_the_input_that_crashes_the_solver_is_refused(six_axis_limits):
@@ -55,7 +81,7 @@ def test_the_input_that_crashes_the_solver_is_refused(six_axis_limits):
     )
     start = np.array([[-2.8452037956537097, -0.4654211338651546, 9.30842267730309]])
     end = np.array([[-2.8452037956537097, 0.4654211338651546, 9.30842267730309]])
-    assert join(start, end, limits) is None
+    assert join(start, end, limits, 0.2) is None
 
 
 def test_a_join_that_would_leave_the_position_limits_is_tightened_until_it_does_not(
@@ -70,25 +96,103 @@ def test_a_join_that_would_leave_the_position_limits_is_tightened_until_it_does_
         if passed.join is not None:
             assert np.all(passed.join.extrema().upper <= six_axis_limits.upper + 1e-9)
         before, _ = corner(points, six_axis_limits)
-        tightened += passed.leave < 0.99 * before.ramp
+        tightened += passed.leave < 0.89 * before.slowing_down
     assert tightened > 0
 
 
-def test_a_join_that_takes_longer_than_what_it_replaces_is_given_up(
+def test_a_corner_that_would_take_longer_than_a_stop_is_given_up(
     six_axis_limits, random_points, monkeypatch
 ):
     before, after = corner(random_points(1, 3), six_axis_limits)
-    detour = StraightSegment.between(*random_points(2, 2), six_axis_limits).pieces(0.0, 9.0)
-    asked = []
+    asked, honest = [], Solver.__call__
 
-    def slow_join(start, end, limits):
-        asked.append(start)
-        return detour
+    def slow(solver, starts, ends):
+        asked.extend(starts)
+        return [each._replace(duration=10.0) for each in honest(solver, starts, ends)]
 
-    monkeypatch.setattr("planner.corners.join", slow_join)
+    monkeypatch.setattr(Solver, "__call__", slow)
     assert fly_by(before, after, six_axis_limits, 0.5) is STOP
-    tried = [before.state(before.duration - fly * before.ramp) for fly in 0.5 / 2 ** np.arange(5)]
-    np.testing.assert_array_equal(asked, tried)  # as asked, then halved four times
+    tried = [
+        before.state(before.duration - 0.5 * part * before.slowing_down)
+        for part in (1.0, 0.999, 0.97, 0.9, 0.5, 0.25, 0.125, 0.0625)
+    ]
+    np.testing.assert_array_equal(asked, tried)
+
+
+@pytest.mark.parametrize("missed", ["too slow", "unknown"])
+def test_a_join_that_the_solver_misses_is_replaced_by_one_next_to_it(
+    six_axis_limits, random_points, monkeypatch, missed
+):
+    before, after = corner(random_points(1, 3), six_axis_limits)
+    honest = Solver.__call__
+
+    def misses_the_first(solver, starts, ends):
+        first, *others = honest(solver, starts, ends)
+        # What was seen to happen: a join much longer than need be, still shorter than to stop.
+        slow = first._replace(duration=1.2 * first.duration)
+        return [slow if missed == "too slow" else None, *others]
+
+    monkeypatch.setattr(Solver, "__call__", misses_the_first)
+    passed = fly_by(before, after, six_axis_limits, 0.5)
+    assert passed.how == "reduced"
+    assert passed.share == 0.5 * 0.999
+    assert passed.join is not None
+
+
+savings = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=5)
+
+
+@given(savings)
+def test_corners_are_ranked_by_what_they_save_and_none_costs(savings):
+    order = ranked(savings)
+    assert set(order) == {i for i, saving in enumerate(savings) if saving >= 0.0}
+    ranks = [savings[i] for i in order]
+    assert all(a >= b - 1e-9 for a, b in pairwise(ranks))
+
+
+def test_the_corner_asked_for_comes_first_among_equals():
+    assert ranked([0.5, 0.5 + 1e-12, 0.5]) == [0, 1, 2]
+    assert ranked([0.5, 0.6, 0.55]) == [1, 2, 0]
+    assert ranked([-0.1, 0.0]) == [1]
+
+
+@pytest.mark.parametrize("distance", [1e-6, 1e-3, 0.05, 0.3, 10.0])
+def test_a_corner_within_a_distance_uses_most_of_it_and_no_more(
+    six_axis_limits, random_points, distance
+):
+    used = []
+    for seed in range(25):
+        before, after = corner(random_points(seed, 3), six_axis_limits)
+        passed = fly_within(before, after, six_axis_limits, distance)
+        whole = fly_by(before, after, six_axis_limits, 1.0)
+        assert passed.join is not None and whole.join is not None
+        q = passed.join.sample(np.linspace(0.0, passed.join.duration, 20001))[0]
+        nearest = np.linalg.norm(q - after.start, axis=1).min()
+        assert nearest <= distance * (1 + 1e-6)
+        widest = passing(whole.join, after.start).distance
+        used.append(nearest / min(distance, widest))
+    assert np.median(used) >= 0.9
+
+
+def test_a_distance_of_nothing_is_a_stop(six_axis_limits, random_points):
+    assert fly_within(*corner(random_points(2, 3), six_axis_limits), six_axis_limits, 0.0) is STOP
+
+
+def test_no_corner_is_planned_with_an_unknown_solver(six_axis_limits, random_points, monkeypatch):
+    monkeypatch.setattr("planner.solver._VERSION", "0.20.1")
+    monkeypatch.setattr("planner.solver._SUPPORTED", False)
+    segments = corner(random_points(3, 3), six_axis_limits)
+    with pytest.raises(UnsupportedSolver, match=r"0\.20\.1.*0\.19"):
+        fly_by(*segments, six_axis_limits, 0.5)
+    assert fly_by(*segments, six_axis_limits, 0.0) is STOP
+
+
+@pytest.mark.parametrize(
+    ("version", "known"),
+    [("0.19.4", True), ("0.19.9", True), ("0.20.0", False), ("0.1.9", False), ("unknown", False)],
+)
+def test_the_series_of_a_version_is_what_counts(version, known):
+    assert is_supported(version) is known
 
 
 def test_nothing_is_cut_from_a_stop(six_axis_limits, random_points):

@@ -63,3 +63,17 @@ def test_no_way_to_go_takes_no_time(six_axis_limits, random_points):
     segment = StraightSegment.between(point, point, six_axis_limits)
     assert segment.duration == 0.0
     np.testing.assert_array_equal(segment.state(0.0)[:, 0], point)
+
+
+def test_a_deceleration_of_its_own_bounds_the_second_ramp_only(six_axis_limits, random_points):
+    start, end = random_points(6, 2)
+    slowing = six_axis_limits.acceleration / np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    segment = StraightSegment.between(start, end, six_axis_limits, slowing)
+    assert segment.slowing_down > segment.speeding_up
+    up = segment.pieces(0.0, segment.speeding_up).extrema().acceleration
+    down = segment.pieces(segment.duration - segment.slowing_down, segment.duration).extrema()
+    # On a line the ratio between the joints is fixed: one of them reaches its bound.
+    assert np.max(up / six_axis_limits.acceleration) == pytest.approx(1.0)
+    assert np.max(down.acceleration / slowing) == pytest.approx(1.0)
+    plain = StraightSegment.between(start, end, six_axis_limits)
+    assert plain.speeding_up == pytest.approx(segment.speeding_up)

@@ -1,0 +1,8 @@
+"""Pictures of motions, for people who compare them with what a teach pendant shows."""
+
+from __future__ import annotations
+
+from hil.plots.frame import AngleFrame
+from hil.plots.plan_picture import draw_plan, save
+
+__all__ = ["AngleFrame", "draw_plan", "save"]

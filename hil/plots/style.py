@@ -1,0 +1,52 @@
+"""How pictures look: light paper, colours that differ in print and for the colour-blind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+
+from hil.report.figures.svg import drawing
+
+INK, MUTED, RULE, SHADE = "#1a1a1a", "#666666", "#dddddd", "#f0e8d2"
+LIMIT = "#b3261e"
+POSITION, VELOCITY, ACCELERATION = "#0072b2", "#00795a", "#b0530b"
+# Darker for a wider fly, and a line style of its own for grey print.
+FLIES = (
+    ("#000000", (0, ())),
+    ("#56a0d3", (0, (6, 1.5))),
+    ("#d98200", (0, (3, 1.2, 1, 1.2))),
+    ("#a5004c", (0, (1.4, 1))),
+)
+SMALL, TEXT, TITLE = 7.5, 9.0, 12.0
+
+
+@contextmanager
+def page() -> Iterator[None]:
+    """Draw inside this: one figure at a time, the same whatever the caller's settings are."""
+    with drawing():
+        mpl.rcParams.update(
+            {
+                "font.size": TEXT,
+                "axes.edgecolor": MUTED,
+                "axes.linewidth": 0.7,
+                "axes.labelcolor": INK,
+                "axes.titlesize": TEXT,
+                "xtick.color": MUTED,
+                "ytick.color": MUTED,
+                "xtick.labelsize": SMALL,
+                "ytick.labelsize": SMALL,
+                "figure.facecolor": "white",
+            }
+        )
+        yield
+
+
+def bare(axes: Axes) -> None:
+    """Leave away what does not carry information."""
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.grid(True, color=RULE, linewidth=0.5)
+    axes.set_axisbelow(True)

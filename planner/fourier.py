@@ -1,0 +1,282 @@
+r"""Sums of sines, the excitation of the paper's method A (eq. 8), bare or brought to rest.
+
+.. math:: q_j(t) = q_{0,j} + w(t) \sum_{k=1}^{W} a_{jk} \sin(\omega_{jk} t)
+
+The paper has w = 1 throughout, which starts at full speed: no controller can execute that. With a
+ramp, w rises from 0 to 1 at the beginning and falls back at the end, in fifth order, so that the
+motion starts and ends at rest in `offset`, is C2, never reaches farther than without, and is
+eq. 8 to the letter in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from math import comb, inf
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from planner.arrays import Array, read_only
+from planner.errors import InvalidSetting, InvalidTrajectory
+from planner.limits import JointLimits
+from planner.piecewise_cubic import Extrema
+from planner.supremum import supremum
+
+# w(u) = 10 u³ - 15 u⁴ + 6 u⁵ and its derivatives in u, highest power first, and the largest
+# magnitude of each on [0, 1].
+_RAMP = (
+    (6.0, -15.0, 10.0, 0.0, 0.0, 0.0),
+    (30.0, -60.0, 30.0, 0.0, 0.0),
+    (120.0, -180.0, 60.0, 0.0),
+    (360.0, -360.0, 60.0),
+)
+_RAMP_LARGEST = (1.0, 15.0 / 8.0, 10.0 / np.sqrt(3.0), 60.0, 360.0, 720.0)
+
+
+class HarmonicBounds(NamedTuple):
+    """The paper's constraints on a series of W harmonics: |a| < amplitude, |w| < frequency.
+
+    Attributes:
+        amplitude: Room around the offset divided by W, (n,) [rad].
+        frequency: Square root of acceleration limit over room, (n,) [rad/s].
+    """
+
+    amplitude: Array
+    frequency: Array
+
+
+def harmonic_bounds(limits: JointLimits, offset: ArrayLike, harmonics: int) -> HarmonicBounds:
+    """Return the constraints of the paper's appendix for `harmonics` sines about `offset` (n,).
+
+    The paper's q_max belongs to a range that is symmetric about the offset; here it is the room
+    on the narrower side. Bare series inside these bounds keep the limits of position and
+    acceleration; velocity and jerk are not bounded by them and have to be checked.
+
+    Raises:
+        InvalidSetting: an offset not strictly inside the limits, or no harmonic.
+    """
+    centre = np.asarray(offset, dtype=np.float64)
+    if harmonics < 1:
+        raise InvalidSetting("harmonics", harmonics, "1 or more")
+    if centre.shape != limits.lower.shape or not np.all(
+        (centre > limits.lower) & (centre < limits.upper)
+    ):
+        raise InvalidSetting("offset", offset, "a position strictly inside the joint limits")
+    room = np.minimum(limits.upper - centre, centre - limits.lower)
+    return HarmonicBounds(room / harmonics, np.sqrt(limits.acceleration / room))
+
+
+@dataclass(frozen=True, eq=False)
+class FourierSeries:
+    """A sum of sines per joint (eq. 8), at rest at both ends if it has a ramp.
+
+    Before time 0 and after `duration` the joints are taken to rest where the motion begins and
+    ends. Without a ramp that is a jump of velocity: such a series can be looked at and designed
+    with, not executed.
+
+    Attributes:
+        offset: Position about which each joint swings, (n,) [rad].
+        amplitude: Of each sine, (n, W) [rad].
+        frequency: Of each sine, angular, (n, W) [rad/s].
+        length: Time from beginning to end, ramps included [s].
+        ramp: Time over which the sines grow at the beginning and fade at the end [s]; 0 for none.
+
+    Raises:
+        InvalidTrajectory: shapes that do not belong together, values that are not finite, a
+            length of 0 or less, ramps longer than the whole.
+    """
+
+    offset: Array
+    amplitude: Array
+    frequency: Array
+    length: float
+    ramp: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("offset", "amplitude", "frequency"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+        n = self.offset.size
+        if (
+            self.offset.ndim != 1
+            or n == 0
+            or self.amplitude.ndim != 2
+            or self.amplitude.shape != self.frequency.shape
+            or len(self.amplitude) != n
+        ):
+            raise InvalidTrajectory(
+                f"offset {self.offset.shape}, amplitude {self.amplitude.shape} and frequency "
+                f"{self.frequency.shape} do not belong together; expected (n,), (n, W), (n, W)"
+            )
+        for field in fields(self):
+            if not np.all(np.isfinite(getattr(self, field.name))):
+                raise InvalidTrajectory(f"{field.name} of a series of sines must be finite")
+        if not (self.length > 0.0 and 0.0 <= 2.0 * self.ramp <= self.length):
+            raise InvalidTrajectory(
+                f"a series of sines of {self.length} s with ramps of {self.ramp} s; "
+                "both ramps together must fit into it"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Length in time [s]."""
+        return self.length
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        return int(self.offset.size)
+
+    def sample(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return q [rad], qd [rad/s], qdd [rad/s²] at the times `t` (m,), each (m, n)."""
+        t = np.asarray(t, dtype=np.float64)
+        within = np.clip(t, 0.0, self.length)
+        window = self._window(within, 2, self._stage(within))
+        sines = self._sines(within, 2)
+        q, qd, qdd = (_product(window, sines, order) for order in range(3))
+        outside = within != t
+        qd[outside] = 0.0
+        qdd[outside] = 0.0
+        return q + self.offset, qd, qdd
+
+    def sample_one(self, t: float) -> tuple[Array, Array, Array]:
+        """Return q [rad], qd [rad/s], qdd [rad/s²] at one time `t` [s], each (n,)."""
+        q, qd, qdd = self.sample(np.array([t]))
+        return q[0], qd[0], qdd[0]
+
+    def extrema(self) -> Extrema:
+        """Return bounds of the extremes over all time, per joint.
+
+        They are never inside the truth, and outside it by 1e-10 at most of what the sum of
+        amplitudes, each at the worst time, would give. The jump that a bare series makes at its
+        ends is not in them.
+        """
+        lower, upper, velocity, acceleration, jerk = np.empty((5, self.n_joints))
+        for joint in range(self.n_joints):
+            one = self._of(joint)
+            upper[joint] = self.offset[joint] + one._largest(0, np.positive)
+            lower[joint] = self.offset[joint] - one._largest(0, np.negative)
+            velocity[joint], acceleration[joint], jerk[joint] = (
+                one._largest(order, np.abs) for order in (1, 2, 3)
+            )
+        return Extrema(lower, upper, velocity, acceleration, jerk)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists; `from_dict` restores every bit, through JSON too."""
+        return {
+            "type": "fourier_series",
+            "offset": self.offset.tolist(),
+            "amplitude": self.amplitude.tolist(),
+            "frequency": self.frequency.tolist(),
+            "length": float(self.length),
+            "ramp": float(self.ramp),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> FourierSeries:
+        """Restore a series from `to_dict`.
+
+        Raises:
+            InvalidTrajectory: a field is missing, or is not what it should be.
+        """
+        if data.get("type") != "fourier_series":
+            raise InvalidTrajectory(f"type is {data.get('type')!r}; expected 'fourier_series'")
+        try:
+            return cls(
+                offset=read_only(data["offset"]),
+                amplitude=read_only(data["amplitude"]),
+                frequency=read_only(data["frequency"]),
+                length=float(data["length"]),
+                ramp=float(data["ramp"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InvalidTrajectory):
+                raise
+            raise InvalidTrajectory(f"not a series of sines: {error!r}") from error
+
+    def _of(self, joint: int) -> FourierSeries:
+        only = slice(joint, joint + 1)
+        return FourierSeries(
+            self.offset[only], self.amplitude[only], self.frequency[only], self.length, self.ramp
+        )
+
+    def _largest(self, order: int, side: np.ufunc) -> float:
+        """Bound from above one side of the derivative `order` of joint 0, less its offset."""
+        stages = [(0, self.ramp, self.length - self.ramp)]
+        if self.ramp > 0.0:
+            stages += [(1, 0.0, self.ramp), (-1, self.length - self.ramp, self.length)]
+        return max(
+            supremum(
+                lambda t, stage=stage: side(self._inside(t, order, stage)),  # type: ignore[misc]
+                start,
+                stop,
+                largest=self._bound(order, stage != 0),
+                curvature=self._bound(order + 2, stage != 0),
+            )
+            for stage, start, stop in stages
+            if stop > start
+        )
+
+    def _inside(self, t: Array, order: int, stage: int) -> Array:
+        """Return the derivative `order` of joint 0, less its offset, at `t` (m,)."""
+        window = self._window(t, order, np.full(t.shape, stage))
+        return _product(window, self._sines(t, order), order)[:, 0]
+
+    def _bound(self, order: int, ramped: bool) -> float:
+        """Bound the magnitude of a derivative of joint 0 by the sum of its amplitudes."""
+        size, rate = np.abs(self.amplitude[0]), np.abs(self.frequency[0])
+        with np.errstate(all="ignore"):  # what overflows becomes inf, which any limit refuses
+            sums = [np.sum(np.where(size > 0.0, size * rate**k, 0.0)) for k in range(order + 1)]
+            sums[0] = np.sum(size * np.minimum(rate * self.length, 1.0))  # |sin x| <= |x|
+            if not ramped:
+                return float(sums[order])
+            ramp = np.float64(self.ramp)
+            bound = sum(
+                comb(order, k) * _RAMP_LARGEST[k] / ramp**k * sums[order - k]
+                for k in range(order + 1)
+            )
+        return inf if np.isnan(bound) else float(bound)
+
+    def _stage(self, t: Array) -> NDArray[np.int_]:
+        """Return where in the motion times (m,) are: 1 growing, 0 between, -1 fading."""
+        growing, fading = t < self.ramp, t > self.length - self.ramp
+        return growing.astype(np.int_) - (fading & ~growing).astype(np.int_)
+
+    def _window(self, t: Array, order: int, stage: NDArray[np.int_]) -> list[Array]:
+        """Return w and its derivatives up to `order` at times (m,) in these stages (m,).
+
+        The third derivative jumps between stages, so a time alone does not say which one is meant.
+        """
+        if self.ramp == 0.0:
+            return [np.ones_like(t), *(np.zeros_like(t) for _ in range(order))]
+        u = np.clip(np.where(stage > 0, t, self.length - t) / self.ramp, 0.0, 1.0)
+        pace = stage / self.ramp
+        grown = np.where(stage == 0, 1.0, _polynomial(_RAMP[0], u))
+        return [grown, *(_polynomial(_RAMP[k], u) * pace**k for k in range(1, order + 1))]
+
+    def _sines(self, t: Array, order: int) -> list[Array]:
+        """Return the sum of sines and its derivatives up to `order`, (m, n) each."""
+        phase = t[:, None, None] * self.frequency
+        sine, cosine = np.sin(phase), np.cos(phase)
+        turned = (sine, cosine, -sine, -cosine)
+        return [
+            np.sum(self.amplitude * self.frequency**k * turned[k % 4], axis=2)
+            for k in range(order + 1)
+        ]
+
+
+def _product(window: list[Array], sines: list[Array], order: int) -> Array:
+    """Return the derivative `order` of window (m,) x sines (m, n), by Leibniz' rule."""
+    total: Array = window[0][:, None] * sines[order]
+    for k in range(1, order + 1):
+        total = total + comb(order, k) * window[k][:, None] * sines[order - k]
+    return total
+
+
+def _polynomial(coefficients: tuple[float, ...], u: Array) -> Array:
+    value = np.full_like(u, coefficients[0])
+    for coefficient in coefficients[1:]:
+        value *= u
+        value += coefficient
+    return value

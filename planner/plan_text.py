@@ -1,0 +1,127 @@
+"""The data of a plan file as TOML for people: angles in degrees, one line per list."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from typing import Any
+
+from planner.degrees import degrees_text, radians_of
+from planner.errors import InvalidPlanFile
+
+_HEAD = """\
+# A motion of joint moves. Names that end in _deg hold degrees, degrees/s, degrees/s^2,
+# degrees/s^3; shares of speed and acceleration lie in (0, 1]; a move without fly_percent
+# (0 to 100) or fly_distance_deg stops at its target.
+"""
+_MOTION = """\
+# What the moves above were planned to, to the last bit: per joint the times of its knots [s] and
+# position, velocity, acceleration, jerk at each (rad, s). After a change above, delete this table.
+"""
+# Which fields of each table are angles or their rates.
+_ANGLES: Mapping[str, frozenset[str]] = {
+    "": frozenset({"start"}),
+    "limits": frozenset({"lower", "upper", "velocity", "acceleration", "jerk"}),
+    "moves": frozenset({"target", "fly_distance"}),
+}
+_SUFFIX = "_deg"
+
+
+def to_toml(data: Mapping[str, Any]) -> str:
+    """Return the data of a plan file as TOML."""
+    parts = [_HEAD + _fields("", {k: v for k, v in data.items() if not _is_table(v)})]
+    for name, value in data.items():
+        if name == "motion":
+            parts.append(f"{_MOTION}[motion]\n{_motion(value)}")
+        elif isinstance(value, Mapping):
+            parts.append(f"[{name}]\n{_fields(name, value)}")
+        elif _is_table(value):
+            parts += [f"[[{name}]]\n{_fields(name, row)}" for row in value]
+    return "\n".join(parts)
+
+
+def from_toml(text: str) -> dict[str, Any]:
+    """Return the data of a plan file, in SI units, from TOML.
+
+    Raises:
+        InvalidPlanFile: the text is not TOML, or an angle is not a number.
+    """
+    try:
+        raw = tomllib.loads(text, parse_float=Decimal)
+    except tomllib.TOMLDecodeError as error:
+        raise InvalidPlanFile(f"not TOML: {error}") from error
+    data = _in_si("", {name: value for name, value in raw.items() if not _is_table(value)})
+    for name, value in raw.items():
+        if isinstance(value, Mapping):
+            data[name] = _in_si(name, value)
+        elif _is_table(value):
+            data[name] = [_in_si(name, row) for row in value]
+    return data
+
+
+def _is_table(value: Any) -> bool:
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return len(value) > 0 and isinstance(value[0], Mapping)
+    return isinstance(value, Mapping)
+
+
+def _fields(table: str, fields: Mapping[str, Any]) -> str:
+    angles = _ANGLES.get(table, frozenset())
+    return "".join(
+        f"{name}{_SUFFIX} = {_in_degrees(value)}\n"
+        if name in angles
+        else f"{name} = {json.dumps(value)}\n"  # JSON of numbers, texts and lists is TOML
+        for name, value in fields.items()
+    )
+
+
+def _in_degrees(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(degrees_text(angle) for angle in value)}]"
+    return degrees_text(value)
+
+
+def _motion(data: Mapping[str, Any]) -> str:
+    def lines(rows: Sequence[Any], indent: str) -> str:
+        return "".join(f"{indent}{json.dumps(row)},\n" for row in rows)
+
+    joints = "".join(f"  [\n{lines(rows, '    ')}  ],\n" for rows in data["coefficients"])
+    return (
+        f"type = {json.dumps(data['type'])}\n"
+        f"knots = [\n{lines(data['knots'], '  ')}]\n"
+        f"coefficients = [\n{joints}]\n"
+    )
+
+
+def _in_si(table: str, fields: Mapping[str, Any]) -> dict[str, Any]:
+    angles = _ANGLES.get(table, frozenset())
+    data: dict[str, Any] = {}
+    for name, value in fields.items():
+        plain = name.removesuffix(_SUFFIX)
+        if plain != name and plain in angles:
+            if plain in fields:
+                raise InvalidPlanFile(f"both {plain!r} and {name!r} are given")
+            data[plain] = _radians(name, value)
+        else:
+            data[name] = _plain(value)
+    return data
+
+
+def _radians(name: str, value: Any) -> Any:
+    if isinstance(value, list):
+        return [_radians(name, entry) for entry in value]
+    if isinstance(value, bool) or not isinstance(value, Decimal | int):
+        raise InvalidPlanFile(f"{name}: {value!r} is not a number of degrees")
+    return radians_of(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Decimal):
+        return float(value)
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, Mapping):
+        return {name: _plain(entry) for name, entry in value.items()}
+    return value

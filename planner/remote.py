@@ -1,0 +1,100 @@
+"""What runs in a planning process, and how calls travel to it and back."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import resource
+import signal
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple, cast
+
+from planner.errors import PlannerError
+
+# How much later than its caller gives up a process ends itself, should its caller be gone.
+_GRACE = 1.0
+
+
+class Task(NamedTuple):
+    """A call, and how long it may take [s]."""
+
+    timeout: float
+    function: Callable[..., object]
+    args: tuple[Any, ...]
+    kwargs: Mapping[str, Any]
+
+
+class Answer(NamedTuple):
+    """What a call returned or raised."""
+
+    result: object
+    error: Exception | None
+
+
+def serve(descriptor: int) -> None:
+    """Answer calls that arrive on an inherited socket, until its other end is closed."""
+    # A crash is expected here; it must not fill a disk.
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    connection: Connection[bytes, bytes] = Connection(descriptor)
+    try:
+        connection.send_bytes(b"ready")
+        while True:
+            connection.send_bytes(_answer(connection.recv_bytes()))
+    except (EOFError, OSError):
+        return
+
+
+def pack(message: Task | Answer) -> bytes:
+    """Return a message as bytes."""
+    buffer = io.BytesIO()
+    _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(message)
+    return buffer.getvalue()
+
+
+def load(message: bytes) -> Any:
+    """Return the message that `pack` made into bytes, a `Task` or an `Answer`."""
+    return pickle.loads(message)
+
+
+def _answer(message: bytes) -> bytes:
+    try:
+        timeout, function, args, kwargs = cast(Task, load(message))
+        # Kills even a solver that hangs where no Python runs.
+        signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)
+        try:
+            result = function(*args, **kwargs)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        return pack(Answer(result, None))
+    except Exception as error:
+        if not isinstance(error, PlannerError):  # unexpected: where it happened is needed
+            error.add_note(f"in the planning process:\n{traceback.format_exc()}")
+        return pack(Answer(None, error))
+
+
+class _Pickler(pickle.Pickler):
+    """Restores frozen dataclasses through their constructors, and errors of any signature.
+
+    Pickle's own way with the first would forget that arrays are read-only; with the second it
+    would call a constructor that wants numbers with the sentence it made of them.
+    """
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, Exception):
+            return _revived, (type(obj), obj.args, vars(obj))
+        if is_dataclass(obj) and not isinstance(obj, type):
+            own = fields(obj)
+            if all(field.init and not field.kw_only for field in own):
+                return type(obj), tuple(getattr(obj, field.name) for field in own)
+        return NotImplemented
+
+
+def _revived(kind: type[Exception], args: tuple[Any, ...], state: dict[str, Any]) -> Exception:
+    error = kind.__new__(kind, *args)
+    error.args = args
+    vars(error).update(state)
+    return error

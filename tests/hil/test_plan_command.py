@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+import json
+
+import matplotlib.image
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from hil.cell import Cell
+from hil.cli.plan import plan
+from hil.cli.plan_input import read_plan_file
+from hil.errors import InputError
+from hil.plots import AngleFrame, draw_plan
+from hil.plots.corner import flown_corners, sharpest_corner
+from hil.plots.joints import corner_times
+from planner.motion_csv import from_csv
+from planner.moves import FlyPercent, Move, plan_moves
+from sim_fixtures.ns16 import CELL_PATH
+
+VIA = """\
+# as on the teach pendant
+joint_1, joint_2, joint_3, joint_4, joint_5, joint_6
+0, 0, -90, 0, 90, 0
+40, 30, -60, 50, 40, 10   # reach
+-20; 10; -100; 0; 60; 90
+0 0 -90 0 90 0
+"""
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    return Cell.load(CELL_PATH)
+
+
+@pytest.fixture(scope="module")
+def app() -> typer.Typer:
+    app = typer.Typer()
+    app.command()(plan)
+    return app
+
+
+@pytest.fixture
+def run(app):
+    def run(*arguments: object) -> str:
+        result = CliRunner().invoke(
+            app, [str(CELL_PATH), *map(str, arguments)], catch_exceptions=False
+        )
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    return run
+
+
+@pytest.fixture
+def via(tmp_path):
+    path = tmp_path / "via.csv"
+    path.write_text(VIA)
+    return path
+
+
+def test_says_how_each_via_point_is_passed(run, via):
+    lines = run("--via", via, "--fly", 50).splitlines()
+    assert lines[0].split()[:3] == ["target", "joint_1", "joint_2"]
+    rows = [line.split() for line in lines[2:6]]
+    assert [row[0] for row in rows] == ["0", "1", "2", "3"]
+    assert rows[1][1:7] == ["40.00", "30.00", "-60.00", "50.00", "40.00", "10.00"]
+    assert [row[9].rstrip(",") for row in rows] == ["start", "flown", "flown", "stopped"]
+    times = [float(row[7]) for row in rows]
+    assert times == sorted(times) and times[0] == 0.0
+
+
+def test_degrees_are_the_teach_pendants_and_end_up_in_the_frame_of_the_urdf(run, via, cell):
+    out = json.loads(run("--via", via, "--json"))
+    assert out["angles"] == "controller"
+    np.testing.assert_allclose(out["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])
+    frame = AngleFrame.of(cell)
+    pendant = np.array([40.0, 30.0, -60.0, 50.0, 40.0, 10.0])
+    np.testing.assert_allclose(frame.urdf(pendant), cell.urdf_angles(np.radians(pendant)))
+    np.testing.assert_allclose(frame.shown(frame.urdf(pendant)), pendant)
+
+
+def test_a_wider_fly_is_faster_and_misses_by_more(run, via):
+    outs = [json.loads(run("--via", via, "--json", "--fly", fly)) for fly in (0, 25, 50, 100)]
+    durations = [out["duration"] for out in outs]
+    missed = [out["targets"][0]["distance_deg"] for out in outs]
+    assert durations == sorted(durations, reverse=True) and len(set(durations)) == 4
+    assert missed == sorted(missed) and missed[0] == 0.0 < missed[1]
+    assert outs[0]["duration"] == pytest.approx(outs[0]["duration_with_stops"])
+    assert {target["how"] for target in outs[0]["targets"]} == {"stopped"}
+    assert all(out["worst_limit_ratio"] <= 1.0 for out in outs)
+
+
+def test_fly_by_distance_and_slower_moves(run, via):
+    out = json.loads(run("--via", via, "--json", "--fly-distance", 1.5))
+    assert 0.0 < out["targets"][0]["distance_deg"] <= 1.5
+    slow = json.loads(run("--via", via, "--json", "--speed", 20, "--acceleration", 30))
+    assert slow["duration"] > 2.0 * out["duration"]
+
+
+def test_random_via_points_are_legal_and_repeatable(run):
+    first, second, other = (
+        json.loads(run("--random", 5, "--seed", seed, "--json")) for seed in (1, 1, 2)
+    )
+    assert first == second != other
+    assert len(first["targets"]) == 5
+
+
+def test_a_plan_file_is_planned_again_and_agrees(run, via, tmp_path, cell):
+    for name in ("plan.toml", "plan.json"):
+        path = tmp_path / name
+        out = run("--via", via, "--fly", 75, "--output", path)
+        assert run("--via", path) == out
+        file = read_plan_file(path)
+        assert file.moves[0].fly == FlyPercent(75.0)
+        assert file.plan().trajectory.duration == pytest.approx(
+            float(out.splitlines()[-2].split()[0]), abs=1e-3
+        )
+
+
+def test_the_table_holds_the_motion(run, via, tmp_path, cell):
+    path = tmp_path / "motion.csv"
+    run("--via", via, "--csv", path)
+    table, names = from_csv(path.read_text())
+    assert names == cell.joint_names
+    np.testing.assert_allclose(np.diff(table.time)[:-1], cell.period)
+    frame = AngleFrame.of(cell)
+    np.testing.assert_allclose(
+        frame.shown(table.position[[0, -1]]), [[0, 0, -90, 0, 90, 0]] * 2, atol=1e-9
+    )
+    assert np.all(np.abs(table.velocity) <= cell.joint_limits.velocity)
+    assert np.max(np.abs(table.acceleration) / cell.joint_limits.acceleration) > 0.9
+    run("--via", via, "--csv", path, "--rate", 50)
+    assert len(path.read_text().splitlines()) < 0.02 / cell.period * len(table.time)
+
+
+def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
+    path = tmp_path / "plan.png"
+    run("--via", via, "--picture", path, "--corner", 2)
+    pixels = matplotlib.image.imread(path)
+    assert pixels.shape[0] > 800 and pixels.shape[1] > 800
+    assert 0.02 < np.mean(np.any(pixels[..., :3] < 0.8, axis=2)) < 0.5
+    for suffix in (".svg", ".pdf"):
+        run("--via", via, "--picture", path.with_suffix(suffix))
+        assert path.with_suffix(suffix).stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        ([], "either --via or --random"),
+        (["--random", "3", "--via", "VIA"], "either --via or --random"),
+        (["--via", "missing.csv"], "cannot be read"),
+        (["--via", "VIA", "--corner", "3"], "no corner"),
+        (["--via", "VIA", "--picture", "plan.bmp"], "no format"),
+        (["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
+        (["--via", "VIA", "--csv", "nowhere/plan.csv"], "cannot be written"),
+        (["--via", "VIA", "--output", "plan.yaml"], "no plan file"),
+    ],
+)
+def test_says_what_is_wrong(app, via, arguments, problem):
+    arguments = [str(via) if argument == "VIA" else argument for argument in arguments]
+    with pytest.raises(InputError, match=problem):
+        CliRunner().invoke(app, [str(CELL_PATH), *arguments], catch_exceptions=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("0 0 0\n1 1 1\n", "3 values"),
+        ("0 0 -90 0 90 0\n", "1 via points"),
+        ("0 0 -90 0 90 0\nzero 0 0 0 0 0\n", "line 2"),
+        ("", "0 via points"),
+    ],
+)
+def test_says_what_is_wrong_with_via_points(app, tmp_path, text, problem):
+    path = tmp_path / "via.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=problem):
+        CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
+
+
+def test_a_plan_file_of_another_arm_is_refused(app, run, via, tmp_path):
+    path = tmp_path / "plan.toml"
+    run("--via", via, "--output", path)
+    path.write_text(path.read_text().replace('"joint_6"', '"tail"'))
+    with pytest.raises(InputError, match="tail"):
+        CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
+    path.write_text("not = [a plan")
+    with pytest.raises(InputError, match="TOML"):
+        CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
+
+
+def planned(cell: Cell, count: int, fly: float = 50.0):
+    limits = cell.joint_limits
+    random = np.random.default_rng(4)
+    points = limits.lower + random.random((count, 6)) * (limits.upper - limits.lower)
+    return plan_moves(points[0], [Move(p, fly=FlyPercent(fly)) for p in points[1:]], limits)
+
+
+def test_shaded_corners_are_where_the_motion_leaves_the_straight_lines(cell):
+    plan = planned(cell, 6)
+    points = np.array([plan.start, *(move.target for move in plan.moves)])
+    time = np.linspace(0.0, plan.trajectory.duration, 20_001)
+    q = plan.trajectory.sample(time)[0]
+    ways = np.diff(points, axis=0)
+    off = np.full(len(time), np.inf)
+    for start, way in zip(points, ways, strict=False):
+        along = np.clip((q - start) @ way / (way @ way), 0.0, 1.0)
+        off = np.minimum(off, np.linalg.norm(q - start - along[:, None] * way, axis=1))
+    straight = off < 1e-7
+    inside = np.zeros(len(time), dtype=bool)
+    for (begin, end), target in zip(corner_times(plan), plan.targets, strict=False):
+        assert begin <= target.time <= end
+        inside |= (time >= begin) & (time <= end)
+    assert np.all(straight[~inside])
+    assert np.mean(straight[inside]) < 0.2
+
+
+def test_flies_of_one_corner_leave_the_others_alone(cell):
+    plan = planned(cell, 5)
+    corners = flown_corners(plan, 1)
+    assert [corner.percent for corner in corners] == [0.0, 25.0, 50.0, 100.0]
+    distances = [corner.passage.distance for corner in corners]
+    assert distances == sorted(distances) and distances[0] == 0.0
+    for corner in corners:
+        for other in (0, 2):
+            ours, theirs = corner.plan.targets[other], plan.targets[other]
+            assert ours.distance == pytest.approx(theirs.distance)
+
+
+def test_a_plan_without_corners_is_drawn_too(cell):
+    for without in (planned(cell, 2), planned(cell, 3, fly=0.0)):
+        figure = draw_plan(without, cell.joint_names, AngleFrame.of(cell))
+        assert len(figure.axes) in (18, 20)
+    assert sharpest_corner(planned(cell, 2)) is None
+    limits = cell.joint_limits
+    middle = (limits.lower + limits.upper) / 2.0
+    still = plan_moves(middle, [Move(middle), Move(middle)], limits)
+    draw_plan(still, cell.joint_names, AngleFrame.of(cell))

@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from planner import InvalidSetting, ViaPointOutOfLimits, plan
+from planner.batch import PlanningPool, plan_many
+from planner.corners import join
+from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
+from planner.isolation import PlanningChild, close_child, in_child, plan_in_child
+from planner.limits import JointLimits
+
+# Legal states that crash community ruckig 0.19.4: |a| exactly at its limit.
+CRASH = {
+    "position": -2.8452037956537097,
+    "velocity": 0.4654211338651546,
+    "acceleration": 9.30842267730309,
+    "max_velocity": 2.792526803190927,
+    "max_jerk": 93.08422677303089,
+}
+DIRECT_CALL = """
+import json, resource, sys, ruckig
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+crash = json.loads(sys.argv[1])
+problem = ruckig.InputParameter(1)
+problem.current_position = problem.target_position = [crash["position"]]
+problem.current_velocity, problem.target_velocity = [-crash["velocity"]], [crash["velocity"]]
+problem.current_acceleration = problem.target_acceleration = [crash["acceleration"]]
+problem.max_velocity, problem.max_jerk = [crash["max_velocity"]], [crash["max_jerk"]]
+problem.max_acceleration = [crash["acceleration"]]
+assert ruckig.Ruckig(1).validate_input(problem, True, True)
+print("asked", flush=True)
+ruckig.Ruckig(1).calculate(problem, ruckig.Trajectory(1))
+"""
+
+# A solver that takes its process with it when a joint is asked to creep.
+ABORTING = """
+import os, sys
+from importlib.util import module_from_spec, spec_from_file_location
+_spec = spec_from_file_location("ruckig", {real!r})
+_real = module_from_spec(_spec)
+_spec.loader.exec_module(_real)
+__version__ = _real.__version__
+InputParameter, Trajectory = _real.InputParameter, _real.Trajectory
+Synchronization, RuckigError = _real.Synchronization, _real.RuckigError
+class Ruckig:
+    def __init__(self, n):
+        self._real = _real.Ruckig(n)
+    def calculate(self, problem, trajectory):
+        v, a, j = problem.max_velocity[0], problem.max_acceleration[0], problem.max_jerk[0]
+        if v * j / a**2 < 0.1:  # in whatever units
+            os.abort()
+        return self._real.calculate(problem, trajectory)
+"""
+CREEP = 1e-3
+
+
+@pytest.fixture
+def aborting_solver(tmp_path, monkeypatch):
+    import ruckig
+
+    (tmp_path / "ruckig.py").write_text(ABORTING.format(real=ruckig.__file__), encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    close_child()  # one that was started before would have the real solver
+    yield
+    close_child()
+
+
+def same(motion, other) -> bool:
+    return all(
+        np.array_equal(a, b)
+        for a, b in zip(
+            motion.knots + motion.coefficients, other.knots + other.coefficients, strict=True
+        )
+    )
+
+
+def gone(pid: int, within: float) -> bool:
+    end = time.monotonic() + within
+    while time.monotonic() < end:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        if state[0] == "Z":  # ended; nobody in this container may reap it
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_the_solver_crashes_on_legal_input():
+    """Why everything in this file exists. Should it fail, the solver has been mended."""
+    done = subprocess.run(
+        [sys.executable, "-c", DIRECT_CALL, json.dumps(CRASH)], capture_output=True, text=True
+    )
+    assert done.stdout == "asked\n", done.stderr
+    assert done.returncode == -signal.SIGSEGV
+
+
+def test_the_states_that_crash_the_solver_are_refused_before_it_is_asked():
+    limits = JointLimits(
+        [-3.0], [3.0], [CRASH["max_velocity"]], [CRASH["acceleration"]], [CRASH["max_jerk"]]
+    )
+    p, v, a = CRASH["position"], CRASH["velocity"], CRASH["acceleration"]
+    assert join(np.array([[p, -v, a]]), np.array([[p, v, a]]), limits, 0.1) is None
+
+
+def test_planning_in_a_child_is_planning(six_axis_limits, random_points):
+    points = random_points(3)
+    motion = plan_in_child(points, six_axis_limits, fly=0.25)
+    assert same(motion, plan(points, six_axis_limits, fly=0.25))
+    assert not motion.knots[0].flags.writeable
+    assert not motion.coefficients[0].flags.writeable
+
+
+def test_errors_come_back_whole(six_axis_limits, random_points):
+    points = random_points(3)
+    points[2, 1] = 99.0
+    with pytest.raises(ViaPointOutOfLimits, match="via point 2, joint 1") as caught:
+        plan_in_child(points, six_axis_limits)
+    assert (caught.value.index, caught.value.joint, caught.value.value) == (2, 1, 99.0)
+
+
+def test_an_unexpected_error_tells_where_it_happened():
+    with pytest.raises(ZeroDivisionError) as caught:
+        in_child(divmod, 1, 0)
+    assert "in the planning process" in caught.value.__notes__[0]
+
+
+def test_without_a_child_it_would_end_this_process(aborting_solver):
+    script = f"""
+import numpy as np
+from planner import JointLimits, plan
+one = np.ones(2)
+plan([one, -one, one / 2], JointLimits(-one, one, one, one, one), speed={CREEP})
+"""
+    path = os.pathsep.join(sys.path)
+    done = subprocess.run(
+        [sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": path}, capture_output=True
+    )
+    assert done.returncode == -signal.SIGABRT, done.stderr
+
+
+def test_a_solver_that_aborts_ends_the_child_only(aborting_solver, six_axis_limits, random_points):
+    points = random_points(5)
+    with PlanningChild() as child:
+        before = child.call(os.getpid)
+        assert child.call(os.getpid) == before == child.pid  # kept warm
+        for _ in range(2):
+            with pytest.raises(PlannerCrashed, match="signal 6") as caught:
+                child.call(plan, points, six_axis_limits, speed=CREEP)
+            assert caught.value.status == -signal.SIGABRT
+        assert child.call(os.getpid) != before
+        assert same(child.call(plan, points, six_axis_limits), plan(points, six_axis_limits))
+    assert gone(before, 5.0)
+    with pytest.raises(PlannerCrashed):
+        plan_in_child(points, six_axis_limits, speed=CREEP)
+    assert same(plan_in_child(points, six_axis_limits), plan(points, six_axis_limits))
+
+
+def test_a_child_that_died_idle_is_an_error_once(six_axis_limits, random_points):
+    with PlanningChild() as child:
+        os.kill(child.call(os.getpid), signal.SIGKILL)
+        with pytest.raises(PlannerCrashed, match="signal 9"):
+            child.call(os.getpid)
+        assert child.call(abs, -1) == 1
+
+
+def test_a_process_that_cannot_start_is_not_the_fault_of_what_it_was_to_plan(
+    tmp_path, monkeypatch, six_axis_limits, random_points
+):
+    (tmp_path / "ruckig.py").write_text("raise SystemExit(3)", encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(PlannerNotStarted, match="status 3"):
+        plan_many([random_points(0)] * 3, six_axis_limits, workers=2)
+    with PlanningChild() as child:
+        with pytest.raises(PlannerNotStarted, match="status 3"):
+            child.call(abs, -1)
+        assert child.pid is None
+        (tmp_path / "ruckig.py").unlink()
+        assert child.call(abs, -1) == 1
+
+
+def test_a_call_that_takes_too_long_is_ended():
+    with PlanningChild(timeout=0.3) as child:
+        pid = child.call(os.getpid)
+        with pytest.raises(PlanningTimedOut, match=r"0\.3 s"):
+            child.call(time.sleep, 60.0)
+        assert gone(pid, 5.0)
+        assert child.call(abs, -1) == 1
+
+
+@pytest.mark.parametrize("task", ["", "child.send(time.sleep, 60.0)"], ids=["idle", "busy"])
+def test_a_child_outlives_its_parent_by_no_more_than_its_call(task):
+    script = f"""
+import os, signal, time
+from planner.isolation import PlanningChild
+child = PlanningChild(timeout=0.5)
+print(child.call(os.getpid), flush=True)
+{task}
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert gone(int(done.stdout), 10.0), done.stderr
+
+
+def test_a_crash_costs_a_search_one_individual(aborting_solver, six_axis_limits, random_points):
+    points = np.array([random_points(seed) for seed in range(80)])
+    speed = np.ones((80, 6))
+    deadly = [0, 41, 79]
+    speed[deadly, 0] = CREEP
+    with PlanningPool(2) as pool:
+        planned = pool.plan_many(points, six_axis_limits, speed=speed)
+        assert [
+            i for i, motion in enumerate(planned) if isinstance(motion, PlannerCrashed)
+        ] == deadly
+        for index in sorted({*range(80)} - {*deadly}):
+            assert same(planned[index], plan_many(points[[index]], six_axis_limits, workers=0)[0])
+        again = pool.plan_many(points[:40], six_axis_limits)  # the pool is whole
+        assert not any(isinstance(motion, Exception) for motion in again)
+
+
+def test_the_number_of_workers_changes_nothing(aborting_solver, six_axis_limits, random_points):
+    points = [random_points(seed, 2 + seed % 5) for seed in range(70)]
+    points[7] = points[7] + 100.0
+    speed = np.full((70, 6), 0.7)
+    speed[33, 0] = CREEP
+    runs = [
+        plan_many(points, six_axis_limits, speed=speed, workers=workers) for workers in (1, 2, 3)
+    ]
+    for index, (one, *others) in enumerate(zip(*runs, strict=True)):
+        for other in others:
+            assert type(one) is type(other)
+            assert str(one) == str(other) if index in (7, 33) else same(one, other)
+    assert isinstance(runs[0][7], ViaPointOutOfLimits)
+    assert isinstance(runs[0][33], PlannerCrashed)
+
+
+def test_ctrl_c_ends_a_search_and_its_workers():
+    script = """
+import numpy as np
+from planner import JointLimits
+from planner.batch import PlanningPool
+one = np.ones(6)
+limits = JointLimits(-one, one, one, one, one)
+points = np.random.default_rng(0).uniform(-1.0, 1.0, (200_000, 6, 6))
+with PlanningPool(2) as pool:
+    print(*(child.call(__import__("os").getpid) for child in pool.children), flush=True)
+    pool.plan_many(points, limits)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as search:
+        pids = [int(pid) for pid in search.stdout.readline().split()]
+        time.sleep(0.3)
+        os.killpg(search.pid, signal.SIGINT)
+        _, said = search.communicate(timeout=10.0)
+    assert search.returncode == -signal.SIGINT
+    assert said.count("Traceback") == 1
+    assert said.rstrip().endswith("KeyboardInterrupt")
+    assert len(pids) == 2
+    assert all(gone(pid, 5.0) for pid in pids)
+
+
+@pytest.mark.parametrize(
+    ("setting", "name"),
+    [({"speed": 0.0}, "speed"), ({"speed": [0.5] * 5}, "speed"), ({"fly": 1.5}, "fly")],
+)
+def test_settings_of_a_batch_are_checked_at_once(six_axis_limits, random_points, setting, name):
+    with pytest.raises(InvalidSetting, match=name):
+        plan_many([random_points(0)], six_axis_limits, **setting, workers=0)
+    with pytest.raises(InvalidSetting, match="workers"):
+        plan_many([random_points(0)], six_axis_limits, workers=-1)

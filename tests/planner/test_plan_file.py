@@ -1,0 +1,222 @@
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import replace
+from decimal import Decimal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from planner import JointLimits
+from planner.degrees import degrees_text, radians_of
+from planner.errors import InvalidPlanFile
+from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
+from planner.plan_file import PlanFile
+
+NAMES = tuple(f"joint_{i}" for i in range(1, 7))
+
+shares = st.floats(0.01, 1.0)
+positions = st.floats(-1.0, 1.0)
+
+
+@st.composite
+def moves(draw, n: int):
+    some = st.none() | st.lists(shares, min_size=n, max_size=n)
+    fly = draw(
+        st.just(Stop())
+        | st.floats(0.0, 100.0).map(FlyPercent)
+        | st.floats(0.0, 3.0).map(FlyDistance)
+    )
+    return Move(
+        target=draw(st.lists(positions, min_size=n, max_size=n)),
+        speed=draw(shares),
+        acceleration=draw(shares),
+        joint_speed=draw(some),
+        joint_acceleration=draw(some),
+        joint_jerk=draw(some),
+        fly=fly,
+        termination=draw(st.sampled_from(["fine", "coarse", "nosettle"])),
+    )
+
+
+@st.composite
+def files(draw):
+    """Any file that a person could write."""
+    n = draw(st.integers(1, 3))
+    rates = st.lists(st.floats(0.1, 100.0), min_size=n, max_size=n)
+    limits = draw(
+        st.none()
+        | st.builds(JointLimits, st.just([-1.0] * n), st.just([1.0] * n), rates, rates, rates)
+    )
+    overrides = draw(
+        st.builds(Overrides, speed=shares, acceleration=shares, deceleration=shares)
+        | st.lists(shares, min_size=n, max_size=n).map(lambda each: Overrides(joint=each))
+        | st.just(Overrides())
+    )
+    start = np.array(draw(st.lists(positions, min_size=n, max_size=n)))
+    names = tuple(draw(st.lists(st.text('aé"\\ .=\n#', min_size=1), min_size=n, max_size=n)))
+    return PlanFile(names, start, tuple(draw(st.lists(moves(n), max_size=4))), overrides, limits)
+
+
+@given(files())
+@settings(max_examples=150, deadline=None)
+def test_every_bit_comes_back_through_toml_and_json(file):
+    data = file.to_dict()
+    for again in (
+        PlanFile.from_toml(file.to_toml()),
+        PlanFile.from_dict(json.loads(json.dumps(data))),
+    ):
+        assert json.dumps(again.to_dict()) == json.dumps(data)  # tells -0.0 from 0.0
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False, min_value=-1e6, max_value=1e6))
+@settings(max_examples=1000)
+def test_degrees_restore_every_bit(angle):
+    text = degrees_text(angle)
+    back = radians_of(Decimal(text))
+    assert np.float64(back).tobytes() == np.float64(angle).tobytes()
+    assert isinstance(tomllib.loads(f"x = {text}")["x"], float)
+
+
+@given(st.decimals(-720, 720, places=4))
+def test_degrees_that_a_person_wrote_come_back_as_they_were_written(written):
+    assert Decimal(degrees_text(radians_of(written))) == written
+
+
+def test_degrees_are_those_of_everyone_else():
+    for angle in (0, 30, 90, 155, -720, 12.5, 516.667):
+        assert radians_of(Decimal(str(angle))) == np.radians(angle)
+
+
+@pytest.fixture
+def planned(six_axis_limits, random_points):
+    points = random_points(3)
+    flies = [FlyPercent(50.0), FlyPercent(100.0), Stop(), FlyDistance(0.05), Stop()]
+    return plan_moves(
+        points[0],
+        [Move(target, speed=0.8, fly=fly) for target, fly in zip(points[1:], flies, strict=True)],
+        six_axis_limits,
+        Overrides(deceleration=0.7),
+    )
+
+
+def test_a_plan_comes_back_as_it_was(planned):
+    file = PlanFile.of(planned, NAMES)
+    again = PlanFile.from_toml(file.to_toml())
+    assert again.to_dict() == file.to_dict()
+    restored = again.plan()
+    assert restored.targets == planned.targets
+    for ours, theirs in zip(
+        (*restored.trajectory.knots, *restored.trajectory.coefficients),
+        (*planned.trajectory.knots, *planned.trajectory.coefficients),
+        strict=True,
+    ):
+        assert ours.tobytes() == theirs.tobytes()
+
+
+def test_the_stored_motion_is_the_one_that_is_run_not_one_planned_again(planned):
+    data = PlanFile.of(planned, NAMES).to_dict()
+    jerk = data["motion"]["coefficients"][2][0]
+    jerk[3] = np.nextafter(jerk[3], 0.0)  # as another machine may have computed it
+    restored = PlanFile.from_dict(data).plan()
+    assert restored.trajectory.coefficients[2][0, 3] == jerk[3]
+
+
+def test_moves_that_were_edited_do_not_pass_for_the_stored_motion(planned):
+    text = PlanFile.of(planned, NAMES).to_toml()
+    edited = text.replace("speed = 0.8", "speed = 0.79", 1)
+    assert edited != text
+    with pytest.raises(InvalidPlanFile, match="take the motion out"):
+        PlanFile.from_toml(edited).plan()
+    without = replace(PlanFile.from_toml(edited), trajectory=None)
+    assert without.plan().trajectory.duration > planned.trajectory.duration
+
+
+def test_a_stored_motion_that_was_damaged_is_refused(planned):
+    for row, quantity, by in ((0, 3, 1.1), (5, 0, 1.0 + 1e-6)):
+        data = PlanFile.of(planned, NAMES).to_dict()
+        data["motion"]["coefficients"][0][row][quantity] *= by
+        with pytest.raises(InvalidPlanFile, match="stored motion"):
+            PlanFile.from_dict(data).plan()
+
+
+def test_other_limits_mean_another_plan(planned):
+    file = PlanFile.of(planned, NAMES)
+    slower = file.plan(planned.limits.scaled(velocity=0.5))
+    assert slower.trajectory.duration > planned.trajectory.duration
+
+
+HAND_WRITTEN = """
+format = "joint motion plan"
+version = 1
+joints = ["shoulder", "elbow"]
+start_deg = [0, 0]
+[limits]
+lower_deg = [-90, -90]
+upper_deg = [90, 90.0]
+velocity_deg = [100, 100]
+acceleration_deg = [300, 300]
+jerk_deg = [3000, 3000]
+[[moves]]
+target_deg = [30, 60.5]
+fly_percent = 50
+[[moves]]
+target = [0.5, -1]
+fly_distance_deg = 2
+speed = 0.5
+[[moves]]
+target_deg = [0, 0]
+"""
+
+
+def test_a_person_can_write_one():
+    file = PlanFile.from_toml(HAND_WRITTEN)
+    np.testing.assert_array_equal(file.moves[0].target, np.radians([30.0, 60.5]))
+    np.testing.assert_array_equal(file.moves[1].target, [0.5, -1.0])
+    assert file.moves[1].fly == FlyDistance(np.radians(2.0))
+    planned = file.plan()
+    assert [target.how for target in planned.targets][-1] == "stopped"
+    assert planned.targets[0].distance > 0.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("version = 1", "version = 2", "version"),
+        ("version = 1", "", "version"),
+        ('"joint motion plan"', '"poem"', "format"),
+        ("fly_percent = 50", "fly_percent = 50\nfly_distance = 0.1", "not both"),
+        ("fly_percent = 50", "fly_percent = 150", "fly percentage"),
+        ("fly_percent = 50", 'fly_percent = "much"', "not a plan"),
+        ("fly_percent = 50", "flyby = 50", "'flyby' is unknown"),
+        ("speed = 0.5", "speed = 50", "speed"),
+        ("target_deg = [30, 60.5]", "target_deg = [30]", "joints are named"),
+        ("target_deg = [30, 60.5]", 'target_deg = ["30", 60.5]', "not a number of degrees"),
+        ("target_deg = [30, 60.5]", "target_deg = [30, 60.5]\ntarget = [1, 2]", "both"),
+        ("target_deg = [30, 60.5]", "target_deg = [30, nan]", "finite"),
+        ("target_deg = [30, 60.5]", "", "'target' is missing"),
+        ("start_deg = [0, 0]", "", "'start' is missing"),
+        ("start_deg = [0, 0]", "start_deg = 0", "position per joint"),
+        ("lower_deg = [-90, -90]", "lower_deg = [-90, 95]", "lower"),
+        ("jerk_deg = [3000, 3000]", "", "not a plan"),
+        ("[[moves]]", "[moves]", "TOML"),
+    ],
+)
+def test_says_what_is_wrong_with_a_file(old, new, problem):
+    with pytest.raises(InvalidPlanFile, match=problem):
+        PlanFile.from_toml(HAND_WRITTEN.replace(old, new, 1))
+
+
+def test_without_limits_there_is_no_plan():
+    head, _, rest = HAND_WRITTEN.partition("[limits]")
+    file = PlanFile.from_toml(head + rest[rest.index("[[moves]]") :])
+    with pytest.raises(InvalidPlanFile, match="limits"):
+        file.plan()
+    limits = PlanFile.from_toml(HAND_WRITTEN).limits
+    assert (
+        file.plan(limits).trajectory.duration
+        == PlanFile.from_toml(HAND_WRITTEN).plan().trajectory.duration
+    )

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from planner import JointLimits, PiecewiseCubic, ViaPointOutOfLimits, plan
+from planner.batch import plan_chunk, plan_many
+from planner.errors import NonFiniteViaPoint, TooFewViaPoints, WrongShape
+from planner.verify import check_limits, check_smooth
+
+
+def bits(motion: PiecewiseCubic) -> bytes:
+    return b"".join(array.tobytes() for array in motion.knots + motion.coefficients)
+
+
+def rates(draw, n: int) -> JointLimits:
+    """Limits of joints of very different nature."""
+    exponents = st.lists(st.floats(-2.0, 1.0), min_size=4, max_size=4)
+    span, velocity, ramp, rise = 10.0 ** np.array([draw(exponents) for _ in range(n)]).T
+    acceleration = velocity / ramp
+    return JointLimits(-span, span, velocity, acceleration, acceleration / rise)
+
+
+@st.composite
+def populations(draw):
+    """Motions that planners stumble over, together: still, microscopic, along limits."""
+    n, count, k = draw(st.integers(1, 6)), draw(st.integers(1, 5)), draw(st.integers(2, 6))
+    limits = rates(draw, n)
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    points = random.uniform(limits.lower, limits.upper, (count, k, n))
+    for row in points.reshape(-1, n)[1:]:
+        kind = draw(st.sampled_from(["random", "random", "limits", "same", "tiny", "one joint"]))
+        before = points[0, 0]
+        if kind == "limits":
+            row[:] = np.where(random.random(n) < 0.5, limits.lower, limits.upper)
+        elif kind == "same":
+            row[:] = before
+        elif kind == "tiny":
+            row[:] = before * (1.0 - 10.0 ** draw(st.integers(-15, -4)))
+        elif kind == "one joint":
+            row[1:] = before[1:]
+    speed = random.uniform(0.05, 1.0, (count, n))
+    return points, limits, speed, draw(st.sampled_from([0.0, 0.01, 0.07, 0.25, 0.5, 1.0]))
+
+
+@given(populations())
+@settings(max_examples=150)
+def test_a_motion_of_a_population_is_the_motion_planned_alone(problem):
+    points, limits, speed, fly = problem
+    together = plan_chunk(points, speed, limits, fly)
+    for via_points, shares, motion in zip(points, speed, together, strict=True):
+        alone = plan(via_points, limits, speed=shares, fly=fly)
+        assert motion.duration == alone.duration
+        times = np.linspace(-0.1, 1.1, 200) * alone.duration
+        for ours, theirs in zip(motion.sample(times), alone.sample(times), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+@given(populations())
+@settings(max_examples=150)
+def test_a_population_keeps_what_a_plan_promises(problem):
+    points, limits, speed, fly = problem
+    for shares, motion in zip(speed, plan_chunk(points, speed, limits, fly), strict=True):
+        allowed = limits.scaled(velocity=shares)
+        check_limits(motion, allowed)
+        check_smooth(motion, allowed)
+        # Pieces of no length are of no use to those who sample.
+        assert all(np.all(np.diff(knots) > 0.0) for knots in motion.knots if knots[-1] > 0.0)
+
+
+@given(populations(), st.data())
+@settings(max_examples=50)
+def test_company_changes_no_bit(problem, data):
+    points, limits, speed, fly = problem
+    together = plan_chunk(points, speed, limits, fly)
+    index = data.draw(st.integers(0, len(points) - 1))
+    (alone,) = plan_chunk(points[[index]], speed[[index]], limits, fly)
+    assert bits(alone) == bits(together[index])
+
+
+def test_of_a_thousand_ordinary_motions_none_differs(six_axis_limits, random_points):
+    points = np.array([random_points(seed) for seed in range(1000)])
+    for via_points, motion in zip(
+        points, plan_many(points, six_axis_limits, workers=0), strict=True
+    ):
+        alone = plan(via_points, six_axis_limits)
+        assert motion.duration == alone.duration
+        times = np.linspace(0.0, alone.duration, 50)
+        for ours, theirs in zip(motion.sample(times), alone.sample(times), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_what_cannot_be_planned_is_told_in_its_place(six_axis_limits, random_points):
+    good, outside, unknown = random_points(0), random_points(1), random_points(2)
+    outside[3, 2] = 50.0
+    unknown[0, 0] = np.nan
+    individuals = [good, outside, good[:1], unknown, good[:, :5], good[:3], good]
+    planned = plan_many(individuals, six_axis_limits, workers=0)
+    assert [type(each) for each in planned] == [
+        PiecewiseCubic,
+        ViaPointOutOfLimits,
+        TooFewViaPoints,
+        NonFiniteViaPoint,
+        WrongShape,
+        PiecewiseCubic,
+        PiecewiseCubic,
+    ]
+    assert bits(planned[0]) == bits(planned[6])
+    assert planned[5].sample(np.array([np.inf]))[0][0] == pytest.approx(good[2], abs=1e-11)
+
+
+def test_nobody_to_plan_for(six_axis_limits):
+    assert plan_many([], six_axis_limits, workers=0) == []
