@@ -35,6 +35,8 @@ test-slow: $(STAMP)  ## the tests that take minutes
 bench: $(STAMP)  ## every benchmark that needs no data beside the project
 	$(BIN)/python -m benchmarks.regressor
 	$(BIN)/python -m benchmarks.session
+	$(BIN)/python -m benchmarks.planner
+	$(BIN)/python -m benchmarks.live_motion
 	$(BIN)/python -m benchmarks.turnaround --busy
 
 clean:  ## remove .venv, runs and caches

@@ -16,7 +16,7 @@ from typing import Final
 from drivers.errors import DriverError
 from drivers.transports.faults import FaultyLink
 from hil.errors import ControllerFault, InputError
-from sim_fixtures import SimulatedController
+from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import PlantDiverged, SettingError
 from sim_fixtures.far_end import FarEnd, FarEndError, UdpFarEnd
 from sim_fixtures.program import Phase
@@ -26,22 +26,26 @@ from sim_fixtures.tally import ServeSummary, Tally
 _PR_SET_TIMERSLACK: Final = 29
 
 
-def open_far_end(udp: str | None, can: str | None) -> FarEnd:
+def open_far_end(
+    udp: str | None, can: str | None, settings: ControllerSettings, n_axes: int
+) -> FarEnd:
     """The controller's end of the link a person names.
 
     Args:
         udp: "HOST:PORT" of the PC program.
         can: "INTERFACE:CHANNEL", ":fd" or ":classic" behind it.
+        settings: of the controller; a bus is asked whether it can carry its cycle and mode.
+        n_axes: axes of the robot.
 
     Raises:
-        InputError: neither or both, not of that form, or impossible to open.
+        InputError: neither or both, not of that form, impossible to open, or unfit for the session.
     """
     if (udp is None) == (can is None):
         raise InputError(
             None, "a link has to be named, one of them", remedy="give --udp or --can, not both"
         )
     try:
-        return _udp(udp) if udp is not None else _can(can or "")
+        return _udp(udp) if udp is not None else _can(can or "", settings, n_axes)
     except FarEndError as error:
         raise InputError(None, str(error)) from error
 
@@ -57,11 +61,17 @@ def _udp(text: str) -> FarEnd:
     return UdpFarEnd(host, int(port))
 
 
-def _can(text: str) -> FarEnd:
+def _can(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:
     interface, _, rest = text.partition(":")
     channel, colon, profile = rest.rpartition(":")
-    if profile not in ("fd", "classic") or not colon:
+    if not colon:
         channel, profile = rest, "fd"
+    elif profile not in ("fd", "classic"):
+        raise InputError(
+            None,
+            f"--can {text!r} ends in {profile!r}, which is neither of the profiles fd and classic",
+            remedy="end it with :fd or :classic (a channel with a colon in it needs one of them)",
+        )
     if not (interface and channel):
         raise InputError(
             None,
@@ -71,7 +81,15 @@ def _can(text: str) -> FarEnd:
     # python-can is loaded only where a bus is asked for.
     from sim_fixtures.can_end import open_far_end as open_can
 
-    return open_can(interface, channel, "classic" if profile == "classic" else "fd")
+    moved_by_pc = settings.corrected or not settings.own_motion
+    return open_can(
+        interface,
+        channel,
+        "classic" if profile == "classic" else "fd",
+        period=settings.period,
+        n_axes=n_axes,
+        mode=settings.open_mode if moved_by_pc else None,
+    )
 
 
 class Buttons:
@@ -173,6 +191,7 @@ class Served:
         intervals: how often all axes have been open.
         starts: how often the start was begun.
         foreign: datagrams from elsewhere; 0 where the link cannot tell.
+        gave_up: whether the controller ended the session because too many openings were lost.
     """
 
     summary: ServeSummary
@@ -181,6 +200,7 @@ class Served:
     intervals: int
     starts: int
     foreign: int
+    gave_up: bool = False
 
 
 def serve_session(
@@ -190,6 +210,7 @@ def serve_session(
     *,
     faults: FaultyLink | None = None,
     patience: float = PATIENCE,
+    stretch: float = 0.0,
     watch: Callable[[SimulatedController, Tally], None] = lambda *_: None,
 ) -> Served:
     """Serve until a session has ended; a start that the PC breaks off begins anew after a second.
@@ -200,6 +221,7 @@ def serve_session(
         pressed: the buttons.
         faults: what the link does to packets, counted from each start.
         patience: seconds that the arm may take to come to rest at the end.
+        stretch: seconds by which a cycle may be made longer to wait for its answer.
         watch: called every cycle with the counts so far.
 
     Raises:
@@ -214,7 +236,7 @@ def serve_session(
         try:
             summary = serve(
                 controller, far_end, faults=faults, wish=pressed.wish, watch=record.observe,
-                patience=patience,
+                patience=patience, stretch=stretch,
             )  # fmt: skip
         except DriverError as error:
             raise InputError(None, str(error)) from error
@@ -228,6 +250,7 @@ def serve_session(
                 intervals=record.intervals,
                 starts=starts,
                 foreign=getattr(far_end, "foreign", 0),
+                gave_up=controller.gave_up,
             )
         _pause(KNOCK_INTERVAL, pressed)
 

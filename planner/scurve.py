@@ -126,18 +126,6 @@ def _peak(
     return peak
 
 
-def ramp_down(velocity: float, acceleration: float, jerk: float) -> PiecewiseCubic:
-    """Plan the fastest change from a constant `velocity` > 0 to rest; path counted from 0."""
-    rise, flat = _pulse(velocity, acceleration, jerk)
-    # The jerk is refitted so that the pulse takes away exactly `velocity`.
-    jerk = velocity / (rise * (rise + flat))
-    return PiecewiseCubic.from_jerks(
-        start=np.array([[0.0, velocity, 0.0]]),
-        knots=np.cumsum([[0.0, rise, flat, rise]], axis=1),
-        jerks=np.array([[-jerk, 0.0, jerk]]),
-    )
-
-
 def _pulse(velocity_change: float, acceleration: float, jerk: float) -> _Pulse:
     """Return the shortest acceleration pulse that changes the velocity so much."""
     rise = min(acceleration / jerk, sqrt(velocity_change / jerk))

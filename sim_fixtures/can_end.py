@@ -18,7 +18,9 @@ from drivers.transports.base import TransportError
 from drivers.transports.can.bus import open_bus
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd
+from drivers.transports.can.layout import MAX_AXES
 from drivers.transports.can.port import Port
+from drivers.transports.can.transport import CanSpec
 from sim_fixtures.far_end import FarEndError
 
 START_PATIENCE: Final = 0.25
@@ -96,6 +98,9 @@ def open_far_end(
     channel: str,
     profile: Literal["fd", "classic"] = "fd",
     *,
+    period: float,
+    n_axes: int = MAX_AXES,
+    mode: int | None = None,
     bitrate: int | None = None,
     data_bitrate: int | None = None,
     start_patience: float = START_PATIENCE,
@@ -107,17 +112,21 @@ def open_far_end(
         interface: "socketcan", "slcan", "udp_multicast", "virtual", ...
         channel: "can0", "/dev/ttyACM0", ...
         profile: "fd" or "classic".
+        period: cycle in s.
+        n_axes: axes of the robot.
+        mode: open mode of the session; None where no axis is opened.
         bitrate: bit/s; None for 1 Mbit/s.
         data_bitrate: bit/s of the data phase on FD; None for 5 Mbit/s.
         start_patience: s that the answer to a start packet is waited for.
         options: further arguments of the python-can bus.
 
     Raises:
-        FarEndError: it cannot be opened.
+        FarEndError: it cannot be opened, or (`CanError` is its cause) cannot carry the session.
     """
-    standard = BusRates(profile)
-    rates = BusRates(profile, bitrate or standard.bitrate, data_bitrate or standard.data_bitrate)
+    spec = CanSpec(interface, channel, profile, bitrate, data_bitrate, period=period, n_axes=n_axes)
+    rates = spec.rates
     try:
+        spec.check(mode)
         bus = open_bus(interface, channel, rates, options or {})
     except TransportError as error:
         raise FarEndError(error.link, f"{error.reason}; {error.remedy}") from error

@@ -136,7 +136,12 @@ class SimulatedController:
         if not settings.own_motion:
             return None
         speed = settings.own_speed * np.array(self.plant.model.velocityLimit)
-        return OwnMotion(settings.own_motion, speed=speed, period=settings.period)
+        return OwnMotion(
+            settings.own_motion,
+            speed=speed,
+            period=settings.period,
+            repeats=settings.own_motion_repeats,
+        )
 
     def _schedule(self, faults: Sequence[ControllerFault]) -> dict[int, list[ControllerFault]]:
         """Sort faults by cycle.
@@ -170,6 +175,16 @@ class SimulatedController:
     def reason(self) -> str:
         """Why the drive was last lost or the session ended; "" if neither."""
         return self._program.reason
+
+    @property
+    def openings_lost(self) -> int:
+        """Openings in a row that were lost to missing replies."""
+        return self._program.openings_lost
+
+    @property
+    def gave_up(self) -> bool:
+        """Whether the session ends, or has ended, because too many openings were lost."""
+        return self._program.gave_up
 
     @property
     def current_delay_cycles(self) -> float:

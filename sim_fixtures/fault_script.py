@@ -13,7 +13,7 @@ from sim_fixtures.errors import SimulationError
 Fault = link.Fault | controller.ControllerFault
 
 GRAMMAR: Final = """\
-KIND@CYCLE[xCOUNT][:OPTION]...   cycles count the controller's packets from 0
+KIND@CYCLE[xCOUNT][:OPTION]...   cycles count the controller's packets from 0; both up to 1e9
 
 lose@1200x3                      packets to the PC never arrive; :to_controller the PC's answers
 delay@1200:5ms                   they arrive later, by ms, us, s or cycles (:1.5cycles)
@@ -58,18 +58,24 @@ class _Line:
             raise FaultScriptError(text, f"{head!r} is not KIND@CYCLE or KIND@CYCLExCOUNT")
         self.text = text
         self.kind: str = match["kind"]
-        self.cycle = int(match["cycle"])
-        self._count: str | None = match["count"]
+        self.cycle = self._cycles("cycle", match["cycle"])
+        self._count = None if match["count"] is None else self._cycles("count", match["count"])
         self._options = options
 
     def error(self, reason: str) -> FaultScriptError:
         return FaultScriptError(self.text, reason)
 
+    def _cycles(self, what: str, digits: str) -> int:
+        # Compared by length first: Python refuses to read thousands of digits.
+        if len(digits.lstrip("0")) > len(str(link.MOST_CYCLES)) or int(digits) > link.MOST_CYCLES:
+            raise self.error(f"the {what} is more than {link.MOST_CYCLES}")
+        return int(digits)
+
     def count(self, default: int = 1) -> int:
         count, self._count = self._count, None
-        if count is not None and int(count) < 1:
+        if count is not None and count < 1:
             raise self.error("the count is not positive")
-        return default if count is None else int(count)
+        return default if count is None else count
 
     def word(self, *words: str) -> str:
         """The one of `words` that is an option; the first if none is."""

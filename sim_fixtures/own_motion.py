@@ -1,4 +1,8 @@
-"""Moves that the controller makes by itself: from posture to posture, at rest in each."""
+"""Moves that the controller makes by itself: from posture to posture, at rest in each.
+
+Repeated for ever they go to and fro through the list: each way but the first is one that the list
+has, so that where the list keeps clear of something, so do the repetitions.
+"""
 
 from __future__ import annotations
 
@@ -51,6 +55,7 @@ class OwnMotion:
         speed: ArrayLike,
         period: float,
         dwell: float = 0.2,
+        repeats: bool = False,
     ) -> None:
         """Take the list; `begin` says from where.
 
@@ -59,6 +64,7 @@ class OwnMotion:
             speed: greatest speed of each joint, (n,) [rad/s].
             period: cycle [s].
             dwell: rest in each posture [s].
+            repeats: go back through the list at its end, and forth again, until told to end.
 
         Raises:
             SettingError: a posture of another size, or a speed that is not a finite number above 0.
@@ -72,6 +78,7 @@ class OwnMotion:
                 raise SettingError("own_motion", tuple(posture), f"{n} joint angles")
         self._postures = [np.array(posture, dtype=np.float64) for posture in postures]
         self._period = period
+        self._repeats = repeats
         self._dwell_cycles = max(1, round(dwell / period))
         self._ending = False
         self.begin(np.zeros(n))
@@ -81,6 +88,7 @@ class OwnMotion:
         self.position: Array = np.array(position, dtype=np.float64)
         self.velocity: Array = np.zeros_like(self.position)
         self._next = 0
+        self._stride = 1
         self._from = self._to = self.position
         self._cycle = self._cycles = 0
         self._rested = 0
@@ -94,7 +102,7 @@ class OwnMotion:
     @property
     def finished(self) -> bool:
         """Whether nothing is left to do."""
-        done = self._ending or self._next == len(self._postures)
+        done = self._ending or not 0 <= self._next < len(self._postures)
         return done and self.standing
 
     def end(self) -> None:
@@ -119,6 +127,10 @@ class OwnMotion:
 
     def _start_move(self) -> None:
         self._from, self._to = self.position, self._postures[self._next]
-        self._next += 1
+        self._next += self._stride
+        at_an_end = not 0 <= self._next < len(self._postures)
+        if self._repeats and len(self._postures) > 1 and at_an_end:
+            self._stride = -self._stride
+            self._next += 2 * self._stride
         self._cycle = self._rested = 0
         self._cycles = ceil(duration(self._to - self._from, self._speed) / self._period)

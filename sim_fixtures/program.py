@@ -16,6 +16,7 @@ or robots; once a cycle it is told what the PC's answer asked for.
 from __future__ import annotations
 
 from enum import IntEnum, auto
+from math import ceil
 from typing import NamedTuple
 
 from sim_fixtures.settings import ControllerSettings
@@ -68,6 +69,10 @@ COLD_START = (*[StartStep.SYNC] * 9, StartStep.INIT, StartStep.SYNC, StartStep.S
 WARM_START = (StartStep.INIT,)
 
 
+def _cycles(count: int) -> str:
+    return "1 cycle" if count == 1 else f"{count} cycles"
+
+
 class Answer(NamedTuple):
     """What one reply of the PC asked for.
 
@@ -98,6 +103,8 @@ class LoopProgram:
         open_axes: which axes stand in open mode in the packet of this cycle, (n,).
         reason: why the drive was last lost or the session ended, in words; "" if neither.
         intervals: how often all axes have been open.
+        openings_lost: openings in a row that ended because replies were missing.
+        gave_up: the session ends because there were too many of these.
         pause_mode: mode of every axis in phase PAUSED.
     """
 
@@ -107,6 +114,8 @@ class LoopProgram:
         self._start = COLD_START if settings.cold_start else WARM_START
         self._age = 0
         self._missed = 0
+        self._missed_open = 0
+        self._reopens_at = 0
         self._stays_off = False
         self._finishing = False
         self._moves = bool(settings.own_motion) and not settings.corrected
@@ -116,6 +125,8 @@ class LoopProgram:
         self.pause_mode = 0
         self.reason = ""
         self.intervals = 0
+        self.openings_lost = 0
+        self.gave_up = False
         self._enter(Phase.START)
 
     @property
@@ -135,6 +146,7 @@ class LoopProgram:
         """Lose the drive now, as at a following error or an emergency stop."""
         if self.powered:
             self.reason = reason
+            self.openings_lost = 0
             self._stays_off = True
             self._own_motion_over = self._own_motion_over or self.phase is Phase.MOVING
             opened = self.phase in HAS_OPEN_AXES
@@ -190,6 +202,7 @@ class LoopProgram:
         self.listening = phase in LISTENING
         self._age = 0
         if phase is Phase.OPENING:
+            self._missed_open = 0
             self._gone.clear()
             self._open_due_axes()
         elif phase not in STILL_OPEN:
@@ -221,21 +234,20 @@ class LoopProgram:
     def _advance_open(self, answer: Answer, standing: bool) -> None:
         """React to the PC while axes are open or opening."""
         settings = self._settings
+        self._missed_open = 0 if answer.valid else self._missed_open + 1
         if answer.drive_off:
+            self.openings_lost = 0
             self.reason = "the PC asked for drive off (505)"
             self._stays_off = True
             self._enter(Phase.DRIVE_OFF)
         elif answer.following_error:
+            self.openings_lost = 0
             self.reason = "the PC reported a following error (508)"
             self._enter(Phase.CLOSED)
         elif self._missed >= settings.missed_replies:
-            reason = f"no valid reply in {self._missed} cycles of open mode"
-            if settings.while_silent == "drive_off":
-                self.trip(reason)
-            else:
-                self.reason = reason
-                self._enter(Phase.CLOSED)
+            self._lose_opening()
         elif answer.exit or (self._finishing and standing):
+            self.openings_lost = 0
             self._enter(Phase.CLOSING)
         elif self.phase is Phase.OPENING:
             if all(self.open_axes):
@@ -244,14 +256,35 @@ class LoopProgram:
             else:
                 self._open_due_axes()
 
+    def _lose_opening(self) -> None:
+        """End open mode because replies are missing; for good, if that happened too often."""
+        settings = self._settings
+        reason = f"no valid reply in {_cycles(self._missed)} of open mode"
+        if self._missed_open < self._missed:
+            reason = (
+                f"no valid reply in {_cycles(self._missed)} in a row, "
+                f"the last {self._missed_open} of them in open mode"
+            )
+        if settings.while_silent == "drive_off":
+            self.trip(reason)
+            return
+        self.openings_lost += 1
+        if settings.lost_openings is not None and self.openings_lost >= settings.lost_openings:
+            self.gave_up = True
+            reason = f"open mode was lost {self.openings_lost} times in a row: {reason}"
+        self.reason = reason
+        self._enter(Phase.CLOSED)
+        self._reopens_at = ceil(settings.reopening_time / settings.period)
+
     def _advance_closed(self) -> None:
         """Leave closed axes for what is on next."""
         settings = self._settings
         limit = settings.open_intervals
         done = limit is not None and self.intervals >= limit
-        if self._finishing or done or self._own_motion_over:
+        if self._finishing or done or self._own_motion_over or self.gave_up:
             self._enter(Phase.SHUTDOWN)
-        else:
+        elif self._age >= self._reopens_at:
+            self._reopens_at = 0
             self._enter(Phase.MOVING if self._moves else Phase.OPENING)
 
     def _advance_timed(self, standing: bool) -> None:
@@ -259,7 +292,7 @@ class LoopProgram:
         settings = self._settings
         phase, age = self.phase, self._age
         if phase is Phase.DRIVE_OFF and age >= settings.drive_off_cycles:
-            if self._finishing:
+            if self._finishing or self.gave_up:
                 self._enter(Phase.ENDING)
             elif not self._stays_off:
                 self._enter(Phase.DRIVING_ON)

@@ -86,6 +86,9 @@ class ControllerSettings:
         opening_stagger: cycles between one axis entering open mode and the next.
         closing_stagger: cycles between one axis leaving open mode and the next.
         missed_replies: replies missing in a row that end open mode.
+        lost_openings: openings in a row that were lost to missing replies and end the session;
+            None for never. One that the PC ended, or that led to a lost drive, begins anew.
+        reopening_time: s that pass at least before the axes open again after such a loss.
         while_silent: what the arm does in open mode without a target it can use. "hold": the last
             target is held, during and after; at speed that stop is so hard that the drive trips.
             "continue": it goes on at the velocity of the last target, and once open mode has ended
@@ -102,6 +105,7 @@ class ControllerSettings:
         own_motion: joint angles [rad] of postures that the controller's own program moves to, one
             after the other, with closed axes; then it ends the session. In a mode in which the
             PC only corrects, it moves while the axes are open.
+        own_motion_repeats: go to and fro through these postures until told to finish.
         own_speed: of those moves, as a fraction of the URDF's velocity limits.
         version: major, minor, build in the init packet.
     """
@@ -121,6 +125,8 @@ class ControllerSettings:
     opening_stagger: int = 3
     closing_stagger: int = 0
     missed_replies: int = 1
+    lost_openings: int | None = None
+    reopening_time: float = 0.0
     while_silent: WhileSilent = "hold"
     ramp_time: float = 0.2
     silence_limit: int = 1000
@@ -132,6 +138,7 @@ class ControllerSettings:
     foreign_open: bool = False
     long_packets: bool = False
     own_motion: tuple[tuple[float, ...], ...] = ()
+    own_motion_repeats: bool = False
     own_speed: float = 0.3
     version: tuple[int, int, int] = (3, 20, 305)
 
@@ -146,6 +153,7 @@ class ControllerSettings:
             "opening_stagger",
             "closing_stagger",
             "boot_time",
+            "reopening_time",
             "foreign_axes",
         ):
             _require(self, name, 0.0)
@@ -156,6 +164,8 @@ class ControllerSettings:
                 "silence_limit",
             ):
                 _require(self, field.name, 1.0)
+        if self.lost_openings is not None:
+            _require(self, "lost_openings", 1.0)
         _require(self, "ramp_time", 0.0, exclusive=True)
         _require(self, "own_speed", 0.0, 1.0, exclusive=True)
         self._check_choices()

@@ -48,6 +48,8 @@ class ServeSummary:
         late: answers that came after their cycle; not taken.
         surplus: further answers to a cycle that had been answered.
         rejected: answers of wrong length, number or content.
+        stretched: cycles made longer than a period to wait for their answer.
+        stretch_max: by how much the longest of them was, s.
         own_late: cycles that began late by a tenth of the period or more though the answer before
             had come in time: the server's fault, not the PC's.
         slips: how many of these were late by a whole period or more; the cycle goes on from there.
@@ -63,9 +65,11 @@ class ServeSummary:
     late: int
     surplus: int
     rejected: int
+    stretched: int
     own_late: int
     slips: int
     ended: bool
+    stretch_max: float
     answer_p50: float
     answer_p99: float
     answer_max: float
@@ -85,9 +89,11 @@ class Tally:
     late: int = 0
     surplus: int = 0
     rejected: int = 0
+    stretched: int = 0
     own_late: int = 0
     slips: int = 0
     ended: bool = False
+    stretch_max: float = 0.0
     answer: Histogram = field(default_factory=Histogram)
     cost: Histogram = field(default_factory=Histogram)
     _unanswered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
@@ -106,6 +112,11 @@ class Tally:
         """The cycle whose answer should have carried `number` had none."""
         self.missed += 1
         self._unanswered.append(number)
+
+    def stretch(self, seconds: float) -> None:
+        """A cycle was made longer by that much."""
+        self.stretched += 1
+        self.stretch_max = max(self.stretch_max, seconds)
 
     def discard(self, number: int | None) -> None:
         """An answer that is not that of the running cycle; `number` is None if it has none."""
@@ -128,9 +139,11 @@ class Tally:
             late=self.late,
             surplus=self.surplus,
             rejected=self.rejected,
+            stretched=self.stretched,
             own_late=self.own_late,
             slips=self.slips,
             ended=self.ended,
+            stretch_max=self.stretch_max,
             answer_p50=self.answer.quantile(0.5),
             answer_p99=self.answer.quantile(0.99),
             answer_max=self.answer.largest,

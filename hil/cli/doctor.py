@@ -32,7 +32,7 @@ def doctor(
         Path, typer.Option(help="Where archives will be written; its disk is tried.")
     ] = Path("runs"),
     quick: Annotated[
-        bool, typer.Option("--quick", help="5 s of each; the verdict is provisional.")
+        bool, typer.Option("--quick", help="5 s of each; the verdict is provisional (exit 5).")
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
@@ -43,7 +43,8 @@ def doctor(
     exchange. Sends nothing to the controller, changes nothing, needs no root; run it as the user
     who will run hil. Every remedy is a command to type. Without CELL the cycle is 1 ms.
 
-    Exit status: 0 fit for the cell's cycle, 5 not fit (or the link cannot work), 2 bad input.
+    Exit status: 0 fit for the cell's cycle; 5 not fit, or the link cannot work, or measured for
+    less than 60 s, so that the verdict is provisional; 2 bad input.
     """
     loaded = None if cell is None else Cell.load(cell)
     diagnosis = examine(
@@ -57,5 +58,5 @@ def doctor(
         typer.echo(json_format.dumps(as_json(diagnosis)))
     else:
         show(diagnosis, Console())
-    if not diagnosis.fit:
+    if not diagnosis.fit or diagnosis.provisional:
         raise typer.Exit(NOT_GOOD)

@@ -19,9 +19,14 @@ from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import SettingError
 from sim_fixtures.fault_script import Fault, FaultScriptError, parse_fault, split_faults
 from sim_fixtures.serve import PATIENCE
+from sim_fixtures.tally import ServeSummary
 
 OWN_MOVE: Final = 30.0
 """Seconds that the longest move of the controller's own may take to end."""
+LOST_OPENINGS: Final = 20
+"""Openings in a row that may be lost to missing replies; then the session ends."""
+REOPENING: Final = 1.0
+"""Seconds at least until the axes open again after such a loss."""
 
 CellArgument = Annotated[
     Path, typer.Argument(help="Cell file with a [simulation] table.", show_default=False)
@@ -63,6 +68,15 @@ FaultOption = Annotated[
     list[str] | None,
     typer.Option("--fault", metavar="SPEC", help="Something that goes wrong; may be repeated."),
 ]
+Patience = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        max=10.0,
+        help="Make a cycle longer by up to so many seconds until its answer comes. No real "
+        "controller does: for PCs that are held up now and then.",
+    ),
+]
 Duration = Annotated[
     float | None, typer.Option(min=0.0, help="Seconds after which the session is ended.")
 ]
@@ -70,6 +84,58 @@ Priority = Annotated[
     int | None,
     typer.Option(min=1, max=99, help="Real-time priority (SCHED_FIFO) to ask the system for."),
 ]
+
+
+WarmStart = Annotated[
+    bool, typer.Option("--warm-start", help="Begin with the init packet, as after 506.")
+]
+OwnMotion = Annotated[
+    bool,
+    typer.Option(
+        "--own-motion",
+        help="In mode 0 the controller's own program moves the arm about, until told to end.",
+    ),
+]
+OwnSpeed = Annotated[
+    float, typer.Option(min=0.01, max=1.0, help="Of that motion: fraction of full speed.")
+]
+Effects = Annotated[
+    bool, typer.Option("--effects", help="Switch on what the identified model leaves out.")
+]
+Seed = Annotated[int | None, typer.Option(min=0, help="Seed of noise and model errors.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
+
+HELP: Final = """\
+Be the controller: a simulated C4G with its arm, for a PC program on a real network or bus.
+
+Nothing here is hardware and nothing moves. The PC program under test runs elsewhere, listens,
+and must do what the real controller asks of it:
+
+- answer every packet within its cycle, with the number received plus one (32767 is followed
+  by 1);
+
+- echo the start: nine sync packets, the init packet (number 10, 1200 bytes), two more syncs;
+
+- answer modes 501 (driving on) and 0 (closed) with the mode received and no demand;
+
+- once every axis reports the open mode and the status byte is 5 (drive on): start from the
+  target received and answer with the next one;
+
+- ask for the end of open mode with status byte 1, then stay in step until 504.
+
+Mode 505 in an answer asks for drive off, 508 reports a following error; targets in such a
+packet are ignored. A drive that was lost stays off until somebody presses the button.
+
+**Example**, two terminals on one machine:
+
+    hil simulate cell.toml --udp 127.0.0.1:2001 --cycle 2 --intervals 1
+
+    your_program --listen 2001
+
+The order does not matter: the first packet is repeated every second until it is answered.
+Ctrl-C ends the session properly (a second one at once); `kill -USR1` presses drive-on,
+`kill -USR2` the emergency stop. `docs/simulate.md` has more, faults included.
+"""
 
 
 def simulate(
@@ -80,59 +146,20 @@ def simulate(
     mode: Mode = None,
     stagger: Stagger = 3,
     missed: Missed = 1,
+    patience: Patience = 0.0,
     while_silent: WhileSilent = "hold",
-    warm_start: Annotated[
-        bool, typer.Option("--warm-start", help="Begin with the init packet, as after 506.")
-    ] = False,
+    warm_start: WarmStart = False,
     intervals: Intervals = None,
-    own_motion: Annotated[
-        bool,
-        typer.Option(
-            "--own-motion", help="In mode 0 the controller's own program moves the arm about."
-        ),
-    ] = False,
-    own_speed: Annotated[
-        float, typer.Option(min=0.01, max=1.0, help="Of that motion: fraction of full speed.")
-    ] = 0.3,
-    effects: Annotated[
-        bool, typer.Option("--effects", help="Switch on what the identified model leaves out.")
-    ] = False,
+    own_motion: OwnMotion = False,
+    own_speed: OwnSpeed = 0.3,
+    effects: Effects = False,
     fault: FaultOption = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of noise and model errors.")] = None,
+    seed: Seed = None,
     duration: Duration = None,
     priority: Priority = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    json: Json = False,
 ) -> None:
-    """Be the controller: a simulated C4G with its arm, for a PC program on a real network or bus.
-
-    Nothing here is hardware and nothing moves. The PC program under test runs elsewhere, listens,
-    and must do what the real controller asks of it:
-
-    - answer every packet within its cycle, with the number received plus one (32767 is followed
-      by 1);
-
-    - echo the start: nine sync packets, the init packet (number 10, 1200 bytes), two more syncs;
-
-    - answer modes 501 (driving on) and 0 (closed) with the mode received and no demand;
-
-    - once every axis reports the open mode and the status byte is 5 (drive on): start from the
-      target received and answer with the next one;
-
-    - ask for the end of open mode with status byte 1, then stay in step until 504.
-
-    Mode 505 in an answer asks for drive off, 508 reports a following error; targets in such a
-    packet are ignored. A drive that was lost stays off until somebody presses the button.
-
-    **Example**, two terminals on one machine:
-
-        hil simulate cell.toml --udp 127.0.0.1:2001 --cycle 2 --intervals 1
-
-        your_program --listen 2001
-
-    The order does not matter: the first packet is repeated every second until it is answered.
-    Ctrl-C ends the session properly (a second one at once); `kill -USR1` presses drive-on,
-    `kill -USR2` the emergency stop. `docs/simulate.md` has more, faults included.
-    """
+    """Serve one session; `HELP` is what a person reads."""
     loaded = Cell.load(cell)
     settings = _settings(
         controller_settings(loaded, effects=effects),
@@ -140,10 +167,13 @@ def simulate(
         open_mode=loaded.controller.mode if mode is None else mode,
         opening_stagger=stagger,
         missed_replies=missed,
+        lost_openings=LOST_OPENINGS,
+        reopening_time=REOPENING,
         while_silent=while_silent.replace("-", "_"),
         cold_start=not warm_start,
         open_intervals=intervals,
-        own_motion=own_postures(loaded) if own_motion else (),
+        own_motion=_postures(loaded) if own_motion else (),
+        own_motion_repeats=True,
         own_speed=own_speed,
     )
     on_link, in_controller = split_faults([_fault(text) for text in fault or ()])
@@ -153,8 +183,8 @@ def simulate(
             loaded, effects=effects, settings=settings, seed=seed, faults=in_controller
         )
 
-    far_end = open_far_end(udp, can)
-    status = Status(udp or can or "", settings, quiet=json)
+    far_end = open_far_end(udp, can, settings, len(loaded.joint_names))
+    status = Status(udp or can or "", settings, quiet=json, stretch=patience)
     try:
         with buttons(duration) as pressed, undisturbed(priority):
             status.introduce(loaded.name)
@@ -165,17 +195,40 @@ def simulate(
                 faults=FaultyLink(on_link, settings.period) if on_link else None,
                 # Its own program stops at the next posture only.
                 patience=OWN_MOVE if own_motion else PATIENCE,
+                stretch=patience,
                 watch=status.watch,
             )
     finally:
         far_end.close()
+    _report(served, status, json=json, interrupted=pressed.interrupted)
+
+
+simulate.__doc__ = HELP
+
+
+def _report(served: Served, status: Status, *, json: bool, interrupted: bool) -> None:
+    """Print the summary; leave with the exit status that the session has earned."""
     if json:
         typer.echo(json_format.dumps(_figures(served)))
     else:
         status.clear()
         typer.echo("\n".join(_sentences(served)))
-    if not served.summary.ended:
-        raise typer.Exit(130 if pressed.interrupted else 4)
+    if not served.summary.ended and interrupted:
+        raise typer.Exit(130)
+    if served.gave_up or not served.summary.ended:
+        raise typer.Exit(4)
+
+
+def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
+    postures = own_postures(cell)
+    if not postures:
+        raise InputError(
+            cell.path,
+            "no posture about its home can be reached clear of floor, walls and the arm itself",
+            field="campaign.home_deg",
+            remedy="leave --own-motion out, or give the arm more room",
+        )
+    return postures
 
 
 def _settings(settings: ControllerSettings, **changes: Any) -> ControllerSettings:
@@ -202,7 +255,15 @@ def _figures(served: Served) -> dict[str, object]:
     }
     times = {
         f"{name}_us": round(1e6 * getattr(summary, name), 1)
-        for name in ("answer_p50", "answer_p99", "answer_max", "cost_p50", "cost_p99", "cost_max")
+        for name in (
+            "stretch_max",
+            "answer_p50",
+            "answer_p99",
+            "answer_max",
+            "cost_p50",
+            "cost_p99",
+            "cost_max",
+        )
     }
     return {
         **counts,
@@ -219,14 +280,14 @@ def _sentences(served: Served) -> list[str]:
     """The summary for a person."""
     summary = served.summary
     if not summary.cycles:
-        return [f"no PC program answered; the first packet was sent {summary.knocks} times"]
+        return [f"no PC program answered; the first packet was sent {_times(summary.knocks)}"]
     end = "the session has ended (504)" if summary.ended else "the session was given up"
     return [
         f"{end}{': ' if served.reason else ''}{served.reason}; "
         f"open mode was reached {_times(served.intervals)}",
         f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
         f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
-        f"{served.foreign} from elsewhere",
+        f"{served.foreign} from elsewhere" + _stretched(summary),
         f"answers came after {_us(summary.answer_p50)} (median), {_us(summary.answer_p99)} "
         f"(99 %), {_us(summary.answer_max)} (longest)",
         f"controller and arm took {_us(summary.cost_p50)} (median), {_us(summary.cost_p99)} "
@@ -234,6 +295,16 @@ def _sentences(served: Served) -> list[str]:
         f"{summary.own_late} cycles began late by our own fault, {summary.slips} of them by a "
         "whole cycle",
     ]
+
+
+def _stretched(summary: ServeSummary) -> str:
+    if not summary.stretched:
+        return ""
+    cycles = "1 cycle was" if summary.stretched == 1 else f"{summary.stretched} cycles were"
+    return (
+        f"; {cycles} stretched to wait for an answer, by up to {1e3 * summary.stretch_max:.1f} ms, "
+        "as no real controller does"
+    )
 
 
 def _us(seconds: float) -> str:

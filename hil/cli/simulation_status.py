@@ -31,8 +31,14 @@ WORDS: Final = {
 }
 
 
+_REPEATED: Final = frozenset({Phase.CLOSED, Phase.OPENING, Phase.OPEN})
+"""Phases that an opening lost again and again goes through."""
+
+
 class Status:
     """One line for each change of phase and, on a terminal, one that is written over.
+
+    Where open mode is lost again and again, one line for the 2nd, 4th, 8th ... time.
 
     A line is written only if the terminal or pipe can take it at once; a reader that has stopped
     reading loses lines, the PC program loses nothing.
@@ -41,12 +47,20 @@ class Status:
         place: where the PC program is expected.
         settings: of the controller.
         quiet: say nothing.
+        stretch: s by which a cycle may be made longer to wait for its answer.
         descriptor: file descriptor to write to.
     """
 
     def __init__(
-        self, place: str, settings: ControllerSettings, *, quiet: bool, descriptor: int = 1
+        self,
+        place: str,
+        settings: ControllerSettings,
+        *,
+        quiet: bool,
+        stretch: float = 0.0,
+        descriptor: int = 1,
     ) -> None:
+        self._stretch = stretch
         self._place = place
         self._settings = settings
         self._quiet = quiet
@@ -67,6 +81,12 @@ class Status:
             f"{'cold' if settings.cold_start else 'warm'} start, open mode ends after "
             f"{settings.missed_replies} missing "
             f"{'reply' if settings.missed_replies == 1 else 'replies'}, process {os.getpid()}"
+            + (
+                f"\ncycles are made longer by up to {self._stretch:g} s to wait for an answer; "
+                "no real controller does that"
+                if self._stretch
+                else ""
+            )
         )
 
     def watch(self, controller: SimulatedController, tally: Tally) -> None:
@@ -76,7 +96,7 @@ class Status:
         phase = controller.phase
         if phase is not self._phase or tally.cycles < self._cycles:
             self._phase = phase
-            self.say(self._change(controller))
+            self._say_change(controller)
         self._cycles = tally.cycles
         if self._terminal and (now := time.monotonic()) >= self._refresh_at:
             self._refresh_at = now + REFRESH
@@ -92,9 +112,21 @@ class Status:
         if self._terminal:
             self._write("\r\x1b[K")
 
+    def _say_change(self, controller: SimulatedController) -> None:
+        lost = controller.openings_lost
+        if lost <= 1 or controller.gave_up or controller.phase not in _REPEATED:
+            self.say(self._change(controller))
+        elif controller.phase is Phase.CLOSED and lost.bit_count() == 1:
+            self.say(
+                f"{self._seconds()}  open mode was lost again, {lost} times in a row by now: "
+                f"{controller.reason}"
+            )
+
+    def _seconds(self) -> str:
+        return f"{time.monotonic() - self._began:8.3f} s"
+
     def _change(self, controller: SimulatedController) -> str:
-        seconds = time.monotonic() - self._began
-        text = f"{seconds:8.3f} s  {WORDS[controller.phase]}"
+        text = f"{self._seconds()}  {WORDS[controller.phase]}"
         if controller.phase is Phase.OPENING:
             text += f" in mode {self._settings.open_mode}"
         if controller.reason and controller.reason != self._reason:
@@ -108,6 +140,7 @@ class Status:
         return (
             f"{tally.cycles} cycles, {tally.replies} replies, {tally.missed} missed, "
             f"{tally.late} late, {tally.rejected} rejected, {tally.own_late} begun late by us"
+            + (f", {tally.stretched} stretched" if self._stretch else "")
         )
 
     def _write(self, text: str) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from scipy.special import gammaincinv
+
 from .latency import RESERVE, Latency
 
 CRITERIA: Final = (
@@ -14,8 +16,7 @@ CRITERIA: Final = (
 )
 ENOUGH_SECONDS: Final = 60.0
 """s of measurement below which a verdict is provisional."""
-_NONE_SEEN: Final = 3.0
-"""Events that a rate may have and still show none with 5 % probability (Poisson)."""
+_CONFIDENCE: Final = 0.95
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class Fitness:
         cycle_ms: the controller's cycle.
         fit: by `CRITERIA`.
         late: cycles late in the measurement.
-        late_per_hour: extrapolated; if none was late, what cannot be excluded with 95 % confidence.
+        late_per_hour_upper_95: upper bound of the rate with 95 % confidence, one-sided, for late
+            cycles that come independently of each other (Poisson). Those of one long stall do not.
         used: largest 99.9 % latency plus reserve, as a share of the cycle.
         reason: in words.
     """
@@ -34,7 +36,7 @@ class Fitness:
     cycle_ms: int
     fit: bool
     late: int
-    late_per_hour: float
+    late_per_hour_upper_95: float
     used: float
     reason: str
 
@@ -47,20 +49,23 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     late, worst = max(((each.late_cycles(period), each) for each in latencies), key=lambda p: p[0])
     slow = max(latencies, key=lambda each: each.percentile(99.9))
     used = (slow.percentile(99.9) + RESERVE) / period
-    hour = (late or _NONE_SEEN) * 3600.0 / worst.seconds
+    hours = worst.seconds / 3600.0
+    # The mean whose Poisson distribution gives `late` or fewer with 5 % probability only.
+    bound = float(gammaincinv(late + 1, _CONFIDENCE)) / hours
     if late:
+        longest = 1e3 * float(worst.samples.max())
         reason = (
             f"{late} cycles late in {worst.seconds:.0f} s of {worst.name} "
-            f"(some {hour:.0f} an hour), the longest {1e3 * float(worst.samples.max()):.1f} ms"
+            f"(some {late / hours:.0f} an hour), the longest {longest:.1f} ms"
         )
     elif used > 0.5:
         reason = f"none late, but {slow.name} uses {100 * used:.0f} % of the cycle at 99.9 %"
     else:
         reason = (
-            f"none late in {worst.seconds:.0f} s (fewer than {hour:.0f} an hour, with 95 % "
+            f"none late in {worst.seconds:.0f} s (fewer than {bound:.0f} an hour, with 95 % "
             f"confidence); {100 * used:.0f} % of the cycle used at 99.9 %"
         )
-    return Fitness(cycle_ms, not late and used <= 0.5, late, hour, used, reason)
+    return Fitness(cycle_ms, not late and used <= 0.5, late, bound, used, reason)
 
 
 def in_words(one: Fitness, two: Fitness) -> str:

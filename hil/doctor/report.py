@@ -109,7 +109,7 @@ def _verdict(verdict: Fitness) -> dict[str, object]:
         "cycle_ms": verdict.cycle_ms,
         "fit": verdict.fit,
         "late_cycles": verdict.late,
-        "late_per_hour": _finite(verdict.late_per_hour),
+        "late_per_hour_upper_95": _finite(verdict.late_per_hour_upper_95),
         "share_used": _finite(verdict.used),
         "reason": verdict.reason,
     }

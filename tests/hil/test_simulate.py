@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
@@ -51,6 +52,11 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def far_end_at(udp: str | None = None, can: str | None = None) -> Any:
+    settings = replace(controller_settings(Cell.load(CELL_PATH)), period=0.002)
+    return open_far_end(udp, can, settings, 6)
 
 
 @contextmanager
@@ -316,6 +322,50 @@ def test_in_own_motion_the_arm_moves_while_its_axes_are_closed():
     assert (ours["intervals"], ours["reason"]) == (0, "")
 
 
+def test_the_own_motion_of_the_command_has_no_end(monkeypatch):
+    built = []
+
+    class Enough(Exception):
+        pass
+
+    def look(build, *_, **__):
+        built.append(build())
+        raise Enough
+
+    monkeypatch.setattr("hil.cli.simulate.serve_session", look)
+    result = invoke("--udp", "127.0.0.1:2001", "--own-motion")
+    assert isinstance(result.exception, Enough)
+    settings = built[0].settings
+    assert settings.own_motion_repeats
+    assert len(settings.own_motion) == 13
+
+
+def test_where_no_posture_is_clear_an_own_motion_is_refused(monkeypatch):
+    monkeypatch.setattr("hil.cli.simulate.own_postures", lambda _: ())
+    result = invoke("--udp", "127.0.0.1:2001", "--own-motion")
+    assert isinstance(result.exception, InputError)
+    assert "no posture" in str(result.exception)
+
+
+def test_open_mode_lost_again_and_again_ends_the_session_with_a_reason_and_a_status(monkeypatch):
+    # of the child, which is forked from here; a second and twenty losses are too long for a test
+    monkeypatch.setattr("hil.cli.simulate.LOST_OPENINGS", 5)
+    monkeypatch.setattr("hil.cli.simulate.REOPENING", 0.1)
+    port = free_port()
+    with (
+        running(*FOREIGN, "--port", port, "--miss", "1", "--miss-count", "1000000",
+                "--exit-after", "0") as program,
+        hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{port}", "--cycle", "2",
+            "--missed", "30", "--intervals", "100") as cabinet,
+    ):  # fmt: skip
+        said = cabinet.finish(timeout=30)
+        assert program.wait(timeout=10) == 0
+    assert cabinet.status == 4
+    assert "the session has ended (504): open mode was lost 5 times in a row" in said
+    assert said.count("axes opening") == 2  # the first two; the others are summed up
+    assert "lost again, 4 times in a row by now" in said
+
+
 def test_own_postures_are_within_limits_and_clear_on_the_way():
     cell = Cell.load(CELL_PATH)
     postures = np.array(own_postures(cell))
@@ -340,9 +390,27 @@ def test_a_cell_of_real_hardware_is_simulated_only_where_asked_for():
     assert simulated_controller(real).period == 0.001
 
 
+def invoke(*options: str) -> Any:
+    app = typer.Typer()
+    app.command()(simulate)
+    return CliRunner().invoke(app, [str(CELL_PATH), *options])
+
+
+def test_the_help_says_what_the_pc_has_to_do():
+    said = invoke("--help").stdout
+    assert "nine sync packets" in said
+    assert "--patience" in said
+
+
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
+        (["--can", "virtual:0:classic", "--cycle", "1"], "135.0 % of a cycle of 1 ms"),
+        (["--can", "virtual:0:fd", "--cycle", "2", "--mode", "8"], "mode 8 does not fit"),
+        (["--can", "virtual:0", "--mode", "8", "--own-motion"], "mode 8 does not fit"),
+        (["--can", "virtual:can0:foo"], "neither of the profiles fd and classic"),
+        (["--can", "virtual:can0:"], "neither of the profiles fd and classic"),
+        (["--udp", "127.0.0.1:2001", "--fault", "lose@1x100000000000000000000"], "more than"),
         ([], "give --udp or --can"),
         (["--udp", "127.0.0.1:2001", "--can", "virtual:0"], "not both"),
         (["--udp", "127.0.0.1"], "HOST:PORT"),
@@ -356,9 +424,7 @@ def test_a_cell_of_real_hardware_is_simulated_only_where_asked_for():
     ],
 )
 def test_what_cannot_be_done_is_said_before_anything_is_sent(options, complaint):
-    app = typer.Typer()
-    app.command()(simulate)
-    result = CliRunner().invoke(app, [str(CELL_PATH), *options])
+    result = invoke(*options)
     assert isinstance(result.exception, InputError)
     assert complaint in str(result.exception)
     assert result.exception.exit_code == 2
@@ -366,11 +432,11 @@ def test_what_cannot_be_done_is_said_before_anything_is_sent(options, complaint)
 
 def test_a_bus_is_named_as_python_can_names_it():
     for text in ("virtual:simulate", "virtual:simulate:fd", "virtual:simulate:classic"):
-        far_end = open_far_end(None, text)
+        far_end = far_end_at(can=text)
         assert far_end.receive(0.001) is None
         far_end.close()
     with pytest.raises(InputError, match="no-such-bus"):
-        open_far_end(None, "no-such-bus:0")
+        far_end_at(can="no-such-bus:0")
 
 
 def test_bad_input_is_one_sentence_and_exit_status_2():
@@ -417,7 +483,7 @@ def test_a_reader_that_has_stopped_reading_costs_lines_not_cycles():
 
 def test_a_datagram_from_elsewhere_is_no_answer():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        far_end = open_far_end(f"127.0.0.1:{free_port()}", None)
+        far_end = far_end_at(f"127.0.0.1:{free_port()}")
         stranger.sendto(b"hello", ("127.0.0.1", far_end.source_port))
         assert far_end.receive(0.2) is None
         assert (far_end.foreign, far_end.last_foreign) == (
@@ -427,7 +493,7 @@ def test_a_datagram_from_elsewhere_is_no_answer():
 
 
 def test_a_pc_that_does_not_listen_is_no_error():
-    far_end = open_far_end(f"127.0.0.1:{free_port()}", None)
+    far_end = far_end_at(f"127.0.0.1:{free_port()}")
     for _ in range(5):
         far_end.send(b"anybody there?")
         assert far_end.receive(0.002) is None
@@ -435,7 +501,7 @@ def test_a_pc_that_does_not_listen_is_no_error():
 
 
 def test_a_network_that_is_gone_is_noted_and_loses_packets():
-    far_end = open_far_end("255.255.255.255:9", None)  # broadcast is not permitted
+    far_end = far_end_at("255.255.255.255:9")  # broadcast is not permitted
     far_end.send(b"x")
     assert (far_end.unsent, far_end.trouble) == (1, "Permission denied")
     far_end.close()

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner import PiecewiseCubic
-from planner.scurve import ramp_down, rest_to_rest
+from planner.scurve import rest_to_rest
 
 magnitude = st.floats(-3.0, 3.0).map(lambda exponent: 10.0**exponent)
 
@@ -56,22 +56,6 @@ def test_rest_to_rest_is_as_fast_as_an_independent_time_optimal_planner(
     ruckig.Ruckig(1).calculate(problem, solution)
     law, _, _ = rest_to_rest(distance, velocity, acceleration, jerk)
     assert law.duration == pytest.approx(solution.duration, rel=1e-6)
-
-
-@given(magnitude, magnitude, magnitude)
-def test_ramp_down_takes_all_velocity_away_within_the_limits(velocity, acceleration, jerk):
-    law = ramp_down(velocity, acceleration, jerk)
-    extrema = law.extrema()
-    within = 1 + 1e-9
-    assert extrema.velocity[0] == velocity
-    assert extrema.acceleration[0] <= acceleration * within
-    assert extrema.jerk[0] <= jerk * within
-    end = law.ends()[0][-1]
-    assert abs(end[1]) <= 1e-9 * velocity
-    assert abs(end[2]) <= 1e-9 * acceleration
-    assert end[0] == pytest.approx(velocity * law.duration / 2.0)  # symmetric
-    # One of the two limits is used in full, or there would be a faster way.
-    assert max(extrema.acceleration[0] / acceleration, extrema.jerk[0] / jerk) > 1 - 1e-9
 
 
 @given(magnitude, magnitude, magnitude, magnitude, magnitude)

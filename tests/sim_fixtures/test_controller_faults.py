@@ -157,6 +157,15 @@ class TestOwnMotion:
         assert np.ptp(target[:, 0]) > 5.0
         assert np.abs(target - measured).max() < 0.3 * small_cell.FOLLOWING_ERROR
 
+    def test_repeated_it_goes_on_until_told_to_finish(self) -> None:
+        changes = {"own_motion": self.POSTURES, "own_speed": 1.0, "own_motion_repeats": True}
+        pc = run(5000, **changes)  # once through the list takes less than half of that
+        assert pc.controller.phase is Phase.MOVING
+        pc.controller.finish()
+        while (packet := pc.controller.next_packet()) is not None:
+            pc.controller.accept(pc._answer(packet))
+        assert pc.controller.phase is Phase.ENDED
+
     def test_the_answers_of_the_pc_do_not_matter_to_it(self) -> None:
         def last(step: float) -> bytes:
             return run(900, own_motion=self.POSTURES, step=step).packets[-1]

@@ -75,6 +75,32 @@ def test_told_to_end_it_finishes_the_move_under_way_and_begins_no_other() -> Non
     np.testing.assert_array_equal(q[-1], (0.5, 0.5))
 
 
+def test_repeated_it_goes_to_and_fro_on_the_ways_of_the_list() -> None:
+    stops = [(0.5, -0.3), (-0.2, 0.4), (0.1, 0.1)]
+    made = OwnMotion(stops, speed=SPEED, period=PERIOD, dwell=0.02, repeats=True)
+    made.begin((0.0, 0.0))
+    visited: list[tuple[float, ...]] = []
+    while len(visited) < 8:
+        moved = not made.standing
+        made.advance()
+        assert not made.finished
+        if moved and made.standing:
+            visited.append(tuple(made.position.tolist()))
+    first, second, third = stops
+    assert visited == [first, second, third, second, first, second, third, second]
+    made.end()
+    assert made.finished
+
+
+def test_a_single_posture_repeated_is_rested_in() -> None:
+    made = OwnMotion([(0.5, -0.3)], speed=SPEED, period=PERIOD, dwell=0.02, repeats=True)
+    made.begin((0.0, 0.0))
+    for _ in range(2000):
+        made.advance()
+    np.testing.assert_array_equal(made.position, (0.5, -0.3))
+    np.testing.assert_array_equal(made.velocity, 0.0)
+
+
 def test_a_posture_of_another_arm_is_refused() -> None:
     with pytest.raises(SettingError, match="2 joint angles"):
         OwnMotion([(0.0, 0.0, 0.0)], speed=SPEED, period=PERIOD)

@@ -133,6 +133,80 @@ def test_missing_replies_end_open_mode_and_only_open_mode() -> None:
     assert loop.phase is Phase.CLOSED
 
 
+def lose_opening(loop: LoopProgram) -> None:
+    advance_to(loop, Phase.OPENING)
+    while loop.phase is Phase.OPENING:
+        advance(loop, answer=MISSING)
+
+
+def test_after_a_lost_opening_the_axes_stay_closed_for_a_while() -> None:
+    loop = program(reopening_time=0.05)
+    advance_to(loop, Phase.OPENING)
+    assert loop.openings_lost == 0
+    lose_opening(loop)
+    phases = []
+    while loop.phase is not Phase.OPENING:
+        phases.append(loop.phase)
+        advance(loop)
+    assert phases == [Phase.CLOSED] * 50
+    advance_to(loop, Phase.OPEN)
+    advance(loop, answer=Answer(valid=True, exit=True))
+    phases = []
+    while loop.phase is not Phase.OPENING:
+        phases.append(loop.phase)
+        advance(loop)
+    assert phases == [Phase.CLOSING] * 2 + [Phase.CLOSED] * 2
+
+
+def test_after_so_many_lost_openings_in_a_row_the_session_ends_with_a_reason() -> None:
+    loop = program(lost_openings=3)
+    for lost in (1, 2, 3):
+        assert not loop.gave_up
+        lose_opening(loop)
+        assert loop.openings_lost == lost
+    assert loop.gave_up
+    advance_to(loop, Phase.ENDED)
+    assert loop.reason == (
+        "open mode was lost 3 times in a row: no valid reply in 1 cycle of open mode"
+    )
+
+
+def test_an_opening_that_the_pc_ends_makes_the_lost_ones_forgotten() -> None:
+    loop = program(lost_openings=2)
+    for _ in range(5):
+        lose_opening(loop)
+        advance_to(loop, Phase.OPEN)
+        advance(loop, answer=Answer(valid=True, exit=True))
+        assert loop.openings_lost == 0
+    assert not loop.gave_up
+
+
+def test_finish_does_not_wait_for_the_next_opening() -> None:
+    loop = program(reopening_time=1.0)
+    lose_opening(loop)
+    loop.finish()
+    advance(loop, 3)
+    assert loop.phase is Phase.SHUTDOWN
+
+
+def test_an_emergency_stop_while_giving_up_still_ends_the_session() -> None:
+    loop = program(lost_openings=1)
+    lose_opening(loop)
+    loop.trip("emergency stop")
+    advance_to(loop, Phase.ENDED)
+    assert loop.gave_up
+
+
+def test_replies_missed_before_open_mode_are_told_from_those_in_it() -> None:
+    loop = program(missed_replies=5)
+    advance_to(loop, Phase.CLOSED)
+    while loop.phase is not Phase.OPENING:
+        advance(loop, answer=MISSING)
+    while loop.phase is Phase.OPENING:
+        advance(loop, answer=MISSING)
+    assert loop.reason == "no valid reply in 5 cycles in a row, the last 3 of them in open mode"
+
+
 def test_long_silence_ends_the_session() -> None:
     loop = program(silence_limit=20)
     advance_to(loop, Phase.CLOSED)
@@ -199,7 +273,14 @@ def test_finish_in_drive_off_ends_without_driving_on() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"period": 0.0005}, {"substeps": 0}, {"missed_replies": 0}, {"open_mode": 3}],
+    [
+        {"lost_openings": 0},
+        {"reopening_time": -1.0},
+        {"period": 0.0005},
+        {"substeps": 0},
+        {"missed_replies": 0},
+        {"open_mode": 3},
+    ],
 )
 def test_impossible_settings_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(SettingError):

@@ -248,6 +248,30 @@ def test_a_missing_answer_is_not_the_servers_lateness():
     assert (summary.missed, summary.own_late) == (1, 0)
 
 
+def test_a_stretched_cycle_waits_for_its_answer_and_the_next_begins_after_it():
+    def answer(index, packet):
+        return [((30.0 if index == 20 else 0.1) * T, echo(packet))]
+
+    summary, cabinet, _ = served(answer, stretch=0.5)
+    assert (summary.replies, summary.missed, summary.late) == (50, 0, 0)
+    assert (summary.stretched, summary.own_late) == (1, 0)
+    assert summary.stretch_max == pytest.approx(29.0 * T)
+    waited = gaps(cabinet)
+    assert waited[20] >= 30.0 * T - 1e-12
+    assert max(waited[:20] + waited[21:]) <= T + 1e-12
+
+
+def test_patience_ends_and_what_comes_then_is_missing():
+    def answer(index, packet):
+        return [((300.0 if index == 20 else 0.1) * T, echo(packet))]
+
+    summary, cabinet, _ = served(answer, stretch=0.1, cycles=400)
+    assert (summary.missed, summary.late) == (1, 1)
+    assert summary.stretched == 1
+    assert summary.stretch_max == pytest.approx(0.1)
+    assert cabinet.accepted[20] is None
+
+
 def test_the_first_packet_is_repeated_until_somebody_listens():
     def answer(index, packet):
         return [] if index < 3 else prompt(index, packet)

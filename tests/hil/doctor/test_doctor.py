@@ -87,7 +87,8 @@ def test_what_is_fit_at_1_ms_is_fit_at_2_ms(values: list[float]) -> None:
 def test_a_quiet_pc_is_fit_and_what_cannot_be_excluded_is_said() -> None:
     quiet = judge([latency(*np.full(60_000, 60e-6))], 1)
     assert quiet.fit
-    assert quiet.late_per_hour == pytest.approx(180)  # 3 in 60 s are missed with 5 % probability
+    # A mean of ln 20 = 2.996 late cycles in 60 s shows none with 5 % probability.
+    assert quiet.late_per_hour_upper_95 == pytest.approx(60 * np.log(20))
     assert "fewer than 180 an hour" in quiet.reason
 
 
@@ -96,6 +97,8 @@ def test_one_late_cycle_in_the_measurement_is_not_fit() -> None:
     assert not rare.fit
     assert rare.late == 1
     assert "some 60 an hour" in rare.reason
+    # (1 + m) exp(-m) = 5 % for m = 4.744: the bound lies well above what was seen.
+    assert rare.late_per_hour_upper_95 == pytest.approx(60 * 4.744, rel=1e-3)
 
 
 def test_a_pc_that_is_always_slow_is_not_fit_though_nothing_was_late() -> None:
@@ -157,6 +160,21 @@ def test_a_short_measurement_calls_itself_provisional() -> None:
     assert "Provisional" not in diagnosis().line
 
 
+@pytest.mark.parametrize(("fit", "seconds", "status"), [
+    (True, 60.0, 0), (True, 5.0, 5), (False, 60.0, 5),
+])  # fmt: skip
+def test_the_exit_status_is_0_only_for_a_verdict_to_be_relied_upon(
+    fit: bool, seconds: float, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made_up(**_: object) -> Diagnosis:
+        return diagnosis(fit=fit, seconds=seconds)
+
+    monkeypatch.setattr("hil.cli.doctor.examine", made_up)
+    ran = CliRunner().invoke(app, ["--json"])
+    assert ran.exit_code == status
+    assert json.loads(ran.stdout)["provisional"] is (seconds < 60)
+
+
 def test_remedies_come_worst_first_and_a_good_check_has_none() -> None:
     warn = Check("w", Status.WARN, "", "slow", ("make it fast",))
     fine = Check("g", Status.OK, "", "good", ("never shown",))
@@ -191,7 +209,7 @@ def test_the_json_says_what_the_page_says() -> None:
     assert found["checks"][0]["remedy"] == ["sudo ss -lunp"]
     assert found["latency"]["turnaround"]["late_cycles_1ms"] == 3
     empty = Diagnosis((), (), judge([], 1), judge([], 2), 1, 60.0)
-    assert json.loads(json.dumps(as_json(empty)))["cycles"][0]["late_per_hour"] is None
+    assert json.loads(json.dumps(as_json(empty)))["cycles"][0]["late_per_hour_upper_95"] is None
 
 
 # --- probes ----------------------------------------------------------------------------------
