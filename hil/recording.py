@@ -25,6 +25,7 @@ def record(
     kind: str,
     stop: Stop,
     duration: float | None = None,
+    wait: float | None = None,
     watch: Watch = unwatched,
     durable: bool = True,
 ) -> Recorded:
@@ -37,11 +38,13 @@ def record(
         kind: one of `KINDS`.
         stop: ends the recording.
         duration: s of the controller's time; None: until `stop`, or the session's end.
+        wait: s that the controller is waited for; None: for ever.
         watch: told of the progress.
         durable: wait at each flush until the disk has the data.
 
     Raises:
-        ControllerFault: the controller never came, or is not the cell's.
+        ControllerFault: the controller did not come in time, or is not the cell's.
+        OperatorStopError: stopped before it came.
         ArchiveWriteError: the archive cannot be written.
     """
     spec = ArchiveSpec(
@@ -61,7 +64,7 @@ def record(
         },
         durable=durable,
     )
-    return link.record(spec, stop, duration=duration, watch=watch)
+    return link.record(spec, stop, duration=duration, wait=wait, watch=watch)
 
 
 def archive_path(output: Path, kind: str) -> Path:

@@ -8,6 +8,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.events import AnswersLost
 from hil.archive import CONTROLLERS_OWN, Archive, open_archive
 from hil.errors import ArchiveError
 from identification.recording import Recording
@@ -91,11 +92,19 @@ def _time(archive: Archive) -> Array:
 
 
 def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
-    """Where cycles are missing: reported lost by the link, or not archived."""
+    """Where motion is not smooth: cycles lost by the link or not archived, answers not taken.
+
+    Of several such answers within 0.1 s the first and the last are known.
+    """
     if "cycle" not in archive.columns:
         return None
     skipped = np.diff(archive.columns["cycle"], prepend=archive.columns["cycle"][0] - 1) > 1
-    return np.asarray(skipped | (archive.columns["gap"] > 0))
+    gaps = np.asarray(skipped | (archive.columns["gap"] > 0))
+    if archive.period is not None:
+        untaken = [event.time for event in archive.events if event.name == AnswersLost.__name__]
+        cycles = np.rint(np.array(untaken) / archive.period)
+        gaps |= np.isin(archive.columns["cycle"], cycles)
+    return gaps
 
 
 def _known(torque: Array | None) -> Array | None:

@@ -1,6 +1,7 @@
 """What the supervisor and the archive process say to each other, as pickles over a socket pair.
 
 Both ends are our own processes, the one started by the other; nobody else can reach the socket.
+Each archive has a number, so that an answer that comes late is not taken for that of the next one.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from hil.archive.recorder import ArchiveSpec
 
 @dataclass(frozen=True, eq=False)
 class Open:
-    """Begin an archive.
+    """Begin an archive; one that is still open is closed as interrupted.
 
     Attributes:
+        job: number of the archive.
         spec: which.
         drive_train: in force on the link.
         from_now: leave out what came before; otherwise begin with the session's oldest record
@@ -26,6 +28,7 @@ class Open:
         until_ended: close it when the motion has ended; otherwise only when told to.
     """
 
+    job: int
     spec: ArchiveSpec
     drive_train: DriveTrain
     from_now: bool
@@ -34,8 +37,9 @@ class Open:
 
 @dataclass(frozen=True)
 class Close:
-    """Complete the archive that is open, with this outcome."""
+    """Complete archive `job`, if it is open, with this outcome."""
 
+    job: int
     outcome: str
     reason: str
 
@@ -47,28 +51,43 @@ class End:
 
 @dataclass(frozen=True)
 class Opened:
-    """The archive is open: the motion may begin."""
+    """Archive `job` is open: the motion may begin."""
+
+    job: int
 
 
 @dataclass(frozen=True)
 class Closed:
-    """The archive is complete.
+    """Archive `job` is complete.
 
     Attributes:
+        job: its number.
         outcome, reason: as in it.
+        interval: of the motion, -1 without one.
         records, records_lost: how many it holds, and how many it should hold but does not.
+        events_lost: likewise of events.
+        missed: packets that never arrived.
+        late: answers that were late or left out.
+        untaken: answers that the controller did not take.
     """
 
+    job: int
     outcome: str
     reason: str
+    interval: int
     records: int
     records_lost: int
+    events_lost: int
+    missed: int
+    late: int
+    untaken: int
 
 
 @dataclass(frozen=True)
 class Failed:
-    """The archive could not be opened or written further; what was flushed is whole."""
+    """Archive `job` could not be opened or written further; what was flushed is whole."""
 
+    job: int
     path: str
     problem: str
     remedy: str
@@ -82,13 +101,15 @@ class Channel:
     """One end of the socket, a `SOCK_SEQPACKET`.
 
     A message may be larger than the socket takes at once: it is sent in parts, the number of
-    parts first.
+    parts first. Neither end waits longer than `TIMEOUT` for the other.
     """
 
     PART = 64 << 10
+    TIMEOUT = 5.0
 
-    def __init__(self, end: socket.socket) -> None:
+    def __init__(self, end: socket.socket, timeout: float = TIMEOUT) -> None:
         self._socket = end
+        end.settimeout(timeout)
 
     def fileno(self) -> int:
         """For `select`."""
@@ -98,6 +119,7 @@ class Channel:
         """Send a message.
 
         Raises:
+            TimeoutError: the far end does not take it; the channel is of no use any more.
             OSError: the far end is gone.
         """
         data = pickle.dumps(message, protocol=5)
@@ -110,7 +132,7 @@ class Channel:
         """The next message; waits for it.
 
         Raises:
-            EOFError: the far end is gone.
+            EOFError: the far end is gone, or has stopped in the middle of a message.
         """
         head = self._part()
         return pickle.loads(b"".join(self._part() for _ in range(int.from_bytes(head, "little"))))
@@ -118,6 +140,8 @@ class Channel:
     def _part(self) -> bytes:
         try:
             part = self._socket.recv(self.PART)
+        except TimeoutError as error:
+            raise EOFError("the far end stopped in the middle of a message") from error
         except ConnectionError as error:
             raise EOFError("the far end is gone") from error
         if not part:

@@ -3,8 +3,8 @@
 Run as ``python -m hil.archive.process`` with the descriptors of ring, event log, control block and
 command socket. It is in a process session of its own and ignores SIGINT and SIGHUP: what is being
 recorded is completed whatever happens to the terminal. If the supervisor dies, it goes on until the
-exchange has ended the motion, closes the archive with the true outcome, and ends. If it cannot
-write, it says so in the control block, and the exchange brings the arm to rest.
+exchange has ended the motion or is dead, closes the archive with the true outcome, and ends. If it
+cannot write, it says so in the control block, and the exchange brings the arm to rest.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from types import FrameType
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.events import InitReceived
+from drivers.events import InitReceived, Outcome
 from drivers.exchange import (
     ArchiveState,
     ControlBlock,
+    Ended,
     EventReader,
     ExchangeEvent,
     RingReader,
 )
 from hil.archive.commands import Answer, Channel, Close, Closed, End, Failed, Open, Opened
+from hil.archive.pulse import Pulse
 from hil.archive.recorder import Recorder
 from hil.errors import ArchiveError
 
@@ -45,8 +47,10 @@ SILENCE = 0.2
 """s without a record after which an unfinished chunk is written out."""
 AFTERMATH_TIMEOUT = 2.0
 """s after the end of a motion, by which its archive is completed on a link that is silent."""
-EXCHANGE_TIMEOUT = 1.0
-"""s without a heartbeat after which the exchange process counts as dead."""
+EXCHANGE_QUIET = 1.0
+"""s without a heartbeat of the exchange process after which the archive says so."""
+ORPHAN_QUIET = 60.0
+"""s after which one that lives, but gives no sign of it, is not waited for by us alone."""
 RECENT = 5000
 """Records kept while no archive is open, for one that is to begin with what came before."""
 
@@ -56,33 +60,53 @@ class Job:
     """The archive that is open.
 
     Attributes:
+        number: by which the supervisor knows it.
         recorder: fills it.
         until_ended: whether it is closed when the motion ends.
         overflow: of the ring's reader when it began.
+        accepted, ended_count: fields of the control block when it began.
         heard: when the last record came, monotonic s.
         flushed: whether everything taken so far was written out.
         ended: when the motion's end was seen, monotonic s.
+        quiet: whether it was said that the exchange gives no sign of life.
     """
 
+    number: int
     recorder: Recorder
     until_ended: bool
     overflow: int
+    accepted: int
+    ended_count: int
     heard: float
     flushed: bool = True
     ended: float | None = None
+    quiet: bool = False
 
 
 class ArchiveProcess:
-    """Drains, writes, and answers the supervisor."""
+    """Drains, writes, and answers the supervisor.
+
+    Args:
+        ring, events, control: the exchange's memory.
+        commands: to the supervisor.
+        exchange: descriptor of the exchange process (a pidfd), which tells its death.
+    """
 
     def __init__(
-        self, ring: RingReader, events: EventReader, control: ControlBlock, commands: Channel
+        self,
+        ring: RingReader,
+        events: EventReader,
+        control: ControlBlock,
+        commands: Channel,
+        exchange: int,
     ) -> None:
         self._ring, self._events, self._control = ring, events, control
         self._commands: Channel | None = commands
         self._job: Job | None = None
         self._leaving = False
-        self._started = self._progress = time.monotonic()
+        self._progress = time.monotonic()
+        self._exchange = exchange
+        self._pulse = Pulse(lambda: control.exchange_heartbeat)
         self._recent: list[Records] = []
         self._recent_events: list[ExchangeEvent] = []
 
@@ -95,6 +119,7 @@ class ArchiveProcess:
             self._take()
             if self._commands is None and self._job is None and self._exchange_gone():
                 return
+            self._look_after_exchange()
 
     def leave(self, _signum: int, _frame: FrameType | None) -> None:
         """SIGTERM: complete the archive that is open, then end."""
@@ -122,28 +147,41 @@ class ArchiveProcess:
         if isinstance(command, Open):
             self._open(command)
         elif isinstance(command, Close):
-            self._take()
-            self._close(command.outcome, command.reason)
+            if self._job is not None and self._job.number == command.job:
+                self._take()
+                self._close(command.outcome, command.reason)
         elif isinstance(command, End):
             self._leaving = True
             if self._job is not None and not self._job.until_ended:
                 self._close("stopped", "the recording was ended")
 
     def _open(self, command: Open) -> None:
+        if self._job is not None:
+            self._take()
+            self._close("interrupted", "another archive was begun")
         self._idle()
         records, events = self._recent, self._recent_events
         self._recent, self._recent_events = [], []
-        overflow = self._ring.overflow
+        overflow, control = self._ring.overflow, self._control
+        accepted, ended_count = control.program_accepted, control.ended_count
         try:
             recorder = Recorder(command.spec.open(), command.drive_train)
             if not command.from_now:
                 recorder.take(*_of_the_last_session(records, events))
         except Exception as error:
-            self._fail(error)
+            self._fail(command.job, error)
             return
-        self._job = Job(recorder, command.until_ended, overflow, heard=time.monotonic())
-        self._control.archive_state = ArchiveState.READY
-        self._answer(Opened())
+        self._job = Job(
+            command.job,
+            recorder,
+            command.until_ended,
+            overflow,
+            accepted,
+            ended_count,
+            heard=time.monotonic(),
+        )
+        control.archive_state = ArchiveState.READY
+        self._answer(Opened(command.job))
 
     def _take(self) -> None:
         """Move what has come into the archive, and close it if the interval is over."""
@@ -151,19 +189,22 @@ class ArchiveProcess:
         if job is None:
             self._idle()
             return
-        gone = self._exchange_gone()  # looked at first, so that what it left behind is taken
+        # Looked at first, so that what it left behind is taken.
+        gone, ended_count = self._exchange_gone(), self._control.ended_count
         events, records = self._events.drain(), self._ring.drain()
         lost, job.overflow = self._ring.overflow - job.overflow, self._ring.overflow
         now = time.monotonic()
         try:
             job.recorder.take(records, events, lost)
+            if ended_count != job.ended_count and job.recorder.ended is None:
+                self._believe_the_count(job.recorder)
             if len(records):
                 job.heard, job.flushed = now, False
             elif not job.flushed and now - job.heard > SILENCE:
                 job.recorder.writer.flush()
                 job.flushed = True
         except Exception as error:  # whatever it is, the arm must not move unrecorded
-            self._fail(error)
+            self._fail(job.number, error)
             return
         self._complete(job, now, gone=gone)
 
@@ -175,10 +216,35 @@ class ArchiveProcess:
         waited = job.ended is not None and now - job.ended > AFTERMATH_TIMEOUT
         if job.until_ended and ended is not None and (job.recorder.over or waited or gone):
             self._close(ended.outcome, ended.reason)
+        elif gone and job.until_ended and self._control.program_accepted == job.accepted:
+            who = "exchange process" if self._commands is not None else "supervising program"
+            self._close("void", f"nothing was sent: the {who} ended")
         elif gone and job.until_ended:
             self._close("lost", "the exchange process ended")
         elif gone and self._commands is None:
             self._close("stopped", "the supervising program ended")
+
+    def _believe_the_count(self, recorder: Recorder) -> None:
+        """The motion has ended, and the event that says so was overwritten."""
+        outcome = _OUTCOMES[Ended(self._control.ended_outcome)]
+        recorder.witness(outcome, self._control.ended_interval)
+
+    def _look_after_exchange(self) -> None:
+        """Note in the archive that the exchange stands still, and that it goes on again."""
+        quiet, job = self._pulse.quiet(), self._job
+        if job is None:
+            return
+        if (quiet > EXCHANGE_QUIET) is not job.quiet:
+            job.quiet = not job.quiet
+            name = "ExchangeSilent" if job.quiet else "ExchangeBack"
+            text = "no sign of life from the exchange process" if job.quiet else "it goes on again"
+            try:
+                job.recorder.remark(name, text)
+            except Exception as error:
+                self._fail(job.number, error)
+                return
+        if quiet > ORPHAN_QUIET and self._commands is None:
+            self._close("lost", f"no sign of life from the exchange process for {quiet:.0f} s")
 
     def _idle(self) -> None:
         """Keep the newest of what comes while no archive is open."""
@@ -198,11 +264,25 @@ class ArchiveProcess:
         try:
             recorder.close(outcome, reason)
         except Exception as error:
-            self._fail(error)
+            self._fail(job.number, error)
             return
-        self._answer(Closed(outcome, reason, recorder.records, recorder.records_lost))
+        ended = recorder.ended
+        self._answer(
+            Closed(
+                job.number,
+                outcome,
+                reason,
+                interval=-1 if ended is None else ended.interval,
+                records=recorder.records,
+                records_lost=recorder.records_lost,
+                events_lost=recorder.events_lost,
+                missed=recorder.missed,
+                late=recorder.late,
+                untaken=recorder.untaken,
+            )
+        )
 
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, number: int, error: Exception) -> None:
         """The arm comes to rest first: that needs nothing but this one field."""
         self._control.archive_state = ArchiveState.FAILED
         self._job = None
@@ -210,7 +290,7 @@ class ArchiveProcess:
             path, problem, remedy = str(error.path), error.problem, error.remedy
         else:
             path, problem, remedy = "", f"{type(error).__name__}: {error}", ""
-        self._answer(Failed(path, problem, remedy))
+        self._answer(Failed(number, path, problem, remedy))
 
     def _answer(self, answer: Answer) -> None:
         if self._commands is None:
@@ -223,8 +303,16 @@ class ArchiveProcess:
     def _exchange_gone(self) -> bool:
         if self._control.finished:
             return True
-        heard = max(self._control.exchange_heartbeat, self._started)
-        return time.monotonic() - heard > EXCHANGE_TIMEOUT
+        return bool(select.select([self._exchange], [], [], 0.0)[0])
+
+
+_OUTCOMES: dict[Ended, Outcome] = {
+    Ended.NONE: "lost",
+    Ended.COMPLETED: "completed",
+    Ended.STOPPED: "stopped",
+    Ended.REFUSED: "refused",
+    Ended.LOST: "lost",
+}
 
 
 def _of_the_last_session(
@@ -241,7 +329,7 @@ def _of_the_last_session(
 
 def main() -> None:
     """Attach what the command line names, and work."""
-    ring, events, control, commands, n_joints = (int(text) for text in sys.argv[1:6])
+    ring, events, control, commands, exchange, n_joints = (int(text) for text in sys.argv[1:7])
     for signum in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(signum, signal.SIG_IGN)
     process = ArchiveProcess(
@@ -249,6 +337,7 @@ def main() -> None:
         EventReader(events),
         ControlBlock(control),
         Channel(socket(fileno=commands, type=SOCK_SEQPACKET)),
+        exchange,
     )
     signal.signal(signal.SIGTERM, process.leave)
     process.run()

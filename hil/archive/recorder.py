@@ -15,14 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
-from drivers.events import InitReceived, LinkLost, MotionEnded
-from drivers.exchange import ExchangeEvent
+from drivers.events import (
+    AnswersLost,
+    InitReceived,
+    LinkLost,
+    MotionEnded,
+    Outcome,
+    PacketRejected,
+)
+from drivers.exchange import EventsLost, ExchangeEvent
 from hil.archive.events import Level
 from hil.archive.wording import describe, level_of
 from hil.archive.writer import ArchiveWriter
 
 Records = NDArray[np.void]
 
+LATE_KINDS = frozenset({"late", "answered late"})
+"""Of `PacketRejected`: the answer left out for a newer packet's, or sent after its cycle."""
 AFTERMATH = 0.5
 """s of the controller's time that are recorded after a motion was refused or lost."""
 
@@ -87,6 +96,10 @@ class Recorder:
         link_lost: whether the link fell silent meanwhile.
         records: how many were archived.
         records_lost: how many were overwritten before they could be archived.
+        events_lost: likewise of the events.
+        missed: packets that never arrived.
+        late: packets whose answer was late or left out for a newer one.
+        untaken: answers that the controller did not take.
     """
 
     def __init__(self, writer: ArchiveWriter, drive_train: DriveTrain) -> None:
@@ -96,6 +109,10 @@ class Recorder:
         self.link_lost = False
         self.records = 0
         self.records_lost = 0
+        self.events_lost = 0
+        self.missed = 0
+        self.late = 0
+        self.untaken = 0
         self._drive_train = drive_train
         self._newest = -1
         self._cut = False
@@ -112,11 +129,21 @@ class Recorder:
         self.note(events)
         self._write(records)
         for event in ours:
-            cycle = getattr(event, "cycle", None)
-            self.writer.event(cycle, type(event).__name__, describe(event), level=level_of(event))
+            self._count(event)
+            self._tell(event)
         if lost:
             self.records_lost += lost
             self.writer.event(None, "RecordsLost", f"{lost} records overwritten", level=Level.ERROR)
+
+    def witness(self, outcome: Outcome, interval: int) -> None:
+        """Take it from elsewhere that the motion has ended: the event that says so was lost."""
+        ended = MotionEnded(outcome, "the event that said why was lost", interval, self._newest)
+        self.note([ended])
+        self._tell(ended)
+
+    def remark(self, name: str, text: str) -> None:
+        """Archive a warning of our own."""
+        self.writer.event(None, name, text, level=Level.WARN)
 
     def note(self, events: Sequence[ExchangeEvent]) -> None:
         """Take in what events say of the interval, without archiving them."""
@@ -125,6 +152,23 @@ class Recorder:
                 self.ended = event
             self.restarted = self.restarted or isinstance(event, InitReceived)
             self.link_lost = self.link_lost or isinstance(event, LinkLost)
+
+    def _tell(self, event: ExchangeEvent) -> None:
+        self.writer.event(
+            getattr(event, "cycle", None),
+            type(event).__name__,
+            describe(event),
+            level=level_of(event),
+            data={"count": event.count} if isinstance(event, AnswersLost) else None,
+        )
+
+    def _count(self, event: ExchangeEvent) -> None:
+        if isinstance(event, EventsLost):
+            self.events_lost += event.count
+        elif isinstance(event, AnswersLost):
+            self.untaken += event.count
+        elif isinstance(event, PacketRejected) and event.kind in LATE_KINDS:
+            self.late += event.count
 
     @property
     def newest(self) -> int:
@@ -143,8 +187,14 @@ class Recorder:
 
     def close(self, outcome: str, reason: str = "") -> None:
         """Complete the archive."""
-        lost = {"records_lost": str(self.records_lost)}
-        self.writer.close(outcome, reason=reason, details=lost)
+        counts = {
+            "records_lost": self.records_lost,
+            "events_lost": self.events_lost,
+            "late_answers": self.late,
+            "answers_not_taken": self.untaken,
+        }
+        details = {key: str(value) for key, value in counts.items()}
+        self.writer.close(outcome, reason=reason, details=details)
 
     def _of_this_session(self, events: Sequence[ExchangeEvent]) -> Sequence[ExchangeEvent]:
         """Events up to the init packet that begins another session, that one included."""
@@ -171,6 +221,7 @@ class Recorder:
             return
         self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
         self.records += len(records)
+        self.missed += int(records["gap"].sum())
         self._newest = int(records["cycle"][-1])
 
 

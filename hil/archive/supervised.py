@@ -8,20 +8,30 @@ import select
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 from typing import IO, Protocol
 
+from drivers.exchange import ControlBlock
 from hil.archive.commands import Answer, Channel, Command, End
+from hil.archive.pulse import Pulse
 
 END_TIMEOUT = 30.0
 """s for the last flush of a slow disk."""
+HUNG = 5.0
+"""s without a sign of life after which it is ended; a slow disk alone does not silence it."""
+LAST_BREATH = 2.0
+"""s that a process whose socket is closed, or that was killed, may take to be gone."""
+LOOK = 0.05
+"""s between two looks while it is waited for."""
 
 
 class SharedMemory(Protocol):
-    """What the archive process attaches: the exchange process's descriptors."""
+    """What the archive process attaches: the exchange process and its descriptors."""
 
+    pid: int
     ring_fd: int
     event_fd: int
     control_fd: int
@@ -38,19 +48,33 @@ class ArchiveProcessHandle:
     Attributes:
         process: the child, in a process session of its own.
         channel: our end of the command socket.
+        pulse: of its heartbeat.
     """
 
     process: subprocess.Popen[bytes]
     channel: Channel
+    pulse: Pulse
     _words: IO[bytes]
+    _gone: bool = False
+    _ended_for: str = field(default="")
 
     @classmethod
     def start(cls, memory: SharedMemory, n_joints: int) -> ArchiveProcessHandle:
-        """Start the process on the exchange's shared memory."""
-        ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
-        passed = (memory.ring_fd, memory.event_fd, memory.control_fd, theirs.fileno())
-        words: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
-        try:
+        """Start the process on the exchange's shared memory.
+
+        Raises:
+            OSError: the system refuses a process, a socket or memory.
+        """
+        control = ControlBlock(memory.control_fd)
+        pulse = Pulse(lambda: control.archive_heartbeat)
+        with contextlib.ExitStack() as undo:
+            words: IO[bytes] = undo.enter_context(tempfile.TemporaryFile())
+            exchange = os.pidfd_open(memory.pid)
+            undo.callback(os.close, exchange)
+            ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
+            undo.callback(theirs.close)
+            undo.callback(ours.close)
+            passed = (memory.ring_fd, memory.event_fd, memory.control_fd, theirs.fileno(), exchange)
             process = subprocess.Popen(
                 [sys.executable, "-m", "hil.archive.process", *map(str, (*passed, n_joints))],
                 pass_fds=passed,
@@ -61,50 +85,94 @@ class ArchiveProcessHandle:
                 # What this process can import, that one can.
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(_import_paths())},
             )
-        except BaseException:
-            ours.close()
-            words.close()
-            raise
-        finally:
+            undo.pop_all()
+            os.close(exchange)
             theirs.close()
-        return cls(process, Channel(ours), words)
+        return cls(process, Channel(ours), pulse, words)
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
-        return self.process.poll() is None
+        """Whether the process runs and can be talked to."""
+        return not self._gone and self.process.poll() is None
+
+    def failure(self) -> str | None:
+        """What is wrong with the process, in words; one that hangs is ended. None if it works."""
+        if self.alive and self.pulse.quiet() > HUNG:
+            self.kill(f"gave no sign of life for {HUNG:g} s and was ended")
+        if self.alive:
+            return None
+        return f"the archive process {self._ended_for or 'ended' + self.last_words()}"
+
+    def kill(self, why: str) -> None:
+        """End a process that hangs, for a reason that follows "the archive process"."""
+        self._ended_for, self._gone = why, True
+        self.process.kill()
+        self._wait(LAST_BREATH)
 
     def send(self, command: Command) -> None:
-        """Send a command; one that cannot be delivered shows in `alive`."""
+        """Send a command; one that cannot be delivered shows in `failure`."""
         try:
             self.channel.send(command)
+        except TimeoutError:
+            self.kill(f"took no command for {Channel.TIMEOUT:g} s and was ended")
         except OSError:
-            return
+            self._lose()
 
-    def answer(self, timeout: float) -> Answer | None:
-        """The next answer, or None if none comes within `timeout` s (or none will ever)."""
-        readable, _, _ = select.select([self.channel], [], [], timeout)
-        if not readable:
-            return None
-        try:
-            answer: Answer = self.channel.receive()
-        except EOFError:
-            return None
-        return answer
+    def answer(self, timeout: float, job: int) -> Answer | None:
+        """The next answer about archive `job`; those about earlier ones are dropped.
+
+        None if none comes within `timeout` s, or none will ever.
+        """
+        deadline = time.monotonic() + timeout
+        while self.alive or not self._gone:
+            left = max(0.0, deadline - time.monotonic())
+            if not select.select([self.channel], [], [], left)[0]:
+                return None
+            try:
+                answer: Answer = self.channel.receive()
+            except EOFError:
+                self._lose()
+                return None
+            if answer.job == job:
+                return answer
+        return None
 
     def last_words(self) -> str:
-        """What a process that died wrote last, as the rest of a sentence; "" without any."""
-        if self.alive:
+        """What a process that died wrote last, as the rest of a sentence."""
+        if self._words.closed:
             return ""
         size = os.fstat(self._words.fileno()).st_size
         text = os.pread(self._words.fileno(), 400, max(0, size - 400)).decode(errors="replace")
         lines = text.strip().splitlines()
-        return f" ({lines[-1]})" if lines else f" (exit status {self.process.returncode})"
+        return f" ({lines[-1]})" if lines else f" (exit status {self.process.poll()})"
 
-    def end(self) -> None:
-        """Let it complete what is open and end; it is waited for, and not killed."""
-        self.send(End())
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(END_TIMEOUT)
+    def end(self) -> str | None:
+        """Let it complete what is open and end; what was wrong with it, None if nothing was.
+
+        It is waited for; one that hangs is killed.
+        """
+        if self.alive:
+            self.send(End())
+        deadline = time.monotonic() + END_TIMEOUT
+        while self.process.poll() is None and not self._gone:
+            if self.pulse.quiet() > HUNG:
+                self.kill(f"gave no sign of life for {HUNG:g} s and was ended")
+            elif time.monotonic() > deadline:
+                self.kill(f"did not end within {END_TIMEOUT:g} s and was killed")
+            else:
+                self._wait(LOOK)
+        status = self.process.poll()
+        if not self._ended_for and status not in (0, None):
+            self._ended_for = f"ended{self.last_words()}"
         self.channel.close()
         self._words.close()
+        return f"the archive process {self._ended_for}" if self._ended_for else None
+
+    def _lose(self) -> None:
+        """Its socket is closed: it is dead or about to be."""
+        self._wait(LAST_BREATH)
+        self._gone = True
+
+    def _wait(self, timeout: float) -> None:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(timeout)

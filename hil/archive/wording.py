@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from drivers.events import (
+    AnswersLost,
     GapSeen,
     InitReceived,
     LinkLost,
@@ -13,12 +14,14 @@ from drivers.events import (
     StateChanged,
 )
 from drivers.exchange import (
+    EventsLost,
     ExchangeEnded,
     ExchangeEvent,
     ExchangeFailed,
     ExchangeStarted,
     Leaving,
     OverrideRefused,
+    ResumeRefused,
 )
 from hil.archive.events import Level
 
@@ -30,10 +33,16 @@ def describe(event: ExchangeEvent) -> str:
             return f"{event.before.name} -> {event.after.name} in cycle {event.cycle}"
         case GapSeen():
             return f"{event.missed} packets missed before cycle {event.cycle}"
+        case AnswersLost():
+            return (
+                f"{event.count} answers were not taken by the controller, until cycle {event.cycle}"
+            )
         case MotionStarted():
             return f"first set-point in cycle {event.cycle}"
         case MotionEnded():
             return f"{event.outcome} in cycle {event.cycle}: {event.reason}"
+        case PacketRejected(kind="answered late"):
+            return f"{event.count} answers left more than a cycle after their packet"
         case PacketRejected():
             return f"{event.count} {event.kind} packets got no answer"
         case Refused():
@@ -54,12 +63,16 @@ def describe(event: ExchangeEvent) -> str:
             return "; ".join(["the exchange is running", *event.realtime.refused, *event.notes])
         case OverrideRefused():
             return f"no override of {event.fraction:g}: {event.reason}"
+        case ResumeRefused():
+            return f"the motion cannot be gone on with: {event.reason}"
+        case EventsLost():
+            return f"{event.count} events were overwritten before they could be archived"
 
 
 def level_of(event: ExchangeEvent) -> Level:
     """How serious an event is."""
-    if isinstance(event, Refused | LinkLost | ExchangeFailed):
+    if isinstance(event, Refused | LinkLost | ExchangeFailed | EventsLost):
         return Level.ERROR
-    if isinstance(event, GapSeen | PacketRejected | OverrideRefused):
+    if isinstance(event, GapSeen | AnswersLost | PacketRejected | OverrideRefused | ResumeRefused):
         return Level.WARN
     return Level.INFO

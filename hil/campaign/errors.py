@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.errors import ControllerFault, InputError, UnsafeError
+from hil.archive.commands import Failed
+from hil.errors import ArchiveWriteError, ControllerFault, InputError, UnsafeError
 
 
 class CampaignFolderError(InputError):
@@ -59,3 +60,8 @@ class NotRehearsedError(UnsafeError):
             "this campaign was not rehearsed, and its link leads out of this computer; "
             "only a simulated controller on this computer (127.0.0.1) is driven without a rehearsal"
         )
+
+
+def write_error(failed: Failed) -> ArchiveWriteError:
+    """What is raised where the archive process cannot write."""
+    return ArchiveWriteError(failed.path or None, failed.problem, remedy=failed.remedy)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from drivers.states import State
 from drivers.transports import SimulatedTransport
 from hil.archive import ArchiveSpec, Recorder
 from hil.cell import Cell
-from hil.errors import ControllerFault
+from hil.errors import ControllerFault, OperatorStopError
 
 from .motion_link import Connection, Progress, Recorded, Watch, described, unwatched
 from .stop import Stop
@@ -150,10 +151,14 @@ class Link:
         stop: Stop,
         *,
         duration: float | None = None,
+        wait: float | None = None,
         watch: Watch = unwatched,
     ) -> Recorded:
-        """See `Recording.record`."""
-        exchange(self.transport, self.session, until=lambda: self._known(stop))
+        """See `Recording.record`; `wait` counts the controller's own time."""
+        until = inf if wait is None else self.transport.now + wait
+        exchange(self.transport, self.session, until=lambda: self._known(stop, until))
+        if stop.requested and self.connection.init is None:
+            raise OperatorStopError("ended before the controller came: nothing was recorded")
         if self.connection.init is None:
             raise ControllerFault("the controller did not start a session: nothing was recorded")
         self.connection.require_usable()
@@ -179,7 +184,18 @@ class Link:
                 raise taking.failure
             outcome, reason = how_recording_ended(taking.recorder, stop, limit)
             taking.recorder.close(outcome, reason)
-        return Recorded(outcome, reason, taking.recorder.records, taking.recorder.records_lost)
+        recorder = taking.recorder
+        return Recorded(
+            outcome,
+            reason,
+            recorder.records,
+            recorder.records_lost,
+            seconds=(recorder.newest + 1) * spec.period,
+            events_lost=recorder.events_lost,
+            missed=recorder.missed,
+            late=recorder.late,
+            untaken=recorder.untaken,
+        )
 
     def close(self) -> None:
         """Ask the far end to end the session and answer until it does."""
@@ -191,9 +207,10 @@ class Link:
 
         exchange(self.transport, self.session, until=drop)
 
-    def _known(self, stop: Stop) -> bool:
+    def _known(self, stop: Stop, until: float) -> bool:
         self._events()
-        return self.connection.init is not None or stop.requested
+        known = self.connection.init is not None
+        return known or stop.requested or self.transport.now > until
 
     def _progress(self, recorder: Recorder) -> Progress:
         newest = self.ring.last(1)

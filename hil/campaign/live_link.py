@@ -13,31 +13,27 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Self
+from typing import Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.announced import compare
 from drivers.errors import DriverError, RequestError
-from drivers.events import InitReceived, LinkLost, MotionEnded
-from drivers.exchange import (
-    ExchangeFailed,
-    ExchangeProcess,
-    ExchangeSettings,
-    RealTimeSettings,
-    RingReader,
-)
+from drivers.events import MotionEnded, Outcome
+from drivers.exchange import ExchangeProcess, ExchangeSettings, RealTimeSettings, RingReader
 from drivers.motion_source import MotionSource
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec
-from hil.archive.commands import Answer, Close, Closed, Failed, Open, Opened
+from hil.archive.commands import Close, Closed, Failed, Open, Opened
 from hil.archive.supervised import ArchiveProcessHandle
 from hil.cell import Cell
-from hil.errors import ArchiveWriteError, ControllerFault
+from hil.errors import ControllerFault
 
-from .motion_link import Connection, Progress, Recorded, Watch, described, unwatched
+from .errors import write_error
+from .exchange_view import ExchangeView
+from .live_recording import LiveRecording
+from .motion_link import Connection, Recorded, Watch, described, drives_in_force, unwatched
 from .stop import Stop
 
 Array = NDArray[np.float64]
@@ -52,7 +48,7 @@ BEAT = 0.05
 OPEN_TIMEOUT = 10.0
 """s within which a file must have been created."""
 REST_TIMEOUT = 30.0
-"""s within which an arm that was told to stop must be at rest and its axes closed."""
+"""s for an arm that was told to stop to rest, and for the archive of a motion that has ended."""
 END_TIMEOUT = 30.0
 """s within which the exchange must have ended after it was told to."""
 
@@ -69,8 +65,10 @@ class LiveLink:
         exchange: the process that answers.
         archive: the process that writes.
         finish: asks the far end to end the session; only a simulated one can be asked.
+        view: what is known of the exchange.
         cycles: records archived so far.
-        connection: what is known of the controller.
+        late: answers so far that were late or left out for a newer one's.
+        untaken: answers so far that the controller did not take.
     """
 
     cell: Cell
@@ -78,12 +76,15 @@ class LiveLink:
     archive: ArchiveProcessHandle
     finish: Callable[[], None] = field(default=lambda: None)
     cycles: int = 0
-    connection: Connection = field(default_factory=Connection)
-    _lost: LinkLost | None = None
-    _ended: MotionEnded | None = None
-    _restarts: int = 0
-    _trace: str = ""
+    late: int = 0
+    untaken: int = 0
+    view: ExchangeView = field(init=False)
+    _job: int = 0
+    _open_path: str = ""
     _closed: bool = False
+
+    def __post_init__(self) -> None:
+        self.view = ExchangeView(self.exchange)
 
     @classmethod
     def open(
@@ -99,7 +100,8 @@ class LiveLink:
 
         Raises:
             CellError: the cell names no real link.
-            ControllerFault: the link cannot be opened (port taken, not permitted, no adapter).
+            ControllerFault: the link cannot be opened (port taken, not permitted, no adapter), or
+                the system refuses a process.
         """
         settings = ExchangeSettings(
             transport=transport if transport is not None else cell.transport_spec(),
@@ -114,14 +116,24 @@ class LiveLink:
             exchange = ExchangeProcess.start(settings)
         except DriverError as error:
             raise ControllerFault(str(error)) from error
+        except OSError as error:
+            raise ControllerFault(f"the exchange process cannot be started: {error}") from error
         try:
             archive = ArchiveProcessHandle.start(exchange, len(cell.joint_names))
-        except BaseException:
+        except BaseException as error:
             exchange.finish()
+            exchange.close()
+            if isinstance(error, OSError):
+                raise ControllerFault(f"the archive process cannot be started: {error}") from error
             raise
         link = cls(cell, exchange, archive, finish)
         threading.Thread(target=link._beat, daemon=True).start()
         return link
+
+    @property
+    def connection(self) -> Connection:
+        """What is known of the controller."""
+        return self.view.connection
 
     @property
     def only_simulated(self) -> bool:
@@ -135,61 +147,61 @@ class LiveLink:
     def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
         """See `MotionLink.connect`."""
         deadline = time.monotonic() + timeout
-        reader = self._reader()
+        reader = self.reader()
         last: Array | None = None
         while not stop.requested and time.monotonic() < deadline:
-            self._look()
+            self.view.look()
             self.connection.require_usable()
             records = reader.drain()
             if len(records):
                 last = records["target_position"][-1].copy()
-            if self._state in READY and last is not None:
+            if self.view.state in READY and last is not None:
                 return last
-            self._require_alive()
+            if (failure := self.view.failure()) is not None:
+                raise ControllerFault(f"{failure}; the controller gets no answers")
             time.sleep(POLL)
         if stop.requested:
             raise ControllerFault("stopped by the operator before anything moved")
         raise ControllerFault(
             f"the controller did not reach drive-on within {timeout:g} s "
-            f"(state {self._state.name}); switch the drive on and try again"
+            f"(state {self.view.state.name}); switch the drive on and try again"
         )
 
     def run(self, source: MotionSource, spec: ArchiveSpec, stop: Stop) -> MotionEnded:
         """See `MotionLink.run`."""
-        self._look()
-        self._ended = None
-        self._open(spec, from_now=True, until_ended=True)
+        self.view.forget_motion()
+        self.open_archive(spec, from_now=True, until_ended=True)
         try:
             self.exchange.submit(source)
         except RequestError as error:
-            self._complete("refused", str(error))
-            raise ControllerFault(str(error)) from error
+            self.complete("refused", str(error))
+            raise ControllerFault(f"{error}; {spec.path} says so") from error
         except DriverError as error:
-            self._require_alive()
-            raise ControllerFault(str(error)) from error
-        asked = False
+            self._raise_failure()
+            self.exchange.stop()
+            closed = self.complete("void", str(error))
+            raise ControllerFault(f"{error}; {spec.path} is {closed.outcome}") from error
+        asked, due = False, float("inf")
         while True:
+            self.view.look()
             if stop.requested and not asked:
                 self.exchange.stop()
                 asked = True
-            self._look()
-            answer = self._answer(POLL)
+            if (idle := self.view.not_begun()) is not None:
+                return self._give_up(idle)
+            answer = self.archive.answer(POLL, self._job)
             if isinstance(answer, Closed):
                 return self._ending(answer)
             if isinstance(answer, Failed):
+                self._open_path = ""
                 self._come_to_rest()
-                raise _write_error(answer)
-            if not self.archive.alive:
-                self._come_to_rest()
-                raise ControllerFault(
-                    f"the archive process ended{self.archive.last_words()}; the arm was brought "
-                    "to rest, and what was recorded before is readable"
-                )
-            if not self.exchange.alive:
-                closed = self._answer(OPEN_TIMEOUT)
-                if isinstance(closed, Closed):
-                    self.cycles += closed.records
-                self._require_alive()
+                raise write_error(answer)
+            self._raise_failure()
+            if self.view.motion_ended or self.view.failure() is not None:
+                due = min(due, time.monotonic() + REST_TIMEOUT)
+            if time.monotonic() > due:
+                what = f"{spec.path} was not completed within {REST_TIMEOUT:g} s"
+                raise ControllerFault(f"the motion is over, but {what}")
 
     def record(
         self,
@@ -197,55 +209,21 @@ class LiveLink:
         stop: Stop,
         *,
         duration: float | None = None,
+        wait: float | None = None,
         watch: Watch = unwatched,
     ) -> Recorded:
         """See `Recording.record`."""
-        while self.connection.init is None and not stop.requested:
-            self._look()
-            self._require_alive()
-            watch(Progress(0, 0, self._state))
-            time.sleep(POLL)
-        if self.connection.init is None:
-            raise ControllerFault("the controller did not start a session: nothing was recorded")
-        self.connection.require_usable()
-        restarts = self._restarts
-        self._open(spec, from_now=False, until_ended=False)
-        reader = self._reader()
-        position: Array | None = None
-        while True:
-            self._look()
-            status = self.exchange.status()
-            records = reader.drain()
-            if len(records):
-                position = records["position"][-1].copy()
-            watch(Progress(status.cycle, status.missed, self._state, position))
-            ending = self._recording_ends(stop, duration, restarted=self._restarts > restarts)
-            if ending is not None:
-                closed = self._complete(*ending)
-                self.cycles += closed.records
-                return Recorded(*ending, closed.records, closed.records_lost)
-            answer = self._answer(POLL)
-            if isinstance(answer, Failed):
-                raise _write_error(answer)
-            if not self.archive.alive:
-                raise ControllerFault(f"the archive process ended{self.archive.last_words()}")
-            self._require_alive()
+        return LiveRecording(self, stop, watch).run(spec, duration, wait)
 
     def close(self) -> None:
-        """End the session where the far end can be asked to, then both processes."""
-        if self._closed:
-            return
-        self._closed = True
-        try:
-            self.finish()
-            self.exchange.finish()
-            deadline = time.monotonic() + END_TIMEOUT
-            while self.exchange.alive and time.monotonic() < deadline:
-                self.exchange.beat()
-                time.sleep(POLL)
-        finally:
-            self.archive.end()
-            self.exchange.close()
+        """End the session where the far end can be asked to, then both processes.
+
+        Raises:
+            ControllerFault: one of them did not end by itself.
+        """
+        trouble = self._shut()
+        if trouble is not None:
+            raise ControllerFault(trouble)
 
     def __enter__(self) -> Self:
         return self
@@ -256,109 +234,157 @@ class LiveLink:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if error is not None and self.exchange.alive:
+        if error is None:
+            self.close()
+            return
+        if self.exchange.alive:
             self.exchange.stop()
-        self.close()
+        self._shut()
 
-    def _reader(self) -> RingReader:
+    def reader(self) -> RingReader:
+        """A reader of the records that does not stand in the archive process's way."""
         n_joints = len(self.cell.joint_names)
         return RingReader(self.exchange.ring_fd, n_joints, acknowledge=False)
 
-    @property
-    def _state(self) -> State:
-        return State(self.exchange.status().state)
+    def open_archive(self, spec: ArchiveSpec, *, from_now: bool, until_ended: bool) -> None:
+        """Have an archive opened; nothing may move before that.
+
+        Raises:
+            ArchiveWriteError: it cannot be created.
+            ControllerFault: the archive process does not answer.
+        """
+        drives = drives_in_force(self.cell, self.connection)
+        spec = described(spec, self.connection, drives)
+        self._job += 1
+        self._open_path = str(spec.path)
+        self.view.lost = None
+        self.archive.send(Open(self._job, spec, drives, from_now, until_ended))
+        answer = self.archive.answer(OPEN_TIMEOUT, self._job)
+        if isinstance(answer, Opened):
+            return
+        self._open_path = ""
+        if isinstance(answer, Failed):
+            raise write_error(answer)
+        if (failure := self.archive.failure()) is not None:
+            raise ControllerFault(f"{failure}; nothing was sent, and {spec.path} is not recorded")
+        # Should it come to it after all, it is to be closed at once.
+        self.archive.send(Close(self._job, "void", "nothing was sent: it was opened too late"))
+        late = f"did not open {spec.path} within {OPEN_TIMEOUT:g} s"
+        raise ControllerFault(f"the archive process {late}; nothing was sent")
+
+    def complete(self, outcome: str, reason: str) -> Closed:
+        """Have the archive completed.
+
+        Raises:
+            ArchiveWriteError: the disk refuses.
+            ControllerFault: the archive process does not answer.
+        """
+        path = self._open_path
+        self.archive.send(Close(self._job, outcome, reason))
+        deadline = time.monotonic() + OPEN_TIMEOUT
+        while time.monotonic() < deadline:
+            answer = self.archive.answer(POLL, self._job)
+            if isinstance(answer, Closed):
+                self.count(answer)
+                return answer
+            if isinstance(answer, Failed):
+                self._open_path = ""
+                raise write_error(answer)
+            if (failure := self.archive_failure()) is not None:
+                raise ControllerFault(f"{failure}; {path} is not complete ({outcome}: {reason})")
+        raise ControllerFault(f"{path} was not completed within {OPEN_TIMEOUT:g} s")
+
+    def failed_write(self) -> Failed | None:
+        """What the archive process says of an archive that cannot be written further, if it does.
+
+        Waits `POLL` s for it.
+        """
+        answer = self.archive.answer(POLL, self._job)
+        return answer if isinstance(answer, Failed) else None
+
+    def archive_failure(self) -> str | None:
+        """What is wrong with the archive process; whoever asks tells what becomes of the file."""
+        failure = self.archive.failure()
+        if failure is not None:
+            self._open_path = ""
+        return failure
+
+    def count(self, closed: Closed) -> None:
+        """Add up what an archive holds."""
+        self._open_path = ""
+        self.cycles += closed.records
+        self.late += closed.late
+        self.untaken += closed.untaken
 
     def _beat(self) -> None:
         while not self._closed and self.exchange.alive:
             self.exchange.beat()
             time.sleep(BEAT)
 
-    def _look(self) -> None:
-        """Take in what the exchange says."""
-        for event in self.exchange.events():
-            self.connection.note(event)
-            if isinstance(event, InitReceived):
-                self._restarts += 1
-            elif isinstance(event, LinkLost):
-                self._lost = event
-            elif isinstance(event, MotionEnded):
-                self._ended = event
-            elif isinstance(event, ExchangeFailed):
-                self._trace = event.trace
-
-    def _open(self, spec: ArchiveSpec, *, from_now: bool, until_ended: bool) -> None:
-        drives = self.cell.drive_train
-        if self.connection.adopted:
-            init, arm = self.connection.init, self.cell.controller.arm
-            assert init is not None
-            drives = compare(drives, self.cell.period, init, arm, accept=True).drive_train
-        spec = described(spec, self.connection, drives)
-        self._lost = None
-        self.archive.send(Open(spec, drives, from_now, until_ended))
-        answer = self._answer(OPEN_TIMEOUT)
-        if isinstance(answer, Failed):
-            raise _write_error(answer)
-        if not isinstance(answer, Opened):
-            raise ControllerFault(
-                f"the archive process did not open {spec.path.name} within {OPEN_TIMEOUT:g} s"
-                f"{self.archive.last_words()}"
-            )
-
-    def _complete(self, outcome: str, reason: str) -> Closed:
-        self.archive.send(Close(outcome, reason))
-        answer = self._answer(OPEN_TIMEOUT)
-        if isinstance(answer, Failed):
-            raise _write_error(answer)
-        if not isinstance(answer, Closed):
-            raise ControllerFault(f"the archive was not completed{self.archive.last_words()}")
-        return answer
-
-    def _answer(self, timeout: float) -> Answer | None:
-        return self.archive.answer(timeout)
-
     def _ending(self, closed: Closed) -> MotionEnded:
-        self.cycles += closed.records
-        self._look()
-        if self._ended is not None:
-            return self._ended
-        if not self.exchange.alive:
-            self._require_alive()
-        return MotionEnded("lost", closed.reason, -1, -1)
+        self.count(closed)
+        self.view.look()
+        if self.view.ended is not None:
+            return self.view.ended
+        if closed.outcome in get_args(Outcome) and self.view.motion_ended:
+            outcome: Outcome = closed.outcome  # type: ignore[assignment]
+            return MotionEnded(outcome, closed.reason, closed.interval, -1)
+        failure = self.view.failure() or closed.reason
+        alone = "the controller gets no answers and acts by its own watch"
+        raise ControllerFault(f"{failure}; {alone}; the archive ({closed.outcome}) is whole so far")
 
-    def _recording_ends(
-        self, stop: Stop, duration: float | None, *, restarted: bool
-    ) -> tuple[str, str] | None:
-        """Outcome and reason of a recording that is to end now, or None."""
-        status = self.exchange.status()
-        if restarted:
-            return "stopped", "the controller began a new session"
-        if self._lost is not None:
-            return "lost", "nothing was heard from the controller any more"
-        if State(status.state) is State.ENDED:
-            return "completed", "the controller ended the session"
-        if duration is not None and status.cycle * self.cell.period >= duration:
-            return "completed", "as long as was asked for"
-        if stop.requested:
-            return ("completed" if duration is None else "stopped"), "ended by the operator"
-        return None
+    def _give_up(self, why: str) -> MotionEnded:
+        """A motion that has not begun is dropped; without an archive it cannot begin any more."""
+        path, refused = self._open_path, self.view.refused
+        outcome = "void" if refused is None else "refused"
+        self.complete(outcome, why if refused is None else str(refused.error))
+        self.exchange.stop()
+        if refused is None:
+            raise ControllerFault(f"{why}; nothing was sent ({path})")
+        return MotionEnded("refused", str(refused.error), -1, -1)
 
-    def _come_to_rest(self) -> None:
-        """Wait until the motion has ended; the exchange stops it by itself."""
+    def _raise_failure(self) -> None:
+        """Raise ControllerFault if the archive process is gone or hangs; the arm rests first."""
+        path = self._open_path
+        if (failure := self.archive_failure()) is not None:
+            rests = "the arm was brought to rest"
+            if not self._come_to_rest():
+                rests = f"the arm was told to stop, but not seen to rest ({self.view.state.name})"
+            raise ControllerFault(f"{failure}; {rests}, and {path} is readable up to its last part")
+
+    def _come_to_rest(self) -> bool:
+        """Whether the motion has ended; the exchange stops it by itself, but is told to again."""
+        self.exchange.stop()
         deadline = time.monotonic() + REST_TIMEOUT
-        while self._ended is None and self.exchange.alive and time.monotonic() < deadline:
-            self._look()
+        while not self.view.motion_ended and time.monotonic() < deadline:
+            if self.view.failure() is not None:
+                return False
+            self.view.look()
             time.sleep(POLL)
+        return self.view.motion_ended
 
-    def _require_alive(self) -> None:
-        if self.exchange.alive:
-            return
-        self._look()
-        why = f" ({self._trace.strip().splitlines()[-1]})" if self._trace else ""
-        raise ControllerFault(
-            f"the exchange process ended{why}; the controller gets no answers and acts by its "
-            "own watch"
-        )
-
-
-def _write_error(failed: Failed) -> ArchiveWriteError:
-    return ArchiveWriteError(failed.path or None, failed.problem, remedy=failed.remedy)
+    def _shut(self) -> str | None:
+        """End both processes; what was wrong with them, None if nothing was."""
+        if self._closed:
+            return None
+        self._closed = True
+        trouble: str | None = None
+        try:
+            self.finish()
+            self.exchange.finish()
+            deadline = time.monotonic() + END_TIMEOUT
+            while self.view.failure() is None and time.monotonic() < deadline:
+                self.exchange.beat()
+                time.sleep(POLL)
+            trouble = self.view.trouble
+            if self.exchange.alive:
+                trouble = (
+                    f"the exchange process still answers {END_TIMEOUT:g} s after it was told to "
+                    "end (an axis is open); it ends when the axes are closed"
+                )
+        finally:
+            failure = self.archive.end()
+            if failure is not None and self._open_path:
+                trouble = f"{failure}; {self._open_path} is not complete"
+            self.exchange.close()
+        return trouble

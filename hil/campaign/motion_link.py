@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.announced import compare
 from drivers.drive_train import DriveTrain
 from drivers.events import InitReceived, MotionEnded, Refused
 from drivers.exchange import ExchangeEvent
@@ -17,6 +18,7 @@ from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
+from hil.cell import Cell
 from hil.errors import ControllerFault
 
 from .stop import Stop
@@ -33,12 +35,22 @@ class Recorded:
         reason: in a sentence.
         records: cycles archived.
         records_lost: cycles overwritten before they could be archived.
+        seconds: of the controller's time since its init packet.
+        events_lost: events overwritten likewise.
+        missed: packets that never arrived.
+        late: packets whose answer was late, or left out for a newer one.
+        untaken: answers that the controller did not take.
     """
 
     outcome: str
     reason: str
     records: int
     records_lost: int
+    seconds: float = 0.0
+    events_lost: int = 0
+    missed: int = 0
+    late: int = 0
+    untaken: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +62,22 @@ class Progress:
         missed: packets that never arrived.
         state: of the session.
         position: (n,) rad, measured last; None before the first record.
+        late: packets whose answer was late, or left out for a newer one.
+        untaken: answers that the controller did not take.
+        foreign: packets from elsewhere; they got no answer.
+        heard: whether any packet of the controller was answered yet.
+        over: why nothing is recorded any more though answers go on; "" while it is recorded.
     """
 
     cycles: int
     missed: int
     state: State
     position: Array | None = None
+    late: int = 0
+    untaken: int = 0
+    foreign: int = 0
+    heard: bool = True
+    over: str = ""
 
 
 Watch = Callable[[Progress], None]
@@ -150,12 +172,21 @@ class Recording(Protocol):
     """A connection on which the controller's own motion is recorded."""
 
     def record(
-        self, spec: ArchiveSpec, stop: Stop, *, duration: float | None, watch: Watch
+        self,
+        spec: ArchiveSpec,
+        stop: Stop,
+        *,
+        duration: float | None,
+        wait: float | None,
+        watch: Watch,
     ) -> Recorded:
         """Answer safely and archive every cycle from the controller's first on.
 
+        Where the far end goes by real time, answers go on after the recording until the arm rests.
+
         Raises:
-            ControllerFault: the controller cannot be read, or never came.
+            ControllerFault: the controller cannot be read, or did not come within `wait` s.
+            OperatorStopError: a stop was asked for before it came.
             ArchiveWriteError: the archive cannot be written.
         """
         ...
@@ -181,6 +212,15 @@ def described(spec: ArchiveSpec, connection: Connection, drives: DriveTrain) -> 
             "accepted_init.differences": "; ".join(connection.differences),
         }
     return spec.with_more(metadata, attachments)
+
+
+def drives_in_force(cell: Cell, connection: Connection) -> DriveTrain:
+    """The cell's drive train, or that of a controller whose figures were accepted."""
+    drives, init, table = cell.drive_train, connection.init, cell.controller
+    if init is None or not connection.adopted:
+        return drives
+    others = frozenset(table.other_axes)
+    return compare(drives, cell.period, init, table.arm, True, others).drive_train
 
 
 def _in_force(text: bytes, drives: DriveTrain) -> bytes:

@@ -41,8 +41,8 @@ def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> 
             path, field, detail["input"], "is not a field of a cell file", f"known are: {known}"
         )
     value = None if isinstance(detail["input"], dict) else detail["input"]
-    problem = detail["msg"].removeprefix("Value error, ")
-    remedy = f"it must be {_description(schema, location)}"
+    problem, _, remedy = detail["msg"].removeprefix("Value error, ").partition("; ")
+    remedy = remedy or f"it must be {_description(schema, location)}"
     return CellError(path, field, value, problem[0].lower() + problem[1:], remedy)
 
 

@@ -73,6 +73,7 @@ def session_settings(cell: Cell, *, accept_init: bool = False) -> dict[str, Any]
         "arm": table.arm,
         "max_gap": table.max_gap,
         "accept_init": accept_init,
+        "other_axes": frozenset(table.other_axes),
     }
     if campaign is not None:
         settings["settle_cycles"] = max(1, round(campaign.settle_s / cell.period))

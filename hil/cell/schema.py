@@ -18,6 +18,7 @@ PositiveVector = list[Positive]
 Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
+ArmAxis = tuple[Annotated[int, Field(ge=1, le=4)], Annotated[int, Field(ge=1, le=10)]]
 Factor = Annotated[FiniteFloat, Field(gt=1, le=5)]
 
 
@@ -96,7 +97,8 @@ class LimitsTable(_Table):
         for joint, (low, high) in enumerate(zip(self.lower_deg, self.upper_deg, strict=False), 1):
             if low >= high:
                 raise ValueError(
-                    f"joint {joint}: lower_deg {low:g} is not below upper_deg {high:g}"
+                    f"joint {joint}: lower_deg {low:g} is not below upper_deg {high:g}; "
+                    "correct one of them"
                 )
         return self
 
@@ -144,7 +146,10 @@ class DriveTrainTable(_Table):
     def _nonzero(self) -> DriveTrainTable:
         for joint, value in enumerate(self.gear_ratio, 1):
             if value == 0:
-                raise ValueError(f"gear_ratio of joint {joint} is 0")
+                raise ValueError(
+                    f"gear_ratio of joint {joint} is 0; "
+                    "give signed motor revolutions per joint revolution"
+                )
         return self
 
 
@@ -180,8 +185,13 @@ class ControllerTable(_Table):
     max_gap: int = Field(
         default=2,
         ge=0,
-        le=100,
-        description="packets missed in a row that a motion survives, 0 to 100",
+        le=5,
+        description="packets missed in a row that a motion survives, 0 to 5",
+    )
+    other_axes: list[ArmAxis] = Field(
+        default_factory=list,
+        description="pairs [arm, axis], both from 1, of axes that may be open though they are no "
+        "joints of this cell, e.g. [[1, 7]]",
     )
     current_delay_cycles: FiniteFloat = Field(
         default=0.0,
@@ -191,7 +201,9 @@ class ControllerTable(_Table):
     @model_validator(mode="after")
     def _adapter_named(self) -> ControllerTable:
         if self.transport == "can" and self.can is None:
-            raise ValueError('transport = "can" needs a table [controller.can]')
+            raise ValueError(
+                'transport = "can" needs a table [controller.can]; add it, or write "udp"'
+            )
         return self
 
 

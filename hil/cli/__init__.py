@@ -15,7 +15,7 @@ from hil.errors import HilError
 from identification import IdentificationError
 from planner import PlannerError
 
-from . import demo, doctor, identify, imports, record, simulate
+from . import demo, doctor, identify, imports, plan, record, simulate
 
 app = typer.Typer(
     name="hil",
@@ -30,6 +30,7 @@ app = typer.Typer(
 )
 app.command("demo")(demo.demo)
 app.command("identify")(identify.identify)
+app.command("plan")(plan.plan)
 app.command("record")(record.record)
 app.command("simulate")(simulate.simulate)
 app.command("doctor")(doctor.doctor)

@@ -37,6 +37,14 @@ def record(
             min=0.001, help="Seconds to record; until Ctrl-C if left out.", show_default=False
         ),
     ] = None,
+    wait: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Seconds to wait for the controller; for ever if left out.",
+            show_default=False,
+        ),
+    ] = None,
     kind: Annotated[
         Literal["excitation", "validation", "standstill"],
         typer.Option(help="What it is for: to be fitted, to be predicted, or for the noise."),
@@ -62,13 +70,18 @@ def record(
     **Example:** `hil record cell.toml -o archives --duration 60`, then `hil identify archives/*`.
 
     Start it before the controller's program, so that the session's beginning is in the file.
-    Exit status 0 when the recording is complete, 4 when the link or the controller failed, 130
-    when Ctrl-C cut short what --duration asked for.
+    When the recording ends, answers go on until the arm has stood still for a second, the drive is
+    off or the session has ended; Ctrl-C (a second one, where the first ended the recording) leaves
+    at once.
+
+    Exit status 0 when the recording is complete, 4 when the link or the controller failed, did not
+    come within --wait or ended before --duration was over, 130 when Ctrl-C cut short what
+    --duration asked for, or the wait for the controller.
     """
     loaded = Cell.load(cell)
     path = archive_path(output, kind)
     with (
-        stop_on_interrupt() as stop,
+        stop_on_interrupt(twice=True) as stop,
         LiveLink.open(loaded, accept_init=accept_init) as link,
         View(loaded, stop, quiet=quiet or json) as view,
     ):
@@ -76,17 +89,22 @@ def record(
         for note in link.notes():
             view.say(f"note: {note}")
         done = record_motion(
-            link, loaded, path, kind=kind, stop=stop, duration=duration, watch=view.show
-        )
-    _report(path, done, loaded, view.missed, json=json)
+            link, loaded, path,
+            kind=kind, stop=stop, duration=duration, wait=wait, watch=view.show,
+        )  # fmt: skip
+    _report(path, done, loaded, json=json)
     if done.outcome == "completed":
+        if duration is not None and done.seconds < duration:
+            raise ControllerFault(
+                f"{done.reason} after {done.seconds:.1f} s of {duration:g} s; {path} is whole."
+            )
         return
-    if stop.requested:
+    if done.outcome == "stopped" and done.reason == "ended by the operator":
         raise OperatorStopError(f"the recording was ended early; {path} is whole.")
     raise ControllerFault(f"{done.reason}; {path} is whole up to there.")
 
 
-def _report(path: Path, done: Recorded, cell: Cell, missed: int, *, json: bool) -> None:
+def _report(path: Path, done: Recorded, cell: Cell, *, json: bool) -> None:
     seconds = done.records * cell.period
     if json:
         summary = {
@@ -95,14 +113,19 @@ def _report(path: Path, done: Recorded, cell: Cell, missed: int, *, json: bool) 
             "reason": done.reason,
             "cycles": done.records,
             "duration": seconds,
-            "missed": missed,
+            "missed": done.missed,
+            "late": done.late,
+            "not_taken": done.untaken,
             "records_lost": done.records_lost,
+            "events_lost": done.events_lost,
         }
         typer.echo(json_format.dumps(summary))
         return
     lost = f", {done.records_lost} records LOST" if done.records_lost else ""
+    lost += f", {done.events_lost} events LOST" if done.events_lost else ""
     typer.echo(
-        f"{path}: {seconds:.1f} s in {done.records} cycles, {missed} packets missed{lost}; "
+        f"{path}: {seconds:.1f} s in {done.records} cycles, {done.missed} packets missed, "
+        f"{done.late} answers late, {done.untaken} not taken{lost}; "
         f"{done.outcome}: {done.reason}"
     )
 
@@ -111,7 +134,7 @@ class View:
     """A live line on a terminal, a line now and then elsewhere."""
 
     def __init__(self, cell: Cell, stop: Stop, *, quiet: bool) -> None:
-        self.missed = 0
+        self._over = ""
         self._cell, self._stop, self._quiet = cell, stop, quiet
         console = Console()
         live = not quiet and console.is_terminal
@@ -135,7 +158,13 @@ class View:
 
     def show(self, progress: Progress) -> None:
         """The state of the recording."""
-        self.missed = progress.missed
+        if progress.over != self._over:
+            self._over = progress.over
+            # Said in any case: who ends the program now may take the answers from a moving arm.
+            typer.echo(
+                f"{progress.over}; still answering until the arm rests (Ctrl-C to leave at once)",
+                err=self._quiet,
+            )
         line = self._line(progress)
         if self._status is not None:
             self._status.update(line)
@@ -144,11 +173,18 @@ class View:
             self.say(line)
 
     def _line(self, progress: Progress) -> str:
+        if not progress.heard:
+            table = self._cell.controller
+            who = table.host if table.transport == "udp" else "the controller"
+            return f"nothing heard from {who} ({progress.foreign} packets from elsewhere)"
         parts = [
             progress.state.name.lower().replace("_", " "),
             f"{progress.cycles * self._cell.period:.1f} s",
             f"{progress.missed} missed",
+            f"{progress.late} late",
         ]
+        if progress.untaken:
+            parts.append(f"{progress.untaken} answers not taken")
         if progress.position is not None and np.isfinite(progress.position).all():
             angles = np.degrees(self._cell.controller_angles(progress.position))
             parts.append(" ".join(f"{angle:.2f}°" for angle in angles))

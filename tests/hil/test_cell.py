@@ -73,9 +73,20 @@ def test_nominal_values_are_the_manufacturers_column_of_table_2(folder: Path) ->
             r"^gear_ratio = \[-116.0",
             "gear_ratio = [0.0",
             "gear_ratio of joint 1 is 0",
-            "drive_train",
+            "motor revolutions per joint",
         ),
-        (r"^upper_deg = \[180.0", "upper_deg = [-200.0", "not below upper_deg", "limits"),
+        (
+            r"^upper_deg = \[180.0",
+            "upper_deg = [-200.0",
+            "not below upper_deg",
+            "correct one of them",
+        ),
+        (
+            r'^transport = "simulated"',
+            'transport = "can"',
+            "needs a table [controller.can]",
+            "add it",
+        ),
         (r"^velocity_deg = \[155.0, ", "velocity_deg = [", "limits.velocity_deg", "6 joints"),
         (r"^urdf = .*", 'urdf = "other.urdf"', "cell.urdf", "put a URDF at"),
         (r"^port = 1000", "port = ", "is not TOML", "correct that line"),
@@ -185,9 +196,17 @@ def test_only_this_computer_is_known_to_be_no_robot(host: str, simulated: bool) 
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("arm", 0), ("arm", 5), ("max_gap", -1), ("max_gap", 101), ("port", 0)]
+    ("key", "value"),
+    [
+        ("arm", 0),
+        ("arm", 5),
+        ("max_gap", -1),
+        ("max_gap", 6),
+        ("other_axes", "[[1, 0]]"),
+        ("port", 0),
+    ],
 )
-def test_settings_of_the_link_have_bounds(key: str, value: int) -> None:
+def test_settings_of_the_link_have_bounds(key: str, value: int | str) -> None:
     cell = Cell.load(CELL_PATH)
     text = replaced_value(cell.text, "controller", key, value)
     with pytest.raises(CellError, match=rf"controller\.{key}"):
@@ -197,11 +216,13 @@ def test_settings_of_the_link_have_bounds(key: str, value: int) -> None:
 def test_the_session_is_set_up_as_the_cell_says() -> None:
     cell = Cell.load(CELL_PATH)
     text = replaced_value(cell.text, "controller", "arm", 2)
+    text = replaced_value(text, "controller", "other_axes", "[[1, 7], [2, 1]]")
     settings = Cell.from_texts(text, cell.urdf, cell.path).session_settings(accept_init=True)
     assert settings == {
         "mode": 4,
         "arm": 2,
         "max_gap": 2,
         "accept_init": True,
+        "other_axes": frozenset({(1, 7), (2, 1)}),
         "settle_cycles": round(cell.campaign.settle_s / cell.period),
     }

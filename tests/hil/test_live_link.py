@@ -28,17 +28,17 @@ from hil.errors import ArchiveWriteError, ControllerFault
 from hil.progress import Silent
 from hil.simulation import simulated_link
 
-PATIENT = ("--missed", "300")
-"""A test asks what happens, not how fast: pauses of this machine shall not end open mode."""
+PATIENT = ("--patience", "0.5")
+"""A test asks what happens, not how fast: the controller waits where this machine pauses."""
 
 
 def on_loopback(cell: Cell, **changes: str) -> Cell:
-    """The cell with its controller on this computer, and patience."""
-    text = replaced_value(cell.text, "controller", "max_gap", 100)
+    """The cell with its controller on this computer."""
+    text = cell.text
     for old, new in changes.items():
         text = replaced_value(text, "drive_train", old, new)
-    patient = Cell.from_texts(text, cell.urdf, cell.path)
-    return patient.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
+    changed = Cell.from_texts(text, cell.urdf, cell.path)
+    return changed.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
 
 
 def campaign_of(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
@@ -154,7 +154,7 @@ def test_a_refusal_comes_with_its_flight_recorder(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
     campaign = campaign_of(tmp_path / "refused", on_loopback(cell), plan)
-    fault = ("--fault", "saturate@600x5000:axis=2")
+    fault = ("--fault", "saturate@350x5000:axis=2")
     with (
         loopback_link(campaign.cell, options=(*PATIENT, *fault)) as link,
         pytest.raises(MotionFailedError) as failed,

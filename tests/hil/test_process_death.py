@@ -2,7 +2,7 @@
 
 Real processes over the loopback device: a simulated controller, the exchange, the archive process,
 and a supervisor that runs a campaign (`live_rig.py`). What is asked is what happens, not how fast:
-neither side minds pauses of this machine.
+the controller waits for answers where this machine pauses.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from drivers.states import State
 from hil.archive import Archive, open_archive
 from hil.campaign import Campaign, CampaignPlan, Stop
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import HilError
 from hil.progress import Silent
@@ -107,19 +106,16 @@ def speed(path: Path) -> float:
 @pytest.fixture
 def rig(tmp_path: Path, cell: Cell, plan: CampaignPlan) -> Iterator[Rig]:
     """A campaign of one excitation and one validation run, started."""
-    text = replaced_value(cell.text, "controller", "max_gap", 100)
-    patient = Cell.from_texts(text, cell.urdf, cell.path).with_link(
-        transport="udp", host="127.0.0.1", bind="127.0.0.1"
-    )
+    local = cell.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
     one = CampaignPlan(plan.excitation, plan.validation[:1])
-    short = patient.with_campaign(repetitions=1, validation_runs=1)
+    short = local.with_campaign(repetitions=1, validation_runs=1)
     campaign = Campaign.create(tmp_path / "campaign", short, one)
     # Approach, standstill, excitation; then the controller ends the session.
     port, environment = free_port(), os.environ | {"OMP_NUM_THREADS": "1"}
     with (
         subprocess.Popen(
             [*SIMULATE, str(campaign.folder.cell), "--udp", f"127.0.0.1:{port}", "--json",
-             "--missed", "300", "--intervals", "3"],
+             "--patience", "0.5", "--intervals", "3"],
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment,
         ) as controller,
         subprocess.Popen(
@@ -255,6 +251,17 @@ def test_a_killed_archive_process_stops_the_arm_and_costs_its_last_chunk(rig: Ri
     assert both.any()
     assert np.array_equal(seen[both], cycle[cycle >= seen[both][0]])
     require_resumed(rig.campaign)
+
+
+def test_an_archive_process_that_hangs_stops_the_arm_and_is_ended(rig: Rig) -> None:
+    rig.wait_for_motion()
+    os.kill(rig.archive, signal.SIGSTOP)
+    said = rig.ended()
+    assert said["error"] == "ControllerFault"
+    assert "gave no sign of life for 5 s and was ended; the arm was brought to rest" in said["text"]
+    assert rig.path.name in said["text"]
+    rig.wait_for_processes()
+    require_stopped_on_path(rig.campaign, excitation_in(rig.ring()))
 
 
 def test_a_full_disk_stops_the_arm_and_what_was_flushed_is_whole(rig: Rig) -> None:

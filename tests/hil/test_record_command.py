@@ -200,53 +200,180 @@ def on_udp(tmp_path: Path, cell: Cell) -> tuple[Path, int]:
     return tmp_path / "cell.toml", port
 
 
+def until_heard(recorder: subprocess.Popen[str]) -> str:
+    """The line that says what was heard; notes on what the system refused come before it."""
+    assert recorder.stdout is not None
+    return next(line for line in recorder.stdout if "heard" in line)
+
+
 HIL = (sys.executable, "-m", "hil")
 
 
-def test_a_recording_over_real_sockets_ends_when_it_is_long_enough(
+def own_motion(cell: Path, port: int, *options: str) -> tuple[object, ...]:
+    """A simulated controller whose own program moves the arm without a rest of a second."""
+    where = ("--udp", f"127.0.0.1:{port}", "--own-motion", "--patience", "0.5")
+    return (*SIMULATE, cell, "--json", *where, *options)
+
+
+def wait_until_recorded(archive: Path, recorder: subprocess.Popen[str], cycles: int = 500) -> None:
+    deadline = time.monotonic() + 60.0
+    while not (archive.exists() and open_archive(archive).n_samples > cycles):
+        assert time.monotonic() < deadline
+        assert recorder.poll() is None, recorder.communicate()
+        time.sleep(0.1)
+
+
+def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
     tmp_path: Path, on_udp: tuple[Path, int]
 ) -> None:
     path, port = on_udp
-    own = ("--udp", f"127.0.0.1:{port}", "--own-motion", "--missed", "300")
     with (
-        running(*SIMULATE, path, *own),
+        running(*own_motion(path, port)) as controller,
+        running(
+            *HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "1.5", "--json"
+        ) as recorder,
+    ):
+        assert recorder.stderr is not None
+        assert "recording complete; still answering" in recorder.stderr.readline()
+        assert open_archive(tmp_path / "a.mcap").complete
+        time.sleep(1.5)
+        assert recorder.poll() is None, "it left a moving arm alone"
+        controller.send_signal(signal.SIGTERM)  # ends its program when the arm stands
+        counts, _ = controller.communicate(timeout=60)
+        said, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 0, errors
+    counted = json.loads(counts)
+    assert counted["phase"] == "ended"
+    assert counted["missed"] <= 1  # the last packet, 504, needs no answer
+    summary = json.loads(said)
+    archive = open_archive(summary["archive"])
+    assert counted["cycles"] > summary["cycles"] + 1000
+    assert summary["outcome"] == "completed"
+    assert summary["records_lost"] == summary["events_lost"] == 0
+    assert summary["cycles"] == archive.n_samples
+    assert archive.outcome is not None
+    assert archive.outcome["late_answers"] == str(summary["late"])
+    assert archive.outcome["answers_not_taken"] == str(summary["not_taken"])
+    cycles = archive.columns["cycle"]
+    assert archive.n_samples + archive.columns["gap"][1:].sum() == cycles[-1] - cycles[0] + 1
+    assert np.isnan(archive.columns["commanded_position"]).all()
+
+
+def test_ctrl_c_ends_the_recording_and_a_second_one_the_answers(
+    tmp_path: Path, on_udp: tuple[Path, int]
+) -> None:
+    path, port = on_udp
+    archive = tmp_path / "a.mcap"
+    with (
+        running(*own_motion(path, port)),
+        running(*HIL, "record", path, "-o", archive) as recorder,
+    ):
+        wait_until_recorded(archive, recorder)
+        recorder.send_signal(signal.SIGINT)
+        assert recorder.stdout is not None
+        next(line for line in recorder.stdout if "still answering" in line)
+        recorder.send_signal(signal.SIGINT)
+        said, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 0, errors
+    assert "ended by the operator" in said
+    assert "answers late" in said
+    assert open_archive(archive).complete
+
+
+def test_an_arm_at_rest_is_left_after_a_second(tmp_path: Path, on_udp: tuple[Path, int]) -> None:
+    path, port = on_udp
+    options = own_motion(path, port, "--intervals", "1")
+    # It opens its axes, which are held where they are; only a PC that leaves ends the interval.
+    still = [word for word in options if word != "--own-motion"]
+    with (
+        running(*still),
         running(
             *HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "1.5", "--json"
         ) as recorder,
     ):
         said, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors
-    summary = json.loads(said)
-    archive = open_archive(summary["archive"])
-    assert archive.complete
-    assert summary["outcome"] == "completed"
-    assert summary["records_lost"] == 0
-    assert summary["cycles"] == archive.n_samples
-    cycles = archive.columns["cycle"]
-    assert archive.n_samples + archive.columns["gap"][1:].sum() == cycles[-1] - cycles[0] + 1
-    assert np.isnan(archive.columns["commanded_position"]).all()
+    assert json.loads(said)["outcome"] == "completed"
 
 
-def test_ctrl_c_ends_a_recording_over_real_sockets_with_a_whole_archive(
+def test_a_session_that_ends_before_the_duration_is_over_is_told(
+    tmp_path: Path, on_udp: tuple[Path, int]
+) -> None:
+    path, port = on_udp
+    with (
+        running(*own_motion(path, port, "--duration", "3")),
+        running(*HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "60") as recorder,
+    ):
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    words = " ".join(errors.split())
+    assert "the controller ended the session after" in words
+    assert "of 60 s" in words
+    assert "a.mcap" in words
+    archive = open_archive(tmp_path / "a.mcap")
+    assert archive.outcome is not None
+    assert archive.outcome["outcome"] == "completed"
+
+
+def children(pid: int, module: str) -> int:
+    """The child of a process that runs a module."""
+    for task in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        if module in Path(f"/proc/{task}/cmdline").read_text():
+            return int(task)
+    raise AssertionError(f"no {module}")
+
+
+def test_a_killed_exchange_ends_a_recording_as_lost(
     tmp_path: Path, on_udp: tuple[Path, int]
 ) -> None:
     path, port = on_udp
     archive = tmp_path / "a.mcap"
-    own = ("--udp", f"127.0.0.1:{port}", "--own-motion", "--missed", "300")
     with (
-        running(*SIMULATE, path, *own),
+        running(*own_motion(path, port)),
         running(*HIL, "record", path, "-o", archive) as recorder,
     ):
-        deadline = time.monotonic() + 60.0
-        while not (archive.exists() and open_archive(archive).n_samples > 500):
-            assert time.monotonic() < deadline
-            assert recorder.poll() is None, recorder.communicate()
-            time.sleep(0.1)
-        recorder.send_signal(signal.SIGINT)
-        said, errors = recorder.communicate(timeout=60)
-    assert recorder.returncode == 0, errors
-    assert "ended by the operator" in said
-    assert open_archive(archive).complete
+        wait_until_recorded(archive, recorder)
+        os.kill(children(recorder.pid, "drivers.exchange"), signal.SIGKILL)
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    assert "the exchange process ended" in errors
+    assert "a.mcap" in errors
+    outcome = open_archive(archive).outcome
+    assert outcome is not None
+    assert (outcome["outcome"], outcome["reason"]) == ("lost", "the exchange process ended")
+
+
+def test_a_hanging_archive_process_is_ended_and_answers_go_on(
+    tmp_path: Path, on_udp: tuple[Path, int]
+) -> None:
+    path, port = on_udp
+    archive = tmp_path / "a.mcap"
+    with (
+        running(*own_motion(path, port)) as controller,
+        running(*HIL, "record", path, "-o", archive) as recorder,
+    ):
+        wait_until_recorded(archive, recorder)
+        os.kill(children(recorder.pid, "hil.archive.process"), signal.SIGSTOP)
+        assert recorder.stdout is not None
+        told = next(line for line in recorder.stdout if "still answering" in line)
+        assert "gave no sign of life for 5 s and was ended" in told
+        controller.send_signal(signal.SIGTERM)
+        counts, _ = controller.communicate(timeout=60)
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    assert "a.mcap is readable up to its last part" in " ".join(errors.split())
+    assert json.loads(counts)["missed"] <= 1  # the last packet, 504, needs no answer
+    assert open_archive(archive).n_samples > 500
+
+
+def test_a_controller_that_never_comes_is_waited_for_as_long_as_was_asked(
+    tmp_path: Path, on_udp: tuple[Path, int]
+) -> None:
+    path, _ = on_udp
+    with running(*HIL, "record", path, "-o", tmp_path / "a.mcap", "--wait", "0.5") as recorder:
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    assert "nothing heard from 127.0.0.1 within 0.5 s" in " ".join(errors.split())
 
 
 def test_a_recording_without_a_controller_ends_with_a_sentence(
@@ -256,9 +383,10 @@ def test_a_recording_without_a_controller_ends_with_a_sentence(
     with running(*HIL, "record", path, "-o", tmp_path / "a.mcap") as recorder:
         assert recorder.stdout is not None
         assert "waiting for the controller" in recorder.stdout.readline()
+        assert "nothing heard from 127.0.0.1 (0 packets from elsewhere)" in until_heard(recorder)
         recorder.send_signal(signal.SIGINT)
         _, errors = recorder.communicate(timeout=60)
-    assert recorder.returncode == 4
+    assert recorder.returncode == 130
     assert "nothing was recorded" in errors.replace("\n", " ")
     assert not (tmp_path / "a.mcap").exists()
 

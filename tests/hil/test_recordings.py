@@ -73,6 +73,19 @@ def test_lost_packets_leave_a_gap_where_they_were_lost(tmp_path: Path) -> None:
     assert recording.time[118] == pytest.approx(0.240)
 
 
+def test_a_motion_is_not_smooth_where_an_answer_was_not_taken(tmp_path: Path) -> None:
+    rows = records()
+    with ArchiveWriter(
+        tmp_path / NAME, joint_names=JOINTS, period=0.002, metadata={}, durable=False
+    ) as writer:
+        writer.write(rows, 50.0 * rows["target_current"])
+        cycle = int(rows["cycle"][150])
+        writer.event(cycle, "AnswersLost", "1 answer was not taken", data={"count": 1})
+        writer.close("completed", reason="")
+    recording = open_recording(tmp_path / NAME)
+    assert [(s.start, s.stop) for s in recording.segments()] == [(0, 150), (150, 400)]
+
+
 def test_an_unknown_torque_is_none(tmp_path: Path) -> None:
     assert open_recording(archive(tmp_path / NAME, records(), torque=False)).torque is None
 

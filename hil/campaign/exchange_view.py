@@ -1,0 +1,137 @@
+"""What the supervising process knows of its exchange process."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from drivers.events import InitReceived, LinkLost, MotionEnded, MotionStarted, Refused
+from drivers.exchange import (
+    ControlBlock,
+    EventsLost,
+    ExchangeEnded,
+    ExchangeFailed,
+    ExchangeProcess,
+    ExchangeStatus,
+    Leaving,
+)
+from drivers.states import State
+from hil.archive.pulse import Pulse
+
+from .motion_link import Connection
+
+BEGIN_TIMEOUT = 60.0
+"""s within which a motion that was accepted must have begun."""
+OFF_TIMEOUT = 2.0
+"""s with the drive off after which a motion that was accepted does not begin any more."""
+HUNG = 5.0
+"""s without a sign of life after which an exchange process is ended: the controller, unanswered
+for so long, has acted by its own watch."""
+
+_WITHOUT_DRIVE = frozenset((State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED))
+
+
+@dataclass(eq=False)
+class ExchangeView:
+    """Events taken in, and whether the process lives.
+
+    Attributes:
+        exchange: the process.
+        connection: what is known of the controller.
+        lost: the last loss of the link.
+        ended: the end of the motion asked for last, if its event came.
+        inits: init packets so far.
+        refused: the refusal since a motion was asked for last.
+        began: whether the motion asked for last has sent anything, or may have.
+    """
+
+    exchange: ExchangeProcess
+    connection: Connection = field(default_factory=Connection)
+    lost: LinkLost | None = None
+    ended: MotionEnded | None = None
+    inits: int = 0
+    began: bool = False
+    refused: Refused | None = None
+    _driven: float = 0.0
+    _asked: float = 0.0
+    _said: str = ""
+    _ended_for: str = ""
+    _ended_before: int = 0
+    _pulse: Pulse = field(init=False)
+
+    def __post_init__(self) -> None:
+        control = ControlBlock(self.exchange.control_fd)
+        self._pulse = Pulse(lambda: control.exchange_heartbeat)
+
+    def look(self) -> None:
+        """Take in what the exchange says."""
+        for event in self.exchange.events():
+            self.connection.note(event)
+            if isinstance(event, InitReceived):
+                self.inits += 1
+            elif isinstance(event, LinkLost):
+                self.lost = event
+            elif isinstance(event, MotionEnded):
+                self.ended = event
+            elif isinstance(event, Refused):
+                self.refused = event
+            elif isinstance(event, MotionStarted | EventsLost):
+                self.began = True
+            elif isinstance(event, ExchangeFailed):
+                self._said = event.trace.strip().splitlines()[-1]
+            elif isinstance(event, Leaving | ExchangeEnded) and not self._said:
+                self._said = event.reason
+
+    def forget_motion(self) -> None:
+        """Another motion is about to be asked for."""
+        self.look()
+        self.ended, self.refused, self.began = None, None, False
+        self._asked = self._driven = time.monotonic()
+        self._ended_before = self.status.ended_count
+
+    def not_begun(self) -> str | None:
+        """Why the motion asked for will not begin any more, in words; None while it may."""
+        now = time.monotonic()
+        if self.state not in _WITHOUT_DRIVE:
+            self._driven = now
+        if self.began or self.motion_ended:
+            return None
+        if now - self._driven > OFF_TIMEOUT:
+            return "the drive went off before the motion began"
+        if now - self._asked > BEGIN_TIMEOUT:
+            return f"the motion did not begin within {BEGIN_TIMEOUT:g} s ({self.state.name})"
+        return None
+
+    @property
+    def motion_ended(self) -> bool:
+        """Whether the motion asked for has ended; the event that says so may have been lost."""
+        return self.ended is not None or self.status.ended_count != self._ended_before
+
+    @property
+    def status(self) -> ExchangeStatus:
+        """The exchange's fields of the control block."""
+        return self.exchange.status()
+
+    @property
+    def state(self) -> State:
+        """Of the session."""
+        return self.status.state
+
+    @property
+    def trouble(self) -> str | None:
+        """What a process that had to be ended was ended for."""
+        return f"the exchange process {self._ended_for}" if self._ended_for else None
+
+    def failure(self) -> str | None:
+        """Why no answers come any more, in words; None as long as they do.
+
+        A process that hangs is ended.
+        """
+        if self.exchange.alive and self._pulse.quiet() > HUNG:
+            self.exchange.kill()
+            self._ended_for = f"gave no sign of life for {HUNG:g} s and was ended"
+        if self.exchange.alive:
+            return None
+        self.look()
+        said = f" ({self._said})" if self._said else ""
+        return f"the exchange process {self._ended_for or 'ended' + said}"

@@ -1,0 +1,251 @@
+"""The archive process against memory filled here: how an archive ends, whoever dies or hangs."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.drive_train import DriveTrain
+from drivers.events import AnswersLost, MotionEnded, MotionStarted, PacketRejected
+from drivers.exchange import (
+    ArchiveState,
+    ControlBlock,
+    Ended,
+    EventWriter,
+    SharedCycleRing,
+    event_log,
+)
+from drivers.exchange import control as control_memory
+from hil.archive import Archive, ArchiveSpec, open_archive
+from hil.archive.commands import Answer, Close, Closed, Open, Opened
+from hil.archive.supervised import ArchiveProcessHandle
+
+PERIOD = 0.001
+NAME = "excitation_000_a1.mcap"
+
+
+class Memory:
+    """What an exchange process would share, and a process to be taken for it."""
+
+    def __init__(self) -> None:
+        self.ring = SharedCycleRing.create(2, 1000)
+        self.ring_fd = self.ring.fd
+        self.event_fd = event_log.create(4096)
+        self.control_fd = control_memory.create()
+        self.events = EventWriter(self.event_fd)
+        self.control = ControlBlock(self.control_fd)
+        self.exchange = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+        self.pid = self.exchange.pid
+        self.cycle = 0
+
+    def cycles(self, count: int) -> None:
+        """Records of an arm at rest."""
+        for _ in range(count):
+            slot = self.ring.slot
+            self.ring.rows[slot] = np.zeros((), self.ring.rows.dtype)
+            self.ring.cycle[slot] = self.cycle
+            self.ring.commit()
+            self.cycle += 1
+
+    def end(self) -> None:
+        """The exchange dies."""
+        self.exchange.kill()
+        self.exchange.communicate()
+
+    def close(self) -> None:
+        self.end()
+        for fd in (self.ring_fd, self.event_fd, self.control_fd):
+            os.close(fd)
+
+
+class Rig:
+    """An archive process on such memory."""
+
+    def __init__(self, memory: Memory, folder: Path) -> None:
+        self.memory, self.folder = memory, folder
+        self.process = ArchiveProcessHandle.start(memory, 2)
+
+    def open(self, job: int, name: str = NAME, *, until_ended: bool = True) -> Path:
+        path, ones = self.folder / name, np.ones(2)
+        drives = DriveTrain(
+            gear_ratio=50.0 * ones,
+            calibration=0.0 * ones,
+            joint_sign=ones,
+            joint_offset=0.0 * ones,
+            torque_constant=ones,
+            current_limit=10.0 * ones,
+        )
+        spec = ArchiveSpec(path, joint_names=("a", "b"), period=PERIOD, metadata={}, durable=False)
+        self.process.send(Open(job, spec, drives, False, until_ended))
+        assert self.answer(job) == Opened(job)
+        return path
+
+    def answer(self, job: int) -> Answer | None:
+        return self.process.answer(30.0, job)
+
+    def closed(self, job: int) -> Closed:
+        answer = self.answer(job)
+        assert isinstance(answer, Closed)
+        return answer
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    memory = Memory()
+    made = Rig(memory, tmp_path)
+    try:
+        yield made
+    finally:
+        memory.end()
+        made.process.process.kill()
+        made.process.process.wait()
+        made.process.end()
+        memory.close()
+
+
+def wait(for_what: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30.0
+    while not for_what():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.02)
+
+
+def outcome(path: Path) -> tuple[str, str]:
+    archive = whole(path)
+    assert archive.outcome is not None
+    return archive.outcome["outcome"], archive.outcome["reason"]
+
+
+def whole(path: Path) -> Archive:
+    archive = open_archive(path)
+    assert archive.complete
+    return archive
+
+
+def test_an_end_whose_event_was_overwritten_is_known_from_the_count(rig: Rig) -> None:
+    path, memory = rig.open(1), rig.memory
+    memory.control.program_accepted = 1
+    memory.cycles(20)
+    memory.events.write(MotionStarted(4, 5))
+    wait(lambda: open_archive(path).n_samples >= 0)
+    memory.control.ended_outcome, memory.control.ended_interval = Ended.STOPPED, 4
+    memory.control.ended_count += 1
+    done = rig.closed(1)
+    assert (done.outcome, done.interval) == ("stopped", 4)
+    assert "was lost" in done.reason
+    assert outcome(path)[0] == "stopped"
+    assert [event.name for event in whole(path).events][-1] == "MotionEnded"
+
+
+def test_events_that_were_overwritten_are_counted_in_the_archive(rig: Rig) -> None:
+    path, memory = rig.open(1, until_ended=False), rig.memory
+    memory.cycles(5)
+    for number in range(5000):  # far more than the log holds, faster than it is read
+        memory.events.write(PacketRejected("foreign", number))
+    time.sleep(0.1)
+    rig.process.send(Close(1, "completed", "enough"))
+    done = rig.closed(1)
+    assert done.events_lost > 0
+    archive = whole(path)
+    assert archive.outcome is not None
+    assert archive.outcome["events_lost"] == str(done.events_lost)
+    assert "EventsLost" in [event.name for event in archive.events]
+
+
+def test_answers_late_and_not_taken_are_in_the_outcome(rig: Rig) -> None:
+    path, memory = rig.open(1, until_ended=False), rig.memory
+    memory.cycles(50)
+    memory.events.write(AnswersLost(2, 10))
+    memory.events.write(PacketRejected("answered late", 3))
+    memory.events.write(PacketRejected("late", 4))
+    memory.events.write(PacketRejected("foreign", 5))
+    time.sleep(0.1)
+    rig.process.send(Close(1, "completed", "enough"))
+    done = rig.closed(1)
+    assert (done.late, done.untaken) == (7, 2)
+    kept = whole(path).outcome
+    assert kept is not None
+    assert (kept["late_answers"], kept["answers_not_taken"]) == ("7", "2")
+
+
+def test_a_motion_that_was_never_asked_for_leaves_a_void_archive(rig: Rig) -> None:
+    path, memory = rig.open(1), rig.memory
+    memory.cycles(20)
+    rig.process.channel.close()  # the supervisor dies
+    time.sleep(0.2)
+    memory.end()
+    wait(lambda: rig.process.process.poll() is not None)
+    assert outcome(path) == ("void", "nothing was sent: the supervising program ended")
+
+
+def test_a_motion_whose_exchange_died_is_lost(rig: Rig) -> None:
+    path, memory = rig.open(1), rig.memory
+    memory.control.program_accepted = 1
+    memory.cycles(20)
+    memory.end()
+    assert rig.closed(1).outcome == "lost"
+    assert whole(path).n_samples == 20
+
+
+def test_an_exchange_without_sign_of_life_that_lives_is_waited_for(rig: Rig) -> None:
+    memory = rig.memory
+    memory.control.exchange_heartbeat = time.monotonic()
+    path = rig.open(1)
+    memory.control.program_accepted = 1
+    memory.cycles(20)
+    assert rig.process.answer(2.0, 1) is None, "it was taken for dead"
+    memory.control.exchange_heartbeat = time.monotonic()
+    memory.cycles(30)
+    memory.events.write(MotionEnded("completed", "the path is at its end", 0, 40))
+    assert rig.closed(1).outcome == "completed"
+    archive = whole(path)
+    assert archive.n_samples == 50
+    names = [event.name for event in archive.events]
+    assert "ExchangeSilent" in names
+
+
+def test_a_second_archive_ends_the_first_as_interrupted(rig: Rig) -> None:
+    first = rig.open(1)
+    rig.memory.cycles(20)
+    second = rig.open(2, "excitation_001_a1.mcap")
+    assert outcome(first)[0] == "interrupted"
+    rig.process.send(Close(1, "completed", "too late"))
+    rig.process.send(Close(2, "completed", "enough"))
+    assert rig.closed(2).reason == "enough"
+    assert outcome(second)[0] == "completed"
+    assert rig.memory.control.archive_state == ArchiveState.NONE
+
+
+def test_an_answer_about_an_earlier_archive_is_dropped(rig: Rig) -> None:
+    rig.open(1)
+    rig.process.send(Close(1, "void", "nothing was sent"))
+    rig.open(2, "excitation_001_a1.mcap")  # would fail on the Closed that waits before it
+
+
+def test_a_process_that_died_at_once_is_said_to_have_died(rig: Rig) -> None:
+    rig.process.process.kill()
+    started = time.monotonic()
+    assert rig.process.answer(10.0, 1) is None
+    assert time.monotonic() - started < 5.0
+    failure = rig.process.failure()
+    assert failure is not None
+    assert "ended" in failure
+
+
+def test_a_process_that_takes_no_command_is_ended(rig: Rig) -> None:
+    rig.open(1)
+    rig.process.process.send_signal(signal.SIGSTOP)
+    rig.process.channel._socket.settimeout(0.2)
+    rig.process.send(Close(1, "x" * 4_000_000, ""))
+    failure = rig.process.failure()
+    assert failure is not None
+    assert "took no command" in failure
+    assert rig.process.process.poll() is not None
