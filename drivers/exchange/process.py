@@ -95,6 +95,9 @@ class ExchangeProcess:
             os.pwrite(settings_fd, pickle.dumps(settings, protocol=5), 0)
             fds = (theirs.fileno(), settings_fd, self.ring_fd, self.event_fd, self.control_fd)
             self._process = _spawn(fds, self._log_fd)
+        except OSError as error:
+            self.close()
+            raise ExchangeError(f"the exchange process cannot be started: {error}") from error
         finally:
             os.close(settings_fd)
             theirs.close()
@@ -108,7 +111,8 @@ class ExchangeProcess:
 
         Raises:
             TransportError: the link cannot be opened.
-            ExchangeError: it did not get that far; the message has its last words.
+            ExchangeError: it could not be started, or did not get that far; the message has its
+                last words.
         """
         exchange = cls(settings)
         try:

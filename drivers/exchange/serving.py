@@ -8,6 +8,8 @@ import socket
 import time
 from typing import Final, Protocol
 
+import numpy as np
+
 from drivers.errors import DriverError, RequestError
 from drivers.events import Event, MotionEnded
 from drivers.exchange.control import STALE, ArchiveState, ControlBlock, Ended
@@ -16,6 +18,7 @@ from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import Inbox
 from drivers.exchange.notices import ExchangeEvent, Leaving, OverrideRefused, ResumeRefused
 from drivers.exchange.shared_ring import SharedCycleRing
+from drivers.record import MEASURED
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
@@ -24,6 +27,11 @@ ORPHAN_LINGER: Final = 2.0
 """s that packets are answered, after the axes were closed, for nobody."""
 FINISH_LINGER: Final = 1.0
 """s that packets are answered, after the axes were closed, when the supervisor wants to end."""
+ARM_MOVED: Final = 5e-4
+"""rad; more than an encoder's noise, less than any motion makes in `ARM_RESTS`."""
+ARM_RESTS: Final = 1.0
+"""s without motion after which an arm is taken to be at rest."""
+_POSITION: Final = MEASURED.index("position")
 _SLOW_EVERY: Final = 32
 """Packets between two looks at what need not be looked at in each cycle."""
 LONGEST_LINGER: Final = 10.0
@@ -80,6 +88,9 @@ class Serving:
         self._closed_since = math.inf
         self._closed_first = math.inf
         self._open = False
+        self._orphaned = False
+        self._arm = ring.measured[0, _POSITION].copy()
+        self._arm_moved_at = -math.inf
         self._digest = Digest()
 
     def __call__(self) -> bool:
@@ -107,7 +118,7 @@ class Serving:
         control, session = self._control, self._session
         self._calls += 1
         if self._calls % _SLOW_EVERY == 0 and self._inbox.hung_up():
-            self._leave("the supervisor closed its end", ORPHAN_LINGER)
+            self._orphan("the supervisor closed its end")
         if control.stop_count != self._stops:
             self._stops = control.stop_count
             session.stop("the supervisor asked for a stop")
@@ -131,9 +142,13 @@ class Serving:
         if self._terminated:
             self._leave("the exchange process was told to terminate", ORPHAN_LINGER)
         elif now - max(self._control.supervisor_heartbeat, self._began) > STALE:
-            self._leave("the supervisor gives no sign of life", ORPHAN_LINGER)
+            self._orphan("the supervisor gives no sign of life")
         elif self._control.finish:
             self._leave("the supervisor wants to end", FINISH_LINGER)
+
+    def _orphan(self, reason: str) -> None:
+        self._orphaned = True
+        self._leave(reason, ORPHAN_LINGER)
 
     def _leave(self, reason: str, linger: float) -> None:
         if not self.reason:
@@ -199,6 +214,7 @@ class Serving:
         control.interval = session.interval
         if self._calls % _SLOW_EVERY == 0 or session.counters.answered == self._answered:
             self._report_counters()
+            self._watch_arm(now)
         if session.counters.answered != self._answered:
             self._answered = session.counters.answered
             self._heard = now
@@ -209,6 +225,13 @@ class Serving:
             self._closed_since = min(self._closed_since, now)
             if self.reason:
                 self._closed_first = min(self._closed_first, now)
+
+    def _watch_arm(self, now: float) -> None:
+        """With its axes closed the arm may still move, by the controller's own program."""
+        position = self._ring.measured[(self._rows - 1) % self._ring.capacity, _POSITION]
+        if (np.abs(position - self._arm) > ARM_MOVED).any():
+            self._arm_moved_at = now
+            np.copyto(self._arm, position)
 
     def _put(self, event: Event) -> None:
         self._events.write(event)
@@ -235,7 +258,7 @@ class Serving:
         control.worst_turnaround_us = 1e6 * self._worst
 
     def _over(self, now: float) -> bool:
-        if self._open:
+        if self._open or (self._orphaned and now - self._arm_moved_at < ARM_RESTS):
             return False
         lingered = now - self._closed_since >= self._linger
         return lingered or now - self._closed_first >= LONGEST_LINGER

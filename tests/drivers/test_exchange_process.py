@@ -135,6 +135,19 @@ def test_a_controller_that_opens_again_and_again_cannot_put_off_the_end():
         assert exchange.wait(1.0) == 0
 
 
+def test_without_supervisor_it_answers_as_long_as_the_controllers_program_moves_the_arm():
+    with running() as (exchange, controller):
+        controller.beat = lambda: None
+        controller.cycle_time = PERIOD
+        end = time.monotonic() + 4.5
+        while time.monotonic() < end:
+            controller.axes["d"][:, 2] += 0.02  # the axes are closed
+            controller.cycle()
+            assert exchange.alive
+        run_to_the_end(exchange, controller)
+        assert exchange.wait(1.0) == 0
+
+
 def test_one_process_runs_one_motion_after_the_other():
     with running() as (exchange, controller):
         ended = []
@@ -594,3 +607,14 @@ def test_states_are_told_in_order():
         controller.cycle(5)
         states = [event.after for event in exchange.events() if isinstance(event, StateChanged)]
         assert states == [State.INIT, State.CLOSED, State.OPEN]
+
+
+def test_a_process_that_cannot_be_started_is_an_error_of_ours_and_leaves_nothing_open(monkeypatch):
+    def refuse(*_, **__):
+        raise BlockingIOError(11, "no more processes")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    before = set(os.listdir("/proc/self/fd"))
+    with pytest.raises(ExchangeError, match="no more processes"):
+        ExchangeProcess.start(settings(free_port()))
+    assert set(os.listdir("/proc/self/fd")) == before
