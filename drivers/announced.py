@@ -117,11 +117,19 @@ def _unknown_axes(
 
 
 def _too_far_off(ours: DriveTrain, theirs: DriveTrain) -> tuple[str, ...]:
-    """What nobody means to accept: the guard's bounds are on the joint side of these values."""
+    """What nobody means to accept: the guard's bounds are on the joint side of these values.
+
+    A calibration more than one turn of the joint away is that of another arm, or none.
+    """
     share = theirs.gear_ratio / ours.gear_ratio
     names = [
         f"gear ratio of axis {axis + 1}"
         for axis in np.flatnonzero(~((share >= 1.0 / _FACTOR) & (share <= _FACTOR)))
+    ]
+    turned = np.abs(theirs.calibration - ours.calibration)
+    names += [
+        f"calibration of axis {axis + 1}"
+        for axis in np.flatnonzero(~(turned <= np.abs(ours.gear_ratio)))
     ]
     couplings = (("k54", theirs.k54), ("k64", theirs.k64), ("k65", theirs.k65))
     names += [name for name, value in couplings if not abs(value) <= _COUPLING]

@@ -6,8 +6,10 @@ from one sent set-point to the next, formed in float64; which of D1..D5 an open 
 table `drivers.packets.MODE_FIELDS`. A motion requested while the axes are open already begins
 under the same conditions, from the set-point held. While axes are open, moving or not, following
 error and current are watched, and that the controller takes the set-points: the target received
-(D1) is within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent. An
-older one than the last is an answer lost, which is counted and told.
+(D1) is within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent, or of
+the last carried on by as many steps as packets were missed, and within 25 % of the last. An older
+one than the last is an answer lost, which is counted and told; more than `max_gap` of them in 100
+cycles bring a motion to rest on its path.
 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave
 open mode, move the arm and come back; one set-point further at full speed would then be a jump.
@@ -103,6 +105,7 @@ class Answers:
         self.unusable = self.announced.unusable
         self.wire: ArmWire | None = None
         self._arm = arm
+        self._max_gap = max_gap
         self._frame = ReplyFrame(init.n_axes)
         self._open_mode: OpenMode | None = None
         self._asked_at = -1
@@ -156,10 +159,12 @@ class Answers:
             # Left before the last axis opened, no axis has had a set-point but its own target.
             answer = self._open_mode.leaving if machine.in_interval else self._open_mode.opening
             answer(reading, measured, commanded, machine.cycle)
-            machine.note_answers(self._open_mode.lost)
+            self._require_targets(reading.answer.held, machine.cycle)
+            machine.note_answers(self._open_mode.lost, self._max_gap)
             return self._asking_for_exit(status) if self._exit_due(machine) else status
         if state is State.OPENING:
             self._open_mode.opening(reading, measured, commanded, machine.cycle)
+            self._require_targets(reading.answer.held, machine.cycle)
             done = self._given_up(machine)
         else:
             done = self._open(self._open_mode, machine, measured, commanded)
@@ -237,7 +242,7 @@ class Answers:
             elif execution is not None and not moving:
                 open_mode.require_start(cycle)
             open_mode.next(execution if moving else None, measured, commanded, cycle)
-            machine.note_answers(open_mode.lost)
+            machine.note_answers(open_mode.lost, self._max_gap)
         if execution is None:
             return machine.stop_reason is not None
         if not moving:
@@ -268,16 +273,22 @@ class Answers:
         ring.age[row] = 0 if ages is None else ages[self.wire.joint_slots].max(axis=0)
         self.wire.read(words.view(np.float32), ring.measured[row], ages)
 
-    def require_carried_on(self, machine: Machine, reading: Reading) -> None:
-        """After a long gap open mode goes on only where the controller carried it on.
+    def note_gap(self, unanswered: int, machine: Machine, reading: Reading) -> None:
+        """So many packets before this one were not answered.
 
-        Moving, at rest or on the way out: meanwhile it may have left, moved the arm, come back.
+        After a long gap open mode goes on only where the controller carried it on, moving, at
+        rest or on the way out: meanwhile it may have left, moved the arm, come back.
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: it did not.
         """
+        if self._open_mode is None:
+            return
+        self._open_mode.missed = unanswered
+        if unanswered <= self._max_gap:
+            return
         in_open = machine.state in (State.OPEN, State.EXITING) and machine.in_interval
-        if self._open_mode is not None and in_open and not machine.entering:
+        if in_open and not machine.entering:
             self._open_mode.require_carried_on(reading, machine.cycle)
 
     def refusal(self, offending: int | None, reading: Reading, words: Words) -> bytes:

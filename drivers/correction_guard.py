@@ -46,6 +46,7 @@ class CorrectionGuard:
 
     def __init__(self, guard: Guard, kind: Literal["velocity", "offset"]) -> None:
         self._guard = guard
+        self._is_velocity = kind == "velocity"
         self._unit = _UNIT[kind]
         limits, T = guard.limits, guard.period
         n = limits.n_joints
@@ -99,6 +100,13 @@ class CorrectionGuard:
         magnitude = np.abs(found)
         if not (magnitude <= allowed).all():
             report(magnitude, found, allowed, self._checks, cycle)
+
+    @property
+    def resting(self) -> bool:
+        """Whether the velocities sent last are zero, or the offsets the same."""
+        history = self._history
+        rates = history if self._is_velocity else np.diff(history, axis=0)
+        return bool((np.abs(rates) <= self._nothing).all())
 
     def note_target(self, target: Array, offset: Array, sent_in: Array) -> None:
         """The controller's target (n,) rad, the offset from it, the cycle each joint's is of."""

@@ -84,6 +84,8 @@ class CorrectionMode(OpenMode):
         self._require_fields(motion, current, cycle)
         guard = self._corrections
         guard.check_motion(motion, execution.granted, cycle)
+        if execution.granted == "stop" and guard.resting:
+            execution.rested()
         guard.check_position(self.held + motion if self._offset else self.held, cycle)
         if self._offset:
             rounding = self._wire.joint_rounding(self._wire.raw[TARGET])
@@ -106,11 +108,16 @@ class CorrectionMode(OpenMode):
     def leaving(
         self,
         reading: Reading,
-        measured: Array,  # noqa: ARG002  nothing is commanded
-        commanded: Array,  # noqa: ARG002
+        measured: Array,
+        commanded: Array,
         cycle: int,
     ) -> None:
-        """Zeros, as the safe answer says."""
+        """Zeros, as the safe answer says; an axis in a mode of positions, its target."""
+        held = reading.held
+        if held.any():
+            self.require_holdable(held, held, cycle)
+            commanded[0] = np.where(held, measured[0], np.nan)
+            commanded[1] = np.where(held, 0.0, np.nan)
         self._check_arm(cycle, where=reading.ready)
 
     def _sent_in(self, cycle: int) -> Array:

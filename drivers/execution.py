@@ -3,14 +3,15 @@
 A source is foreign code inside the cycle: whatever it raises (SystemExit and the like included),
 any array that is not (n,) numbers, and bounds wider than what it was granted become
 `SourceFailed`. It is granted the bounds of a plan; those of an override from the first change of
-override on, and those of a stop from `stop` or the first `hold` on. A stop that takes too long is a
-failure too; a hold may last.
+override on, and those of a stop from `stop` or the first `hold` on; a correction, whose bounds
+nobody names, has the latter until it is at rest. A stop that takes too long is a failure too. A
+hold may last, but a source that does not come to rest in it is stopped.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import cast
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from drivers.motion_source import (
     CorrectionSource,
     FeedForwardSource,
     MotionSource,
-    OverridableSource,
     is_correction,
     is_holdable,
     is_motion,
@@ -31,6 +31,9 @@ from drivers.motion_source import (
 from drivers.states import CORRECTION_MODES, POSITION_MODES
 
 Array = NDArray[np.float64]
+
+_AT_REST: Final = 1e-9
+"""rad per cycle and rad/s: what rounding leaves of standstill."""
 
 
 class Execution(ABC):
@@ -64,6 +67,7 @@ class Execution(ABC):
         self._stop_cycles = stop_cycles
         self._granted: tuple[BoundsName, ...] = ("plan",)
         self._stopping = 0
+        self._holding: int | None = None
         self._resting = 0
         self.finished = False
         self.started = False
@@ -107,14 +111,15 @@ class Execution(ABC):
 
     def override(self, fraction: float) -> str | None:
         """Pass a change of override on; says why that cannot be, or None."""
-        if not callable(getattr(self._source, "override", None)):
-            return "this motion knows no override"
-        if self.outcome == "stopped":
-            return "the motion was told to stop"
-        if not 0.0 <= fraction <= 1.0:
-            return f"an override of {fraction!r} is not one of 0..1"
         try:
-            cast(OverridableSource, self._source).override(float(fraction))
+            change = getattr(self._source, "override", None)
+            if not callable(change):
+                return "this motion knows no override"
+            if self.outcome == "stopped":
+                return "the motion was told to stop"
+            if not 0.0 <= fraction <= 1.0:
+                return f"an override of {fraction!r} is not one of 0..1"
+            change(float(fraction))
         except BaseException as error:
             return f"the motion source refused it: {in_words(error)}"
         self._grant("override")
@@ -125,26 +130,33 @@ class Execution(ABC):
         if self.outcome == "stopped" or self.finished:
             return None
         source: object = self._source
-        if not is_holdable(source):
-            return "held, which this motion cannot: it was stopped instead"
-        self._grant("stop")
         try:
+            if not is_holdable(source):
+                return "held, which this motion cannot: it was stopped instead"
+            self._grant("stop")
             source.hold()
         except BaseException as error:
             return f"the motion source failed to hold: {in_words(error)}"
+        if self._holding is None:
+            self._holding = 0
         return None
+
+    def rested(self) -> None:
+        """It is at rest: as far as a hold goes, that is what was asked for."""
+        self._holding = None
 
     def resume(self) -> str | None:
         """Go on after a hold; says why that cannot be, or None."""
         source: object = self._source
-        if not is_holdable(source):
-            return "this motion cannot be held"
-        if self.outcome == "stopped":
-            return "the motion was told to stop"
         try:
+            if not is_holdable(source):
+                return "this motion cannot be held"
+            if self.outcome == "stopped":
+                return "the motion was told to stop"
             source.resume()
         except BaseException as error:
             return f"the motion source refused it: {in_words(error)}"
+        self._holding = None
         return None
 
     def _grant(self, bounds: BoundsName) -> None:
@@ -159,8 +171,9 @@ class Execution(ABC):
             )
         return array
 
-    def _count_stopping(self, cycle: int) -> None:
+    def _count_cycles(self, cycle: int) -> None:
         if self.outcome != "stopped":
+            self._count_holding(cycle)
             return
         self._stopping += 1
         if self._stopping > self._stop_cycles:
@@ -169,6 +182,13 @@ class Execution(ABC):
                 "it was told to stop",
                 cycle,
             )
+
+    def _count_holding(self, cycle: int) -> None:
+        if self._holding is None:
+            return
+        self._holding += 1
+        if self._holding > self._stop_cycles:
+            self.stop(f"it did not come to rest in {self._stop_cycles} cycles of a hold", cycle)
 
 
 class MotionExecution(Execution):
@@ -221,7 +241,9 @@ class MotionExecution(Execution):
             raise
         except BaseException as error:
             raise _failed("failed", error, cycle) from error
-        self._count_stopping(cycle)
+        if self._holding is not None and self._stands(position, velocity):
+            self.rested()
+        self._count_cycles(cycle)
         # The source may reuse its arrays.
         self.position = position.copy()
         return self.position, velocity, bounds
@@ -245,6 +267,10 @@ class MotionExecution(Execution):
         except BaseException as error:
             raise _failed("failed to feed forward", error, cycle) from error
 
+    def _stands(self, position: Array, velocity: Array) -> bool:
+        step = np.abs(position - self.position).max()
+        return bool(max(step, np.abs(velocity).max()) <= _AT_REST)
+
     def _bounds(self, cycle: int) -> BoundsName:
         bounds = self._source.bounds
         if not isinstance(bounds, str) or bounds not in self._granted:
@@ -257,6 +283,12 @@ class CorrectionExecution(Execution):
     """Asks a `CorrectionSource` for corrections; after its end they stay zero."""
 
     _source: CorrectionSource
+
+    def rested(self) -> None:
+        """Nobody names the bounds of a correction: those granted for a hold end here."""
+        super().rested()
+        if self.outcome != "stopped":
+            self._granted = tuple(name for name in self._granted if name != "stop")
 
     def begin(self, position: Array, cycle: int) -> None:  # noqa: ARG002  nobody asks where
         """Every axis is open.
@@ -289,7 +321,7 @@ class CorrectionExecution(Execution):
             raise
         except BaseException as error:
             raise _failed("failed", error, cycle) from error
-        self._count_stopping(cycle)
+        self._count_cycles(cycle)
         return motion.copy(), current.copy()
 
 
@@ -299,13 +331,16 @@ def execution_of(
     n_joints: int,
     settle_cycles: int,
     stop_cycles: int,
-) -> Execution | None:
-    """The execution of a source of the kind that the open mode needs; None for any other."""
-    if mode in CORRECTION_MODES and is_correction(source):
-        return CorrectionExecution(source, n_joints, settle_cycles, stop_cycles)
-    if mode in POSITION_MODES and is_motion(source):
-        return MotionExecution(source, n_joints, settle_cycles, stop_cycles)
-    return None
+) -> Execution | str:
+    """The execution of a source of the kind that the open mode needs; else why there is none."""
+    try:
+        if mode in CORRECTION_MODES and is_correction(source):
+            return CorrectionExecution(source, n_joints, settle_cycles, stop_cycles)
+        if mode in POSITION_MODES and is_motion(source):
+            return MotionExecution(source, n_joints, settle_cycles, stop_cycles)
+    except BaseException as error:
+        return f"the motion source cannot be looked at: {in_words(error)}"
+    return f"a {type(source).__name__} is not the kind of source mode {mode} needs"
 
 
 def _failed(what: str, error: BaseException, cycle: int) -> SourceFailed:

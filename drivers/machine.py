@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Final
 
 import numpy as np
@@ -37,6 +38,10 @@ _LOSS: Final = {
 }
 
 
+LOSS_WINDOW: Final = 100
+"""Cycles over which lost answers are added up."""
+
+
 class Machine:
     """Walks the state table and says what that does to the motion.
 
@@ -68,6 +73,7 @@ class Machine:
         self.stop_reason: str | None = None
         self.offending: int | None = None
         self.events: list[Event] = []
+        self._losses: deque[tuple[int, int]] = deque()
 
     def request(self, execution: Execution, unusable: str | None) -> None:
         """Keep a motion for the next time in open mode.
@@ -100,20 +106,36 @@ class Machine:
     def hold(self) -> None:
         """Come to rest on the path and wait there; a stop where the source cannot.
 
-        A motion not begun is dropped, as by a stop. Without one nothing changes.
+        A motion not begun is dropped, as by a stop.
+
+        Raises:
+            RequestError: there is none. Nothing is kept for one to come.
         """
         execution = self.execution
-        if execution is None or self.stop_reason is not None:
+        if execution is None:
+            raise RequestError(self.state.name.lower(), "no motion was requested", "hold")
+        if self.stop_reason is not None:
             return
         reason = execution.hold() if execution.started else "held before it began"
         if reason is not None:
             self.stop(reason)
 
-    def note_answers(self, lost: int) -> None:
-        """So many of our last answers did not reach the controller, or it did not take them."""
-        if lost:
-            self.counters.unanswered += lost
-            self.events.append(AnswersLost(lost, self.cycle))
+    def note_answers(self, lost: int, max_gap: int) -> None:
+        """So many of our last answers did not reach the controller, or it did not take them.
+
+        More than `max_gap` of them in `LOSS_WINDOW` cycles end a motion on its path: the target
+        comes in leaps then, each of which a controller might put up with.
+        """
+        if not lost:
+            return
+        self.counters.unanswered += lost
+        self.events.append(AnswersLost(lost, self.cycle))
+        self._losses.append((self.cycle, lost))
+        while self._losses[0][0] <= self.cycle - LOSS_WINDOW:
+            self._losses.popleft()
+        count = sum(number for _, number in self._losses)
+        if count > max_gap and self.state is State.OPEN and self.execution:
+            self.stop(f"{count} answers were lost in {LOSS_WINDOW} cycles")
 
     def note_gap(self, missed: int, unanswered: int, max_gap: int) -> None:
         """`missed` packets never arrived; `unanswered` above `max_gap` end a motion on its path."""
@@ -159,7 +181,8 @@ class Machine:
         if execution is None or what is Input.REFUSAL:
             return
         if not execution.started:
-            if not keeps_request(before, after):
+            # Whatever a controller does that was silent for so long, nobody waits for it now.
+            if what is Input.SILENCE or not keeps_request(before, after):
                 self.end("lost", _LOSS[what])
         elif after not in HAS_SET_POINTS:
             if execution.leaving:
@@ -172,12 +195,17 @@ class Machine:
         self.entered_at = self.cycle
         self.events.append(StateChanged(before, after, self.cycle))
         if after is State.OPEN:
+            self._losses.clear()
             self.entering = True
             self.in_interval = True
             self.interval += 1
         if after not in HAS_SET_POINTS:
             self.stop_reason = None
         self.offending = None
+
+    def forget_request(self) -> None:
+        """The controller that a motion was to wait for was started over."""
+        self.end("lost", _LOSS[Input.INIT])
 
     def end(self, outcome: Outcome, reason: str) -> None:
         """The requested motion, if there is one, is over."""

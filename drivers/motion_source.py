@@ -82,7 +82,8 @@ class CorrectionSource(Protocol):
     """Corrections of a motion that the controller itself generates. Joint arrays are (n,).
 
     Like a `MotionSource`, it is asked once per answered packet. A correction starts at zero,
-    keeps the bounds of a plan (those of a stop after `stop`), and has to be back at zero when it
+    keeps the bounds of a plan (those of a stop after `stop`, and from `hold` until it rests: a
+    velocity at zero, an offset unchanged), and has to be back at zero when it
     says that it is finished; the session never clamps or fades it.
     """
 
@@ -128,7 +129,8 @@ class HoldableSource(Protocol):
     def hold(self) -> None:
         """Come to rest on the path, within the bounds of a stop, and wait; not `finished`.
 
-        A hold may last for ever; `stop` may follow it.
+        A hold may last for ever; `stop` may follow it. A source that goes on instead is stopped
+        after `session.STOP_TIMEOUT`.
         """
         ...
 

@@ -36,6 +36,7 @@ class OpenMode(ABC):
     Attributes:
         held: (n,) rad, the set-point sent last.
         lost: answers that the packet read last shows not to have been taken.
+        missed: packets before that one that were not answered; to be set for each.
     """
 
     def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame) -> None:
@@ -46,6 +47,7 @@ class OpenMode(ABC):
         self._every = np.ones(guard.limits.n_joints, dtype=np.bool_)
         self.held = self._still
         self.lost = 0
+        self.missed = 0
 
     def opening(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
         """Some axes are open: the safe answer holds them, if they can be held.
@@ -204,7 +206,7 @@ class PositionMode(OpenMode):
 
         An older target, or answers lost for longer than `max_gap`, would make a leap of the next.
         """
-        lost = self._taken.check(self._wire.raw[TARGET], cycle, where)
+        lost = self._taken.check(self._wire.raw[TARGET], self.missed, cycle, where)
         age = self._wire.age
         # The answer to the packet may have been taken all the same if the target is older.
         self.lost = lost if lost and (age is None or not age[TARGET].any()) else 0

@@ -43,6 +43,10 @@ class Sequence:
         """Whether this cannot be a later packet of the same session."""
         return not self.broken and not 1 <= self.distance(number) <= self._window
 
+    def leads_to(self, number: int, missed: int) -> bool:
+        """Whether this number comes after the last, at most so many missed, or after none."""
+        return self.broken or self.last == 0 or self.distance(number) <= missed + 1
+
     def accept(self, number: int) -> int:
         """Go on to this number; returns how many packets were missed before it."""
         ahead = self.distance(number)

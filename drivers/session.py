@@ -77,6 +77,8 @@ FLIGHT_RECORDER: Final = 50
 """Records that go with a refusal."""
 STOP_TIMEOUT: Final = 10.0
 """s that a motion may take from being told to stop to rest; drive-off is asked for after that."""
+MAX_GAP: Final = 100
+"""Largest `max_gap`."""
 SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
 """Open modes a motion can run in."""
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
@@ -90,7 +92,7 @@ class Session:
         guard: checks each set-point; its period must be the controller's cycle.
         ring: one record per cyclic packet answered goes there.
         mode: open mode in which the arm is moved, one of `SERVED_MODES`.
-        max_gap: packets that may be missed in a row without stopping a motion.
+        max_gap: packets that may be missed in a row without stopping a motion, 0..`MAX_GAP`.
         arm: number of the arm, 1..4.
         settle_cycles: how long the end of a motion is held before open mode is left.
         init_timeout: s of silence allowed before the init packet and in a pause.
@@ -131,6 +133,8 @@ class Session:
         if mode not in SERVED_MODES:
             served = ", ".join(str(int(m)) for m in SERVED_MODES)
             raise ValueError(f"motion in mode {mode} is not served; modes {served} are")
+        if not 0 <= max_gap <= MAX_GAP:
+            raise ValueError(f"a gap of {max_gap} packets is not one of 0..{MAX_GAP}")
         if not 1 <= arm <= N_ARMS:
             raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
         self.deadline = math.inf
@@ -201,9 +205,8 @@ class Session:
         """
         n, stop_cycles = self._drive_train.n_joints, round(STOP_TIMEOUT / self._guard.period)
         execution = execution_of(source, self._mode, n, self._settle_cycles, stop_cycles)
-        if execution is None:
-            reason = f"a {type(source).__name__} is not the kind of source mode {self._mode} needs"
-            raise RequestError(self.state.name.lower(), reason)
+        if isinstance(execution, str):
+            raise RequestError(self.state.name.lower(), execution)
         self._machine.request(execution, self._answers.unusable if self._answers else None)
 
     def override(self, fraction: float) -> None:
@@ -218,7 +221,11 @@ class Session:
             raise RequestError(self.state.name.lower(), reason, "change of override")
 
     def hold(self) -> None:
-        """Rest on the path until `resume`; a motion that cannot, or has not begun, is stopped."""
+        """Rest on the path until `resume`; a motion that cannot, or has not begun, is stopped.
+
+        Raises:
+            RequestError: there is no motion.
+        """
         self._machine.hold()
 
     def resume(self) -> None:
@@ -290,17 +297,12 @@ class Session:
             return self._last_reply
         init = InitPacket.decode(packet)
         self._cold_start = self.state is State.SYNC and self._sequence.last > 0
+        if self.state is State.SYNC and not self._sequence.leads_to(INIT_NUMBER, self._max_gap):
+            self._machine.forget_request()
         self._machine.take(Input.INIT)
-        self._answers = answers = Answers(
-            init,
-            self._drive_train,
-            self._guard,
-            self._arm,
-            self._mode,
-            self._accept_init,
-            self._other_axes,
-            self._max_gap,
-        )
+        arm = (self._drive_train, self._guard, self._arm, self._mode)
+        options = (self._accept_init, self._other_axes, self._max_gap)
+        self._answers = answers = Answers(init, *arm, *options)
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self._machine.cycle = 0
         told = answers.announced
@@ -361,8 +363,7 @@ class Session:
             machine.note_gap(missed, unanswered, self._max_gap)
             machine.require_axes(reading, self._mode)
             machine.take(reading.input)
-            if unanswered > self._max_gap:
-                answers.require_carried_on(machine, reading)
+            answers.note_gap(unanswered, machine, reading)
             measured, commanded = ring.measured[row], ring.commanded[row]
             status = answers.answer(machine, reading, words, measured, commanded)
         except BaseException as error:

@@ -22,6 +22,7 @@ from planner.errors import (
     PlannerCrashed,
     PlannerError,
     PlannerNotStarted,
+    PlannerOutOfStep,
     PlanningError,
     PlanningTimedOut,
     StartMismatch,
@@ -92,6 +93,7 @@ __all__ = [
     "PlannerCrashed",
     "PlannerNotStarted",
     "PlanningTimedOut",
+    "PlannerOutOfStep",
     "StartMismatch",
     "NotBegun",
 ]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from planner.arrays import Array
 from planner.piecewise_cubic import PiecewiseCubic
-from planner.verify import POSITION_ROUNDING, RATE_ROUNDING
+from planner.verify import jump_rounding, position_rounding
 
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
@@ -85,7 +85,7 @@ class Block(NamedTuple):
         # Any time inside its piece is a fair sample, so a root that does not exist may be that.
         times = np.fmax(np.fmin(times, length), 0.0)
         position, velocity, acceleration = after(p, v, a, j, times)
-        slack = POSITION_ROUNDING * _size(bounds)
+        slack = position_rounding(bounds)
         within = np.minimum(p, position.min(axis=0)).min(axis=-1) >= bounds.lower - slack
         within &= np.maximum(p, position.max(axis=0)).max(axis=-1) <= bounds.upper + slack
         for value, start, bound in (
@@ -132,21 +132,3 @@ def after(p: Array, v: Array, a: Array, j: Array, x: Array) -> tuple[Array, Arra
         v + x * (a + x * j * 0.5),
         a + x * j,
     )
-
-
-def jump_rounding(bounds: LimitRows, durations: Array) -> Array:
-    """Return the jumps of position, velocity, acceleration that count as rounding, (c, n, 3)."""
-    # A knot is told no finer than the clock allows: late in a long motion that shows.
-    tick = 4.0 * np.spacing(durations)[:, None]
-    return np.stack(
-        (
-            POSITION_ROUNDING * _size(bounds) + tick * bounds.velocity,
-            RATE_ROUNDING * bounds.velocity + tick * bounds.acceleration,
-            RATE_ROUNDING * bounds.acceleration + tick * bounds.jerk,
-        ),
-        axis=-1,
-    )
-
-
-def _size(bounds: LimitRows) -> Array:
-    return np.maximum(np.abs(bounds.lower), np.abs(bounds.upper))

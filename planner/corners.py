@@ -11,10 +11,12 @@ taken; none is taken that would be slower than to stop.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import ruckig
+from numpy.typing import NDArray
 
 from planner.arrays import Array
 from planner.blocks import Block, LimitRows
@@ -28,7 +30,7 @@ from planner.verify import jump_rounding
 How = Literal["stopped", "flown", "reduced"]
 
 # Shares of the fly asked for that are compared, and those tried one by one if none of them will do.
-FIRST_SHARES: Final = (1.0, 0.999, 0.97)
+FIRST_SHARES: Final = (1.0, 0.9999, 0.999, 0.99, 0.97)
 LAST_SHARES: Final = (0.9, 0.5, 0.25, 0.125, 0.0625)
 # A corner that takes less of its ramps than this cannot be told from a stop: its path passes at
 # some 1e-12 of the distance of a full one.
@@ -141,13 +143,15 @@ def fly_within(
     return best
 
 
-def ranked(savings: Sequence[float]) -> list[int]:
-    """Return which corners are worth a try, best first: those that save most, none that costs.
+def ranked(savings: Array) -> NDArray[np.intp]:
+    """Return the rows of savings (s, ...) [s] in the order in which to try corners, best first.
 
-    The first, as a rule that asked for, comes first unless another one is clearly better.
+    Rows are those of `FIRST_SHARES`, -inf where no corner is known; the first, as a rule that
+    asked for, comes first unless another one is clearly better. One that costs is not to be tried.
     """
-    order = [i for i, saving in enumerate(savings) if saving >= 0.0]
-    return sorted(order, key=lambda i: -savings[i] - (BETTER if i == 0 else 0.0))
+    preferred = savings.copy()
+    preferred[0] += BETTER
+    return np.argsort(-preferred, axis=0, kind="stable")
 
 
 class _Candidate(NamedTuple):
@@ -172,10 +176,10 @@ def _candidates(
     """Give solved corners in the order in which they are to be tried."""
     ask = Solver(bounds, share * (before.slowing_down + after.speeding_up))
     first = _solved(before, after, ask, share, FIRST_SHARES)
-    yield from (first[i] for i in ranked([each.saving for each in first]))
-    for part in LAST_SHARES:
-        last = _solved(before, after, ask, share, (part,))
-        yield from (each for each in last if each.saving >= 0.0)
+    savings = np.array([-np.inf if each is None else each.saving for each in first])
+    order = (first[i] for i in ranked(savings).tolist())
+    last = (_solved(before, after, ask, share, (part,))[0] for part in LAST_SHARES)
+    yield from (each for each in chain(order, last) if each is not None and each.saving >= 0.0)
 
 
 def _solved(
@@ -184,16 +188,19 @@ def _solved(
     ask: Solver,
     share: float,
     parts: Sequence[float],
-) -> list[_Candidate]:
-    """Ask the solver for corners that take parts of a share; give those it knows."""
+) -> list[_Candidate | None]:
+    """Ask the solver for corners that take parts of a share; None where it knows none."""
     shares = share * np.array(parts)
     leave, enter = shares * before.slowing_down, shares * after.speeding_up
     starts, ends = before.states(before.duration - leave), after.states(enter)
     solutions = ask(starts, ends)
     return [
-        _Candidate(float(shares[i]), float(leave[i]), float(enter[i]), starts[i], ends[i], solution)
+        None
+        if solution is None
+        else _Candidate(
+            float(shares[i]), float(leave[i]), float(enter[i]), starts[i], ends[i], solution
+        )
         for i, solution in enumerate(solutions)
-        if solution is not None
     ]
 
 

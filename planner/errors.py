@@ -19,6 +19,7 @@
      ├─ PlannerCrashed          the process that planned died on this input
      ├─ PlannerNotStarted       it died before it could be asked
      ├─ PlanningTimedOut        it gave no answer in time
+     ├─ PlannerOutOfStep        its answer is not to what was asked
      ├─ StartMismatch           the arm is not where the motion begins
      └─ NotBegun                a player was asked to advance before it was begun
 
@@ -192,6 +193,13 @@ class PlanningTimedOut(PlannerError, TimeoutError):
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
         super().__init__(f"no plan within {timeout:g} s; the planning process was ended")
+
+
+class PlannerOutOfStep(PlannerError, RuntimeError):
+    """An answer of the process that plans belongs to another call, or none was begun here."""
+
+    def __init__(self) -> None:
+        super().__init__("the planning process was asked something else, or nothing, from here")
 
 
 class InvalidPlanFile(PlannerError, ValueError):

@@ -26,11 +26,16 @@ from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from numpy.typing import ArrayLike
 
-from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
+from planner.errors import (
+    PlannerCrashed,
+    PlannerNotStarted,
+    PlannerOutOfStep,
+    PlanningTimedOut,
+)
 from planner.limits import JointLimits
 from planner.piecewise_cubic import PiecewiseCubic
 from planner.plan import plan
-from planner.remote import Task, load, pack
+from planner.remote import Task, load, numbered, pack, unnumbered
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -48,6 +53,7 @@ class PlanningChild:
 
     A function is known to the child by the name it is imported under, so it must belong to a
     module that can be imported (not to a script being run). Arguments and results are copied.
+    A fork of this process that goes on using the handle gets a child of its own.
 
     Args:
         timeout: Longest time one call may take [s].
@@ -59,10 +65,13 @@ class PlanningChild:
         PlannerCrashed: the process died; a new one is on its way for the next call.
         PlannerNotStarted: it died before it could be asked anything; why is on stderr.
         PlanningTimedOut: the call took too long; likewise a new one is on its way.
+        PlannerOutOfStep: there is an answer, but not to the call begun last in this process.
         Exception: whatever the function itself raised.
     """
 
     def __init__(self, *, timeout: float = 10.0) -> None:
+        self._number = 0
+        self._owner = os.getpid()
         self._timeout = timeout
         self._process: subprocess.Popen[bytes] | None = None
         self._greeted = False
@@ -83,6 +92,7 @@ class PlanningChild:
     @property
     def pid(self) -> int | None:
         """Process id; None once closed."""
+        self._disown()
         return self._process.pid if self._process is not None else None
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -93,7 +103,9 @@ class PlanningChild:
 
     def send(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
         """Begin a call, whose result `receive` then fetches."""
-        message = pack(Task(self._timeout, function, args, kwargs))
+        self._number += 1
+        message = numbered(self._number, pack(Task(self._timeout, function, args, kwargs)))
+        self._disown()
         if self._process is None:
             self._start()
         self.deadline = monotonic() + self._timeout + (0.0 if self._greeted else _START_TIMEOUT)
@@ -107,13 +119,19 @@ class PlanningChild:
 
     def receive(self) -> Any:
         """Return the result of the call that `send` began, or raise what it raised."""
+        self._disown()
+        if self._process is None:
+            raise PlannerOutOfStep
         try:
             if not self._greeted:
                 self._read()
                 self._greeted = True
                 self.deadline = monotonic() + self._timeout
-            answer = load(self._read())
-        except PlanningTimedOut:
+            number, message = unnumbered(self._read())
+            if number != self._number:
+                raise PlannerOutOfStep
+            answer = load(message)
+        except (PlanningTimedOut, PlannerOutOfStep):
             self._restart()
             raise
         except (EOFError, OSError):
@@ -127,12 +145,23 @@ class PlanningChild:
 
     def close(self) -> None:
         """End the process; a later call starts a new one."""
+        self._disown()
         if self._process is None:
             return
         self._connection.close()
         self._process.kill()
         self._process.wait()
         self._process = None
+
+    def _disown(self) -> None:
+        """In a fork, let go of the child of the process it was forked from, and leave it alive."""
+        if self._owner == os.getpid():
+            return
+        self._owner = os.getpid()
+        if self._process is not None:
+            self._connection.close()  # this copy of it only
+            self._process.returncode = 0  # there is nothing here to wait for
+            self._process = None
 
     def _read(self) -> bytes:
         if not self._connection.poll(max(0.0, self.deadline - monotonic())):
@@ -209,6 +238,13 @@ def close_child() -> None:
             _warm.pop().close()
 
 
+def _after_fork() -> None:
+    """Let go of what a fork has a copy of: the child, and a lock that a thread may have held."""
+    global _lock
+    _lock = threading.Lock()
+    while _warm:
+        _warm.pop().close()
+
+
 atexit.register(close_child)
-# A fork has a copy of the connection, but the child is not its own to talk to.
-os.register_at_fork(after_in_child=_warm.clear)
+os.register_at_fork(after_in_child=_after_fork)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from math import ceil, isfinite
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +20,13 @@ from planner.sampled import SampledTrajectory
 from planner.trajectory import Trajectory
 
 _TIME = "time [s]"
+_BOM = "\ufeff"  # spreadsheets begin their tables with it
 _QUANTITIES = {"position": "", "velocity": "/s", "acceleration": "/s^2"}
 _ANGLES = {"rad": 1.0, "deg": np.pi / 180.0}
 # A last period this much shorter than the others is rounding, not motion.
 _ROUNDING = 1e-9
+# More rows a second than any controller has cycles.
+_HIGHEST_RATE = 1e5
 
 
 class CsvMotion(NamedTuple):
@@ -39,13 +42,18 @@ def to_csv(trajectory: Trajectory, rate: float, joint_names: Sequence[str]) -> s
     Numbers are written so that every bit comes back.
 
     Raises:
-        InvalidSetting: a rate of 0 or less, or not one name per joint.
+        InvalidSetting: a rate not above 0 or above 100 kHz, not one name per joint, each another,
+            or a motion of no duration, which no rows can tell.
     """
-    if not (isfinite(rate) and rate > 0.0):
-        raise InvalidSetting("rate", rate, "above 0 Hz")
-    if len(joint_names) != trajectory.n_joints:
-        raise InvalidSetting("joint_names", list(joint_names), f"{trajectory.n_joints} names")
-    steps = ceil(trajectory.duration * rate - _ROUNDING)
+    if not 0.0 < rate <= _HIGHEST_RATE:
+        raise InvalidSetting("rate", rate, f"above 0 Hz, at most {_HIGHEST_RATE:g} Hz")
+    if trajectory.duration <= 0.0:
+        raise InvalidSetting("duration", trajectory.duration, "a motion of more than 0 s")
+    if len({*joint_names}) != trajectory.n_joints or len(joint_names) != trajectory.n_joints:
+        raise InvalidSetting(
+            "joint_names", list(joint_names), f"{trajectory.n_joints} different names"
+        )
+    steps = max(1, ceil(trajectory.duration * rate - _ROUNDING))
     time = np.minimum(np.arange(steps + 1) / rate, trajectory.duration)
     time[-1] = trajectory.duration
     columns = np.stack(trajectory.sample(time), axis=2).reshape(len(time), -1)
@@ -65,7 +73,10 @@ def from_csv(text: str) -> CsvMotion:
         InvalidTrajectory: a column missing, double or unknown, a row that is not numbers, or
             rows that make no motion.
     """
-    rows = [row for row in csv.reader(io.StringIO(text)) if row]
+    try:
+        rows = [row for row in csv.reader(io.StringIO(text.removeprefix(_BOM))) if row]
+    except csv.Error as error:
+        raise InvalidTrajectory(f"not a table of comma-separated values: {error}") from error
     if len(rows) < 3:
         raise InvalidTrajectory("a table of a motion needs its headings and two rows or more")
     headings = [cell.strip() for cell in rows[0]]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from planner.arguments import member, real, reals, whole
 from planner.arrays import Array, read_only
 from planner.commands import (
     STOP,
@@ -102,15 +103,16 @@ class MoveServices:
 
     def select_motion_type(self, motion_type: int) -> Status:
         """Select how the arm gets to targets: `MotionType.JOINT`, nothing else is offered."""
-        if motion_type != MotionType.JOINT:
+        if member(MotionType, motion_type) is not MotionType.JOINT:
             return self._refuse(Status.INCONSISTENT, f"motion type {motion_type} is not JOINT (1)")
         return self._set()
 
     def set_advance_motion(self, count: int) -> Status:
         """Set how many targets beyond the present one are asked for (NEED_MORE_DATA), from 0."""
-        if not isinstance(count, int) or count < 0:
+        targets = whole(count)
+        if targets is None or targets < 0:
             return self._refuse(Status.INCONSISTENT, f"advance of {count} targets")
-        return self._set(advance=count)
+        return self._set(advance=targets)
 
     def set_joint_speeds(self, percent: ArrayLike, joints: Sequence[int] | None = None) -> Status:
         """Set the share of the velocity limit, in (0, 100] %, of all or of some joints."""
@@ -133,25 +135,29 @@ class MoveServices:
 
         Nothing but the ramps is scaled, so the path at fly-by corners can change.
         """
-        if not 0.0 < percent <= 100.0:
-            return self._refuse(Status.INCONSISTENT, f"acceleration override of {percent} %")
-        share, overrides = percent / 100.0, self._settings.overrides
-        if kind != AccelerationKind.DECELERATION:
+        share, overrides = real(percent) / 100.0, self._settings.overrides
+        scaled = member(AccelerationKind, kind)
+        if not 0.0 < share <= 1.0 or scaled is None:
+            reason = f"acceleration override of {percent} %, kind {kind}"
+            return self._refuse(Status.INCONSISTENT, reason)
+        if scaled is not AccelerationKind.DECELERATION:
             overrides = replace(overrides, acceleration=share)
-        if kind != AccelerationKind.ACCELERATION:
+        if scaled is not AccelerationKind.ACCELERATION:
             overrides = replace(overrides, deceleration=share)
         return self._set(overrides=overrides)
 
     def select_flyby_mode(self, on: bool) -> Status:
         """Select whether the arm flies by the targets set from now on or stops there."""
+        if not isinstance(on, bool | np.bool_) and whole(on) not in (0, 1):
+            return self._refuse(Status.INCONSISTENT, f"fly-by {on!r} is neither on nor off")
         return self._set(flying=bool(on))
 
     def select_flyby_criteria(self, criterion: int) -> Status:
         """Select what rules the size of a corner, a `FlybyCriterion`."""
-        try:
-            return self._set(criterion=FlybyCriterion(criterion))
-        except ValueError as error:
-            return self._refuse(Status.INCONSISTENT, str(error))
+        selected = member(FlybyCriterion, criterion)
+        if selected is None:
+            return self._refuse(Status.INCONSISTENT, f"there is no fly-by criterion {criterion}")
+        return self._set(criterion=selected)
 
     def set_flyby_criteria_parameter(self, criterion: int, value: float) -> Status:
         """Set the size of a corner: FLY_PER in 0..100 %, or the distance from the via point.
@@ -159,15 +165,16 @@ class MoveServices:
         The distance is the Euclidean one in joint space [rad], and is not exceeded.
         """
         most = {FlybyCriterion.PERCENT: 100.0, FlybyCriterion.DISTANCE: _WIDEST}
-        if criterion not in most or not (0.0 <= value <= most[FlybyCriterion(criterion)]):
+        named, size = member(FlybyCriterion, criterion), real(value)
+        if named is None or not 0.0 <= size <= most[named]:
             return self._refuse(Status.INCONSISTENT, f"fly-by criterion {criterion} of {value}")
-        return self._set(flyby={**self._settings.flyby, FlybyCriterion(criterion): float(value)})
+        return self._set(flyby={**self._settings.flyby, named: size})
 
     def cancel_flyby_criteria(self, criterion: int) -> Status:
         """Forget the value of a criterion; if it is selected, the percentage is from now on."""
-        if criterion not in _FLYBY:
+        cancelled = member(FlybyCriterion, criterion)
+        if cancelled is None:
             return self._refuse(Status.INCONSISTENT, f"there is no fly-by criterion {criterion}")
-        cancelled = FlybyCriterion(criterion)
         kept = self._settings.criterion
         return self._set(
             flyby={**self._settings.flyby, cancelled: _FLYBY[cancelled]},
@@ -179,10 +186,10 @@ class MoveServices:
 
         Set-points are exact whatever it is; it says what a servo has to do behind them.
         """
-        try:
-            return self._set(accuracy=PointAccuracy(accuracy))
-        except ValueError as error:
-            return self._refuse(Status.INCONSISTENT, str(error))
+        selected = member(PointAccuracy, accuracy)
+        if selected is None:
+            return self._refuse(Status.INCONSISTENT, f"there is no point accuracy {accuracy}")
+        return self._set(accuracy=selected)
 
     def set_point_accuracy_parameter(self, criterion: int, value: float) -> Status:
         """Set the size of a corner and select its criterion in one, as COMAU maps this service."""
@@ -195,16 +202,22 @@ class MoveServices:
         Its speed is lowered accordingly; `set_next_target` answers TIME_TOO_SHORT where the time
         is too short. Flying by either end of the move shortens it.
         """
-        if not 0.0 <= seconds < np.inf:
+        if not 0.0 <= real(seconds) < np.inf:
             return self._refuse(Status.INCONSISTENT, f"motion time of {seconds} s")
-        return self._set(motion_time=float(seconds))
+        return self._set(motion_time=real(seconds))
 
     def _set_shares(self, name: str, percent: ArrayLike, joints: Sequence[int] | None) -> Status:
         shares = np.array(getattr(self._settings, name))
-        chosen = range(len(shares)) if joints is None else joints
         try:
-            shares[list(chosen)] = np.asarray(percent, dtype=np.float64) / 100.0
-        except (TypeError, ValueError, IndexError) as error:
+            named = range(len(shares)) if joints is None else list(joints)
+            chosen = [joint for joint in map(whole, named) if joint is not None]
+            if len(chosen) < len(named) or not all(0 <= joint < len(shares) for joint in chosen):
+                raise ValueError(f"joints {joints!r} are not of the arm's 0 to {len(shares) - 1}")
+            each = reals(percent)
+            if each.shape not in ((), (len(chosen),)):
+                raise ValueError(f"{each.shape} values for {len(chosen)} joints")
+            shares[chosen] = each / 100.0
+        except (TypeError, ValueError) as error:
             return self._refuse(Status.INCONSISTENT, f"joint {name}: {error}")
         if not np.all((shares > 0.0) & (shares <= 1.0)):
             return self._refuse(Status.INCONSISTENT, f"joint {name} of {percent!r} %")

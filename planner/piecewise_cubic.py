@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from planner.arrays import Array, read_only
+from planner.arrays import Array
 from planner.errors import InvalidTrajectory
+from planner.plain import DAMAGED, numbers, rows
 
 
 class Extrema(NamedTuple):
@@ -164,12 +165,15 @@ class PiecewiseCubic:
         Raises:
             InvalidTrajectory: a field is missing, or is not the table that it should be.
         """
-        if data.get("type") != "piecewise_cubic":
-            raise InvalidTrajectory(f"type is {data.get('type')!r}; expected 'piecewise_cubic'")
         try:
-            knots = tuple(read_only(row) for row in data["knots"])
-            coefficients = tuple(read_only(row) for row in data["coefficients"])
-        except (KeyError, TypeError, ValueError) as error:
+            kind = data.get("type")
+            if kind != "piecewise_cubic":
+                raise InvalidTrajectory(f"type is {kind!r:.80}; expected 'piecewise_cubic'")
+            knots = tuple(numbers(row, 1) for row in rows(data["knots"]))
+            coefficients = tuple(numbers(row, 2) for row in rows(data["coefficients"]))
+        except InvalidTrajectory:
+            raise
+        except DAMAGED as error:
             raise InvalidTrajectory(f"not a table of cubic pieces: {error!r}") from error
         _check_table(knots, coefficients)
         return cls(knots, coefficients)

@@ -13,19 +13,21 @@ from typing import Any
 import numpy as np
 
 from planner import plan_text
-from planner.arrays import Array, read_only
+from planner.arrays import Array
 from planner.commands import STOP, Fly, FlyDistance, FlyPercent, Move, Overrides
 from planner.errors import InvalidPlanFile, PlannerError
 from planner.limits import JointLimits
 from planner.moves import MotionPlan, plan_moves
 from planner.piecewise_cubic import PiecewiseCubic
+from planner.plain import DAMAGED, number, numbers, one_or_more, rows, table, text
 from planner.verify import check_limits, check_smooth
 
 FORMAT = "joint motion plan"
 VERSION = 1
-# Planned again on another machine a motion may differ in its last digits [rad, s]; no more.
+# Planned again on another machine a motion may differ in its last digits [rad, s], and in its
+# rates by as small a share of their limits; no more, at any instant.
 _SAME = 1e-9
-_COMPARED_AT = 1000
+_SAME_RATES = 1e-6
 _LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 _SHARES = ("joint_speed", "joint_acceleration", "joint_jerk")
 _FLY = ("fly_percent", "fly_distance")
@@ -60,6 +62,8 @@ class PlanFile:
             sizes.append(self.limits.n_joints)
         if self.trajectory is not None:
             sizes.append(self.trajectory.n_joints)
+        if len(set(self.joint_names)) < n:
+            raise InvalidPlanFile(f"a joint is named twice in {', '.join(self.joint_names)}")
         if n == 0 or any(size != n for size in sizes):
             raise InvalidPlanFile(f"{n} joints are named, but positions or limits are for {sizes}")
 
@@ -121,29 +125,13 @@ class PlanFile:
         Raises:
             InvalidPlanFile: a field is missing, unknown, or not what it should be.
         """
-        if data.get("format") != FORMAT:
-            raise InvalidPlanFile(f"format is {data.get('format')!r}; expected {FORMAT!r}")
-        if data.get("version") != VERSION:
-            raise InvalidPlanFile(f"version is {data.get('version')!r}; this reads {VERSION}")
         try:
-            _only(
-                data,
-                ("format", "version", "joints", "start", "overrides", "limits", "moves", "motion"),
-            )
-            limits, motion = data.get("limits"), data.get("motion")
-            return cls(
-                joint_names=tuple(str(name) for name in data["joints"]),
-                start=_vector(data["start"]),
-                moves=tuple(_move_from_dict(move) for move in data["moves"]),
-                overrides=Overrides(**_only(data.get("overrides", {}), _OVERRIDES)),
-                limits=None if limits is None else JointLimits(**_only(limits, _LIMITS)),
-                trajectory=None if motion is None else PiecewiseCubic.from_dict(motion),
-            )
+            return _from_dict(cls, table(data))
         except InvalidPlanFile:
             raise
         except KeyError as error:
             raise InvalidPlanFile(f"{error.args[0]!r} is missing") from error
-        except (PlannerError, TypeError, ValueError, AttributeError) as error:
+        except (PlannerError, *DAMAGED) as error:
             raise InvalidPlanFile(f"not a plan: {error}") from error
 
     def to_toml(self) -> str:
@@ -165,15 +153,45 @@ class PlanFile:
             check_smooth(stored, planned.limits)
         except PlannerError as error:
             raise InvalidPlanFile(f"the stored motion: {error}") from error
-        again = planned.trajectory
-        t = np.linspace(0.0, stored.duration, _COMPARED_AT)
-        apart = float(np.max(np.abs(stored.sample(t)[0] - again.sample(t)[0])))
-        if not (apart <= _SAME and abs(stored.duration - again.duration) <= _SAME):
+        again, limits = planned.trajectory, planned.limits
+        extrema = _apart(stored, again).extrema()
+        apart = float(max(np.max(-extrema.lower), np.max(extrema.upper)))
+        rates = max(
+            float(np.max(extrema.velocity / limits.velocity)),
+            float(np.max(extrema.acceleration / limits.acceleration)),
+        )
+        late = abs(stored.duration - again.duration)
+        if not (apart <= _SAME and late <= _SAME and rates <= _SAME_RATES):
             raise InvalidPlanFile(
                 f"the stored motion of {stored.duration:.6f} s is not what the moves plan to "
                 f"({again.duration:.6f} s, up to {apart:.3g} rad away): they were edited, or "
                 "planned by another version; take the motion out to plan them anew"
             )
+
+
+def _from_dict(cls: type[PlanFile], data: Mapping[str, Any]) -> PlanFile:
+    if data.get("format") != FORMAT:
+        raise InvalidPlanFile(f"format is {data.get('format')!r:.80}; expected {FORMAT!r}")
+    version = data.get("version")
+    if type(version) is not int or version != VERSION:
+        raise InvalidPlanFile(f"version is {version!r:.80}; this reads {VERSION}")
+    _only(data, ("format", "version", "joints", "start", "overrides", "limits", "moves", "motion"))
+    overrides = _only(table(data.get("overrides", {})), _OVERRIDES)
+    joint = one_or_more(overrides.pop("joint", 1.0))
+    limits, motion = data.get("limits"), data.get("motion")
+    return cls(
+        joint_names=tuple(text(name) for name in rows(data["joints"])),
+        start=_vector(data["start"]),
+        moves=tuple(_move_from_dict(table(move)) for move in rows(data["moves"])),
+        overrides=Overrides(**{k: number(v) for k, v in overrides.items()}, joint=joint),
+        limits=None if limits is None else _limits_from_dict(table(limits)),
+        trajectory=None if motion is None else PiecewiseCubic.from_dict(table(motion)),
+    )
+
+
+def _limits_from_dict(data: Mapping[str, Any]) -> JointLimits:
+    known = _only(data, _LIMITS)
+    return JointLimits(**{name: numbers(known[name], 1) for name in _LIMITS})
 
 
 def _move_to_dict(move: Move) -> dict[str, Any]:
@@ -194,8 +212,18 @@ def _move_to_dict(move: Move) -> dict[str, Any]:
 
 
 def _move_from_dict(data: Mapping[str, Any]) -> Move:
-    fields = {name: value for name, value in _only(data, _MOVE).items() if name not in _FLY}
-    fields["target"] = _vector(data["target"])
+    fields: dict[str, Any] = {}
+    for name, value in _only(data, _MOVE).items():
+        if name == "target":
+            fields[name] = _vector(value)
+        elif name == "termination":
+            fields[name] = text(value)
+        elif name in _SHARES:
+            fields[name] = one_or_more(value)
+        elif name not in _FLY:
+            fields[name] = number(value)
+    if "target" not in fields:
+        raise InvalidPlanFile("'target' is missing")
     return Move(fly=_fly(data), **fields)
 
 
@@ -203,9 +231,9 @@ def _fly(data: Mapping[str, Any]) -> Fly:
     if "fly_percent" in data and "fly_distance" in data:
         raise InvalidPlanFile("a move flies by percentage or by distance, not both")
     if "fly_percent" in data:
-        return FlyPercent(float(data["fly_percent"]))
+        return FlyPercent(number(data["fly_percent"]))
     if "fly_distance" in data:
-        return FlyDistance(float(data["fly_distance"]))
+        return FlyDistance(number(data["fly_distance"]))
     return STOP
 
 
@@ -217,7 +245,39 @@ def _only(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, Any]:
 
 
 def _vector(values: Any) -> Array:
-    array = read_only(values)
-    if array.ndim != 1 or not np.all(np.isfinite(array)):
-        raise InvalidPlanFile(f"{values} is not one finite position per joint")
+    try:
+        array = numbers(values, 1)
+    except (TypeError, OverflowError) as error:
+        reason = f"{values!r:.80} is not one finite position per joint: {error}"
+        raise InvalidPlanFile(reason) from error
+    if not np.all(np.isfinite(array)):
+        raise InvalidPlanFile(f"{values!r:.80} is not one finite position per joint")
     return array
+
+
+def _apart(one: PiecewiseCubic, other: PiecewiseCubic) -> PiecewiseCubic:
+    """Return the difference of two motions: between the knots of both it is cubic as well.
+
+    The longer one is compared up to where the other ends.
+    """
+    end = min(one.duration, other.duration)
+    knots, coefficients = [], []
+    for joint in range(one.n_joints):
+        times = np.union1d(one.knots[joint], other.knots[joint])
+        times = np.unique(np.minimum(times, end))
+        times = times if len(times) > 1 else np.zeros(2)
+        ours, theirs = (_pieces_from(motion, joint, times[:-1]) for motion in (one, other))
+        knots.append(times)
+        coefficients.append(ours - theirs)
+    return PiecewiseCubic(tuple(knots), tuple(coefficients))
+
+
+def _pieces_from(motion: PiecewiseCubic, joint: int, times: Array) -> Array:
+    """Return what goes on from times (m,) [s], coefficients (m, 4), of one joint."""
+    knots = motion.knots[joint]
+    piece = np.searchsorted(knots[1:-1], times, side="right")
+    p, v, a, j = motion.coefficients[joint][piece].T
+    x = times - knots[piece]
+    return np.stack(
+        (p + x * (v + x * (a / 2.0 + x * j / 6.0)), v + x * (a + x * j / 2.0), a + x * j, j), axis=1
+    )

@@ -10,6 +10,7 @@ from typing import Any
 
 from planner.degrees import degrees_text, radians_of
 from planner.errors import InvalidPlanFile
+from planner.plain import DAMAGED, table
 
 _HEAD = """\
 # A motion of joint moves. Names that end in _deg hold degrees, degrees/s, degrees/s^2,
@@ -49,15 +50,22 @@ def from_toml(text: str) -> dict[str, Any]:
         InvalidPlanFile: the text is not TOML, or an angle is not a number.
     """
     try:
-        raw = tomllib.loads(text, parse_float=Decimal)
+        return _data(tomllib.loads(text, parse_float=Decimal))
     except tomllib.TOMLDecodeError as error:
         raise InvalidPlanFile(f"not TOML: {error}") from error
+    except InvalidPlanFile:
+        raise
+    except DAMAGED as error:
+        raise InvalidPlanFile(f"not a plan: {error!r:.200}") from error
+
+
+def _data(raw: Mapping[str, Any]) -> dict[str, Any]:
     data = _in_si("", {name: value for name, value in raw.items() if not _is_table(value)})
     for name, value in raw.items():
         if isinstance(value, Mapping):
             data[name] = _in_si(name, value)
         elif _is_table(value):
-            data[name] = [_in_si(name, row) for row in value]
+            data[name] = [_in_si(name, table(row)) for row in value]
     return data
 
 
@@ -67,8 +75,8 @@ def _is_table(value: Any) -> bool:
     return isinstance(value, Mapping)
 
 
-def _fields(table: str, fields: Mapping[str, Any]) -> str:
-    angles = _ANGLES.get(table, frozenset())
+def _fields(name_of_table: str, fields: Mapping[str, Any]) -> str:
+    angles = _ANGLES.get(name_of_table, frozenset())
     return "".join(
         f"{name}{_SUFFIX} = {_in_degrees(value)}\n"
         if name in angles
@@ -95,8 +103,8 @@ def _motion(data: Mapping[str, Any]) -> str:
     )
 
 
-def _in_si(table: str, fields: Mapping[str, Any]) -> dict[str, Any]:
-    angles = _ANGLES.get(table, frozenset())
+def _in_si(name_of_table: str, fields: Mapping[str, Any]) -> dict[str, Any]:
+    angles = _ANGLES.get(name_of_table, frozenset())
     data: dict[str, Any] = {}
     for name, value in fields.items():
         plain = name.removesuffix(_SUFFIX)

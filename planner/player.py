@@ -8,13 +8,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from planner.arrays import Array
-from planner.errors import InvalidSetting, NotBegun, StartMismatch
+from planner.errors import InvalidSetting, LimitExceeded, NotBegun, StartMismatch
 from planner.limits import JointLimits
 from planner.path_reader import PathReader
 from planner.piecewise_cubic import PiecewiseCubic
 from planner.stop import slowing_bounds, within
 from planner.time_law import RateBounds, TimeLaw, admits
 from planner.trajectory import Trajectory
+from planner.verify import position_rounding
 
 # A last period this much shorter than the others is rounding, not motion.
 _ROUNDING = 1e-9
@@ -103,6 +104,10 @@ class TrajectoryPlayer:
             "stop": stopping,
         }
         self._table = _tabulate(trajectory, period)
+        self._limits = limits
+        reach = self._table.position
+        self._lower = reach.min(axis=0) if extrema is None else extrema.lower
+        self._upper = reach.max(axis=0) if extrema is None else extrema.upper
         # The end of the motion, but for a last period that is no more than rounding.
         self._end = trajectory.duration - _ROUNDING * period
         self._path = PathReader(trajectory)
@@ -164,6 +169,7 @@ class TrajectoryPlayer:
 
         Raises:
             StartMismatch: a joint is farther from the planned start than the tolerance.
+            LimitExceeded: with the difference carried along, a joint would leave its range.
         """
         offset = np.asarray(position, dtype=np.float64) - self._start
         off = ~(np.abs(offset) <= self._tolerance)  # written so that NaN is off
@@ -172,10 +178,22 @@ class TrajectoryPlayer:
             raise StartMismatch(
                 joint, float(position[joint]), float(self._start[joint]), self._tolerance
             )
+        self._check_range(offset)
         # The table stays as it is: to copy it would cost the cycle of the first set-point.
         self._offset = offset
         self._begun = True
         self._rewind()
+
+    def _check_range(self, offset: Array) -> None:
+        limits, slack = self._limits, position_rounding(self._limits)
+        for reach, bound, sign in (
+            (self._lower + offset, limits.lower, -1.0),
+            (self._upper + offset, limits.upper, 1.0),
+        ):
+            excess = sign * (reach - bound) - slack
+            if np.any(excess > 0.0):
+                joint = int(np.argmax(excess))
+                raise LimitExceeded("position", joint, float(reach[joint]), float(bound[joint]))
 
     def advance(self) -> tuple[Array, Array]:
         """Return the next set-point: position (n,) [rad] and velocity (n,) [rad/s]."""

@@ -13,7 +13,7 @@ import numpy as np
 from planner.arrays import Array
 from planner.blocks import Block, LimitRows, Rows
 from planner.commands import FlyPercent
-from planner.corners import BETTER, FIRST_SHARES, LAST_SHARES, LEAST_SHARE
+from planner.corners import FIRST_SHARES, LAST_SHARES, LEAST_SHARE, ranked
 from planner.joins import Join, Solutions, finish_many, solve_many
 from planner.legs import SEGMENT_ACCELERATION, SEGMENT_JERK, SEGMENT_VELOCITY
 from planner.piecewise_cubic import PiecewiseCubic
@@ -77,10 +77,7 @@ def _round(
     leave, enter = task.cuts(rows, shares)
     saving = leave + enter - candidates.durations
     saving = saving.reshape(len(FIRST_SHARES), -1)
-    preferred = saving.copy()
-    preferred[0] += BETTER
-    order = np.argsort(-preferred, axis=0, kind="stable")
-    for place in order:
+    for place in ranked(saving):
         picked = np.flatnonzero(np.take_along_axis(saving, place[None], axis=0)[0] >= 0.0)
         picked = picked[[corners.joins[row] is None for row in asked[picked].tolist()]]
         chosen = place[picked] * len(asked) + picked

@@ -16,6 +16,8 @@ from planner.errors import PlannerError
 
 # How much later than its caller gives up a process ends itself, should its caller be gone.
 _GRACE = 1.0
+# Bytes of the number of a call, which stands before the call and before its answer.
+_NUMBER = 8
 
 
 class Task(NamedTuple):
@@ -43,9 +45,20 @@ def serve(descriptor: int) -> None:
     try:
         connection.send_bytes(b"ready")
         while True:
-            connection.send_bytes(_answer(connection.recv_bytes()))
+            number, message = unnumbered(connection.recv_bytes())
+            connection.send_bytes(numbered(number, _answer(message)))
     except (EOFError, OSError):
         return
+
+
+def numbered(number: int, message: bytes) -> bytes:
+    """Return a message under the number of its call: outside of it, so that it is always known."""
+    return number.to_bytes(_NUMBER, "big") + message
+
+
+def unnumbered(message: bytes) -> tuple[int, bytes]:
+    """Return the number of a call and the message that stood under it."""
+    return int.from_bytes(message[:_NUMBER], "big"), message[_NUMBER:]
 
 
 def pack(message: Task | Answer) -> bytes:

@@ -33,7 +33,7 @@ def check_limits(trajectory: Bounded, limits: Bounds) -> None:
         LimitExceeded: naming the first offending quantity, its worst joint, value and bound.
     """
     extrema = trajectory.extrema()
-    slack = POSITION_ROUNDING * _size(limits)
+    slack = position_rounding(limits)
     for quantity, value, bound, excess in (
         ("position", extrema.lower, limits.lower, limits.lower - extrema.lower - slack),
         ("position", extrema.upper, limits.upper, extrema.upper - limits.upper - slack),
@@ -93,19 +93,23 @@ def check_rest(trajectory: Trajectory, limits: Bounds) -> None:
         )
 
 
-def jump_rounding(limits: Bounds, duration: float) -> Array:
-    """Return the jumps of position, velocity, acceleration that count as rounding, (n, 3)."""
+def position_rounding(limits: Bounds) -> Array:
+    """Return by how much a position may leave its range, which counts as rounding, (..., n)."""
+    return POSITION_ROUNDING * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
+
+
+def jump_rounding(limits: Bounds, duration: float | Array) -> Array:
+    """Return the jumps of position, velocity, acceleration that count as rounding, (..., n, 3).
+
+    Durations (...) [s] and limits (..., n) are of one motion or of many.
+    """
     # A knot is told no finer than the clock allows: late in a long motion that shows.
-    tick = 4.0 * np.spacing(duration)
+    tick = 4.0 * np.spacing(np.asarray(duration, dtype=np.float64))[..., None]
     return np.stack(
         (
-            POSITION_ROUNDING * _size(limits) + tick * limits.velocity,
+            position_rounding(limits) + tick * limits.velocity,
             RATE_ROUNDING * limits.velocity + tick * limits.acceleration,
             RATE_ROUNDING * limits.acceleration + tick * limits.jerk,
         ),
-        axis=1,
+        axis=-1,
     )
-
-
-def _size(limits: Bounds) -> Array:
-    return np.maximum(np.abs(limits.lower), np.abs(limits.upper))

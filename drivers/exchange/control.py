@@ -83,7 +83,8 @@ class ControlBlock:
         override_count: raised by one for each override asked for, after it was written.
         finish: 1 when the exchange is to leave open mode and end.
         program_id: of the program to be taken, raised for each; any other is not taken any more.
-        held: 1 while the motion is to rest on its path, 0 when it is to go on.
+        held: 1 if the motion going on is to rest on its path, 0 if it is to go on; an order, not
+            a state: it says nothing of a later motion.
         hold_count: raised by one each time, after `held` was written.
         archive_heartbeat: s.
         archive_state: an `ArchiveState`.

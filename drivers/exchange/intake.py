@@ -8,9 +8,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.exchange.listening import listens_to_all
 from drivers.packets import AXIS_LENGTH, HEADER_LENGTH, LAST_NUMBER, N_ARMS, is_init
 from drivers.session import Session
-from drivers.states import State
+from drivers.states import HAS_SET_POINTS
 from drivers.transports.base import Stamped, Transport
 
 POLL: Final = 0.1
@@ -25,6 +26,10 @@ MOST_WAITING: Final = 100_000
 """Packets looked at for the newest, more than any queue of a kernel holds."""
 MOST_KINDS: Final = 64
 """Packets left of a pile at most."""
+TOO_OLD: Final = 3.0
+"""Cycles since the newest of a pile came, from which on newer ones must have found no room."""
+_TOO_OLD_AT_LEAST: Final = 0.005
+"""s; the same, where cycles are short against what the system may be busy for."""
 _A_LITTLE: Final = 1000
 _SLEPT: Final = 0.1
 """Cycles that receiving a packet takes at most if it was there already."""
@@ -33,11 +38,19 @@ Ages = NDArray[np.uint16]
 
 
 class Arrival(NamedTuple):
-    """A packet, when it arrived on the link's clock, and how old its values are."""
+    """A packet taken from the link.
+
+    Attributes:
+        packet: its bytes.
+        arrived: when, on the link's clock; where the link cannot say, when it was received.
+        ages: of its values, see `Transport.ages`.
+        stamped: whether the link could say.
+    """
 
     packet: bytes
     arrived: float
     ages: Ages | None
+    stamped: bool
 
 
 class Intake:
@@ -48,6 +61,13 @@ class Intake:
     left unanswered as if the link had lost them, and counted as "late". Where axes opened or
     closed meanwhile the session sees it, and packets before an init packet are not mixed with
     those after it.
+
+    A queue that was full holds the oldest packets. Where the newest one found is so old that
+    others must have been turned away since, it is left unanswered too while axes are open: the
+    controller's next packet comes within a cycle.
+
+    On a link that cannot say when a packet arrived, that is guessed for finding piles, and for
+    nothing else.
     """
 
     def __init__(self, transport: Transport, session: Session) -> None:
@@ -71,23 +91,28 @@ class Intake:
             return ()
         now = transport.now
         period = session.period
-        arrived = self._arrival(packet, before, now, period)
+        stamp = self._stamp()
+        arrived = self._guess(packet, before, now, period) if stamp is None else stamp
         heard, self._heard = self._heard, now
         due, self._due = self._due, arrived + TOO_SOON * period
         late = now - arrived > WAITED_HERE * period
         held_up = late or now - heard > HELD_UP * period or arrived < due
         # Where nobody in particular is listened to, packets of several may wait.
         if held_up and not listens_to_all(session):
-            return self._newest(packet, arrived, period)
-        return (Arrival(packet, arrived, transport.ages),)
+            return self._newest(self._told(packet, stamp, now, self._kept_ages()), period)
+        return (self._told(packet, stamp, now, transport.ages),)
 
-    def _arrival(self, packet: bytes, before: float, now: float, period: float) -> float:
-        """When a packet arrived that was received between `before` and `now`."""
-        stamp = None if self._stamped is None else self._stamped.arrived
-        if stamp is not None:
-            return stamp
-        # A link that cannot say. If there was no wait for the packet it came earlier, presumably
-        # when it was due.
+    def _stamp(self) -> float | None:
+        return None if self._stamped is None else self._stamped.arrived
+
+    def _told(self, packet: bytes, stamp: float | None, now: float, ages: Ages | None) -> Arrival:
+        if stamp is None:
+            return Arrival(packet, now, ages, False)
+        return Arrival(packet, stamp, ages, True)
+
+    def _guess(self, packet: bytes, before: float, now: float, period: float) -> float:
+        """When a packet presumably arrived that was received between `before` and `now`."""
+        # If there was no wait for it, it came earlier: when it was due.
         number = _number(packet)
         cycles, self._number = _ahead(number, self._number), number
         if now - before > _SLEPT * period:
@@ -97,34 +122,41 @@ class Intake:
             self._arrived = min(now, self._arrived + steps * period)
         return self._arrived
 
-    def _newest(self, packet: bytes, arrived: float, period: float) -> tuple[Arrival, ...]:
+    def _newest(self, first: Arrival, period: float) -> tuple[Arrival, ...]:
         """Of a packet and those that wait behind it, the newest of each kind."""
         transport = self._transport
         pile = _Pile()
-        pile.add(Arrival(packet, arrived, self._kept_ages()))
+        pile.add(first)
         for _ in range(MOST_WAITING):
             before = transport.now
             following = transport.receive(0.0)
             if following is None:
                 break
-            arrived = self._arrival(following, before, transport.now, period)
-            pile.add(Arrival(following, arrived, self._kept_ages()))
-        self._session.discarded("late", pile.left_out)
-        return pile.kept
+            stamp, now = self._stamp(), transport.now
+            if stamp is None:
+                self._guess(following, before, now, period)
+            pile.add(self._told(following, stamp, now, self._kept_ages()))
+        kept, left_out = pile.kept, pile.left_out
+        if left_out and self._too_old(kept, period):
+            kept, left_out = (), left_out + 1
+        self._session.discarded("late", left_out)
+        return kept
+
+    def _too_old(self, kept: tuple[Arrival, ...], period: float) -> bool:
+        """Whether a pile, of one kind, is that of a queue that had no room for the newest.
+
+        One packet alone is none: its controller may be waiting for the answer. Packets of several
+        kinds tell the session something, however old they are.
+        """
+        if len(kept) != 1 or not kept[0].stamped or self._session.state not in HAS_SET_POINTS:
+            return False
+        age = self._transport.now - kept[0].arrived
+        return age > max(TOO_OLD * period, _TOO_OLD_AT_LEAST)
 
     def _kept_ages(self) -> Ages | None:
         """Ages of the packet received last; the link may reuse its array for the next."""
         ages = self._transport.ages
         return None if ages is None else ages.copy()
-
-
-def listens_to_all(session: Session) -> bool:
-    """Whether there is no session that a change of port could break.
-
-    Before the init packet there is none, and a lost one goes on with the first packet that gets
-    an answer: a stray datagram must not decide who is listened to.
-    """
-    return session.state is State.SYNC or session.deadline == math.inf
 
 
 class _Pile:

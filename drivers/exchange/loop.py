@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Final
 
 from drivers.errors import TransportClosed
-from drivers.exchange.intake import Intake, listens_to_all
+from drivers.exchange.intake import Intake
+from drivers.exchange.listening import Listening
 from drivers.exchange.punctuality import MAX_LATE, Punctuality
 from drivers.session import Session
 from drivers.states import State
@@ -30,11 +31,14 @@ def exchange(
     can wait until then is done there.
 
     Where packets have piled up, only the newest are answered, see `Intake`. Answers that leave
-    later than the controller's next packet are counted, and end a motion, see `Punctuality`.
+    later than the controller's next packet are counted, and end a motion, see `Punctuality`. Before
+    the init packet and after a loss, anybody at the controller's address may begin, see
+    `Listening`.
 
     A closed link is silence for good: the session is told so, and ends what was going on.
     """
     intake = Intake(transport, session)
+    listening = Listening(transport, session)
     punctuality = Punctuality(session, max_late)
     taken = 0
     send, reply = transport.send, session.reply
@@ -42,17 +46,23 @@ def exchange(
         try:
             arrivals = intake.take()
             if not arrivals:
-                _idle(transport, session)
+                session.tick(transport.now)
+                listening.heard_nothing()
+                _count_rejected(transport, session)
                 continue
-            for packet, arrived, ages in arrivals:
-                punctuality.heard(arrived)
+            for packet, arrived, ages, stamped in arrivals:
+                punctuality.heard(arrived if stamped else math.inf)
+                deadline = session.deadline
                 answer = reply(packet, arrived, ages)
                 if answer is not None:
+                    now = transport.now
+                    # Silence is counted from the answer: the packet may have waited long for it.
+                    if session.deadline != deadline:
+                        session.deadline += now - arrived
                     # Before it leaves: a controller that waits for it may be faster than we are.
-                    punctuality.answered(arrived, transport.now)
+                    punctuality.answered(arrived, now)
                     send(answer)
-            if listens_to_all(session):
-                transport.forget_peer()
+                listening.heard(answer is not None)
             taken += 1
             if taken % COUNT_EVERY == 0:
                 _count_rejected(transport, session)
@@ -60,14 +70,6 @@ def exchange(
             if math.isfinite(session.deadline):
                 session.tick(max(transport.now, session.deadline))
             return
-
-
-def _idle(transport: Transport, session: Session) -> None:
-    """Nothing came: tell the session what time it is."""
-    session.tick(transport.now)
-    if listens_to_all(session):
-        transport.forget_peer()
-    _count_rejected(transport, session)
 
 
 def _count_rejected(transport: Transport, session: Session) -> None:

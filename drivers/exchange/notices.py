@@ -32,6 +32,13 @@ class OverrideRefused:
 
 
 @dataclass(frozen=True)
+class HoldRefused:
+    """Nothing is held, for the reason given; a motion requested later begins as usual."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
 class ResumeRefused:
     """The motion cannot be gone on with, for the reason given."""
 
@@ -73,6 +80,7 @@ ExchangeEvent = (
     Event
     | ExchangeStarted
     | OverrideRefused
+    | HoldRefused
     | ResumeRefused
     | EventsLost
     | Leaving

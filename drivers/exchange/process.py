@@ -177,7 +177,8 @@ class ExchangeProcess:
     def hold(self) -> None:
         """Ask the motion going on to rest on its path until `resume`; one that cannot is stopped.
 
-        A motion that has not begun is dropped.
+        A motion that has not begun is dropped; where there is none, `HoldRefused` is among the
+        events, and one handed over later begins as usual.
         """
         self._hold(1)
 

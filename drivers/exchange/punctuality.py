@@ -28,7 +28,10 @@ class Punctuality:
         self._in_a_row = 0
 
     def heard(self, arrived: float) -> None:
-        """A packet arrived at that time and is to be answered next."""
+        """A packet arrived at that time and is to be answered next.
+
+        Infinite if the time is not known: a guess must not stop a motion.
+        """
         if arrived > self._left:
             self._in_a_row = 0
             return

@@ -16,7 +16,13 @@ from drivers.exchange.control import STALE, ArchiveState, ControlBlock, Ended
 from drivers.exchange.digest import Digest
 from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import Inbox
-from drivers.exchange.notices import ExchangeEvent, Leaving, OverrideRefused, ResumeRefused
+from drivers.exchange.notices import (
+    ExchangeEvent,
+    HoldRefused,
+    Leaving,
+    OverrideRefused,
+    ResumeRefused,
+)
 from drivers.exchange.shared_ring import SharedCycleRing
 from drivers.record import MEASURED
 from drivers.session import Session
@@ -169,13 +175,13 @@ class Serving:
             self.say(OverrideRefused(fraction, str(error)))
 
     def _change_hold(self, held: bool) -> None:
-        if held:
-            self._session.hold()
-            return
         try:
-            self._session.resume()
+            if held:
+                self._session.hold()
+            else:
+                self._session.resume()
         except DriverError as error:
-            self.say(ResumeRefused(str(error)))
+            self.say((HoldRefused if held else ResumeRefused)(str(error)))
 
     def _take_program(self, now: float) -> None:
         """Read the program that was handed over, request it, and say what became of it."""
@@ -258,6 +264,11 @@ class Serving:
         control.worst_turnaround_us = 1e6 * self._worst
 
     def _over(self, now: float) -> bool:
+        """Whether nobody needs answers any more, once there is a reason to end.
+
+        Without a supervisor it answers as long as the arm moves, whoever moves it, without limit:
+        nobody is left to see what the controller does when answers end.
+        """
         if self._open or (self._orphaned and now - self._arm_moved_at < ARM_RESTS):
             return False
         lingered = now - self._closed_since >= self._linger

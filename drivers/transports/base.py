@@ -73,7 +73,8 @@ class Transport(Protocol):
     def forget_peer(self) -> None:
         """There is no session: its next packet may come from elsewhere at the same address.
 
-        Called after each packet and each wait for as long as that is so.
+        Called, for as long as that is so, after each packet that got no answer, and when there
+        was none with an answer for a while.
         """
         ...
 
@@ -88,7 +89,10 @@ class Stamped(Protocol):
 
     @property
     def arrived(self) -> float | None:
-        """When the packet received last arrived, s on the clock of `now`; None if unknown."""
+        """When the packet received last arrived, s on the clock of `now`; None if unknown.
+
+        Never in the future, nor before the packet that came before it.
+        """
         ...
 
 

@@ -39,9 +39,10 @@ _MEMINFO: Final = struct.Struct("=9I")
 _TIMEVAL: Final = struct.Struct("@qq")
 _TIMESPEC: Final = struct.Struct("@qq")
 _CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
-_LONGEST_STAY: Final = 10.0
-"""s in the kernel's queue; a datagram that seems to have been there for longer was not: the
-system's clock was set meanwhile."""
+_CLOCK_SET: Final = 1e-3
+"""s that the wall clock moves against the monotonic one if it was set; else they run alike."""
+MOST_PASSED_OVER: Final = 1000
+"""Datagrams of strangers passed over once the time is up, more than a queue usually holds."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,9 @@ class UdpTransport:
     Attributes:
         address: host and port bound.
         notes: socket options that the system refused, in words. None of them is needed.
-        arrived: when the kernel had the datagram received last, on the clock of `now`; None where
-            it does not say.
+        arrived: when the kernel had the datagram received last, on the clock of `now`, and never
+            before the one that came before it; None where it does not say. Where the system's
+            clock was set since the last one, when it was received.
 
     Raises:
         TransportError: address unknown, port taken, or not permitted.
@@ -96,7 +98,9 @@ class UdpTransport:
         self._socket = _bound(bind, port)
         self.address: tuple[str, int] = self._socket.getsockname()
         self.notes = _set_options(self._socket)
-        self._timeout = -1.0
+        self._timeout = math.nan
+        self._earliest = time.monotonic()  # no datagram to come arrived before
+        self._offset = time.time() - self._earliest
         self.arrived: float | None = None
         self._receive = self._socket.recvmsg
         self._send = self._socket.sendto
@@ -118,29 +122,35 @@ class UdpTransport:
     def receive(self, timeout: float) -> bytes | None:
         """The next datagram of the peer, or None after `timeout` s without one.
 
+        One that is there already is found behind any number of strangers up to
+        `MOST_PASSED_OVER`, also with a time-out of 0.
+
         Raises:
             TransportClosed: closed, or the socket failed.
         """
         end = time.monotonic() + timeout
+        passed_over = 0
         while True:
             flags = 0 if timeout == self._timeout else self._have_patience(timeout)
             try:
                 packet, told, _, sender = self._receive(LONGEST + 1, _CONTROL_SPACE, flags)
             except BlockingIOError:
-                pass
+                # The kernel counts in scheduler ticks and may have ended the wait a tick early.
+                timeout = end - time.monotonic()
+                if timeout <= 0.0:
+                    return None
+                continue
             except OSError as error:
                 raise TransportClosed(self._trouble(error)) from error
-            else:
-                if (sender == self._peer and len(packet) <= LONGEST) or self._accepts(
-                    packet, sender
-                ):
-                    self.arrived = _arrival(told)
-                    return packet
-            # Strangers do not lengthen the wait, and the kernel, which counts in scheduler ticks,
-            # may have ended it a tick early.
-            timeout = end - time.monotonic()
-            if timeout <= 0.0:
-                return None
+            if (sender == self._peer and len(packet) <= LONGEST) or self._accepts(packet, sender):
+                self.arrived = self._arrival(told)
+                return packet
+            # Strangers do not lengthen the wait, but what is behind them is not left there.
+            timeout = max(0.0, end - time.monotonic())
+            if timeout == 0.0:
+                passed_over += 1
+                if passed_over > MOST_PASSED_OVER:
+                    return None
 
     def send(self, packet: bytes) -> None:
         """Answer the peer; a datagram that the system does not take is counted as "unsent".
@@ -207,6 +217,23 @@ class UdpTransport:
             return False
         return True
 
+    def _arrival(self, told: list[tuple[int, int, bytes]]) -> float | None:
+        """The kernel's time of arrival, which is that of the wall clock, on the monotonic clock."""
+        if not told:
+            return None
+        seconds, nanoseconds = _TIMESPEC.unpack(told[0][2])
+        wall = time.time()
+        now = time.monotonic()
+        offset, self._offset = self._offset, wall - now
+        if abs(self._offset - offset) > _CLOCK_SET:
+            arrived = now
+        else:
+            # The queue is in order, so a stamp older than the last one's is of a clock since set.
+            stayed = wall - seconds - 1e-9 * nanoseconds
+            arrived = min(now, max(now - stayed, self._earliest))
+        self._earliest = arrived
+        return arrived
+
     def _count(self, kind: str) -> None:
         self._rejected[kind] = self._rejected.get(kind, 0) + 1
 
@@ -269,16 +296,6 @@ def _set_options(udp: socket.socket) -> tuple[str, ...]:
         except OSError as error:
             notes.append(f"{name} = {value} was refused ({error.strerror})")
     return tuple(notes)
-
-
-def _arrival(told: list[tuple[int, int, bytes]]) -> float | None:
-    """The kernel's time of arrival, which is that of the wall clock, on the monotonic clock."""
-    if not told:
-        return None
-    seconds, nanoseconds = _TIMESPEC.unpack(told[0][2])
-    stayed = time.time() - seconds - 1e-9 * nanoseconds
-    now = time.monotonic()
-    return now - stayed if 0.0 <= stayed < _LONGEST_STAY else now
 
 
 def _dropped(udp: socket.socket) -> int:

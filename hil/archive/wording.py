@@ -19,6 +19,7 @@ from drivers.exchange import (
     ExchangeEvent,
     ExchangeFailed,
     ExchangeStarted,
+    HoldRefused,
     Leaving,
     OverrideRefused,
     ResumeRefused,
@@ -63,6 +64,8 @@ def describe(event: ExchangeEvent) -> str:
             return "; ".join(["the exchange is running", *event.realtime.refused, *event.notes])
         case OverrideRefused():
             return f"no override of {event.fraction:g}: {event.reason}"
+        case HoldRefused():
+            return f"nothing is held: {event.reason}"
         case ResumeRefused():
             return f"the motion cannot be gone on with: {event.reason}"
         case EventsLost():
@@ -73,6 +76,9 @@ def level_of(event: ExchangeEvent) -> Level:
     """How serious an event is."""
     if isinstance(event, Refused | LinkLost | ExchangeFailed | EventsLost):
         return Level.ERROR
-    if isinstance(event, GapSeen | AnswersLost | PacketRejected | OverrideRefused | ResumeRefused):
+    if isinstance(
+        event,
+        GapSeen | AnswersLost | PacketRejected | OverrideRefused | ResumeRefused | HoldRefused,
+    ):
         return Level.WARN
     return Level.INFO

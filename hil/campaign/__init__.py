@@ -11,7 +11,7 @@ from .folder import CampaignFolder
 from .link import Link
 from .live_link import LiveLink
 from .motion_link import MotionLink, Progress, Recorded
-from .plan import CampaignPlan, design
+from .plan import CampaignPlan, PlannedMotion, design
 from .stop import Stop, stop_on_interrupt
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "MotionLink",
     "MotionRefusedError",
     "NotRehearsedError",
+    "PlannedMotion",
     "Progress",
     "Recorded",
     "Stop",

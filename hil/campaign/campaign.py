@@ -16,7 +16,7 @@ from hil.cell import Cell
 from hil.files import make_folder
 from hil.progress import Reporter
 from hil.version import software
-from planner import PiecewiseCubic, TrajectoryPlayer, plan
+from planner import Move, PiecewiseCubic, PlanFile, TrajectoryPlayer, in_child, plan_moves
 
 from .errors import (
     CampaignFolderError,
@@ -26,7 +26,7 @@ from .errors import (
 )
 from .folder import CampaignFolder
 from .motion_link import MotionLink
-from .plan import CampaignPlan, MotionChecks
+from .plan import CampaignPlan, MotionChecks, moves_to_dict
 from .stop import Stop
 
 Array = NDArray[np.float64]
@@ -39,11 +39,12 @@ START_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """One interval of motion: what kind it is and the trajectory to run."""
+    """One interval of motion: what kind it is, the trajectory to run, and the moves behind it."""
 
     kind: str
     index: int
     trajectory: PiecewiseCubic
+    moves: PlanFile | None = None
 
     def __str__(self) -> str:
         return f"{self.kind} {self.index}"
@@ -157,13 +158,14 @@ class Campaign:
     def _missing(self, where: Array) -> list[Interval]:
         """What is still to be run with the arm at `where` (n,), there and back."""
         settings, home, archived = self.cell.campaign, self.cell.home, self.folder
+        excitation, moves = self.plan.excitation.trajectory, self.plan.moves
         wanted = [
             Interval("standstill", 0, hold(home, settings.standstill_s)),
+            *(Interval("excitation", i, excitation, moves) for i in range(settings.repetitions)),
             *(
-                Interval("excitation", i, self.plan.excitation.trajectory)
-                for i in range(settings.repetitions)
+                Interval("validation", i, motion.trajectory, motion.moves)
+                for i, motion in enumerate(self.plan.validation)
             ),
-            *(Interval("validation", i, m) for i, m in enumerate(self.plan.validation)),
         ]
         missing = [w for w in wanted if archived.whole(w.kind, w.index) is None]
         if missing and np.max(np.abs(home - where)) > AT_REST_TOLERANCE:
@@ -171,9 +173,12 @@ class Campaign:
         return missing
 
     def _move(self, index: int, start: Array, end: Array) -> Interval:
-        slow = self.cell.campaign.approach_speed
-        motion = plan(np.array([start, end]), self.cell.joint_limits, speed=slow)
-        return Interval("move", index, motion)
+        """The way between the arm and home; planned where a crash does not end this process."""
+        move = Move(end, speed=self.cell.campaign.approach_speed)
+        motion = in_child(plan_moves, start, (move,), self.cell.joint_limits)
+        return Interval(
+            "move", index, motion.trajectory, PlanFile.of(motion, self.cell.joint_names)
+        )
 
     def _run_one(
         self,
@@ -184,13 +189,15 @@ class Campaign:
         *,
         durable: bool,
     ) -> None:
-        cell, bounds = self.cell, self.cell.file.bounds.stop
+        cell, bounds = self.cell, self.cell.file.bounds
         player = TrajectoryPlayer(
             interval.trajectory,
             cell.period,
             cell.joint_limits,
-            stop_acceleration=bounds.acceleration,
-            stop_jerk=bounds.jerk,
+            override_acceleration=bounds.override.acceleration,
+            override_jerk=bounds.override.jerk,
+            stop_acceleration=bounds.stop.acceleration,
+            stop_jerk=bounds.stop.jerk,
             start_tolerance=START_TOLERANCE,
         )
         name = self.folder.next_name(interval.kind, interval.index)
@@ -219,10 +226,11 @@ class Campaign:
         }
 
     def _plan_of(self, interval: Interval) -> dict[str, Any]:
-        """What was planned for an interval: its trajectory, and how an excitation was found."""
+        """The trajectory of an interval, its moves, and how an excitation was found."""
+        moves = moves_to_dict(interval.moves)
         if interval.kind == "excitation":
-            return {"excitation": self.plan.excitation.to_dict()}
-        return {"trajectory": interval.trajectory.to_dict()}
+            return {"excitation": self.plan.excitation.to_dict(), **moves}
+        return {"trajectory": interval.trajectory.to_dict(), **moves}
 
     def _metadata(self) -> dict[str, str]:
         return {

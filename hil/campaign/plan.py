@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from hil.cell import Cell
 from hil.errors import InputError
@@ -14,29 +15,79 @@ from hil.progress import Reporter
 from identification.excitation import (
     CollisionChecker,
     CurrentModel,
+    DrawnMotion,
     Excitation,
     check_motion,
     random_search,
     random_validation_motions,
 )
-from planner import JointLimits, NotSmooth, PiecewiseCubic
+from planner import JointLimits, NotSmooth, PiecewiseCubic, PlanFile
 from planner.verify import check_smooth
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""1 kept no moves: of validation motions the trajectories only, and no limits."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedMotion:
+    """A motion, and the moves that it was planned from.
+
+    Attributes:
+        trajectory: the motion.
+        moves: start, moves and limits, without the motion; None where they were not kept.
+    """
+
+    trajectory: PiecewiseCubic
+    moves: PlanFile | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data; `from_dict` restores every bit, through JSON too."""
+        return {"trajectory": self.trajectory.to_dict(), **moves_to_dict(self.moves)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Restore what `to_dict` returned.
+
+        Raises:
+            KeyError, TypeError, ValueError: the data are no planned motion.
+        """
+        return cls(PiecewiseCubic.from_dict(data["trajectory"]), moves_from_dict(data))
+
+
+def moves_to_dict(moves: PlanFile | None) -> dict[str, Any]:
+    """Return the entry `moves` of plain data, a plan file without its motion; none without moves.
+
+    The motion stands beside it, so that it is not kept twice.
+    """
+    return {} if moves is None else {"moves": replace(moves, trajectory=None).to_dict()}
+
+
+def moves_from_dict(data: Mapping[str, Any]) -> PlanFile | None:
+    """Return the entry `moves` of plain data, None if there is none."""
+    return PlanFile.from_dict(data["moves"]) if "moves" in data else None
 
 
 @dataclass(frozen=True, eq=False)
 class CampaignPlan:
-    """The excitation, and the motions that are kept for validation and never fitted."""
+    """The excitation, and the motions that are kept for validation and never fitted.
+
+    Attributes:
+        excitation: the motion to fit, and how it was found.
+        validation: the motions to predict.
+        moves: those of the excitation, with the limits that it was planned for; None where they
+            were not kept.
+    """
 
     excitation: Excitation
-    validation: tuple[PiecewiseCubic, ...]
+    validation: tuple[PlannedMotion, ...]
+    moves: PlanFile | None = None
 
     def save(self, path: Path) -> None:
         """Write the plan as JSON."""
         content = {
             "format_version": FORMAT_VERSION,
             "excitation": self.excitation.to_dict(),
+            **moves_to_dict(self.moves),
             "validation": [motion.to_dict() for motion in self.validation],
         }
         write_atomically(path, json.dumps(content) + "\n")
@@ -50,13 +101,21 @@ class CampaignPlan:
         """
         try:
             content: dict[str, Any] = json.loads(path.read_text("utf-8"))
-            if content["format_version"] != FORMAT_VERSION:
-                raise ValueError(f"format version {content['format_version']}")
+            version = content["format_version"]
+            if version not in (1, FORMAT_VERSION):
+                raise ValueError(f"format version {version}")
+            motions = content["validation"]
             return cls(
                 Excitation.from_dict(content["excitation"]),
-                tuple(PiecewiseCubic.from_dict(motion) for motion in content["validation"]),
+                tuple(
+                    PlannedMotion(PiecewiseCubic.from_dict(motion))
+                    if version == 1
+                    else PlannedMotion.from_dict(motion)
+                    for motion in motions
+                ),
+                moves_from_dict(content),
             )
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(
                 path, f"is not a campaign plan ({error})", remedy="design the excitation again"
             ) from error
@@ -96,7 +155,17 @@ def design(cell: Cell, reporter: Reporter) -> CampaignPlan:
         checker=checks.checker,
         currents=checks.currents,
     )
-    return CampaignPlan(excitation, validation)
+
+    def moves_of(motion: Excitation | DrawnMotion) -> PlanFile:
+        return PlanFile(
+            cell.joint_names, motion.via_points[0], motion.moves, limits=cell.joint_limits
+        )
+
+    return CampaignPlan(
+        excitation,
+        tuple(PlannedMotion(drawn.trajectory, moves_of(drawn)) for drawn in validation),
+        moves_of(excitation),
+    )
 
 
 @dataclass(frozen=True, eq=False)

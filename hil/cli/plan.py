@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
-from math import radians
+from math import isfinite, radians
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,20 +12,23 @@ import typer
 
 from hil.cell import Cell
 from hil.cli.plan_input import (
+    PLAN_FILES,
+    isolated,
     moves_through,
+    planned_again,
     random_via_points,
-    read_plan_file,
     read_via_points,
 )
 from hil.errors import InputError
 from hil.files import write_atomically
-from hil.plots import AngleFrame, draw_plan, save
+from hil.plots import AngleFrame, check_format, draw_plan, save
 from planner.motion_csv import to_csv
 from planner.moves import Fly, FlyDistance, FlyPercent, MotionPlan, plan_moves
 from planner.plan_file import PlanFile
 
-_PLAN_FILES = (".toml", ".json")
 _RATES = ("velocity", "acceleration", "jerk")
+_MOST_ROWS = 1_000_000
+"""of a table; it is made in memory."""
 
 
 def plan(
@@ -89,12 +92,13 @@ def plan(
 
     **Example:** `hil plan cell.toml --random 6 --fly 50 --picture plan.png`
     """
+    _check_requests(output, picture, rate)
     loaded = Cell.load(cell)
     frame = AngleFrame.of(loaded)
     if (via is None) == (random is None):
         raise InputError(None, "what is to be planned?", remedy="give either --via or --random")
-    if via is not None and via.suffix in _PLAN_FILES:
-        planned = _planned_again(via, loaded)
+    if via is not None and via.suffix.lower() in PLAN_FILES:
+        planned = planned_again(via, loaded)
     else:
         points = (
             random_via_points(loaded, frame, random or 1, seed)
@@ -103,7 +107,7 @@ def plan(
         )
         asked: Fly = FlyPercent(fly) if fly_distance is None else FlyDistance(radians(fly_distance))
         moves = moves_through(points, fly=asked, speed=speed / 100, acceleration=acceleration / 100)
-        planned = plan_moves(points[0], moves, loaded.joint_limits)
+        planned = isolated(plan_moves, points[0], moves, loaded.joint_limits)
     if corner is not None and corner >= len(planned.moves):
         raise InputError(
             None,
@@ -112,6 +116,9 @@ def plan(
             remedy=f"there are {len(planned.moves)} targets, the last one is a stop",
         )
     names = loaded.joint_names
+    rows_a_second = _cycles_a_second(loaded) if rate is None else rate
+    if csv is not None:
+        _check_rows(planned.duration, rows_a_second)
     typer.echo(
         json_format.dumps(_summary(planned, loaded, frame))
         if json
@@ -120,10 +127,7 @@ def plan(
     if output is not None:
         _write_plan(output, PlanFile.of(planned, names))
     if csv is not None:
-        _write(
-            csv,
-            to_csv(planned.trajectory, _cycles_a_second(loaded) if rate is None else rate, names),
-        )
+        _write(csv, to_csv(planned.trajectory, rows_a_second, names))
     if picture is not None:
         figure = draw_plan(
             planned,
@@ -135,17 +139,31 @@ def plan(
         save(figure, picture)
 
 
-def _planned_again(path: Path, cell: Cell) -> MotionPlan:
-    """Plan the moves of a file for the limits of a cell."""
-    file = read_plan_file(path)
-    if file.joint_names != cell.joint_names:
+def _check_requests(output: Path | None, picture: Path | None, rate: float | None) -> None:
+    """Refuse what could be written in no case before time is spent on planning."""
+    if output is not None and output.suffix.lower() not in PLAN_FILES:
         raise InputError(
-            path,
-            f"is for the joints {', '.join(file.joint_names)}",
-            field="joints",
-            remedy=f"those of the cell are {', '.join(cell.joint_names)}",
+            output,
+            f"{output.suffix!r} is no plan file",
+            field="--output",
+            remedy=f"use {' or '.join(PLAN_FILES)}",
         )
-    return file.plan(cell.joint_limits)
+    if picture is not None:
+        check_format(picture)
+    if rate is not None and not (isfinite(rate) and rate > 0.0):
+        raise InputError(
+            None, f"{rate} rows a second make no table", field="--rate", remedy="give more than 0"
+        )
+
+
+def _check_rows(duration: float, rate: float) -> None:
+    if duration * rate > _MOST_ROWS:
+        raise InputError(
+            None,
+            f"{rate:g} rows a second of a motion of {duration:.3f} s are too many for a table",
+            field="--rate",
+            remedy=f"give a lower rate; at most {_MOST_ROWS} rows are written",
+        )
 
 
 def _cycles_a_second(cell: Cell) -> float:
@@ -215,12 +233,10 @@ def _worst(plan: MotionPlan) -> tuple[float, str, int]:
 
 
 def _write_plan(path: Path, file: PlanFile) -> None:
-    if path.suffix not in _PLAN_FILES:
-        raise InputError(
-            path, f"{path.suffix!r} is no plan file", remedy=f"use {' or '.join(_PLAN_FILES)}"
-        )
-    text = file.to_toml() if path.suffix == ".toml" else json_format.dumps(file.to_dict()) + "\n"
-    _write(path, text)
+    if path.suffix.lower() == ".toml":
+        _write(path, file.to_toml())
+    else:
+        _write(path, json_format.dumps(file.to_dict()) + "\n")
 
 
 def _write(path: Path, text: str) -> None:

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from hil.plots.frame import AngleFrame
-from hil.plots.plan_picture import draw_plan, save
+from hil.plots.plan_picture import check_format, draw_plan, save
 
-__all__ = ["AngleFrame", "draw_plan", "save"]
+__all__ = ["AngleFrame", "check_format", "draw_plan", "save"]

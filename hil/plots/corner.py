@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hil.plots import style
 from hil.plots.frame import AngleFrame
 from hil.plots.joints import corner_times
+from planner.isolation import in_child
 from planner.moves import FlyPercent, MotionPlan, TargetPassage, plan_moves
 
 Array = NDArray[np.float64]
@@ -44,12 +45,16 @@ class FlownCorner:
 
 
 def flown_corners(plan: MotionPlan, target: int) -> list[FlownCorner]:
-    """Plan again with the corner at one target (from 0, not the last) at each percentage."""
+    """Plan again with the corner at one target (from 0, not the last) at each percentage.
+
+    Raises:
+        PlannerCrashed, PlanningTimedOut: the solver crashed, or found no end.
+    """
     corners = []
     for percent in PERCENTAGES:
         moves = list(plan.moves)
         moves[target] = replace(moves[target], fly=FlyPercent(percent))
-        again = plan_moves(plan.start, moves, plan.limits, plan.overrides)
+        again = in_child(plan_moves, plan.start, moves, plan.limits, plan.overrides)
         corners.append(
             FlownCorner(percent, again, again.targets[target], *corner_times(again)[target])
         )

@@ -77,16 +77,25 @@ def draw_plan(
     return figure
 
 
+def check_format(path: Path) -> None:
+    """Refuse a name that tells no format in which pictures are written.
+
+    Raises:
+        InputError: it does not.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(
+            path, f"{path.suffix!r} is no format for pictures", remedy=f"use {', '.join(FORMATS)}"
+        )
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a picture in the format of its name.
 
     Raises:
         InputError: the format is unknown, or the file cannot be written.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise InputError(
-            path, f"{path.suffix!r} is no format for pictures", remedy=f"use {', '.join(FORMATS)}"
-        )
+    check_format(path)
     metadata = {"Date": None} if path.suffix.lower() == ".svg" else {}
     try:
         with style.page():

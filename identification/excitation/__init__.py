@@ -23,6 +23,7 @@ from identification.excitation.design import (
     random_search,
     random_validation_motions,
 )
+from identification.excitation.drawn import DrawnMotion
 from identification.excitation.errors import (
     CollisionModelError,
     DesignError,
@@ -53,6 +54,7 @@ __all__ = [
     # designs
     "Criteria",
     "Drawing",
+    "DrawnMotion",
     "Excitation",
     "random_search",
     "random_validation_motions",

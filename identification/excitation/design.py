@@ -31,11 +31,13 @@ from identification.excitation.criteria import (
     information,
     log10_det,
 )
+from identification.excitation.drawn import DrawnMotion, moves_through
 from identification.excitation.errors import DesignError, NoFeasibleMotionError
 from identification.factor import Factor
 from identification.model import RobotModel
 from planner import (
     JointLimits,
+    Move,
     PiecewiseCubic,
     PlannerCrashed,
     PlanningError,
@@ -105,6 +107,11 @@ class Excitation:
     seed: int
     tried: int
     rejected: Mapping[str, int]
+
+    @property
+    def moves(self) -> tuple[Move, ...]:
+        """The moves from the first via point on; they plan to the trajectory, bit for bit."""
+        return moves_through(self.via_points, self.speed, self.fly)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data; `from_dict` restores every bit, through JSON too."""
@@ -204,7 +211,7 @@ def random_search(
     if candidates < 1:
         raise DesignError("candidates", candidates, "at least 1")
     draw = _Draw(limits, home, n_via, fly, drawing, checker, currents)
-    best: tuple[_Drawn, Criteria] | None = None
+    best: tuple[DrawnMotion, Criteria] | None = None
     for k in range(candidates):
         drawn = draw(np.random.default_rng([_EXCITATION, seed, k]))
         if drawn is not None:
@@ -219,7 +226,7 @@ def random_search(
     return Excitation(
         via_points=drawn.via_points,
         speed=drawn.speed,
-        fly=fly,
+        fly=drawn.fly,
         trajectory=drawn.trajectory,
         criteria=criteria,
         seed=seed,
@@ -239,7 +246,7 @@ def random_validation_motions(
     drawing: Drawing = Drawing(),
     checker: CollisionChecker | None = None,
     currents: CurrentModel | None = None,
-) -> tuple[PiecewiseCubic, ...]:
+) -> tuple[DrawnMotion, ...]:
     """Return wide random motions to predict torques on, never to fit parameters to.
 
     They run through the same interpolator under the same constraints as an excitation (see
@@ -256,18 +263,11 @@ def random_validation_motions(
         for attempt in range(_TRIES_PER_MOTION):
             drawn = draw(np.random.default_rng([_VALIDATION, seed, k, attempt]))
             if drawn is not None:
-                motions.append(drawn.trajectory)
+                motions.append(drawn)
                 break
         else:
             raise draw.failure()
     return tuple(motions)
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    via_points: Array
-    speed: Array
-    trajectory: PiecewiseCubic
 
 
 class _Draw:
@@ -299,7 +299,7 @@ class _Draw:
             self._reject([replace(contact, subject=f"{contact.subject} at home")])
             raise self.failure()
 
-    def __call__(self, random: np.random.Generator) -> _Drawn | None:
+    def __call__(self, random: np.random.Generator) -> DrawnMotion | None:
         """Return a feasible motion, or None and count why there is none."""
         speed = random.uniform(*self._drawing.speed, self._limits.n_joints)
         via_points = self._via_points(random)
@@ -320,7 +320,7 @@ class _Draw:
         if violations:
             self._reject(violations)
             return None
-        return _Drawn(via_points, speed, trajectory)
+        return DrawnMotion(via_points, speed, self._fly, trajectory)
 
     def failure(self) -> NoFeasibleMotionError:
         """Return the error that tells what forbids every motion."""

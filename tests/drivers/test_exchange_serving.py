@@ -8,12 +8,14 @@ import time
 import pytest
 from rig import N
 
+from drivers.errors import RequestError
 from drivers.events import Counters, GapSeen, MotionEnded, PacketRejected
 from drivers.exchange import (
     ControlBlock,
     Ended,
     EventReader,
     EventWriter,
+    HoldRefused,
     Leaving,
     SharedCycleRing,
     control,
@@ -46,6 +48,8 @@ class Told:
         self.asked.append("stop")
 
     def hold(self):
+        if not self.requested:
+            raise RequestError("closed", "no motion was requested", "hold")
         self.asked.append("hold")
 
     def resume(self):
@@ -163,12 +167,22 @@ class TestLeaving:
 
 class TestHold:
     def test_each_change_is_passed_on_once(self, bench):
+        bench.session.requested = True
         for held in (1, 0, 1):
             bench.control.held = held
             bench.control.hold_count += 1
             bench.step()
             bench.step()
         assert bench.session.asked == ["hold", "resume", "hold"]
+
+    def test_where_there_is_no_motion_a_hold_is_refused_and_told(self, bench):
+        bench.control.held = 1
+        bench.control.hold_count += 1
+        bench.step()
+        assert bench.session.asked == []
+        (notice,) = bench.reader.drain()
+        assert isinstance(notice, HoldRefused)
+        assert "no motion was requested" in notice.reason
 
     def test_of_two_that_come_together_the_last_counts(self, bench):
         for held in (1, 0):

@@ -18,7 +18,8 @@ from drivers import (
     State,
 )
 from drivers.answers import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
-from drivers.errors import ExitNotGranted
+from drivers.errors import ExitNotGranted, FirstSetPointUnknown
+from drivers.states import CORRECTION_MODES
 
 TIMEOUT = round(EXIT_TIMEOUT / PERIOD)
 
@@ -250,6 +251,53 @@ class TestReopenedWhileLeaving:
         rig.cycle()
         rig.axes["mode"][2] = mode
         assert not rig.cycle().axes["d"].any()
+
+
+class TestAStrayAxisWhileCorrectionsEnd:
+    """It is in a mode of positions, so its own target is given back: if it can be held there."""
+
+    def stray(self, wanted, target=None, age=0, opening=False):
+        rig = Rig(mode=wanted)
+        rig.open()
+        rig.cycle(5)
+        if opening:
+            rig.close()
+        rig.modes = [wanted if opening else 0, 0, 4, 0, 0, 0]
+        if target is not None:
+            rig.axes["d"][2, 0] = target
+        rig.ages = np.full((N, 8), age, np.uint16)
+        return rig, rig.cycle()
+
+    @pytest.mark.parametrize("opening", [False, True])
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_a_target_that_is_no_number_is_not_given_back(self, mode, opening):
+        rig, answer = self.stray(mode, np.nan, opening=opening)
+        assert all_drive_off(answer)
+        assert np.isfinite(answer.axes["d"]).all()
+        assert type(rig.refusal) is NotFinite
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_nor_one_far_from_the_arm(self, mode):
+        rig, answer = self.stray(mode, 50.0)
+        assert answer.axes["mode"].tolist() == [0, 0, 508, 0, 0, 0]
+        assert type(rig.refusal) is FollowingError
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_nor_one_of_an_earlier_cycle(self, mode):
+        rig, answer = self.stray(mode, age=1)
+        assert all_drive_off(answer)
+        assert type(rig.refusal) is FirstSetPointUnknown
+
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    def test_another_is(self, mode):
+        rig, answer = self.stray(mode)
+        assert rig.state is State.EXITING
+        assert answer.axes["mode"].tolist() == [0, 0, 4, 0, 0, 0]
+        assert answer.axes["d"][2, 0] == rig.axes["d"][2, 0]
+        assert (
+            np.isfinite(rig.records[-1]["commanded_position"]).tolist()
+            == [False] * 2 + [True] + [False] * 3
+        )
 
 
 class TestOpeningThatNeverCompletes:

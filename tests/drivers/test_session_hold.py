@@ -4,9 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import PERIOD, START, Cruise, N, Rig, all_drive_off, limits, moving, smooth_move
+from rig import (
+    PERIOD,
+    START,
+    Correction,
+    Cruise,
+    N,
+    Rig,
+    all_drive_off,
+    limits,
+    moving,
+    smooth_move,
+)
 
-from drivers import RequestError, SourceFailed, State
+from drivers import AccelerationLimit, Mode, Refused, RequestError, SourceFailed, State
 from planner import JointLimits, TrajectoryPlayer, plan
 
 WAY = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
@@ -28,6 +39,14 @@ def playing(cycles: int = 60) -> Rig:
     rig.cycle(cycles)
     assert rig.state is State.OPEN
     return rig
+
+
+def nothing(self):
+    pass
+
+
+class IgnoresHold(Cruise):
+    hold = resume = nothing
 
 
 def at_rest(rig: Rig) -> bool:
@@ -113,12 +132,79 @@ class TestHold:
         rig.cycle()
         assert (rig.ended.outcome, rig.ended.interval) == ("stopped", -1)
 
-    def test_without_a_motion_nothing_changes(self):
+    def test_needs_a_motion_and_keeps_nothing_for_one_to_come(self):
         rig = Rig()
         rig.open()
-        rig.session.hold()
-        rig.cycle(10)
+        with pytest.raises(RequestError, match="no hold can be requested in state 'open'"):
+            rig.session.hold()
+        rig.session.request(player())
+        rig.cycle(60)
         assert (rig.state, rig.exits_asked) == (State.OPEN, 0)
+        assert not at_rest(rig)
+
+    def test_a_source_that_does_nothing_is_stopped(self):
+        rig = Rig(guard_limits=limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0)))
+        source = IgnoresHold()
+        rig.session.request(source)
+        rig.open()
+        rig.cycle(300)
+        rig.session.hold()
+        rig.cycle(2000)
+        rig.session.hold()
+        rig.cycle(3000)
+        assert source.stops == 0
+        rig.cycle()
+        assert source.stops == 1
+        rig.run()
+        assert rig.ended.outcome == "stopped"
+        assert rig.ended.reason == "it did not come to rest in 5000 cycles of a hold"
+
+    def test_one_that_was_resumed_in_time_is_not(self):
+        rig = Rig(guard_limits=limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0)))
+        source = IgnoresHold()
+        rig.session.request(source)
+        rig.open()
+        rig.cycle(300)
+        rig.session.hold()
+        rig.cycle(4000)
+        rig.session.resume()
+        rig.cycle(2000)
+        assert source.stops == 0
+
+
+class TestHoldOfCorrections:
+    """Nobody names their bounds: those of a stop are granted from hold until rest."""
+
+    def corrected(self, rows, hold_at: int):
+        rig = Rig(mode=Mode.VELOCITY)
+        source = type("Held", (Correction,), {"hold": nothing, "resume": nothing})(rows)
+        rig.session.request(source)
+        rig.open()
+        rig.cycle(hold_at)
+        assert rig.state is State.OPEN
+        rig.session.hold()
+        rig.cycle(len(rows) - hold_at + 1)
+        return rig
+
+    @staticmethod
+    def ramp(acceleration: float) -> np.ndarray:
+        """(m, n) rad/s of joint 1: from zero at this acceleration, 200 cycles in all."""
+        rows = np.zeros((201, N))
+        slopes = np.minimum(0.15 * np.arange(200), acceleration)
+        rows[1:, 0] = np.cumsum(slopes) * PERIOD
+        return rows
+
+    def test_at_rest_the_bounds_of_a_plan_are_back(self):
+        rows = np.vstack([np.zeros((30, N)), self.ramp(14.0)])
+        rig = self.corrected(rows, 20)
+        assert type(rig.refusal) is AccelerationLimit
+        assert rig.refusal.bound == pytest.approx(8.0)
+
+    def test_not_at_rest_those_of_a_stop_stay(self):
+        rows = self.ramp(14.0)
+        rig = self.corrected(rows, 20)
+        refused = rig.seen(Refused)
+        assert not any(isinstance(event.error, AccelerationLimit) for event in refused)
 
 
 class TestResume:
@@ -170,6 +256,28 @@ class TestSourcesThatRaiseAnything:
         assert all_drive_off(answer)
         assert type(rig.refusal) is SourceFailed
         assert kind.__name__ in str(rig.refusal)
+
+    def test_so_does_a_property_where_a_method_should_be(self):
+        def fails(self):
+            raise SystemExit("no")
+
+        for name in ("override", "hold", "resume"):
+            parts = {"hold": nothing, "resume": nothing, name: property(fails)}
+            rig = Rig()
+            rig.session.request(source := type("Odd", (Cruise,), parts)())
+            rig.open()
+            rig.cycle(50)
+            if name == "hold":
+                rig.session.hold()
+                rig.cycle()
+                assert source.stops == 1
+                continue
+            call = {"override": lambda rig=rig: rig.session.override(0.5)}
+            with pytest.raises(RequestError, match="SystemExit: no"):
+                call.get(name, rig.session.resume)()
+            assert rig.state is State.OPEN
+        with pytest.raises(RequestError, match="SystemExit: no"):
+            Rig().session.request(type("Odd", (Cruise,), {"feed_forward": property(fails)})())
 
     def test_an_override_that_raises_anything_is_a_request_refused(self):
         def fails(self, fraction):

@@ -227,6 +227,8 @@ class TestAcceptedInit:
             ("kinematic_influence", 3, 1.01, "k54"),
             ("kinematic_influence", 4, -1.01, "k64"),
             ("kinematic_influence", 5, 1e9, "k65"),
+            ("calibration", 2, 112.1, "calibration of axis 3"),
+            ("calibration", 2, -108.1, "calibration of axis 3"),
         ],
     )
     def test_what_is_far_off_cannot_be_accepted(self, field, axis, value, name):
@@ -240,6 +242,12 @@ class TestAcceptedInit:
     @pytest.mark.parametrize("value", [-219.9, -55.1])
     def test_what_is_within_a_factor_of_two_can(self, value):
         rig = self.other(gear_ratio=(2, value))
+        rig.start()
+        assert rig.seen(InitReceived)[0].adopted
+
+    @pytest.mark.parametrize("value", [111.9, -107.9])
+    def test_a_calibration_within_one_turn_of_the_joint_can(self, value):
+        rig = self.other(calibration=(2, value))
         rig.start()
         assert rig.seen(InitReceived)[0].adopted
 

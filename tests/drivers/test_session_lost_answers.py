@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import START, Cruise, N, Rig, assert_refused, limits, still
+from rig import START, Cruise, N, Rig, assert_refused, limits, moving, still
 
 from drivers import MotionNotCarriedOn, State
 from drivers.events import AnswersLost
@@ -46,8 +46,10 @@ def test_no_set_point_is_further_from_the_target_than_those_allowed(max_gap):
             break
         assert abs(answer.axes["d"][0, 0] - target) <= 0.2 + (max_gap + 1) * STEP + 1e-5
     error = assert_refused(rig, answer, MotionNotCarriedOn)
-    assert (error.joint, error.bound) == (0, pytest.approx(0.2))
-    assert error.value == pytest.approx(3 * STEP, rel=1e-3), "one step less and it is within 0.2"
+    # Three steps beyond the oldest are more than 0.2, seven from the newest more than 0.5.
+    bound, steps = (0.2, 3) if max_gap < 5 else (0.5, 7)
+    assert (error.joint, error.bound) == (0, pytest.approx(bound))
+    assert error.value == pytest.approx(steps * STEP, rel=1e-3), "one step less is within it"
     assert "set-points sent last" in str(error)
 
 
@@ -68,8 +70,118 @@ def test_a_few_are_counted_and_told_and_the_motion_goes_on(lost):
     assert rig.ended.outcome == "stopped"
 
 
-def test_one_now_and_then_is_counted_each_time():
+@pytest.mark.parametrize(("max_gap", "pattern"), [(2, 3), (2, 40), (0, 40), (5, 9)])
+def test_too_many_in_a_hundred_cycles_stop_the_motion_on_its_path(max_gap, pattern):
+    rig = at_speed(max_gap=max_gap)
+    lost = 0
+    while lost <= max_gap:
+        assert not rig.session._machine.stop_reason
+        lose(rig, 1)
+        lost += 1
+        rig.cycle(1 if lost > max_gap else pattern - 1)
+    rig.run()
+    assert rig.ended.outcome == "stopped"
+    assert rig.ended.reason == f"{max_gap + 1} answers were lost in 100 cycles"
+
+
+def test_a_poor_way_back_ends_a_motion_within_a_few_cycles():
     rig = at_speed()
+    for _ in range(900):
+        lose(rig, 2)
+        rig.cycle(1)
+        if rig.exits_asked:
+            break
+    rig.modes = 0
+    rig.cycle()
+    assert rig.ended.outcome == "stopped"
+    assert rig.ended.reason == "3 answers were lost in 100 cycles"
+
+
+def test_slowly_moving_too_many_in_a_row_stop_it_too():
+    rig, _ = moving()
+    lose(rig, 3)
+    rig.run()
+    assert rig.ended.reason == "3 answers were lost in 100 cycles"
+
+
+def test_those_of_long_ago_do_not_count():
+    rig = at_speed()
+    for _ in range(6):
+        lose(rig, 1)
+        rig.cycle(49)
+    assert rig.session.counters.unanswered == 6
+    assert rig.session._machine.stop_reason is None
+    assert rig.state is State.OPEN
+
+
+@pytest.mark.parametrize(("lost", "allowed"), [(6, True), (7, False)])
+def test_the_target_is_never_further_off_than_a_quarter_of_the_threshold(lost, allowed):
+    rig = at_speed(max_gap=20)
+    lose(rig, lost)
+    answer = rig.cycle()
+    if allowed:
+        assert rig.state is State.OPEN
+        return
+    error = assert_refused(rig, answer, MotionNotCarriedOn)
+    assert error.bound == pytest.approx(0.5)
+    assert error.value == pytest.approx(7 * STEP, rel=1e-3)
+
+
+class TestCarriedOn:
+    """A controller that goes on by itself while packets are missing."""
+
+    def carried_on(self, missed: int, extra: float = 0.0, **options) -> Rig:
+        """At 50 motor revolutions per second, 0.1 per cycle, and a threshold of one."""
+        speed, one = 2.618, np.full(N, 1.0)
+        wide = limits(
+            lower=-9.0 * one,
+            upper=9.0 * one,
+            velocity=2.8 * one,
+            acceleration=30.0 * one,
+            jerk=900.0 * one,
+            following_error=one,
+        )
+        source = type("Faster", (Fast,), {"SPEED": speed})()
+        rig = Rig(guard_limits=wide, **options)
+        rig.session.request(source)
+        rig.open()
+        rig.cycle(600)
+        step = rig.axes["d"][0, 1]
+        assert abs(step) == pytest.approx(0.1, rel=1e-3)
+        rig.miss(missed)
+        rig.axes["d"][0, [0, 2]] += missed * step + np.sign(step) * extra
+        return rig
+
+    @pytest.mark.parametrize("missed", [1, 2])
+    def test_at_full_speed_a_gap_not_too_long_is_survived(self, missed):
+        rig = self.carried_on(missed)
+        rig.cycle(10)
+        assert rig.state is State.OPEN
+        assert rig.session.counters.unanswered == 0
+        rig.session.stop()
+        rig.run()
+        assert rig.ended.outcome == "stopped"
+
+    @pytest.mark.parametrize("missed", [3, 4, 5])
+    def test_more_than_a_quarter_of_the_threshold_is_not(self, missed):
+        rig = self.carried_on(missed, max_gap=5)
+        error = assert_refused(rig, rig.cycle(), MotionNotCarriedOn)
+        assert (error.value, error.bound) == (pytest.approx(0.1 * missed, rel=1e-3), 0.25)
+
+    @pytest.mark.parametrize(("extra", "survived"), [(0.099, True), (0.101, False)])
+    def test_give_or_take_a_tenth_of_the_threshold(self, extra, survived):
+        rig = self.carried_on(1, extra)
+        rig.cycle()
+        assert (rig.state is State.OPEN) is survived
+
+    def test_without_a_gap_nothing_is_carried_on(self):
+        rig = self.carried_on(0)
+        rig.axes["d"][0, [0, 2]] += 1.2 * rig.axes["d"][0, 1]
+        assert_refused(rig, rig.cycle(), MotionNotCarriedOn)
+
+
+def test_one_now_and_then_is_counted_each_time():
+    rig = at_speed(max_gap=5)
     for _ in range(5):
         lose(rig, 1)
         rig.cycle(3)

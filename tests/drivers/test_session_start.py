@@ -6,9 +6,9 @@ import struct
 
 import numpy as np
 import pytest
-from rig import N, Rig, init_packet
+from rig import N, Rig, init_packet, still
 
-from drivers import CyclicPacket, InitReceived, LinkLost, Mode, PacketRejected, State
+from drivers import CyclicPacket, InitReceived, LinkLost, Mode, MotionEnded, PacketRejected, State
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 
 WORDS = 9
@@ -334,7 +334,59 @@ class TestPcThatStartsInMidSession:
         assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
 
 
+class TestARequestThatWaitsForTheController:
+    def waiting(self) -> Rig:
+        rig = Rig()
+        rig.session.tick(0.0)
+        rig.session.request(still(3))
+        return rig
+
+    def test_is_dropped_when_nothing_comes_for_too_long(self):
+        rig = self.waiting()
+        rig.session.tick(301.0)
+        assert not rig.session.requested
+        ended = [event for event in rig.session.events() if isinstance(event, MotionEnded)]
+        assert [(event.outcome, event.reason) for event in ended] == [
+            ("lost", "nothing was heard from the controller")
+        ]
+
+    @pytest.mark.parametrize(
+        ("numbers", "kept"),
+        [
+            ((), True),
+            (range(1, 10), True),
+            (range(1, 8), True),
+            (range(1, 7), False),
+            ((1,), False),
+        ],
+    )
+    def test_is_dropped_when_the_init_packet_is_not_the_one_announced(self, numbers, kept):
+        rig = self.waiting()
+        for number in numbers:
+            rig.sync(number)
+        rig.send(rig.init.encode())
+        assert rig.session.requested is kept
+        if not kept:
+            assert rig.ended.outcome == "lost"
+            assert rig.ended.reason == "the controller started over"
+
+    def test_is_kept_if_made_after_the_silence(self):
+        rig = self.waiting()
+        rig.sync(1)
+        rig.session.tick(400.0)
+        assert not rig.session.requested
+        rig.session.request(still(3))
+        rig.now = 500.0
+        rig.send(rig.init.encode())
+        assert rig.session.requested
+
+
 class TestConstruction:
+    @pytest.mark.parametrize("max_gap", [-1, 101])
+    def test_a_patience_that_is_none_is_refused(self, max_gap):
+        with pytest.raises(ValueError, match=r"not one of 0\.\.100"):
+            Rig(max_gap=max_gap)
+
     def test_parts_for_different_numbers_of_joints_are_refused(self):
         rig = Rig()
         with pytest.raises(ValueError, match="joints"):

@@ -22,8 +22,10 @@ from drivers import (
     State,
     exchange,
 )
+from drivers.exchange import listening
 from drivers.transports import TransportError, UdpSpec, UdpTransport
 from drivers.transports.base import Stamped
+from drivers.transports.udp import MOST_PASSED_OVER
 
 HOST = "127.0.0.1"
 STRANGER = "127.0.0.2"
@@ -158,6 +160,31 @@ class TestPeer:
         assert near.receive(PATIENCE) == b"x" * 48
         assert near.rejected() == {"foreign": 20}
 
+    def test_without_patience_too(self, near, controller, stranger):
+        controller.send(b"a" * 48)
+        assert near.receive(PATIENCE) == b"a" * 48
+        for number in range(10):
+            for _ in range(3):
+                stranger.send(bytes(48))
+            controller.send(bytes([number]) * 48)
+        received = [near.receive(timeout) for timeout in (0.0, -1.0, 1e-9, 0.0, -1e-9)]
+        assert received == [bytes([number]) * 48 for number in range(5)]
+        while (packet := near.receive(0.0)) is not None:
+            received.append(packet)
+        assert received == [bytes([number]) * 48 for number in range(10)]
+        assert near.rejected() == {"foreign": 30}
+
+    def test_without_patience_a_flood_does_not_keep_it(self, near, stranger):
+        kernel = near._receive
+
+        def endless(*arguments):
+            stranger.send(bytes(48))
+            return kernel(*arguments)
+
+        near._receive = endless
+        assert near.receive(0.0) is None
+        assert near.rejected() == {"foreign": MOST_PASSED_OVER + 1}
+
 
 class TestWaiting:
     @pytest.mark.parametrize("timeout", [1e-9, 0.0005, 0.003, 0.0101])
@@ -204,13 +231,59 @@ class TestArrival:
             assert near.arrived <= near.now
         assert arrivals == sorted(arrivals)
 
-    @pytest.mark.parametrize("step", [-3600.0, 3600.0])
+    @pytest.mark.parametrize("step", [-3600.0, -1.0, -0.01, 0.01, 0.5, 0.999, 5.0, 3600.0])
     def test_a_wall_clock_set_meanwhile_makes_no_packet_old(self, near, controller, step):
-        controller.send(bytes(48))
         wall = time.time
+        controller.send(bytes(48))
+        near.receive(PATIENCE)
+        controller.send(bytes(48))
+        time.sleep(0.02)
+        before = near.now
         with patch("time.time", lambda: wall() + step):
             near.receive(PATIENCE)
-        assert near.now - 0.05 < near.arrived <= near.now
+        assert before <= near.arrived <= near.now, "it is taken to have come when it was received"
+        controller.send(bytes(48))
+        before = near.now
+        near.receive(PATIENCE)
+        assert before <= near.arrived <= near.now, "and the clock may be set back"
+
+    @pytest.mark.parametrize("step", [-0.5, 0.5])
+    def test_what_waited_while_the_clock_was_set_is_no_older_than_what_was_received(
+        self, near, controller, step
+    ):
+        wall = time.time
+        for _ in range(5):
+            controller.send(bytes(48))
+        before = near.now
+        with patch("time.time", lambda: wall() + step):
+            for _ in range(5):
+                near.receive(PATIENCE)
+                assert before <= near.arrived <= near.now
+
+    def test_arrivals_are_known_again_after_the_clock_was_set(self, near, controller):
+        # The kernel's clock cannot be set here: to the link it was, and was set back.
+        wall = time.time
+        controller.send(bytes(48))
+        with patch("time.time", lambda: wall() + 5.0):
+            near.receive(PATIENCE)
+        controller.send(bytes(48))
+        near.receive(PATIENCE)
+        controller.send(bytes(48))
+        sent = near.now
+        time.sleep(0.05)
+        near.receive(PATIENCE)
+        assert near.arrived <= sent + 1e-5
+
+    def test_a_wait_of_any_length_is_told(self, near, controller):
+        controller.send(bytes(48))
+        sent = near.now
+        clock, wall = time.monotonic, time.time
+        with (
+            patch("time.monotonic", lambda: clock() + 60.0),
+            patch("time.time", lambda: wall() + 60.0),
+        ):
+            near.receive(PATIENCE)
+            assert near.arrived == pytest.approx(sent, abs=0.02)
 
     def test_without_times_from_the_kernel_it_is_unknown(self):
         option = socket.socket.setsockopt
@@ -342,15 +415,41 @@ class TestSession:
         assert PacketRejected("foreign", 1) in session.events()
         assert stranger.heard_nothing()
 
-    def test_before_the_init_packet_a_controller_may_change_its_port(
-        self, near, controller, another, session
+    def sync(self, number: int) -> bytes:
+        return int.to_bytes(number, 4, "little") + bytes(728)
+
+    def test_before_the_init_packet_a_controller_that_was_silent_may_change_its_port(
+        self, near, controller, another, session, monkeypatch
     ):
-        controller.send(int.to_bytes(1, 4, "little") + bytes(728))
-        self.serve(near, session, 1)
-        exchange(near, session, until=iter([False, True]).__next__)
+        monkeypatch.setattr(listening, "FALLEN_SILENT", 0.1)
+        controller.send(self.sync(1))
+        end = time.monotonic() + 0.35
+        exchange(near, session, until=lambda: time.monotonic() > end)
         another.send(init_packet().encode())
         self.serve(near, session, 1)
         another.wait()
+        assert session.state is State.INIT
+
+    def test_a_stranger_does_not_take_over_a_start_that_goes_on(
+        self, near, controller, another, session
+    ):
+        controller.send(self.sync(1))
+        loops = 0
+
+        def until():
+            nonlocal loops
+            loops += 1
+            if loops in (2, 4):
+                another.send(init_packet().encode())
+                controller.send(self.sync(loops))
+            elif loops == 6:
+                controller.send(init_packet().encode())
+            return session.state is State.INIT or loops > 20
+
+        exchange(near, session, until=until)
+        for _ in range(4):
+            controller.wait()
+        assert another.heard_nothing()
         assert session.state is State.INIT
 
     def test_a_stray_datagram_does_not_lock_the_controller_out(
@@ -387,7 +486,7 @@ class TestSession:
             for _ in range(20):
                 another.send(packet)
 
-        for packet in (b"\xff" * 228, bytes(228), (1).to_bytes(4, "little") + bytes(728)):
+        for packet in (bytes(228), self.sync(1), b"\xff" * 228):
             flood(packet)
         controller.send(init_packet().encode())
         flood(b"\xff" * 228)
@@ -396,6 +495,21 @@ class TestSession:
             session,
             until=lambda: session.state is State.INIT or time.monotonic() > end,
         )
+        controller.wait()
+        assert session.state is State.INIT
+
+    def test_nor_does_one_that_began_a_start_and_did_not_go_on(
+        self, near, controller, another, session, monkeypatch
+    ):
+        monkeypatch.setattr(listening, "FALLEN_SILENT", 0.2)
+        end = time.monotonic() + 5.0
+        another.send(self.sync(1))
+
+        def until():
+            controller.send(init_packet().encode())
+            return session.state is State.INIT or time.monotonic() > end
+
+        exchange(near, session, until=until)
         controller.wait()
         assert session.state is State.INIT
 
@@ -411,6 +525,29 @@ class TestSession:
         self.serve(near, session, 1)
         another.wait()
         assert session.state is State.INIT
+
+    def test_of_a_backlog_with_strangers_in_it_only_the_newest_is_answered(
+        self, near, controller, stranger, session
+    ):
+        controller.send(init_packet().encode())
+        self.serve(near, session, 1)
+        controller.wait()
+        for number in range(11, 41):
+            stranger.send(bytes(60))
+            controller.send(self.packet(number))
+        time.sleep(0.01)
+        loops = 0
+
+        def until():
+            nonlocal loops
+            loops += 1
+            return loops > 1
+
+        exchange(near, session, until=until)
+        controller.wait()
+        assert int.from_bytes(controller.replies[-1][:4], "little") == 41
+        assert controller.heard_nothing()
+        assert session.counters.discarded["late"] == 29
 
     def test_the_answer_to_a_packet_goes_out_before_the_next_is_looked_at(
         self, near, controller, session

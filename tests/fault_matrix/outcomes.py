@@ -67,7 +67,8 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "init packet": "no start",
         "init .. opening": "completed",
         "open at rest": "open",
-        "moving .. exiting": "completed",
+        "moving": "stopped / completed / stopped",
+        "exiting": "completed",
     },
     "5 answers lost": {
         "sync": "completed",
@@ -201,7 +202,8 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "exiting": "completed",
     },
     "warm restart": {
-        "sync .. init": "waits",
+        "sync": "lost: restart",
+        "init packet .. init": "waits",
         "drive off .. opening": "lost: restart",
         "open at rest": "closed",
         "moving": "lost: restart",

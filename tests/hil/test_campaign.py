@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from drivers.states import State
 from drivers.transports import Lose, SimulatedTransport
@@ -23,13 +24,22 @@ from hil.campaign import (
     Link,
     MotionFailedError,
     MotionRefusedError,
+    PlannedMotion,
     Stop,
 )
 from hil.cell import Cell
-from hil.errors import ArchiveWriteError, ControllerFault
+from hil.errors import ArchiveWriteError, ControllerFault, InputError
 from hil.progress import Silent, Task
 from hil.simulation import simulated_controller, simulated_link, simulated_provenance
-from planner import PiecewiseCubic
+from planner import (
+    FlyPercent,
+    Move,
+    PiecewiseCubic,
+    PlanFile,
+    PlannerCrashed,
+    TrajectoryPlayer,
+    plan_moves,
+)
 
 Run = Callable[..., Campaign]
 
@@ -264,9 +274,9 @@ def test_a_plan_that_changed_since_is_refused(
 def test_motions_that_do_not_join_are_refused_before_anything_moves(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    good = plan.validation[0]
+    good = plan.validation[0].trajectory
     shifted = tuple(np.column_stack([c[:, 0] + 0.01, c[:, 1:]]) for c in good.coefficients)
-    bad = replace(plan, validation=(PiecewiseCubic(good.knots, shifted),))
+    bad = replace(plan, validation=(PlannedMotion(PiecewiseCubic(good.knots, shifted)),))
     campaign = Campaign.create(tmp_path / "jump", cell.with_campaign(validation_runs=1), bad)
     with pytest.raises(MotionRefusedError, match="validation 0 was not sent: it begins with joint"):
         execute(campaign)
@@ -276,9 +286,9 @@ def test_motions_that_do_not_join_are_refused_before_anything_moves(
 def test_a_motion_for_another_arm_is_refused(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    good = plan.validation[0]
+    good = plan.validation[0].trajectory
     five = PiecewiseCubic(good.knots[:5], good.coefficients[:5])
-    bad = replace(plan, validation=(five,))
+    bad = replace(plan, validation=(PlannedMotion(five),))
     campaign = Campaign.create(tmp_path / "five", cell.with_campaign(validation_runs=1), bad)
     with pytest.raises(MotionRefusedError, match="for 5 joints, the arm has 6"):
         execute(campaign)
@@ -338,12 +348,12 @@ def test_a_disk_that_refuses_brings_the_arm_to_rest_before_anything_else(
 def test_a_motion_outside_the_limits_is_refused_before_anything_moves(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    good = plan.validation[0]
+    good = plan.validation[0].trajectory
     far = tuple(
         np.column_stack([c[:, 0] + (4.0 if j == 1 else 0.0), c[:, 1:]])
         for j, c in enumerate(good.coefficients)
     )
-    bad = replace(plan, validation=(PiecewiseCubic(good.knots, far),))
+    bad = replace(plan, validation=(PlannedMotion(PiecewiseCubic(good.knots, far)),))
     campaign = Campaign.create(tmp_path / "far", cell.with_campaign(validation_runs=1), bad)
     with pytest.raises(MotionRefusedError, match=r"validation 0 was not sent: .*position of joint"):
         execute(campaign)
@@ -386,3 +396,127 @@ def test_a_damaged_manifest_and_a_foreign_folder_are_named(tmp_path: Path) -> No
 def test_the_plan_is_restored_to_the_bit(campaign: Campaign) -> None:
     again = CampaignPlan.load(campaign.folder.plan)
     assert json.dumps(again.excitation.to_dict()) == json.dumps(campaign.plan.excitation.to_dict())
+    assert again.moves is not None and campaign.plan.moves is not None
+    assert again.moves.to_dict() == campaign.plan.moves.to_dict()
+    validation = [motion.to_dict() for motion in campaign.plan.validation]
+    assert [motion.to_dict() for motion in again.validation] == validation
+
+
+def stored_plan(campaign: Campaign, name: str) -> tuple[PlanFile, PiecewiseCubic]:
+    """The plan file that an archive carries, and the motion that stands beside its moves."""
+    text = open_archive(campaign.folder.archives / name).attachments["plan.json"].decode()
+    assert text.count('"knots"') == 1, "the motion is stored once"
+    stored = json.loads(text)
+    motion = stored.get("excitation", stored)["trajectory"]
+    file = PlanFile.from_dict(stored["moves"] | {"motion": motion})
+    return file, PiecewiseCubic.from_dict(motion)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["excitation_000_a1.mcap", "validation_001_a1.mcap", "move_000_a1.mcap", "move_001_a1.mcap"],
+)
+def test_the_moves_in_an_archive_plan_to_the_motion_that_was_run(
+    campaign: Campaign, name: str
+) -> None:
+    file, motion = stored_plan(campaign, name)
+    assert file.joint_names == campaign.cell.joint_names
+    assert replace(file, trajectory=None).plan().trajectory.to_dict() == motion.to_dict()
+    assert file.plan().trajectory.to_dict() == motion.to_dict()
+
+
+def test_validation_keeps_the_via_points_the_speed_and_the_fly_it_was_drawn_with(
+    campaign: Campaign,
+) -> None:
+    file, _ = stored_plan(campaign, "validation_000_a1.mcap")
+    settings = campaign.cell.campaign
+    assert len(file.moves) == settings.n_via + 1
+    assert {move.fly for move in file.moves} == {FlyPercent(100.0 * settings.fly)}
+    speeds = {tuple(np.asarray(move.joint_speed)) for move in file.moves}
+    assert len(speeds) == 1 and len(set(speeds.pop())) == campaign.cell.joint_limits.n_joints
+
+
+def test_a_plan_without_moves_of_an_earlier_version_is_read_and_run(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, run: Run
+) -> None:
+    short, motions = one_repetition(cell, plan)
+    old = {
+        "format_version": 1,
+        "excitation": motions.excitation.to_dict(),
+        "validation": [motion.trajectory.to_dict() for motion in motions.validation],
+    }
+    path = tmp_path / "plan.json"
+    path.write_text(json.dumps(old))
+    read = CampaignPlan.load(path)
+    assert read.moves is None and [motion.moves for motion in read.validation] == [None]
+    campaign = run(tmp_path / "old", short, read)
+    validation = open_archive(campaign.folder.completed("validation")[0])
+    stored = json.loads(validation.attachments["plan.json"])
+    assert stored == {"trajectory": motions.validation[0].trajectory.to_dict()}
+
+
+@pytest.mark.parametrize("moves", [7, {"format": "joint motion plan"}, {"format": "other"}])
+def test_a_plan_with_unusable_moves_is_refused(
+    tmp_path: Path, plan: CampaignPlan, moves: object
+) -> None:
+    path = tmp_path / "plan.json"
+    plan.save(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"moves": moves}))
+    with pytest.raises(InputError, match="is not a campaign plan"):
+        CampaignPlan.load(path)
+
+
+def test_a_solver_that_crashes_on_the_way_home_ends_the_campaign_and_not_the_process(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def crashing(*arguments: object, **settings: object) -> None:
+        raise PlannerCrashed(-11)
+
+    monkeypatch.setattr("hil.campaign.campaign.in_child", crashing)
+    campaign = Campaign.create(tmp_path / "crash", *one_repetition(cell, plan))
+    with pytest.raises(PlannerCrashed, match="signal 11"):
+        execute(campaign)
+    assert campaign.folder.manifest() == []
+
+
+def overridden(player: TrajectoryPlayer) -> NDArray[np.float64]:
+    """The set-points of a motion that is slowed to a third on its way."""
+    player.begin(player.start)
+    before = [player.advance()[0] for _ in range(200)]
+    player.override(0.3)
+    return np.array(before + [player.advance()[0] for _ in range(300)])
+
+
+def test_an_override_changes_as_fast_as_the_cells_bounds_allow(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    written = "override = { acceleration = 1.3, jerk = 1.7 }"
+    assert written in cell.text
+    text = cell.text.replace(written, "override = { acceleration = 1.05, jerk = 1.1 }")
+    careful = Cell.from_texts(text, cell.urdf, cell.path)
+    campaign = Campaign.create(tmp_path / "careful", *one_repetition(careful, plan))
+
+    class Taken(Exception):
+        pass
+
+    played: list[TrajectoryPlayer] = []
+    link = simulated_link(campaign.cell)
+
+    def take(player: TrajectoryPlayer, *rest: object) -> None:
+        played.append(player)
+        raise Taken
+
+    link.run = take  # type: ignore[method-assign, assignment]
+    with pytest.raises(Taken):
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+    (ours,) = played
+    limits = cell.joint_limits
+    way = (Move(cell.home, speed=cell.campaign.approach_speed),)
+    trajectory = plan_moves(ours.start, way, limits).trajectory
+    careful_one, default = (
+        TrajectoryPlayer(trajectory, cell.period, limits, **bounds)
+        for bounds in ({"override_acceleration": 1.05, "override_jerk": 1.1}, {})
+    )
+    ramps = [overridden(player) for player in (ours, careful_one, default)]
+    np.testing.assert_array_equal(ramps[0], ramps[1])
+    assert np.max(np.abs(ramps[0] - ramps[2])) > 1e-3

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
 import matplotlib.image
 import numpy as np
@@ -17,6 +20,7 @@ from hil.plots.corner import flown_corners, sharpest_corner
 from hil.plots.joints import corner_times
 from planner.motion_csv import from_csv
 from planner.moves import FlyPercent, Move, plan_moves
+from planner.plan_file import PlanFile
 from sim_fixtures.ns16 import CELL_PATH
 
 VIA = """\
@@ -157,6 +161,9 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
         (["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
         (["--via", "VIA", "--csv", "nowhere/plan.csv"], "cannot be written"),
         (["--via", "VIA", "--output", "plan.yaml"], "no plan file"),
+        (["--via", "VIA", "--csv", "motion.csv", "--rate", "1e13"], "--rate: 1e.13 rows a second"),
+        (["--via", "VIA", "--csv", "motion.csv", "--rate", "0"], "--rate: 0.0 rows a second"),
+        (["--via", "VIA", "--csv", "motion.csv", "--rate", "nan"], "--rate: nan rows a second"),
     ],
 )
 def test_says_what_is_wrong(app, via, arguments, problem):
@@ -172,6 +179,11 @@ def test_says_what_is_wrong(app, via, arguments, problem):
         ("0 0 -90 0 90 0\n", "1 via points"),
         ("0 0 -90 0 90 0\nzero 0 0 0 0 0\n", "line 2"),
         ("", "0 via points"),
+        ("0,0,-90,0,90,O\n0,0,-90,0,90,0\n9,9,-90,0,90,0\n", "line 1, cell 6: 'O' is no"),
+        ("a,b,c,d,e,f\nA,B,C,D,E,F\n0,0,-90,0,90,0\n", "line 2, cell 1: 'A' is no"),
+        ("0 0 -90 0 90 0\na b c d e f\n", "line 2, cell 1: 'a' is no"),
+        ("0 0 -90 0 90 0\n0 inf -90 0 90 0\n", "line 2, cell 2: 'inf' is no"),
+        ("0 0 -90 0 90 0\n0 0 -9_0 0 90 0\n", "line 2, cell 3: '-9_0' is no"),
     ],
 )
 def test_says_what_is_wrong_with_via_points(app, tmp_path, text, problem):
@@ -179,6 +191,100 @@ def test_says_what_is_wrong_with_via_points(app, tmp_path, text, problem):
     path.write_text(text)
     with pytest.raises(InputError, match=problem):
         CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_start(run, via, tmp_path):
+    plain, marked = tmp_path / "plain.csv", tmp_path / "marked.csv"
+    plain.write_text(VIA.split("\n", 2)[2])
+    marked.write_bytes(b"\xef\xbb\xbf" + plain.read_bytes())
+    assert run("--via", marked) == run("--via", plain) == run("--via", via)
+
+
+@pytest.fixture
+def planning_nothing(monkeypatch):
+    """Planning is an error: what cannot be written is refused before it."""
+
+    def planned(*arguments: object) -> None:
+        raise AssertionError("planned")
+
+    monkeypatch.setattr("hil.cli.plan.isolated", planned)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--output", "plan.yaml"], ["--picture", "plan.bmp"], ["--rate", "-1"]],
+)
+def test_what_cannot_be_written_is_refused_before_planning(app, via, planning_nothing, arguments):
+    with pytest.raises(InputError, match=r"no plan file|no format|no table"):
+        CliRunner().invoke(
+            app, [str(CELL_PATH), "--via", str(via), *arguments], catch_exceptions=False
+        )
+
+
+@pytest.mark.parametrize("suffix", ["toml", "json"])
+@pytest.mark.parametrize("edit", ["moves", "limits", "motion"])
+def test_a_motion_that_is_not_that_of_its_moves_is_refused(app, run, via, tmp_path, suffix, edit):
+    path = tmp_path / "plan.json"
+    run("--via", via, "--output", path)
+    data = json.loads(path.read_text())
+    if edit == "moves":
+        data["moves"][1]["target"][0] += 0.1
+    elif edit == "limits":
+        data["limits"]["velocity"][0] *= 0.5
+    else:
+        data["motion"]["coefficients"][0][0][0] += 0.1
+    if suffix == "json":
+        path.write_text(json.dumps(data))
+    else:
+        path = path.with_suffix(".toml")
+        path.write_text(PlanFile.from_dict(data).to_toml())
+    with pytest.raises(InputError, match=rf"plan\.{suffix}: .*motion"):
+        CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
+    del data["motion"]
+    path = path.with_suffix(".json")
+    path.write_text(json.dumps(data))
+    run("--via", path)
+
+
+def test_the_limits_of_a_motion_may_be_left_out_where_they_are_the_cells(run, app, via, tmp_path):
+    path = tmp_path / "plan.json"
+    out = run("--via", via, "--output", path)
+    data = json.loads(path.read_text())
+    del data["limits"]
+    path.write_text(json.dumps(data))
+    assert run("--via", path) == out
+
+
+CRASH = """\
+import os, signal
+import ruckig
+class Crashing:
+    def __init__(self, *_): pass
+    def calculate(self, *_): os.kill(os.getpid(), signal.SIGSEGV)
+ruckig.Ruckig = Crashing
+"""
+
+
+@pytest.mark.parametrize("how", ["via", "file", "picture"])
+def test_a_solver_that_crashes_is_one_sentence(run, via, tmp_path, how):
+    (tmp_path / "sitecustomize.py").write_text(CRASH)
+    arguments = ["--via", str(via)]
+    if how == "file":
+        run("--via", via, "--output", tmp_path / "plan.toml")
+        arguments = ["--via", str(tmp_path / "plan.toml")]
+    if how == "picture":  # nothing to round but in the corner that is drawn
+        arguments += ["--fly", "0", "--picture", str(tmp_path / "plan.png")]
+    ended = subprocess.run(
+        [sys.executable, "-m", "hil", "plan", str(CELL_PATH), *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert ended.returncode == 2, ended
+    (sentence,) = ended.stderr.splitlines()
+    assert sentence.startswith("error:") and "killed by signal 11" in sentence
+    assert not (tmp_path / "plan.png").exists()
 
 
 def test_a_plan_file_of_another_arm_is_refused(app, run, via, tmp_path):

@@ -22,7 +22,7 @@ from identification.excitation import (
 )
 from identification.excitation.collision import joint_poses
 from identification.excitation.constraints import sampled
-from planner import JointLimits, PlannerCrashed, plan
+from planner import JointLimits, PlannerCrashed, plan, plan_moves
 from sim_fixtures.ns16 import load_truth, urdf_text
 
 DEG = np.pi / 180.0
@@ -251,9 +251,10 @@ def test_via_points_stay_in_the_share_of_the_range_they_are_given(model, limits)
 def test_validation_motions_are_feasible_wide_and_never_the_excitation(
     found, limits, checker, make_currents
 ):
-    motions = random_validation_motions(
+    drawn = random_validation_motions(
         limits, home=HOME, seed=3, count=6, checker=checker, currents=make_currents(1)
     )
+    motions = [each.trajectory for each in drawn]
     assert len(motions) == 6
     for motion in motions:
         assert check_motion(motion, limits, checker=checker, currents=make_currents(1)).ok
@@ -266,7 +267,18 @@ def test_validation_motions_are_feasible_wide_and_never_the_excitation(
     again = random_validation_motions(
         limits, home=HOME, seed=3, count=2, checker=checker, currents=make_currents(1)
     )
-    assert [m.to_dict() for m in again] == [m.to_dict() for m in motions[:2]]
+    assert [m.trajectory.to_dict() for m in again] == [m.to_dict() for m in motions[:2]]
+
+
+def test_what_was_drawn_plans_to_the_motion_bit_for_bit(found, limits, checker, make_currents):
+    (drawn,) = random_validation_motions(
+        limits, home=HOME, seed=3, count=1, fly=0.3, checker=checker, currents=make_currents(1)
+    )
+    assert drawn.fly == 0.3
+    for motion in (drawn, found):
+        np.testing.assert_array_equal(motion.via_points[[0, -1]], [HOME, HOME])
+        again = plan_moves(motion.via_points[0], motion.moves, limits)
+        assert again.trajectory.to_dict() == motion.trajectory.to_dict()
 
 
 def test_validation_gives_up_by_name(limits, make_currents):

@@ -9,7 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner import JointLimits
-from planner.corners import STOP, Solver, fly_by, fly_within, join, ranked
+from planner.corners import (
+    FIRST_SHARES,
+    LAST_SHARES,
+    STOP,
+    Solver,
+    fly_by,
+    fly_within,
+    join,
+    ranked,
+)
 from planner.errors import UnsupportedSolver
 from planner.passing import passing
 from planner.segments import StraightSegment
@@ -114,7 +123,7 @@ def test_a_corner_that_would_take_longer_than_a_stop_is_given_up(
     assert fly_by(before, after, six_axis_limits, 0.5) is STOP
     tried = [
         before.state(before.duration - 0.5 * part * before.slowing_down)
-        for part in (1.0, 0.999, 0.97, 0.9, 0.5, 0.25, 0.125, 0.0625)
+        for part in FIRST_SHARES + LAST_SHARES
     ]
     np.testing.assert_array_equal(asked, tried)
 
@@ -135,7 +144,7 @@ def test_a_join_that_the_solver_misses_is_replaced_by_one_next_to_it(
     monkeypatch.setattr(Solver, "__call__", misses_the_first)
     passed = fly_by(before, after, six_axis_limits, 0.5)
     assert passed.how == "reduced"
-    assert passed.share == 0.5 * 0.999
+    assert passed.share == 0.5 * 0.9999
     assert passed.join is not None
 
 
@@ -143,17 +152,21 @@ savings = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=5)
 
 
 @given(savings)
-def test_corners_are_ranked_by_what_they_save_and_none_costs(savings):
-    order = ranked(savings)
-    assert set(order) == {i for i, saving in enumerate(savings) if saving >= 0.0}
+def test_corners_are_ranked_by_what_they_save(savings):
+    order = ranked(np.array(savings)).tolist()
+    assert sorted(order) == list(range(len(savings)))
     ranks = [savings[i] for i in order]
     assert all(a >= b - 1e-9 for a, b in pairwise(ranks))
 
 
-def test_the_corner_asked_for_comes_first_among_equals():
-    assert ranked([0.5, 0.5 + 1e-12, 0.5]) == [0, 1, 2]
-    assert ranked([0.5, 0.6, 0.55]) == [1, 2, 0]
-    assert ranked([-0.1, 0.0]) == [1]
+def test_the_corner_asked_for_comes_first_among_equals_and_an_unknown_one_last():
+    def order(*savings):
+        return ranked(np.array(savings)).tolist()
+
+    assert order(0.5, 0.5 + 1e-12, 0.5) == [0, 1, 2]
+    assert order(0.5, 0.6, 0.55) == [1, 2, 0]
+    # Where the one asked for is unknown, no other takes its place.
+    assert order(-np.inf, 0.5, 0.5 + 1e-12) == [2, 1, 0]
 
 
 @pytest.mark.parametrize("distance", [1e-6, 1e-3, 0.05, 0.3, 10.0])

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from planner.errors import InvalidSetting, PlannerCrashed
+from planner.errors import InvalidSetting, PlannerCrashed, PlannerNotStarted
 from planner.interpolator import Interpolator
 from planner.legs import corner
 from planner.rrs import EventKind, FlybyCriterion, SpeedCorrection, Status
@@ -41,7 +41,7 @@ def test_nothing_is_answered_before_initialize_and_after_terminate(six_axis_limi
         interpolator.set_initial_position(a)
         assert interpolator.get_next_step().status == Status.NO_TARGET == -42
         queue(interpolator, [b])
-        interpolator.get_next_step()
+        steps_to_rest(interpolator)
         assert interpolator.terminate() == Status.OK
 
 
@@ -52,6 +52,48 @@ def test_nothing_is_answered_before_initialize_and_after_terminate(six_axis_limi
         ("select_motion_type", (4,), -76),
         ("set_advance_motion", (-1,), -76),
         ("set_advance_motion", (1.5,), -76),
+        ("set_advance_motion", (True,), -76),
+        ("set_advance_motion", ("1",), -76),
+        ("select_motion_type", (True,), -76),
+        ("select_motion_type", ([1],), -76),
+        ("set_joint_speeds", (50.0, [-1]), -76),
+        ("set_joint_speeds", (50.0, [True, False]), -76),
+        ("set_joint_speeds", (50.0, [0.5]), -76),
+        ("set_joint_speeds", (50.0, 1), -76),
+        ("set_joint_speeds", ([[50.0] * 6],), -76),
+        ("set_joint_speeds", (10**400,), -76),
+        ("set_joint_speeds", (None,), -76),
+        ("set_joint_speeds", ([True] * 6,), -76),
+        ("set_override_speed", ("fast",), -76),
+        ("set_override_speed", (None,), -76),
+        ("set_override_speed", (True,), -76),
+        ("set_override_speed", (10**400,), -76),
+        ("set_override_speed", (50.0, 7), -76),
+        ("set_override_speed", (50.0, []), -76),
+        ("set_override_acceleration", ("50",), -76),
+        ("set_override_acceleration", (50.0, 9), -76),
+        ("select_flyby_mode", ("off",), -76),
+        ("select_flyby_mode", (None,), -76),
+        ("select_flyby_mode", ([],), -76),
+        ("select_flyby_criteria", (np.nan,), -76),
+        ("select_flyby_criteria", ([],), -76),
+        ("set_flyby_criteria_parameter", ([], 1.0), -76),
+        ("set_flyby_criteria_parameter", (FlybyCriterion.PERCENT, "x"), -76),
+        ("cancel_flyby_criteria", ({},), -76),
+        ("select_point_accuracy", ("fine",), -76),
+        ("select_point_accuracy", (True,), -76),
+        ("set_motion_time", (None,), -76),
+        ("set_motion_time", ("1",), -76),
+        ("set_interpolation_time", ("a",), -76),
+        ("set_interpolation_time", (np.nan,), -76),
+        ("set_initial_position", (None,), -76),
+        ("set_initial_position", ([10**400] + [0] * 5,), -76),
+        ("set_initial_position", ([1j] * 6,), -76),
+        ("set_initial_position", ([[0.0], [0.0, 1.0]],), -76),
+        ("set_next_target", ("two", [0.0] * 6), -76),
+        ("set_next_target", (True, [0.0] * 6), -76),
+        ("set_next_target", (2, ["0"] * 6), -76),
+        ("set_next_target", (2, [False] * 6), -76),
         ("set_joint_speeds", (0.0,), -76),
         ("set_joint_speeds", (101.0,), -76),
         ("set_joint_speeds", (np.nan,), -76),
@@ -93,6 +135,49 @@ def test_a_refused_service_changes_nothing(
         return positions(steps_to_rest(interpolator))
 
     np.testing.assert_array_equal(run(disturbed=True), run(disturbed=False))
+
+
+def test_numbers_of_numpy_are_numbers(six_axis_limits, random_points):
+    points = random_points(56, 2)
+    interpolator = ready(six_axis_limits, points[0])
+    for status in (
+        interpolator.set_advance_motion(np.int64(2)),
+        interpolator.set_joint_speeds(np.float32(50.0), np.arange(2)),
+        interpolator.set_joint_speeds(np.full(6, 50)),
+        interpolator.set_override_speed(np.int32(100), np.int64(SpeedCorrection.PROGRAM)),
+        interpolator.select_flyby_mode(np.True_),
+        interpolator.select_flyby_criteria(np.int16(FlybyCriterion.DISTANCE)),
+    ):
+        assert status == Status.OK, interpolator.refusal
+    assert interpolator.set_next_target(np.int64(3), points[1]) >= 0
+    assert interpolator.get_current_target_id() == 3
+
+
+@pytest.mark.parametrize("wanted", ["joint", 5, None, [0], np.zeros(2)])
+def test_a_step_in_any_other_format_is_refused(six_axis_limits, random_points, wanted):
+    a, b = random_points(57, 2)
+    interpolator = ready(six_axis_limits, a)
+    queue(interpolator, [b])
+    assert interpolator.get_next_step(wanted).status == Status.OUTPUT_FORMAT
+    assert interpolator.get_next_step(np.int64(0)).status >= 0
+
+
+@pytest.mark.parametrize("bring_to_rest", ["stop_motion", "cancel_motion"])
+@pytest.mark.parametrize("service", ["initialize", "reset", "terminate"])
+def test_a_moving_arm_is_not_forgotten(six_axis_limits, random_points, service, bring_to_rest):
+    a, b = random_points(58, 2)
+    interpolator = ready(six_axis_limits, a)
+    queue(interpolator, [b])
+    moving = [interpolator.get_next_step() for _ in range(50)]
+    assert getattr(interpolator, service)() == Status.INCONSISTENT
+    getattr(interpolator, bring_to_rest)()
+    assert getattr(interpolator, service)() == Status.INCONSISTENT  # it still comes to rest
+    steps = moving + steps_to_rest(interpolator)
+    assert np.max(np.abs(np.diff(positions(steps), axis=0))) < 1.01 * PERIOD * np.max(
+        six_axis_limits.velocity
+    )
+    assert getattr(interpolator, service)() == Status.OK
+    assert interpolator.get_current_target_id() is None
 
 
 def test_what_would_make_a_moving_arm_jump_is_refused(six_axis_limits, random_points):
@@ -137,7 +222,7 @@ def test_a_corner_that_would_jump_is_not_taken(six_axis_limits, random_points, m
         return planned._replace(leave=0.9 * planned.leave)
 
     monkeypatch.setattr("planner.interpolator.corner", careless)
-    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+    interpolator = ready(six_axis_limits, points[0], fly=50.0, isolated=False)
     queue(interpolator, points[1:2])
     assert interpolator.set_next_target(2, points[2]) == Status.FATAL
     steps = steps_to_rest(interpolator)
@@ -179,3 +264,17 @@ def test_joints_at_an_end_of_their_range_are_flagged(six_axis_limits):
     steps = steps_to_rest(interpolator)
     assert steps[-1].joint_limits == 0b010010
     assert not any(step.joint_limits for step in steps[:-2])
+
+
+def test_an_interpolator_whose_planning_process_does_not_start_is_not_initialized(
+    six_axis_limits, random_points, monkeypatch
+):
+    def fails(*_):
+        raise PlannerNotStarted(1)
+
+    monkeypatch.setattr("planner.interpolator.in_child", fails)
+    interpolator = Interpolator(six_axis_limits, PERIOD)
+    assert interpolator.initialize() == Status.FATAL
+    assert "could not be started" in interpolator.refusal
+    assert interpolator.set_initial_position(random_points(0, 1)[0]) == Status.INCONSISTENT
+    assert Interpolator(six_axis_limits, PERIOD, isolated=False).initialize() == Status.OK

@@ -5,16 +5,23 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import planner.isolation
 from planner import InvalidSetting, ViaPointOutOfLimits, plan
 from planner.batch import PlanningPool, plan_many
 from planner.corners import join
-from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
+from planner.errors import (
+    PlannerCrashed,
+    PlannerNotStarted,
+    PlannerOutOfStep,
+    PlanningTimedOut,
+)
 from planner.isolation import PlanningChild, close_child, in_child, plan_in_child
 from planner.limits import JointLimits
 
@@ -283,3 +290,101 @@ def test_settings_of_a_batch_are_checked_at_once(six_axis_limits, random_points,
         plan_many([random_points(0)], six_axis_limits, **setting, workers=0)
     with pytest.raises(InvalidSetting, match="workers"):
         plan_many([random_points(0)], six_axis_limits, workers=-1)
+
+
+def in_fork(check) -> bool:
+    """Whether a check holds in a fork of this process, in less than 30 s."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            os._exit(0 if check() else 1)
+        finally:
+            os._exit(2)
+    deadline = time.monotonic() + 30.0
+    while time.monotonic() < deadline:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            return status == 0
+        time.sleep(0.01)
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    return False
+
+
+def test_a_fork_has_a_child_of_its_own_and_leaves_the_other_alone():
+    with PlanningChild() as child:
+        theirs = child.call(os.getpid)
+
+        def has_its_own() -> bool:
+            own = child.pid is None and child.call(os.getpid)
+            child.close()
+            return own not in (False, theirs)
+
+        assert in_fork(has_its_own)
+        assert child.call(os.getpid) == theirs
+
+
+def test_a_fork_cannot_take_the_answer_that_its_parent_waits_for():
+    with PlanningChild() as child:
+        child.send(os.getpid)
+
+        def refused() -> bool:
+            try:
+                child.receive()
+            except PlannerOutOfStep:
+                return True
+            return False
+
+        assert in_fork(refused)
+        assert child.receive() == child.pid
+
+
+def test_a_pool_used_on_both_sides_of_a_fork_gives_each_its_own_motions(
+    six_axis_limits, random_points
+):
+    points = np.array([random_points(seed) for seed in range(64)])
+    with PlanningPool(1) as pool:
+        before = pool.plan_many(points, six_axis_limits)
+
+        def backwards() -> bool:
+            motions = pool.plan_many(points[::-1], six_axis_limits)
+            pool.close()
+            return all(same(a, b) for a, b in zip(motions, before[::-1], strict=True))
+
+        pid = os.fork()
+        if pid == 0:
+            try:
+                os._exit(0 if backwards() else 1)
+            finally:
+                os._exit(2)
+        after = pool.plan_many(points, six_axis_limits)
+        assert os.waitpid(pid, 0)[1] == 0
+        assert all(same(a, b) for a, b in zip(after, before, strict=True))
+
+
+def test_a_fork_taken_while_a_thread_plans_can_plan_and_end():
+    in_child(os.getpid)
+    busy = threading.Thread(target=in_child, args=(time.sleep, 1.0))
+    busy.start()
+    time.sleep(0.2)
+
+    def plans_and_ends() -> bool:
+        own = in_child(os.getpid)
+        close_child()  # what runs at its exit
+        return own != os.getpid()
+
+    assert in_fork(plans_and_ends)
+    busy.join()
+
+
+def test_an_answer_to_another_call_is_refused_and_the_next_one_is_right(monkeypatch):
+    with PlanningChild() as child:
+        child.call(os.getpid)
+        honest = planner.isolation.numbered
+        monkeypatch.setattr(
+            planner.isolation, "numbered", lambda number, message: honest(number + 1, message)
+        )
+        with pytest.raises(PlannerOutOfStep):
+            child.call(os.getpid)
+        monkeypatch.undo()
+        assert child.call(os.getpid) == child.pid

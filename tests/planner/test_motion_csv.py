@@ -99,8 +99,48 @@ def test_refuses_a_table_that_is_no_motion(text, problem):
 
 def test_refuses_a_rate_or_names_that_do_not_fit(six_axis_limits, random_points):
     motion = plan(random_points(1), six_axis_limits)
-    for rate in (0.0, -1.0, np.nan, np.inf):
+    for rate in (0.0, -1.0, np.nan, np.inf, 1.01e5):
         with pytest.raises(InvalidSetting):
             to_csv(motion, rate, NAMES)
     with pytest.raises(InvalidSetting):
         to_csv(motion, 10.0, NAMES[:5])
+    with pytest.raises(InvalidSetting, match="different"):
+        to_csv(motion, 10.0, NAMES[:5] + NAMES[:1])
+
+
+def test_a_motion_of_no_duration_is_refused_for_no_table_can_tell_it(six_axis_limits):
+    standing = plan(np.zeros((2, 6)), six_axis_limits)
+    assert standing.duration == 0.0
+    with pytest.raises(InvalidSetting, match="duration"):
+        to_csv(standing, 100.0, NAMES)
+
+
+def test_a_motion_shorter_than_rounding_has_its_two_ends_in_the_table(six_axis_limits):
+    points = np.zeros((2, 6))
+    points[1] = 1e-30
+    motion = plan(points, six_axis_limits)
+    assert 0.0 < motion.duration < 1e-9
+    np.testing.assert_array_equal(
+        from_csv(to_csv(motion, 1.0, NAMES)).trajectory.time, [0.0, motion.duration]
+    )
+
+
+HEAD = "time [s],a.position [rad],a.velocity [rad/s],a.acceleration [rad/s^2]\n"
+
+
+def test_the_mark_that_spreadsheets_begin_a_table_with_is_passed_over():
+    assert from_csv("\ufeff" + HEAD + "0,0,0,0\n1,1,0,0\n").joint_names == ("a",)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        HEAD + "0,0,0," + "9" * 200_000 + "\n1,0,0,0\n",
+        HEAD.replace("\n", "\r") + "0,0,0,0\r1,0,0,0\r",
+        HEAD + "0,0,0,\x00\n1,0,0,0\n",
+        HEAD + '0,0,0,"0\n1,0,0,0\n',
+    ],
+)
+def test_a_damaged_table_is_an_invalid_motion(text):
+    with pytest.raises(InvalidTrajectory):
+        from_csv(text)

@@ -57,7 +57,9 @@ def files(draw):
         | st.just(Overrides())
     )
     start = np.array(draw(st.lists(positions, min_size=n, max_size=n)))
-    names = tuple(draw(st.lists(st.text('aé"\\ .=\n#', min_size=1), min_size=n, max_size=n)))
+    names = tuple(
+        draw(st.lists(st.text('aé"\\ .=\n#', min_size=1), min_size=n, max_size=n, unique=True))
+    )
     return PlanFile(names, start, tuple(draw(st.lists(moves(n), max_size=4))), overrides, limits)
 
 
@@ -201,7 +203,7 @@ def test_a_person_can_write_one():
         ("start_deg = [0, 0]", "", "'start' is missing"),
         ("start_deg = [0, 0]", "start_deg = 0", "position per joint"),
         ("lower_deg = [-90, -90]", "lower_deg = [-90, 95]", "lower"),
-        ("jerk_deg = [3000, 3000]", "", "not a plan"),
+        ("jerk_deg = [3000, 3000]", "", "'jerk' is missing"),
         ("[[moves]]", "[moves]", "TOML"),
     ],
 )
@@ -220,3 +222,116 @@ def test_without_limits_there_is_no_plan():
         file.plan(limits).trajectory.duration
         == PlanFile.from_toml(HAND_WRITTEN).plan().trajectory.duration
     )
+
+
+PLAIN = {
+    "format": "joint motion plan",
+    "version": 1,
+    "joints": ["a", "b"],
+    "start": [0, 0],
+    "moves": [{"target": [1, 1]}],
+}
+HUGE = 10**400
+
+
+def nested(depth: int) -> list:
+    inner: list = []
+    for _ in range(depth):
+        inner = [inner]
+    return inner
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"version": True},
+        {"version": 1.0},
+        {"version": "1"},
+        {"joints": "ab"},
+        {"joints": ["a", "a"]},
+        {"joints": [1, 2]},
+        {"joints": None},
+        {"start": [HUGE, 0]},
+        {"start": ["0", 0]},
+        {"start": [True, 0]},
+        {"start": [[0, 0]]},
+        {"start": nested(5000)},
+        {"moves": None},
+        {"moves": {"target": [1, 1]}},
+        {"moves": [5]},
+        {"moves": [{"target": ["1", "2"]}]},
+        {"moves": [{"target": [1, 1], "speed": HUGE}]},
+        {"moves": [{"target": [1, 1], "speed": "1"}]},
+        {"moves": [{"target": [1, 1], "speed": True}]},
+        {"moves": [{"target": [1, 1], "fly_percent": "50"}]},
+        {"moves": [{"target": [1, 1], "fly_percent": HUGE}]},
+        {"moves": [{"target": [1, 1], "fly_distance": True}]},
+        {"moves": [{"target": [1, 1], "joint_speed": [True, 1]}]},
+        {"moves": [{"target": [1, 1], "termination": ["fine"]}]},
+        {"overrides": None},
+        {"overrides": {"joint": ["1", 1]}},
+        {"overrides": {"speed": True}},
+        {"limits": [1]},
+        {"limits": {"lower": [HUGE, 0]}},
+        {"motion": [1]},
+        {"motion": {"type": "piecewise_cubic", "knots": [[0, HUGE]], "coefficients": []}},
+        {"motion": {"type": "piecewise_cubic", "knots": [["0", 1]], "coefficients": [[[0] * 4]]}},
+        {"motion": {"type": "piecewise_cubic", "knots": 5, "coefficients": 5}},
+    ],
+)
+def test_a_damaged_file_is_an_invalid_one_whatever_the_damage(damage):
+    assert PlanFile.from_dict(PLAIN).joint_names == ("a", "b")
+    with pytest.raises(InvalidPlanFile):
+        PlanFile.from_dict(PLAIN | damage)
+
+
+@pytest.mark.parametrize("data", [[], None, 5, "plan"])
+def test_what_is_no_table_is_no_plan(data):
+    with pytest.raises(InvalidPlanFile):
+        PlanFile.from_dict(data)
+
+
+@pytest.mark.parametrize(
+    "angle",
+    ["1.2345678901234567e9999999", "1e999999999", "1" * 5000, "[" * 5000 + "]" * 5000, "true"],
+    ids=["no float", "infinite", "too many digits", "too deep", "truth"],
+)
+def test_no_number_in_a_text_brings_anything_but_a_refusal(angle):
+    text = (
+        'format = "joint motion plan"\nversion = 1\njoints = ["a", "b"]\n'
+        f"start_deg = [{angle}, 0]\n[[moves]]\ntarget_deg = [1, 1]\n"
+    )
+    with pytest.raises(InvalidPlanFile):
+        PlanFile.from_toml(text)
+
+
+def test_a_detour_however_short_is_not_what_the_moves_plan_to():
+    three = [np.full(2, value) for value in (3.0, 2.5, 9.0, 90.0)]
+    limits = JointLimits(-three[0], *three)
+    points = [[0.0, 0.0], [2.0, 1.0], [-2.0, -1.0]]
+    planned = plan_moves(points[0], [Move(point, speed=0.002) for point in points[1:]], limits)
+    data = PlanFile.of(planned, ("a", "b")).to_dict()
+    assert PlanFile.from_dict(data).plan().duration == planned.duration
+    # In the middle of a cruise, out and back within 50 ms of the minutes that it takes.
+    knots, pieces = (data["motion"][name][0] for name in ("knots", "coefficients"))
+    cruise = int(np.argmax(np.diff(knots)))
+    begin, part = knots[cruise] + 100.0, 0.05 / 8
+    p, v, a, _ = pieces[cruise]
+    state, times, detour = [p + 100.0 * v, v, a], [], []
+    for index, sign in enumerate((1, -1, -1, 1, -1, 1, 1, -1)):
+        times.append(begin + index * part)
+        detour.append([*state, 80.0 * sign])
+        p, v, a = state
+        j = 80.0 * sign
+        state = [
+            p + part * (v + part * (a / 2 + part * j / 6)),
+            v + part * (a + part * j / 2),
+            a + part * j,
+        ]
+    times.append(begin + 0.05)
+    detour.append([*pieces[cruise][:1], *pieces[cruise][1:]])
+    detour[-1][0] += (times[-1] - knots[cruise]) * pieces[cruise][1]
+    knots[cruise + 1 : cruise + 1] = times
+    pieces[cruise + 1 : cruise + 1] = detour
+    with pytest.raises(InvalidPlanFile, match="is not what the moves plan to"):
+        PlanFile.from_dict(data).plan()

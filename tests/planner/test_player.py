@@ -8,7 +8,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drivers.exchange.program import pack, unpack
-from planner import InvalidSetting, JointLimits, NotBegun, StartMismatch, TrajectoryPlayer, plan
+from planner import (
+    InvalidSetting,
+    JointLimits,
+    LimitExceeded,
+    NotBegun,
+    StartMismatch,
+    TrajectoryPlayer,
+    plan,
+)
 
 PERIOD = 0.002
 
@@ -269,3 +277,19 @@ def test_it_goes_on_the_same_in_another_process_which_cannot_write_to_its_tables
     # Tables and cubics are mapped; what is copied of them would be read from the pickle.
     assert not copy._table.position.flags.writeable
     assert not copy._path._pieces.flags.writeable
+
+
+def test_a_start_that_would_carry_the_motion_out_of_its_range_is_refused(six_axis_limits):
+    upper = six_axis_limits.upper
+    points = np.array([np.zeros(6), upper, np.zeros(6)])
+    motion = plan(points, six_axis_limits, fly=0.0)
+    player = TrajectoryPlayer(motion, 0.002, six_axis_limits)
+    player.begin(player.start)
+    beside = np.zeros(6)
+    beside[2] = 9e-4
+    with pytest.raises(LimitExceeded, match="position of joint 2"):
+        player.begin(beside)
+    player.begin(-beside)  # away from the end of the range
+    reached = [player.advance()[0] for _ in range(4000)]
+    assert player.finished
+    assert np.max(np.array(reached) - upper) <= 1e-12

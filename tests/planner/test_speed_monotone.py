@@ -1,4 +1,4 @@
-"""How motions flown by more than half of the ramps depend on speed, over many of them."""
+"""How the durations of motions depend on speed, over many of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from planner.limits import JointLimits
 from planner.moves import Fly, FlyDistance, FlyPercent, Move, plan_moves
 
 
@@ -38,6 +39,9 @@ def lengthened(limits, fly: Fly, count: int) -> list[float]:
 @pytest.mark.slow
 @pytest.mark.parametrize("fly", [FlyPercent(25.0), FlyPercent(50.0)])
 def test_round_to_half_of_the_ramps_none_of_ten_thousand_grows(six_axis_limits, fly):
+    # Not a law: the solver misses the fastest join at a few isolated states, and now and then all
+    # the shares next to each other that it is asked about fall on such. The steps of speed here
+    # are large, so that what they gain hides a small miss; docs/motion.md tells the rate of it.
     assert lengthened(six_axis_limits, fly, 3400) == []
 
 
@@ -47,8 +51,36 @@ def test_beyond_half_of_the_ramps_a_few_in_ten_thousand_grow(six_axis_limits, fl
     # A joint can be unable to take just so long from one moving state to another: it is too fast
     # to come to rest on the way, and too slow without. At a higher speed the cuts of a fixed share
     # lie at faster states, so that a corner can fall into such a gap that it cleared before. Within
-    # a distance short moves use more than half, too, and the share is searched for. (At
-    # half of the ramps and below the slower states are passed on the way, and it cannot.)
+    # a distance short moves use more than half, too, and the share is searched for.
     grown = lengthened(six_axis_limits, fly, 3400)
     assert 0 < len(grown) < 30
     assert max(grown) < 0.1
+
+
+@pytest.mark.slow
+def test_with_a_stop_at_every_target_none_grows(six_axis_limits):
+    assert lengthened(six_axis_limits, FlyPercent(0.0), 1000) == []
+
+
+def test_a_miss_of_the_solver_at_three_neighbouring_shares_is_passed_by():
+    # Speeds 0.07 % apart: at the second, full, 0.999 and 0.97 of the corner all fall on a miss.
+    limits = JointLimits(
+        np.full(2, -3.0),
+        np.full(2, 3.0),
+        np.array([2.8797932657906435, 2.2689280275926285]),
+        np.array([12.48152857, 9.8339316]),
+        np.array([64.82294528, 51.07262355]),
+    )
+    points = [
+        [0.25196215, 0.50586841],
+        [-2.30535914, -0.93125282],
+        [0.14937923, -1.05213825],
+        [-0.45426267, 0.00991735],
+    ]
+    slow, fast = (
+        plan_moves(
+            points[0], [Move(p, speed=s, fly=FlyPercent(40.0)) for p in points[1:]], limits
+        ).duration
+        for s in (0.7058524290377093, 0.7063463775534808)
+    )
+    assert fast < slow
