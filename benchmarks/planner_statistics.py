@@ -14,6 +14,7 @@ from planner.arrays import Array
 from planner.commands import FlyPercent, Move
 from planner.motion_plan import MotionPlan
 from planner.moves import plan_moves
+from planner.verify import position_rounding
 
 FLYS = (0.1, 0.25, 0.5, 0.75, 1.0)
 # Of the method's first trial: T / T with stops, and mean passing distance [deg].
@@ -122,6 +123,7 @@ def _reach(planned: MotionPlan, limits: JointLimits) -> Array:
     extrema = planned.trajectory.extrema()
     half = (limits.upper - limits.lower) / 2.0
     beyond = np.maximum(extrema.upper - limits.upper, limits.lower - extrema.lower)
+    beyond = beyond - position_rounding(limits)  # which is not reaching further
     rates = (
         extrema.velocity / limits.velocity,
         extrema.acceleration / limits.acceleration,

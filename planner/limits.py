@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array, read_only
 from planner.errors import InvalidLimits
+
+# No arm comes near; far beyond, the corners' solver has been seen to take its process with it.
+SMALLEST_RATE: Final = 1e-10
+LARGEST_RATE: Final = 1e10
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +28,8 @@ class JointLimits:
         jerk: Largest |jerk| [rad/s³].
 
     Raises:
-        InvalidLimits: shapes differ, a value is not finite, lower >= upper, a rate <= 0.
+        InvalidLimits: shapes differ, a value is not finite, lower >= upper, a rate outside
+            1e-10..1e10.
     """
 
     lower: Array
@@ -49,8 +55,13 @@ class JointLimits:
                 f"{self.upper[joint]} rad",
             )  # fmt: skip
         for name in ("velocity", "acceleration", "jerk"):
-            if np.any(getattr(self, name) <= 0.0):
-                raise InvalidLimits(name, f"must be positive, got {getattr(self, name).tolist()}")
+            rates = getattr(self, name)
+            if np.any(rates <= 0.0):
+                raise InvalidLimits(name, f"must be positive, got {rates.tolist()}")
+            if np.any((rates < SMALLEST_RATE) | (rates > LARGEST_RATE)):
+                raise InvalidLimits(
+                    name, f"must lie in {SMALLEST_RATE:g}..{LARGEST_RATE:g}, got {rates.tolist()}"
+                )
 
     @property
     def n_joints(self) -> int:

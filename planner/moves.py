@@ -65,7 +65,8 @@ def plan_moves(
         InvalidViaPoints: start or a target is of the wrong shape, not finite, or out of limits;
             via point 0 is the start, via point i the target of the i-th move.
         InvalidSetting: overrides of another number of joints.
-        PlanningError: no plan was found that keeps the limits (none such is known).
+        PlanningError: the finished plan breaks a limit or jumps by more than rounding, and is not
+            returned; seen only with limits that lie many powers of ten (1e8) apart.
         UnsupportedSolver: a corner is to be rounded, and the installed ruckig is not known.
     """
     points = checked_via_points([start, *(move.target for move in moves)], limits)

@@ -31,7 +31,8 @@ def plan(
     Raises:
         InvalidViaPoints: wrong shape, fewer than two, not finite, or out of limits.
         InvalidSetting: speed or fly outside its range.
-        PlanningError: no plan was found that keeps the limits (none such is known).
+        PlanningError: the finished plan breaks a limit or jumps by more than rounding, and is not
+            returned; seen only with limits that lie many powers of ten (1e8) apart.
         UnsupportedSolver: a corner is to be rounded, and the installed ruckig is not known.
     """
     points = checked_via_points(via_points, limits)

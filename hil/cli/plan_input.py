@@ -46,7 +46,7 @@ def read_plan_file(path: Path) -> PlanFile:
         if path.suffix.lower() == ".toml":
             return PlanFile.from_toml(text)
         return PlanFile.from_dict(json.loads(text))
-    except (InvalidPlanFile, json.JSONDecodeError, AttributeError) as error:
+    except (ValueError, AttributeError) as error:
         raise InputError(path, str(error)) from error
     except RecursionError as error:
         raise InputError(path, "is nested too deeply", remedy="name a plan file") from error

@@ -156,7 +156,7 @@ def test_corners_are_ranked_by_what_they_save(savings):
     order = ranked(np.array(savings)).tolist()
     assert sorted(order) == list(range(len(savings)))
     ranks = [savings[i] for i in order]
-    assert all(a >= b - 1e-9 for a, b in pairwise(ranks))
+    assert all(a + 1e-9 >= b for a, b in pairwise(ranks))
 
 
 def test_the_corner_asked_for_comes_first_among_equals_and_an_unknown_one_last():

@@ -21,6 +21,8 @@ GOOD = {
         ("velocity", [1.0, np.nan]),
         ("velocity", [1.0, 0.0]),
         ("acceleration", [-2.0, 2.0]),
+        ("velocity", [1.0, 1e-300]),
+        ("jerk", [1e100, 10.0]),
         ("jerk", [10.0]),
         ("jerk", [[10.0, 10.0]]),
     ],
