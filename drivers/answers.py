@@ -53,7 +53,7 @@ from drivers.machine import Machine
 from drivers.open_mode import OpenMode, PositionMode
 from drivers.packets import EXIT_FROM_OPEN, InitPacket
 from drivers.reading import Reader, Reading
-from drivers.record import CycleRing
+from drivers.record import CycleRecords
 from drivers.replies import D1, ReplyFrame, Words
 from drivers.states import CORRECTION_MODES, HAS_SET_POINTS, Input, State
 
@@ -251,7 +251,7 @@ class Answers:
         return execution.leaving
 
     def record(
-        self, ring: CycleRing, row: int, reading: Reading, words: Words, ages: Ages | None
+        self, ring: CycleRecords, row: int, reading: Reading, words: Words, ages: Ages | None
     ) -> None:
         """Put what a packet says into its record; nothing was commanded yet.
 

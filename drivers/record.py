@@ -51,12 +51,11 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
     return np.dtype(fields, align=True)
 
 
-class CycleRing:
-    """The last `capacity` records, written in place by the session, drained by whoever archives.
+class CycleRecords:
+    """The last `capacity` records, written in place by the session, which never waits.
 
-    The writer never waits and never looks at the reader: where the reader is too slow, the oldest
-    records are overwritten and counted in `overflow`. Drained records stay readable through
-    `last` until they are overwritten.
+    Whoever reads them does so beside the writer: `CycleRing` in the same thread, a reader of
+    shared memory in another process.
 
     Args:
         n_joints: n.
@@ -84,8 +83,6 @@ class CycleRing:
         self.measured = self._block(MEASURED[0], len(MEASURED), joint_bytes)
         self.commanded = self._block(COMMANDED[0], len(COMMANDED), joint_bytes)
         self._written = 0
-        self._read = 0
-        self._lost = 0
 
     def _block(self, first: str, count: int, joint_bytes: int) -> Array:
         """Consecutive joint fields of all rows as one array (capacity, count, n)."""
@@ -108,6 +105,24 @@ class CycleRing:
         """Make the row at `slot` part of the ring."""
         self._written += 1
 
+    def last(self, count: int) -> NDArray[np.void]:
+        """A copy of the newest `count` records (fewer if there are fewer), oldest first."""
+        count = min(count, self._written, self.capacity)
+        return self.rows.take(np.arange(self._written - count, self._written), mode="wrap")
+
+
+class CycleRing(CycleRecords):
+    """Records drained by the thread that writes them.
+
+    Where it drains too rarely, the oldest records are overwritten and counted in `overflow`.
+    Drained records stay readable through `last` until they are overwritten.
+    """
+
+    def __init__(self, n_joints: int, capacity: int = 4096) -> None:
+        super().__init__(n_joints, capacity)
+        self._read = 0
+        self._lost = 0
+
     @property
     def overflow(self) -> int:
         """Records overwritten before they were drained, so far."""
@@ -119,8 +134,3 @@ class CycleRing:
         fresh = self.last(self._written - self._read)
         self._read = self._written
         return fresh
-
-    def last(self, count: int) -> NDArray[np.void]:
-        """A copy of the newest `count` records (fewer if there are fewer), oldest first."""
-        count = min(count, self._written, self.capacity)
-        return self.rows.take(np.arange(self._written - count, self._written), mode="wrap")

@@ -67,7 +67,7 @@ from drivers.packets import (
     is_init,
     packet_number,
 )
-from drivers.record import CycleRing
+from drivers.record import CycleRecords
 from drivers.replies import MODE, words_of
 from drivers.sequence import Sequence
 from drivers.states import CORRECTION_MODES, POSITION_MODES, Input, State
@@ -113,7 +113,7 @@ class Session:
         self,
         drive_train: DriveTrain,
         guard: Guard,
-        ring: CycleRing,
+        ring: CycleRecords,
         *,
         mode: int = Mode.POSITION,
         max_gap: int = 2,

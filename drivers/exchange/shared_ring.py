@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.exchange import memory
-from drivers.record import CycleRing, cycle_dtype
+from drivers.record import CycleRecords, cycle_dtype
 
 _MAGIC: Final = 0x31474E4952434948
 _HEADER_BYTES: Final = 256
@@ -22,8 +22,8 @@ _HEADER_BYTES: Final = 256
 _TAG, _JOINTS, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
 
 
-class SharedCycleRing(CycleRing):
-    """A `CycleRing` that other processes can read, the writer's end.
+class SharedCycleRing(CycleRecords):
+    """Records that other processes can read, the writer's end.
 
     Attributes:
         fd: descriptor of the memory.
@@ -79,10 +79,6 @@ class SharedCycleRing(CycleRing):
     def overflow(self) -> int:
         """Records overwritten before the reader had them, so far."""
         return self._lost
-
-    def drain(self) -> NDArray[np.void]:
-        """Not the writer's business; see `RingReader`."""
-        raise NotImplementedError("a shared ring is drained by a RingReader")
 
 
 class RingReader:

@@ -128,10 +128,6 @@ class TestRing:
         with pytest.raises(ValueError, match="at least 2"):
             SharedCycleRing.create(N, 1)
 
-    def test_draining_is_the_readers_business(self):
-        with pytest.raises(NotImplementedError):
-            SharedCycleRing.create(N, 10).drain()
-
 
 def gaps(numbers):
     return [GapSeen(1, number) for number in numbers]
