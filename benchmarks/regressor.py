@@ -55,7 +55,7 @@ def _motion(n_joints: int) -> Motion:
     )
 
 
-def _pinocchio_gram(model: pin.Model, motion: Motion, stacked: Array) -> Array:
+def pinocchio_gram(model: pin.Model, motion: Motion, stacked: Array) -> Array:
     """Return the Gram matrix of pinocchio's stacked regressor, shape (60, 60)."""
     data = model.createData()
     regressor = pin.computeJointTorqueRegressor
@@ -66,8 +66,8 @@ def _pinocchio_gram(model: pin.Model, motion: Motion, stacked: Array) -> Array:
     return rows.T @ rows
 
 
-def _difference(model: RobotModel, ours: Array, theirs: Array) -> float:
-    """Return the largest difference of the two Gram matrices, columns scaled to unit length."""
+def common_columns(model: RobotModel) -> tuple[list[int], list[int]]:
+    """Return columns of ours, and the columns of pinocchio's that are the same parameters."""
     width = len(LINK_SYMBOLS) + model.rotor_inertia
     own: list[int] = []
     foreign: list[int] = []
@@ -76,12 +76,18 @@ def _difference(model: RobotModel, ours: Array, theirs: Array) -> float:
         if symbol < len(LINK_SYMBOLS):
             own.append(column)
             foreign.append(10 * joint + FROM_PINOCCHIO[symbol])
+    return own, foreign
+
+
+def _difference(model: RobotModel, ours: Array, theirs: Array) -> float:
+    """Return the largest difference of the two Gram matrices, columns scaled to unit length."""
+    own, foreign = common_columns(model)
     a, b = ours[np.ix_(own, own)], theirs[np.ix_(foreign, foreign)]
     length = np.sqrt(np.diag(b))
     return float(np.max(np.abs(a - b) / length / length[:, None]))
 
 
-def _timed(function: Callable[[], Array]) -> float:
+def timed(function: Callable[[], object]) -> float:
     """Return the processor time of a call: on a busy machine the wall clock times the others."""
     start = time.thread_time()
     function()
@@ -110,10 +116,10 @@ def main() -> None:
     stacked = np.zeros((SAMPLES, reference.nv, 10 * reference.nv))
 
     def theirs() -> Array:
-        return _pinocchio_gram(reference, motion, stacked)
+        return pinocchio_gram(reference, motion, stacked)
 
     difference = _difference(model, ours(), theirs())
-    times = np.array([(_timed(ours), _timed(theirs)) for _ in range(REPETITIONS)])
+    times = np.array([(timed(ours), timed(theirs)) for _ in range(REPETITIONS)])
     ours_ms, pinocchio_ms = (float(value) * 1e3 for value in np.median(times, axis=0))
     result = {
         "ratio_to_pinocchio": round(pinocchio_ms / ours_ms, 3),

@@ -37,9 +37,13 @@ class CriteriaResult(_Frozen):
 class ExcitationResult(_Frozen):
     """The excitation: as planned, and as it was really executed (from the archives)."""
 
+    method: str | None = None
+    """Name of the search that found it."""
     duration: float
     n_via: int | None
     fly: float | None
+    n_sines: int | None = None
+    """Sines per joint, where the motion is a sum of sines."""
     planned: CriteriaResult | None
     executed: CriteriaResult
 

@@ -35,9 +35,11 @@ Rows = slice | NDArray[np.intp]
 # 512 takes a quarter longer, 256 two thirds.
 CHUNK = 1280
 
-# Working arrays kept for the next call: fresh memory costs more than the arithmetic on it.
-_SPARE = 4
-_GRAIN = 64  # sizes are multiples of this, so that a search meets few different ones
+# Working arrays kept for the next call: fresh memory costs more than the arithmetic on it. Sizes
+# are multiples of the grain, so that a search over motions of all durations meets few different
+# ones: the six between half a chunk and a chunk, and some shorter (some 8 kB per sample).
+_SPARE = 8
+_GRAIN = 128
 
 
 class Regressor(NamedTuple):

@@ -8,6 +8,7 @@ set-point per controller cycle, at an override that may change, and stops it on 
 from __future__ import annotations
 
 from planner.batch import PlanningPool, plan_many
+from planner.children import map_in_children
 from planner.commands import FlyDistance, FlyPercent, Move, Overrides, Stop
 from planner.errors import (
     InvalidLimits,
@@ -62,6 +63,7 @@ __all__ = [
     "in_child",
     "close_child",
     "PlanningChild",
+    "map_in_children",
     "check_limits",
     "check_rest",
     "JointLimits",

@@ -8,25 +8,16 @@ workers; a worker that dies is started anew.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from multiprocessing.connection import wait
-from time import monotonic
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array
 from planner.blocks import LimitRows
-from planner.errors import (
-    InvalidSetting,
-    InvalidViaPoints,
-    PlannerCrashed,
-    PlannerError,
-    PlanningError,
-    PlanningTimedOut,
-)
+from planner.children import chunks_of, map_in_children
+from planner.errors import InvalidSetting, InvalidViaPoints, PlannerError, PlanningError
 from planner.isolation import PlanningChild
 from planner.limits import JointLimits
 from planner.piecewise_cubic import PiecewiseCubic
@@ -78,13 +69,10 @@ class PlanningPool:
         shares = _one_each(speed, len(individuals), limits.n_joints)
         if not 0.0 <= fly <= 1.0:
             raise InvalidSetting("fly", fly, "a number from 0 to 1")
-        chunks = [
-            range(begin, min(begin + _CHUNK, len(individuals)))
-            for begin in range(0, len(individuals), _CHUNK)
-        ]
+        chunks = chunks_of(len(individuals), _CHUNK)
         population = _Population(individuals, shares, limits, fly)
         if self.children:
-            return _shared(self.children, chunks, population)
+            return list(map_in_children(self.children, plan_chunk, chunks, population.part))
         return [planned for chunk in chunks for planned in plan_chunk(*population.part(chunk))]
 
 
@@ -176,47 +164,6 @@ def _alone(points: Array, speed: Array, limits: JointLimits, fly: float) -> Plan
         return plan(points, limits, speed=speed, fly=fly)
     except PlanningError as error:
         return error
-
-
-def _shared(
-    children: Sequence[PlanningChild], chunks: Sequence[Sequence[int]], population: _Population
-) -> list[Planned]:
-    """Let workers plan chunks; one that ends its worker is tried again individual by individual."""
-    planned: dict[int, Planned] = {}
-    waiting, idle = deque(chunks), list(children)
-    busy: dict[Any, tuple[PlanningChild, Sequence[int]]] = {}
-    try:
-        while waiting or busy:
-            while waiting and idle:
-                child, chunk = idle.pop(), waiting.popleft()
-                _begin(child, population.part(chunk))
-                busy[child.connection] = child, chunk
-            nearest = min(child.deadline for child, _ in busy.values())
-            ready = wait(list(busy), max(0.0, nearest - monotonic()))
-            late = [link for link, (child, _) in busy.items() if child.deadline <= monotonic()]
-            for link in {*ready, *late}:
-                child, chunk = busy.pop(link)
-                idle.append(child)
-                try:
-                    planned.update(zip(chunk, child.receive(), strict=True))
-                except (PlannerCrashed, PlanningTimedOut) as error:
-                    if len(chunk) == 1:
-                        planned[chunk[0]] = error
-                    else:
-                        waiting.extend([index] for index in chunk)
-    except BaseException:  # Ctrl-C, or a fault of ours: nobody will fetch what is under way
-        for child in children:
-            child.close()
-        raise
-    return [planned[index] for index in range(len(planned))]
-
-
-def _begin(child: PlanningChild, task: tuple[Any, ...]) -> None:
-    """Give a worker a task; one that died while idle is replaced, once."""
-    try:
-        child.send(plan_chunk, *task)
-    except PlannerCrashed:
-        child.send(plan_chunk, *task)
 
 
 def _one_each(speed: ArrayLike, count: int, n_joints: int) -> Array:

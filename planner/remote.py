@@ -61,15 +61,15 @@ def unnumbered(message: bytes) -> tuple[int, bytes]:
     return int.from_bytes(message[:_NUMBER], "big"), message[_NUMBER:]
 
 
-def pack(message: Task | Answer) -> bytes:
-    """Return a message as bytes."""
+def pack(message: object) -> bytes:
+    """Return a message as bytes: a `Task`, an `Answer`, or what one of them is to carry."""
     buffer = io.BytesIO()
     _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(message)
     return buffer.getvalue()
 
 
 def load(message: bytes) -> Any:
-    """Return the message that `pack` made into bytes, a `Task` or an `Answer`."""
+    """Return the message that `pack` made into bytes."""
     return pickle.loads(message)
 
 

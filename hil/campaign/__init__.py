@@ -11,7 +11,8 @@ from .folder import CampaignFolder
 from .link import Link
 from .live_link import LiveLink
 from .motion_link import MotionLink, Progress, Recorded
-from .plan import CampaignPlan, PlannedMotion, design
+from .plan import CampaignPlan, PlannedMotion
+from .quick_design import design, plan_around
 from .stop import Stop, stop_on_interrupt
 
 __all__ = [
@@ -31,5 +32,6 @@ __all__ = [
     "Recorded",
     "Stop",
     "design",
+    "plan_around",
     "stop_on_interrupt",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,18 @@ from numpy.typing import NDArray
 from hil.archive import ArchiveSpec
 from hil.cell import Cell
 from hil.files import make_folder
+from hil.motion_checks import MotionChecks
 from hil.progress import Reporter
 from hil.version import software
-from planner import Move, PiecewiseCubic, PlanFile, TrajectoryPlayer, in_child, plan_moves
+from planner import (
+    FourierSeries,
+    Move,
+    PiecewiseCubic,
+    PlanFile,
+    TrajectoryPlayer,
+    in_child,
+    plan_moves,
+)
 
 from .errors import (
     CampaignFolderError,
@@ -26,7 +35,7 @@ from .errors import (
 )
 from .folder import CampaignFolder
 from .motion_link import MotionLink
-from .plan import CampaignPlan, MotionChecks, moves_to_dict
+from .plan import CampaignPlan, moves_to_dict
 from .stop import Stop
 
 Array = NDArray[np.float64]
@@ -43,7 +52,7 @@ class Interval:
 
     kind: str
     index: int
-    trajectory: PiecewiseCubic
+    trajectory: PiecewiseCubic | FourierSeries
     moves: PlanFile | None = None
 
     def __str__(self) -> str:
@@ -156,7 +165,7 @@ class Campaign:
             before = interval
 
     def _missing(self, where: Array) -> list[Interval]:
-        """What is still to be run with the arm at `where` (n,), there and back."""
+        """What is still to be run with the arm at `where` (n,), there and back in the end."""
         settings, home, archived = self.cell.campaign, self.cell.home, self.folder
         excitation, moves = self.plan.excitation.trajectory, self.plan.moves
         wanted = [
@@ -168,17 +177,41 @@ class Campaign:
             ),
         ]
         missing = [w for w in wanted if archived.whole(w.kind, w.index) is None]
-        if missing and np.max(np.abs(home - where)) > AT_REST_TOLERANCE:
-            missing = [self._move(0, where, home), *missing, self._move(1, home, where)]
-        return missing
+        return self._with_ways(missing, where) if missing else []
 
-    def _move(self, index: int, start: Array, end: Array) -> Interval:
-        """The way between the arm and home; planned where a crash does not end this process."""
+    def _with_ways(self, intervals: list[Interval], where: Array) -> list[Interval]:
+        """Put moves between: from `where` (n,) to home, from home to an excitation, and back.
+
+        An excitation may begin and end elsewhere than at home; whatever else does is not met.
+        """
+        home, at = self.cell.home, where
+        joined: list[Interval] = []
+        ways: dict[bytes, Interval] = {}
+
+        def go(target: Array) -> None:
+            nonlocal at
+            if np.max(np.abs(target - at)) > AT_REST_TOLERANCE:
+                key = at.tobytes() + target.tobytes()
+                if key not in ways:
+                    ways[key] = self._way(at, target)
+                index = sum(interval.kind == "move" for interval in joined)
+                joined.append(replace(ways[key], index=index))
+            at = target
+
+        for interval in intervals:
+            start, end = _ends(interval) if interval.kind == "excitation" else (home, home)
+            go(start)
+            joined.append(interval)
+            at = end
+        go(home)
+        go(where)
+        return joined
+
+    def _way(self, start: Array, end: Array) -> Interval:
+        """The straight way between two postures; planned where a crash does not end us."""
         move = Move(end, speed=self.cell.campaign.approach_speed)
         motion = in_child(plan_moves, start, (move,), self.cell.joint_limits)
-        return Interval(
-            "move", index, motion.trajectory, PlanFile.of(motion, self.cell.joint_names)
-        )
+        return Interval("move", 0, motion.trajectory, PlanFile.of(motion, self.cell.joint_names))
 
     def _run_one(
         self,
@@ -242,8 +275,7 @@ class Campaign:
 
 def _jump(before: Interval, after: Interval) -> str | None:
     """Why `after` cannot follow `before`, or None if it begins where that ends."""
-    end = before.trajectory.sample(np.array([before.trajectory.duration]))[0][0]
-    start = after.trajectory.sample(np.zeros(1))[0][0]
+    (_, end), (start, _) = _ends(before), _ends(after)
     distance = np.abs(start - end)
     if np.max(distance) <= START_TOLERANCE:
         return None
@@ -252,6 +284,12 @@ def _jump(before: Interval, after: Interval) -> str | None:
         f"it begins with joint {joint + 1} at {start[joint]:.6g} rad, but {before} ends at "
         f"{end[joint]:.6g} rad"
     )
+
+
+def _ends(interval: Interval) -> tuple[Array, Array]:
+    """Where a motion begins and where it ends, (n,) [rad] each."""
+    start, end = interval.trajectory.sample(np.array([0.0, interval.trajectory.duration]))[0]
+    return start, end
 
 
 def hold(position: Array, duration: float) -> PiecewiseCubic:

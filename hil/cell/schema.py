@@ -250,7 +250,11 @@ class CampaignTable(_Table):
     fly: Annotated[FiniteFloat, Field(ge=0, le=1)] = Field(
         default=0.5, description="fly-by fraction, 0 (stop at every via point) to 1"
     )
-    candidates: int = Field(default=300, ge=1, description="random via-point sets to choose from")
+    candidates: int = Field(
+        default=300,
+        ge=1,
+        description="motions that the quick search of a campaign without a design may try",
+    )
     seed: int = Field(
         default=1, ge=0, description="seed of the search and of the validation motions"
     )

@@ -15,7 +15,7 @@ from hil.errors import HilError
 from identification import IdentificationError
 from planner import PlannerError
 
-from . import demo, doctor, identify, imports, plan, record, simulate
+from . import demo, design, doctor, identify, imports, plan, record, simulate
 
 app = typer.Typer(
     name="hil",
@@ -29,6 +29,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.command("demo")(demo.demo)
+app.command("design")(design.design)
 app.command("identify")(identify.identify)
 app.command("plan")(plan.plan)
 app.command("record")(record.record)

@@ -18,12 +18,14 @@ from hil.campaign import (
     LiveLink,
     MotionLink,
     design,
+    plan_around,
     stop_on_interrupt,
 )
 from hil.cell import Cell
 from hil.cli.verdict import finish
 from hil.demo_link import CAN, LOOPBACK, loopback_link
-from hil.errors import ControllerFault, OperatorStopError
+from hil.design import load_design
+from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.identify import identify_campaign
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
@@ -57,6 +59,15 @@ def demo(
             "elasticity, delay.",
         ),
     ] = False,
+    excitation: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Run this excitation, a result of `hil design` for the NS 16 cell, instead of "
+            "one found in a few seconds.",
+            show_default=False,
+        ),
+    ] = None,
     link: Annotated[
         Literal["simulated", "udp", "can"],
         typer.Option(
@@ -83,6 +94,12 @@ def demo(
     """
     reporter = make_reporter(quiet=quiet or json)
     if resume:
+        if excitation is not None:
+            raise InputError(
+                excitation,
+                "cannot be run in a campaign that has an excitation already",
+                remedy="leave out --excitation, or name another folder",
+            )
         campaign = Campaign.open(output)
     else:
         _refuse_what_is_not_ours(output, force=force)
@@ -97,7 +114,11 @@ def demo(
                 cycle_ms=2 if link == "can" else None,
                 can=CAN if link == "can" else None,
             )
-        plan = design(cell, reporter)
+        plan = (
+            design(cell, reporter)
+            if excitation is None
+            else plan_around(cell, load_design(excitation, cell))
+        )
         _make_room(output)
         campaign = Campaign.create(output, cell, plan)
     _run(campaign, reporter, effects=effects)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
+from hil.errors import InputError
 from hil.results import (
     CoverageResult,
     CriteriaResult,
@@ -23,6 +25,7 @@ from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, Motion, RobotModel
 from identification.excitation import (
+    Excitation,
     condition_number,
     correlation,
     coupling_index,
@@ -35,9 +38,10 @@ from identification.preprocessing import Samples
 from identification.repetitions import RepeatedEstimate
 from identification.validation import prediction_error
 from identification.verdict import Verdict
+from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, urdf_text
 
-from .sources import Sources
+from .sources import Source, Sources
 
 Array = NDArray[np.float64]
 
@@ -53,7 +57,10 @@ def summarise(
 ) -> Results:
     """Everything that was found, as it goes into `results.json`."""
     cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
-    rows = [moving_rows(samples) for samples in training]
+    rows = [
+        executed_rows(source, samples)
+        for source, samples in zip(sources.training, training, strict=True)
+    ]
     gram = information(_executed(cell.model, training, rows))
     simulated = sources.metadata.get("simulated") == "yes"
     truth = planted_values(cell) if simulated and cell.file.simulation else None
@@ -112,7 +119,7 @@ def _excitation(
     """Criteria of what was executed (all repetitions), and of the plan where one was attached."""
     lengths = [part.stop - part.start for part in rows]
     executed = _criteria(gram, sum(lengths))
-    planned = (sources.plan or {}).get("excitation")
+    planned = _planned(sources)
     if planned is None:
         return ExcitationResult(
             duration=lengths[0] * _period(training[0]),
@@ -121,19 +128,54 @@ def _excitation(
             planned=None,
             executed=executed,
         )
-    criteria = planned["criteria"]
+    trajectory, criteria = planned.trajectory, planned.criteria
     return ExcitationResult(
-        duration=max(knots[-1] for knots in planned["trajectory"]["knots"]),
-        n_via=len(planned["via_points"]) - 2,
-        fly=planned["fly"],
+        method=planned.method,
+        duration=trajectory.duration,
+        n_via=_n_via(planned.via_points),
+        fly=planned.fly,
+        n_sines=trajectory.amplitude.shape[1] if isinstance(trajectory, FourierSeries) else None,
         planned=CriteriaResult(
-            **criteria,
-            coupling_index_max=coupling_index_max(len(gram)),
-            condition=None,
-            scaled_condition=None,
+            **asdict(criteria), coupling_index_max=coupling_index_max(len(gram))
         ),
         executed=executed,
     )
+
+
+def _planned(sources: Sources) -> Excitation | None:
+    """The excitation that was planned, where the archives say what it was."""
+    plan = sources.plan or {}
+    try:
+        return Excitation.from_dict(plan["excitation"]) if "excitation" in plan else None
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            sources.training[0].name,
+            f"its plan.json holds no excitation that can be read ({error!r})",
+            remedy="identify with the version of hil that recorded it",
+        ) from error
+
+
+def _n_via(via_points: Array | None) -> int | None:
+    """Via points, without the posture that a closed path begins and ends at."""
+    if via_points is None:
+        return None
+    closed = np.array_equal(via_points[0], via_points[-1])
+    return len(via_points) - 2 if closed else len(via_points)
+
+
+def executed_rows(source: Source, samples: Samples) -> slice:
+    """Time samples of the motion itself: those of a plan, from where it was told to move.
+
+    Where no set-points were recorded, from the first to the last in which some joint moves.
+    """
+    commanded, time = source.recording.commanded_position, source.recording.time
+    if commanded is None:
+        return moving_rows(samples)
+    steps = np.flatnonzero((np.abs(np.diff(commanded, axis=0)) > 0.0).any(axis=1))
+    if not steps.size:
+        return slice(0, 0)
+    first, last = np.searchsorted(samples.motion.time, time[[steps[0], steps[-1] + 1]])
+    return slice(int(first), int(last) + 1)
 
 
 def moving_rows(samples: Samples) -> slice:

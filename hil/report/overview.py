@@ -8,6 +8,14 @@ from dataclasses import dataclass
 from hil.report import numbers
 from hil.results import CriteriaResult, Results
 
+_METHODS = {
+    "a": "designed by the paper's method A",
+    "b": "designed by the paper's method B",
+    "balanced": "designed for balanced criteria",
+    "front": "designed as the knee of log det and I_c",
+    "random": "the best of random motions",
+}
+
 
 @dataclass(frozen=True)
 class Fact:
@@ -43,10 +51,14 @@ def facts(results: Results) -> list[Fact]:
     rate = 1.0 / results.period if results.period > 0 else float("inf")
     n_friction = len(results.parameters) - results.n_base
     motion = [f"{numbers.fixed(excitation.duration, 2)} s"]
+    if excitation.n_sines is not None:
+        motion.append(f"{excitation.n_sines} sines per joint")
     if excitation.n_via is not None:
         motion.append(f"{excitation.n_via} via points")
     if excitation.fly is not None:
         motion.append(f"fly-by {100.0 * excitation.fly:g} %")
+    if excitation.method is not None:
+        motion.append(_METHODS.get(excitation.method, f"found by {excitation.method}"))
     return [
         Fact("Cell", results.cell),
         Fact("Joints", f"{len(results.joint_names)}: " + ", ".join(results.joint_names)),

@@ -1,66 +1,114 @@
-"""Choosing motions that excite the parameters: criteria, constraints, designs."""
+"""Choosing motions that excite the parameters: criteria, constraints, searches."""
 
 from identification.excitation.collision import CollisionChecker, Contact
 from identification.excitation.constraints import (
+    KINDS,
+    Constraints,
     CurrentModel,
     MotionCheck,
     Violation,
     check_motion,
+    excess_by_kind,
 )
 from identification.excitation.criteria import (
+    Criteria,
     condition_number,
     correlation,
     coupling_index,
     coupling_index_max,
     fitness_eq7,
+    fitness_of,
     information,
     log10_det,
 )
-from identification.excitation.design import (
-    Criteria,
-    Drawing,
-    Excitation,
-    random_search,
-    random_validation_motions,
-)
+from identification.excitation.design import Design
 from identification.excitation.drawn import DrawnMotion
 from identification.excitation.errors import (
     CollisionModelError,
     DesignError,
+    ForeignJournalError,
+    JournalError,
     NoFeasibleMotionError,
     WorkspaceError,
 )
+from identification.excitation.excitation import Excitation
+from identification.excitation.front import Front
+from identification.excitation.genome import Genome
+from identification.excitation.journal import Journal
+from identification.excitation.ledger import Progress
+from identification.excitation.objective import Measures, Objective
+from identification.excitation.polish import PolishResult, dominating, polish
+from identification.excitation.population import Population
+from identification.excitation.problem import Problem
+from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
+from identification.excitation.scale import SAMPLE_COUNT, Scale
+from identification.excitation.scores import Scores
+from identification.excitation.search import RESCORE_PERIOD, search
+from identification.excitation.settings import Method, SearchSettings
+from identification.excitation.sines import SineGenome
+from identification.excitation.validation_motions import Drawing, random_validation_motions
+from identification.excitation.via_points import ViaPointGenome
 from identification.excitation.workspace import Box, Wall, Workspace
 
 __all__ = [
     # criteria
+    "Criteria",
     "condition_number",
     "correlation",
     "coupling_index",
     "coupling_index_max",
     "fitness_eq7",
+    "fitness_of",
     "information",
     "log10_det",
+    "Measures",
+    "Objective",
+    "SAMPLE_PERIOD",
+    "midpoints",
+    "sampled",
     # constraints
     "Box",
     "Wall",
     "Workspace",
     "CollisionChecker",
     "Contact",
+    "Constraints",
     "CurrentModel",
+    "KINDS",
     "MotionCheck",
     "Violation",
     "check_motion",
-    # designs
-    "Criteria",
+    "excess_by_kind",
+    # motions
+    "Genome",
+    "SineGenome",
+    "ViaPointGenome",
     "Drawing",
     "DrawnMotion",
     "Excitation",
-    "random_search",
     "random_validation_motions",
+    # searches
+    "Design",
+    "Front",
+    "Journal",
+    "Method",
+    "PolishResult",
+    "Population",
+    "Problem",
+    "Progress",
+    "RESCORE_PERIOD",
+    "SAMPLE_COUNT",
+    "Scale",
+    "Scores",
+    "SearchSettings",
+    "dominating",
+    "polish",
+    "search",
     # errors
     "CollisionModelError",
     "DesignError",
+    "ForeignJournalError",
+    "JournalError",
     "NoFeasibleMotionError",
     "WorkspaceError",
 ]

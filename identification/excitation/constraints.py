@@ -1,70 +1,33 @@
-"""What a motion must keep before it is sent: joint limits, clearance, torque and motor current."""
+"""What a motion must keep: joint limits, duration, clearance, torque and motor current."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import ShapeError
-from identification.excitation.collision import CollisionChecker
-from identification.model import RobotModel
+from identification.excitation.collision import CollisionChecker, PathContact
+from identification.excitation.current_model import CurrentModel
+from identification.excitation.errors import DesignError
+from identification.excitation.joint_limits import limit_violations, rest_violations
+from identification.excitation.sampling import SAMPLE_PERIOD, sampled
+from identification.excitation.violation import KINDS, Violation, excess_by_kind
 from identification.motion import Motion
-from planner import JointLimits, LimitExceeded, PiecewiseCubic, check_limits
+from planner import FourierSeries, JointLimits, PiecewiseCubic
+
+__all__ = [
+    "KINDS",
+    "Constraints",
+    "CurrentModel",
+    "MotionCheck",
+    "Violation",
+    "check_motion",
+    "clearance",
+    "excess_by_kind",
+]
 
 Array = NDArray[np.float64]
-Kind = Literal["planning", "joint limit", "duration", "collision", "torque", "current"]
-
-SAMPLE_PERIOD = 0.008
-"""s; motions are looked at this often. A fast arm's tip moves some 4 cm meanwhile."""
-
-_UNITS: dict[Kind, str] = {
-    "planning": "",
-    "joint limit": "",
-    "duration": " s",
-    "collision": " m",
-    "torque": " N·m",
-    "current": " A",
-}
-
-
-@dataclass(frozen=True)
-class Violation:
-    """One constraint that a motion breaks, at its worst instant.
-
-    Attributes:
-        kind: which constraint.
-        subject: joint, motor ("motor of joint_3"), or the pair that comes too close.
-        value: what it reaches (a distance for a collision), SI.
-        bound: what it may reach at most (for a collision and a too short motion: at least), SI.
-        time: when [s]; None on a way that has no times yet.
-        posture: joint positions there [rad]; empty where they play no part.
-    """
-
-    kind: Kind
-    subject: str
-    value: float
-    bound: float
-    time: float | None
-    posture: tuple[float, ...] = ()
-
-    @property
-    def excess(self) -> float:
-        """How far beyond the bound (> 0), as a share of it; absolute where the bound is zero."""
-        return abs(self.value - self.bound) / (abs(self.bound) or 1.0)
-
-    def __str__(self) -> str:
-        unit = _UNITS[self.kind]
-        text = (
-            f"{self.kind} of {self.subject}: {self.value:.4g}{unit}, bound {self.bound:.4g}{unit}"
-        )
-        if self.time is not None:
-            text += f", at {self.time:.3f} s"
-        if self.posture:
-            text += f", joints at ({', '.join(f'{q:.3f}' for q in self.posture)}) rad"
-        return text
 
 
 @dataclass(frozen=True)
@@ -80,123 +43,113 @@ class MotionCheck:
 
 
 @dataclass(frozen=True, eq=False)
-class CurrentModel:
-    """Predicts joint torques and motor currents of a motion from nominal parameters.
+class Constraints:
+    """What a motion must keep.
 
-    Torque of the joints and current of the motors belong together as
-    ``tau = motor_from_joint^T (torque_constant * current)``.
+    Everything is looked at whatever else is broken: only then do the excesses of two motions
+    compare, and a motion that is mended in one respect is not found broken in another.
 
     Attributes:
-        model: the robot.
-        values: (p,) its nominal parameters.
-        motor_from_joint: (n, n) motor rad per joint rad; gears and coupling.
-        torque_constant: (n,) on the motor side [N·m/A].
-        current_limit: (n,) largest |current| of each motor [A].
-        uncertainty: share by which the real torques may be larger than the nominal ones.
-        torque_limit: (n,) largest |torque| of each joint [N·m], where one is set besides.
+        limits: joint limits, kept at every instant.
+        min_duration, max_duration: of the motion [s].
+        checker: floor, walls, boxes and the arm itself; None to look at none of them.
+        currents: nominal torques and currents with their uncertainty; None to look at neither.
+        at_rest: whether a motion must begin and end at rest. A bare series of sines does not: it
+            can be designed and looked at, and cannot be run.
 
     Raises:
-        ShapeError: an array does not belong to the model's number of joints or parameters.
+        DesignError: no duration is allowed.
     """
 
-    model: RobotModel
-    values: Array
-    motor_from_joint: Array
-    torque_constant: Array
-    current_limit: Array
-    uncertainty: float = 0.0
-    torque_limit: Array | None = None
+    limits: JointLimits
+    min_duration: float = 0.0
+    max_duration: float = 20.0
+    checker: CollisionChecker | None = None
+    currents: CurrentModel | None = None
+    at_rest: bool = True
 
     def __post_init__(self) -> None:
-        n = self.model.n_joints
-        for name, shape in (
-            ("values", (self.model.n_parameters,)),
-            ("motor_from_joint", (n, n)),
-            ("torque_constant", (n,)),
-            ("current_limit", (n,)),
-            ("torque_limit", (n,)),
-        ):
-            array = getattr(self, name)
-            if array is not None and np.shape(array) != shape:
-                raise ShapeError(name, np.shape(array), str(shape))
+        if not self.max_duration > 0.0:
+            raise DesignError("max_duration", self.max_duration, "above 0 s")
+        if not self.min_duration <= self.max_duration:
+            raise DesignError("min_duration", self.min_duration, "at most max_duration")
 
-    def torque(self, motion: Motion) -> Array:
-        """Return the joint torques (m, n) [N·m] that a motion needs at most."""
-        nominal = self.model.torque(
-            self.values, motion.position, motion.velocity, motion.acceleration
-        )
-        return (1.0 + self.uncertainty) * nominal
+    def violations(
+        self,
+        trajectory: PiecewiseCubic | FourierSeries,
+        motion: Motion,
+        torque: Array | None = None,
+    ) -> tuple[Violation, ...]:
+        """Return what a motion breaks: of each kind and subject the worst, of contacts the deepest.
 
-    def current(self, torque: Array) -> Array:
-        """Return the motor currents (m, n) [A] that make joint torques (m, n) [N·m]."""
-        motor_torque = np.linalg.solve(self.motor_from_joint.T, torque.T).T
-        return np.asarray(motor_torque / self.torque_constant, dtype=np.float64)
+        Joint limits and contacts are looked at between the samples too, the rest at them.
 
-    def check(self, motion: Motion) -> list[Violation]:
-        """Return for each joint and motor its largest excess, if there is any."""
-        torque = self.torque(motion)
-        joints = self.model.joint_names
-        motors = tuple(f"motor of {name}" for name in joints)
-        found = _beyond("current", motors, self.current(torque), self.current_limit, motion)
-        if self.torque_limit is not None:
-            found += _beyond("torque", joints, torque, self.torque_limit, motion)
-        return found
+        Args:
+            trajectory: the motion.
+            motion: samples of it, both ends included.
+            torque: (m, n) nominal joint torque at the samples [N·m], where it is known already.
+
+        Raises:
+            ShapeError: samples or torque of another arm.
+        """
+        found = rest_violations(trajectory, self.limits) if self.at_rest else []
+        found += limit_violations(trajectory, self.limits, motion)
+        found += self._wrong_duration(trajectory.duration)
+        if self.checker is not None:
+            contact = self.checker.deepest_along(trajectory, motion)
+            found += [] if contact is None else [_collision(self.checker, contact)]
+        if self.currents is not None:
+            found += self.currents.check(motion, torque)
+        return tuple(found)
+
+    def _wrong_duration(self, duration: float) -> list[Violation]:
+        bound = min(max(duration, self.min_duration), self.max_duration)
+        if bound == duration:
+            return []
+        return [Violation("duration", "the motion", duration, bound, None)]
 
 
 def check_motion(
-    trajectory: PiecewiseCubic,
+    trajectory: PiecewiseCubic | FourierSeries,
     limits: JointLimits,
     *,
     checker: CollisionChecker | None = None,
     currents: CurrentModel | None = None,
     period: float = SAMPLE_PERIOD,
 ) -> MotionCheck:
-    """Check a whole motion: limits analytically, all else every `period` [s]."""
-    found: list[Violation] = []
-    try:
-        check_limits(trajectory, limits)
-    except LimitExceeded as excess:
-        subject = f"{excess.quantity} of joint {excess.joint}"
-        found.append(Violation("joint limit", subject, excess.value, excess.bound, None))
-    motion = sampled(trajectory, period)
-    if checker is not None:
-        contact = clearance(checker, motion.position, motion.time)
-        found += [contact] if contact is not None else []
-    if currents is not None:
-        found += currents.check(motion)
-    return MotionCheck(tuple(found))
+    """Check a whole motion, of whatever duration, before it is sent.
 
-
-def sampled(trajectory: PiecewiseCubic, period: float) -> Motion:
-    """Return a motion every `period` [s], both ends included."""
-    steps = int(np.ceil(trajectory.duration / period))
-    time = np.minimum(np.arange(steps + 1) * period, trajectory.duration)
-    return Motion(time, *trajectory.sample(time))
+    Limits, rest at both ends and contacts are looked at over all time, torques and currents every
+    `period` [s].
+    """
+    constraints = Constraints(limits, max_duration=np.inf, checker=checker, currents=currents)
+    return MotionCheck(constraints.violations(trajectory, sampled(trajectory, period)))
 
 
 def clearance(checker: CollisionChecker, q: Array, time: Array | None = None) -> Violation | None:
-    """Return the first contact along postures (m, n) at times (m,), if there is one."""
-    contact = checker.first_contact(q)
+    """Return the deepest contact in postures (m, n), reached at times (m,), if there is one."""
+    contact = checker.deepest_contact(q)
     if contact is None:
         return None
+    return _collision(
+        checker,
+        PathContact(
+            contact.first,
+            contact.second,
+            None if time is None else float(time[contact.sample]),
+            tuple(q[contact.sample].tolist()),
+            contact.distance,
+        ),
+    )
+
+
+def _collision(checker: CollisionChecker, contact: PathContact) -> Violation:
     return Violation(
         "collision",
         f"{contact.first} and {contact.second}",
         contact.distance,
         checker.workspace.margin,
-        None if time is None else float(time[contact.sample]),
-        tuple(q[contact.sample].tolist()),
+        contact.time,
+        contact.posture,
+        scale=checker.arm_length,
     )
-
-
-def _beyond(
-    kind: Kind, subjects: tuple[str, ...], values: Array, bounds: Array, motion: Motion
-) -> list[Violation]:
-    found = []
-    for j, worst in enumerate(np.argmax(np.abs(values), axis=0).tolist()):
-        value = float(abs(values[worst, j]))
-        if not value <= bounds[j]:  # NaN is beyond every bound
-            posture = tuple(motion.position[worst].tolist())
-            time = float(motion.time[worst])
-            found.append(Violation(kind, subjects[j], value, float(bounds[j]), time, posture))
-    return found

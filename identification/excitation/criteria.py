@@ -13,6 +13,9 @@ search can rank it last.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Self
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
@@ -28,6 +31,41 @@ def information(factor: Factor) -> Array:
     return total[:-1, :-1]
 
 
+@dataclass(frozen=True)
+class Criteria:
+    """How well a motion excites the parameters (paper, eqs. 5, 7 and 9).
+
+    Attributes:
+        log10_det: log10 of det(Phi^T Phi) / N^p; depends on units.
+        coupling_index: I_c, the smaller the better.
+        fitness: eq. 7 as printed, with the paper's weights 0.7 and 0.3.
+        n_samples: N, time samples that they were computed from.
+        condition: condition number of Phi; depends on units.
+        scaled_condition: the same with columns of unit length. Both are None where nobody
+            computed them.
+    """
+
+    log10_det: float
+    coupling_index: float
+    fitness: float
+    n_samples: int
+    condition: float | None = None
+    scaled_condition: float | None = None
+
+    @classmethod
+    def of_gram(cls, gram: Array, n_samples: int) -> Self:
+        """Judge a motion by the Gram matrix (p, p) of N time samples."""
+        determinant, index = log10_det_and_coupling(gram, n_samples)
+        return cls(
+            log10_det=determinant,
+            coupling_index=index,
+            fitness=fitness_of(determinant, index, len(gram)),
+            n_samples=n_samples,
+            condition=condition_number(gram, scaled=False),
+            scaled_condition=condition_number(gram, scaled=True),
+        )
+
+
 def log10_det(gram: Array, n_samples: int) -> float:
     r"""Return :math:`\log_{10}(\det(\Phi^T\Phi) / N^{N_\pi})`, -inf for a singular matrix.
 
@@ -37,10 +75,21 @@ def log10_det(gram: Array, n_samples: int) -> float:
             there are one per joint and sample).
     """
     scale, lower = _factorise(gram)
+    return -np.inf if lower is None else _log10_det(scale, lower, n_samples)
+
+
+def coupling_index(gram: Array) -> float:
+    """Return I_c of eq. 5, between 0 and :func:`coupling_index_max`; inf for a singular matrix."""
+    _, lower = _factorise(gram)
+    return np.inf if lower is None else _coupling_index(lower)
+
+
+def log10_det_and_coupling(gram: Array, n_samples: int) -> tuple[float, float]:
+    """Return :func:`log10_det` and :func:`coupling_index` from one factorisation."""
+    scale, lower = _factorise(gram)
     if lower is None:
-        return -np.inf
-    logs = np.log10(np.diag(lower)) + np.log10(scale) - 0.5 * np.log10(n_samples)
-    return float(2.0 * logs.sum())
+        return -np.inf, np.inf
+    return _log10_det(scale, lower, n_samples), _coupling_index(lower)
 
 
 def correlation(gram: Array) -> Array:
@@ -52,18 +101,10 @@ def correlation(gram: Array) -> Array:
     _, lower = _factorise(gram)
     if lower is None:
         return np.full(np.shape(gram), np.nan)
-    half, _ = lapack.dpotri(lower, lower=1)
-    deviation = np.sqrt(np.diag(half))
-    correlated = np.tril(half) / deviation[:, None] / deviation
+    correlated = _lower_correlation(lower)
     correlated += np.tril(correlated, -1).T
     np.fill_diagonal(correlated, 1.0)
-    return np.asarray(correlated)
-
-
-def coupling_index(gram: Array) -> float:
-    """Return I_c of eq. 5, between 0 and :func:`coupling_index_max`; inf for a singular matrix."""
-    coupled = np.abs(np.tril(correlation(gram), -1)).sum()
-    return float(coupled) if np.isfinite(coupled) else np.inf
+    return correlated
 
 
 def coupling_index_max(p: int) -> float:
@@ -77,11 +118,17 @@ def fitness_eq7(gram: Array, n_samples: int, *, weights: tuple[float, float] = (
     The two terms differ in size by an order of magnitude, so the first one rules; it is the
     paper's formula nonetheless. -inf for a singular matrix.
     """
-    determinant = log10_det(gram, n_samples)
-    index = coupling_index(gram)
+    determinant, index = log10_det_and_coupling(gram, n_samples)
+    return fitness_of(determinant, index, len(gram), weights=weights)
+
+
+def fitness_of(
+    determinant: float, index: float, p: int, *, weights: tuple[float, float] = (0.7, 0.3)
+) -> float:
+    """Return :func:`fitness_eq7` of p parameters from log10 det / N^p and I_c."""
     if not np.isfinite(determinant) or not np.isfinite(index):
         return -np.inf
-    coupling = np.inf if index == 0.0 else coupling_index_max(len(gram)) / index
+    coupling = np.inf if index == 0.0 else coupling_index_max(p) / index
     return weights[0] * determinant + weights[1] * coupling
 
 
@@ -112,6 +159,22 @@ def _factorise(gram: Array) -> tuple[Array, Array | None]:
     if info != 0 or np.min(np.diag(lower)) ** 2 <= _smallest_pivot(len(matrix)):
         return scale, None
     return scale, lower
+
+
+def _log10_det(scale: Array, lower: Array, n_samples: int) -> float:
+    logs = np.log10(np.diag(lower)) + np.log10(scale) - 0.5 * np.log10(n_samples)
+    return float(2.0 * logs.sum())
+
+
+def _coupling_index(lower: Array) -> float:
+    return float(np.abs(np.tril(_lower_correlation(lower), -1)).sum())
+
+
+def _lower_correlation(lower: Array) -> Array:
+    """Return the lower triangle of the correlation matrix from the Cholesky factor."""
+    half, _ = lapack.dpotri(lower, lower=1)
+    deviation = np.sqrt(np.diag(half))
+    return np.asarray(np.tril(half) / deviation[:, None] / deviation)
 
 
 def _smallest_pivot(p: int) -> float:

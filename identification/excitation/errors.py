@@ -5,13 +5,15 @@ IdentificationError
 ├── CollisionModelError    no collision shapes can be had from a robot description
 ├── WorkspaceError         obstacles or a margin that mean nothing (also a ValueError)
 ├── DesignError            a setting outside its range (also a ValueError)
-└── NoFeasibleMotionError  every motion tried breaks a constraint
+├── NoFeasibleMotionError  every motion tried breaks a constraint
+└── JournalError           a file that is not the journal of a search
+    └── ForeignJournalError    the journal of another search, or of other software
 ```
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from identification.errors import IdentificationError
@@ -46,16 +48,74 @@ class NoFeasibleMotionError(IdentificationError):
     """Every motion that was tried breaks a constraint.
 
     Attributes:
-        rejected: how many were rejected, by kind of constraint.
+        rejected: how many break it, by kind of constraint; a motion may count for several.
         nearest: of each kind the violation that came closest to being none.
+        closest: all violations of the motion that came closest to being feasible, by their sum.
+        tried: how many motions there were.
+        unexciting: how many kept every constraint, but left a parameter without excitation.
+        stopped: whether the search was stopped before its end.
     """
 
-    def __init__(self, rejected: Mapping[str, int], nearest: Mapping[str, Violation]) -> None:
+    def __init__(
+        self,
+        rejected: Mapping[str, int],
+        nearest: Mapping[str, Violation],
+        *,
+        closest: Sequence[Violation] = (),
+        tried: int | None = None,
+        unexciting: int = 0,
+        stopped: bool = False,
+    ) -> None:
         self.rejected = dict(rejected)
         self.nearest = dict(nearest)
-        total = sum(self.rejected.values())
-        reasons = "; ".join(
+        self.closest = tuple(closest)
+        self.tried = sum(self.rejected.values()) if tried is None else tried
+        self.unexciting = unexciting
+        self.stopped = stopped
+        super().__init__(self._sentence())
+
+    def _sentence(self) -> str:
+        reasons = [
             f"{kind} forbids {count}, the mildest: {self.nearest[kind]}"
             for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])
-        )
-        super().__init__(f"none of {total} motions is feasible: {reasons}")
+        ]
+        if len(self.closest) > 1:
+            all_of_it = " and ".join(map(str, self.closest))
+            reasons.append(f"the motion that comes closest breaks {all_of_it}")
+        if self.unexciting:
+            reasons.append(
+                f"{self.unexciting} keep every constraint but leave a parameter without excitation"
+            )
+        if self.stopped:
+            reasons.append("the search was stopped before its end")
+        if self.tried == 0:
+            return "no motion was tried: " + "; ".join(reasons)
+        return f"none of {self.tried} motions is feasible: " + "; ".join(reasons)
+
+
+class JournalError(IdentificationError, ValueError):
+    """A file that is not the journal of a search."""
+
+
+class ForeignJournalError(JournalError):
+    """The journal of another search, or one that other software wrote.
+
+    Attributes:
+        part: "problem", "settings" or "versions".
+        name: what differs: a setting, a part of the problem, or a package.
+        recorded: its value in the journal (of a part of the problem: its fingerprint).
+        value: its value here.
+    """
+
+    def __init__(self, part: str, name: str, recorded: object, value: object) -> None:
+        self.part = part
+        self.name = name
+        self.recorded = recorded
+        self.value = value
+        if part == "problem":
+            reason = f"its {name} is not this one's"
+        elif part == "settings":
+            reason = f"its {name} is {recorded}, here it is {value}"
+        else:
+            reason = f"it was written with {name} {recorded}, installed is {value}"
+        super().__init__(f"the journal belongs to another search: {reason}")

@@ -455,6 +455,25 @@ def test_a_plan_without_moves_of_an_earlier_version_is_read_and_run(
     assert stored == {"trajectory": motions.validation[0].trajectory.to_dict()}
 
 
+def test_a_plan_that_knows_no_method_is_read(tmp_path: Path, plan: CampaignPlan) -> None:
+    """Version 2: excitations came from a random search, without condition numbers."""
+    path = tmp_path / "plan.json"
+    plan.save(path)
+    old = json.loads(path.read_text()) | {"format_version": 2}
+    del old["excitation"]["method"]
+    for name in ("condition", "scaled_condition"):
+        del old["excitation"]["criteria"][name]
+    path.write_text(json.dumps(old))
+    read = CampaignPlan.load(path)
+    assert read.excitation.method == "random"
+    assert read.excitation.criteria.condition is None
+    assert read.excitation.trajectory.to_dict() == plan.excitation.trajectory.to_dict()
+    assert read.moves is not None
+    path.write_text(json.dumps(old | {"format_version": 4}))
+    with pytest.raises(InputError, match="format version 4"):
+        CampaignPlan.load(path)
+
+
 @pytest.mark.parametrize("moves", [7, {"format": "joint motion plan"}, {"format": "other"}])
 def test_a_plan_with_unusable_moves_is_refused(
     tmp_path: Path, plan: CampaignPlan, moves: object

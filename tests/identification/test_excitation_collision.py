@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import pickle
 from itertools import combinations, pairwise
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -18,7 +20,9 @@ from identification.excitation import (
     WorkspaceError,
 )
 from identification.excitation.collision import joint_poses
+from identification.excitation.sampling import sampled
 from identification.kinematics import chain_from_urdf
+from planner import FourierSeries, JointLimits, plan
 from sim_fixtures.ns16 import urdf_text
 
 NOWHERE = Workspace(floor=None, margin=0.0)
@@ -108,21 +112,43 @@ def test_clear_postures_are_those_where_pinocchio_finds_no_distance_below_zero(a
     assert 0.1 < np.mean(clear) < 0.95
 
 
-@given(st.integers(0, 10**6), st.sampled_from([0.0, 0.05, 0.15]))
-@settings(max_examples=30)
-def test_the_first_contact_is_the_one_that_looking_at_every_sample_finds(arm, seed, margin):
-    checker = checkers(margin)
-    ends = postures(arm, seed, 4)
+@pytest.fixture(scope="module")
+def brute(arm):
+    """The least distance of all that may meet, floor included, posture by posture."""
+    shapes = pin.buildGeomFromUrdfString(arm, urdf_text(), pin.GeometryType.COLLISION)
+    floor = pin.GeometryObject(
+        "floor", 0, pin.SE3.Identity(), coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+    )
+    ground = shapes.addGeometryObject(floor)
+    for a, b in combinations(range(shapes.ngeoms), 2):
+        joints = [shapes.geometryObjects[k].parentJoint for k in (a, b)]
+        if abs(joints[0] - joints[1]) > (0 if b == ground else 1):
+            shapes.addCollisionPair(pin.CollisionPair(a, b))
+    data, places = arm.createData(), pin.GeometryData(shapes)
+
+    def least(q):
+        found = []
+        for row in q:
+            pin.computeDistances(arm, data, shapes, places, row)
+            found.append(min(result.min_distance for result in places.distanceResults))
+        return np.array(found)
+
+    return least
+
+
+@given(seed=st.integers(0, 10**6), margin=st.sampled_from([0.0, 0.05, 0.15]))
+@settings(max_examples=20)
+def test_the_deepest_contact_is_that_of_looking_at_every_sample(arm, brute, seed, margin):
+    ends = np.concatenate((np.zeros((1, 6)), postures(arm, seed, 3)))
     q = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(ends)])
-    q = np.concatenate((np.linspace(np.zeros(6), ends[0], 60), q))
-    blocked = np.flatnonzero(~checker.clear(q))
-    contact = checker.first_contact(q)
-    if len(blocked) == 0:
+    distances = brute(q)
+    contact = checkers(margin).deepest_contact(q)
+    if distances.min() >= margin:
         assert contact is None
     else:
         assert contact is not None
-        assert contact.sample == blocked[0]
-        assert contact.distance < margin
+        assert contact.distance == pytest.approx(distances[contact.sample], abs=1e-5)
+        assert contact.distance <= min(distances.min() + 0.00501, margin)
 
 
 def checkers(margin, made={}):  # noqa: B006 - the cache is the point
@@ -132,16 +158,179 @@ def checkers(margin, made={}):  # noqa: B006 - the cache is the point
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=15)
+@settings(max_examples=10)
 def test_no_distance_changes_faster_than_the_bodies_travel(arm, seed):
-    checker = checkers(0.05)
+    scene = checkers(0.05)._scene
     q = np.linspace(*postures(arm, seed, 2), 40)
-    paths = checker._paths(q)
-    for a, b in checker._pairs:
-        distance = np.array([checker._distance(a, b, paths, k) for k in range(len(q))])
-        step = np.diff(paths[a].travel + paths[b].travel)
-        apart = (distance[1:] > 0.0) & (distance[:-1] > 0.0)  # how deep they overlap is a guess
-        assert np.all(np.abs(np.diff(distance))[apart] <= step[apart] + 1e-6)
+    path = scene.path(q)
+    for pair in range(len(scene.separation.first)):
+        a, b = scene.indices(pair)
+        distance = np.array([scene.distance(pair, path, k) for k in range(len(q))])
+        step = np.diff(path.gone[a] + path.gone[b])
+        assert np.all(np.abs(np.diff(distance)) <= step + 1e-5)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=10)
+def test_no_slab_is_thicker_than_the_distance_of_what_it_lies_between(arm, seed):
+    scene = mixed_shapes()._scene
+    path = scene.path(np.random.default_rng(seed).uniform(-2.0, 2.0, (30, 3)))
+    count = len(scene.separation.first)
+    pair, sample = np.indices((count, 30)).reshape(2, -1)
+    lower, normal = scene.separation.bound(path.bodies, pair, sample)
+    distance = np.array(
+        [scene.distance(p, path, k) for p, k in zip(pair.tolist(), sample.tolist(), strict=True)]
+    )
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=0), 1.0, atol=1e-12)
+    assert np.all(lower <= distance + 1e-5)
+    exact = scene.separation.exact[pair]
+    np.testing.assert_allclose(lower[exact], distance[exact], atol=1e-9)
+    assert np.any(exact)
+    quick = scene.separation.coarse(path.bodies, np.arange(30)).ravel()
+    assert np.all(quick <= distance + 1e-5)
+
+
+def mixed_shapes():
+    """An arm of every kind of shape, one joint a slide, among all kinds of obstacles."""
+    urdf = robot(
+        link("base", '<box size="0.3 0.2 0.1"/>'),
+        link("a", '<cylinder radius="0.05" length="0.3"/>', at="0.1 0.2 0"),
+        link("b", '<cylinder radius="0.04" length="0.2"/>', at="0 0.1 0.1"),
+        link("c", '<box size="0.1 0.2 0.3"/>', at="0.2 0 0"),
+        link("tool", '<sphere radius="0.05"/>', at="0 0 0.3"),
+        joint(1, "base", "a", "0 0 1", at="0 0 0.3"),
+        joint(2, "a", "b", "0 0.6 0.8", kind="prismatic", at="0.2 0.3 0.1"),
+        joint(3, "b", "c", "1 0 0", at="0.1 0 0.2"),
+        '<joint name="fixed" type="fixed"><parent link="c"/><child link="tool"/></joint>',
+    )
+    workspace = Workspace(
+        floor=-0.4,
+        walls=(Wall((1.0, -1.0, 0.5), -1.2),),
+        boxes=(Box((0.4, 0.4, -0.2), (0.9, 0.7, 0.5)),),
+        margin=0.02,
+    )
+    return CollisionChecker(urdf, workspace)
+
+
+def short_motion(seed):
+    """A quick motion of some seconds about the middle of the range, as the arm can run it."""
+    random = np.random.default_rng(seed)
+    middle = np.array([0.0, -1.2, 2.0, 0.0, 0.0, 0.0])
+    via = middle + random.uniform(-1.0, 1.0, (4, 6)) * [2.0, 1.1, 1.5, 3.0, 2.0, 3.0]
+    return plan(via, FAST, fly=0.5)
+
+
+def short_sines(seed):
+    """Sines for some seconds about the middle of the range."""
+    random = np.random.default_rng(seed)
+    size = np.array([1.5, 0.6, 1.0, 2.0, 1.2, 2.0])[:, None] / 3.0
+    return FourierSeries(
+        offset=np.array([0.0, -1.2, 2.0, 0.0, 0.0, 0.0]),
+        amplitude=size * random.uniform(-1.0, 1.0, (6, 3)),
+        frequency=random.uniform(0.5, 3.0, (6, 3)),
+        length=3.0,
+        ramp=0.5,
+    )
+
+
+FAST = JointLimits(
+    [-3.2, -2.5, -0.4, -6.3, -2.1, -6.3],
+    [3.2, 0.1, 4.6, 6.3, 2.1, 6.3],
+    [2.7, 2.7, 3.0, 6.3, 6.1, 9.6],
+    [9.0, 9.0, 9.9, 21.0, 20.4, 32.0],
+    [90.0, 90.0, 99.0, 210.0, 204.0, 320.0],
+)
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    kind=st.sampled_from([short_motion, short_sines]),
+    beyond=st.sampled_from([-3e-3, -1e-4, 1e-4, 3e-3]),
+)
+@settings(max_examples=20, deadline=None)
+def test_a_motion_is_clear_if_and_only_if_every_instant_of_it_is(brute, seed, kind, beyond):
+    # The margin is set close to the least distance, where whether they touch is hard to tell.
+    motion = kind(seed)
+    time = np.linspace(0.0, motion.duration, int(motion.duration / 0.008) + 2)
+    coarse = brute(motion.sample(time)[0])
+    around = time[np.argmin(coarse)] + np.linspace(-0.008, 0.008, 161)
+    least = min(coarse.min(), brute(motion.sample(around)[0]).min())
+    checker = CollisionChecker(urdf_text(), Workspace(margin=max(least + beyond, 0.0)))
+    for period in (0.008, 0.03):
+        contact = checker.deepest_along(motion, sampled(motion, period))
+        if least + beyond <= 0.0 and least > 0.0:
+            continue  # the margin was cut off at zero
+        assert (contact is not None) == (beyond > 0.0 or least < 0.0)
+        if contact is not None:
+            assert contact.distance < checker.workspace.margin
+            np.testing.assert_allclose(
+                contact.posture, motion.sample_one(contact.time)[0], atol=1e-12
+            )
+            there = brute(np.array([contact.posture]))[0]
+            assert contact.distance == pytest.approx(there, abs=1e-5)
+            assert contact.distance <= least + 0.025
+
+
+@pytest.mark.parametrize("steps", [7, 40])
+def test_what_is_met_only_between_two_samples_is_found(steps):
+    # A ball on an arm of 1 m sweeps past a post of 2 cm in a hundredth of a second.
+    urdf = robot(
+        link("base"),
+        link("arm", '<sphere radius="0.01"/>', at="1 0 0"),
+        '<joint name="turn" type="continuous"><parent link="base"/><child link="arm"/>'
+        '<axis xyz="0 0 1"/></joint>',
+    )
+    limits = JointLimits([-4.0], [4.0], [4.0], [20.0], [200.0])
+    motion = plan([[-1.5], [1.63]], limits)
+    samples = sampled(motion, motion.duration / steps)
+    post = Box((0.99, -0.001, -1.0), (1.01, 0.001, 1.0))
+    tip = np.abs(np.sin(samples.position[:, 0]))
+    assert np.all(tip > 0.02)  # no sample touches
+    standing = Workspace(floor=None, boxes=(post,), margin=0.0)
+    contact = CollisionChecker(urdf, standing).deepest_along(motion, samples)
+    assert contact is not None
+    assert (contact.first, contact.second) == ("arm", "box 0")
+    assert abs(np.sin(contact.posture[0])) < 0.011
+    aside = Box((1.0102, -0.001, -1.0), (1.02, 0.001, 1.0))  # 0.2 mm beside the way
+    lying = Workspace(floor=None, boxes=(aside,), margin=0.0)
+    assert CollisionChecker(urdf, lying).deepest_along(motion, samples) is None
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=20)
+def test_no_point_leaves_the_straight_line_by_more_than_its_acceleration_allows(seed):
+    scene = mixed_shapes()._scene
+    random = np.random.default_rng(seed)
+    q0, rate, bend = random.uniform(-1.0, 1.0, (3, 3)) * [[1.0], [3.0], [8.0]]
+    step = 0.1
+    t = np.linspace(0.0, step, 21)[:, None]
+    path = scene.path(q0 + rate * t + bend * t**2 / 2.0)
+    speed = np.abs(rate + bend * t).max(axis=0)
+    both_ends = path.q[[0, -1]]
+    bulges = scene.from_base.bulge(speed[:, None], np.abs(bend)[:, None], both_ends, step)[:, 0]
+    share = t[:, 0] / step
+    for pair, bulge in enumerate(bulges.tolist()):
+        left = 0.0
+        for body in map(int, scene.indices(pair)):
+            hull = scene._bodies[body].hull
+            for side in (-1.0, 0.0, 1.0):
+                end = path.bodies.centre[:, body] + side * (
+                    hull.half_length * path.bodies.axis[:, body]
+                )
+                chord = np.outer(end[:, 0], 1.0 - share) + np.outer(end[:, -1], share)
+                left = max(left, float(np.linalg.norm(end - chord, axis=0).max()))
+        assert left <= bulge + 1e-12
+
+
+def test_a_checker_sent_to_another_process_finds_the_same(arm):
+    checker = CollisionChecker(
+        urdf_text(), Workspace(floor=0.1, boxes=(Box((1, 0, 0), (2, 1, 1)),))
+    )
+    again = pickle.loads(pickle.dumps(checker))
+    assert again.pairs == checker.pairs
+    assert again.workspace == checker.workspace
+    q = np.linspace(*postures(arm, 5, 2), 100)
+    assert again.deepest_contact(q) == checker.deepest_contact(q)
 
 
 def test_reaching_into_the_floor_is_named(arm):
@@ -150,13 +339,16 @@ def test_reaching_into_the_floor_is_named(arm):
     upright = np.array([0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0])
     q = np.linspace(upright, into_floor, 200)
     high = Workspace(floor=0.3, margin=0.02)
-    contact = CollisionChecker(urdf_text(), high).first_contact(q)
+    contact = CollisionChecker(urdf_text(), high).deepest_contact(q)
     assert contact is not None
-    assert contact.second == "floor"
-    assert 0 < contact.sample < 199
-    assert 0.0 <= contact.distance < 0.02
+    # The forearm is level at the end, and the ball of 6 cm about the wrist its lowest part.
+    assert (contact.first, contact.second) == ("link_5", "floor")
+    wrist = joint_poses(chain_from_urdf(urdf_text()), q)[1][5]
+    height = wrist[contact.sample, 2] - 0.06 - 0.3
+    assert contact.distance == pytest.approx(height, abs=1e-6)
+    assert contact.sample == np.argmin(wrist[:, 2])
     # Without the floor the same way is free.
-    assert CollisionChecker(urdf_text(), NOWHERE).first_contact(q) is None
+    assert CollisionChecker(urdf_text(), NOWHERE).deepest_contact(q) is None
 
 
 def test_walls_and_boxes_are_named_and_met_where_they_stand():
@@ -168,19 +360,26 @@ def test_walls_and_boxes_are_named_and_met_where_they_stand():
     )
     q = np.linspace(0.0, np.pi, 1801)[:, None]  # 0.1 degrees each
     wall = Workspace(floor=None, walls=(Wall((0.0, -2.0, 0.0), -1.6),), margin=0.0)  # y <= 0.8
-    contact = CollisionChecker(urdf, wall).first_contact(q)
+    contact = CollisionChecker(urdf, wall).deepest_contact(q)
     assert (contact.first, contact.second) == ("arm", "wall 0")
-    assert np.sin(q[contact.sample, 0]) == pytest.approx(0.7, abs=2e-3)
+    assert q[contact.sample, 0] == pytest.approx(np.pi / 2, abs=2e-3)
+    assert contact.distance == pytest.approx(0.8 - 1.1, abs=1e-5)
+    touching = np.sin(q[:, 0]) > 0.7
+    np.testing.assert_array_equal(CollisionChecker(urdf, wall).clear(q), ~touching)
 
     box = Workspace(floor=None, boxes=(Box((-2.0, -1.0, -1.0), (-0.5, 1.0, 1.0)),), margin=0.05)
-    contact = CollisionChecker(urdf, box).first_contact(q)
+    checker = CollisionChecker(urdf, box)
+    contact = checker.deepest_contact(q)
     assert (contact.first, contact.second) == ("arm", "box 0")
-    assert np.cos(q[contact.sample, 0]) == pytest.approx(-0.5 + 0.15, abs=2e-3)
+    np.testing.assert_array_equal(checker.clear(q), np.cos(q[:, 0]) >= -0.5 + 0.15)
+    shallow = q[np.cos(q[:, 0]) >= -0.42]
+    contact = checker.deepest_contact(shallow)
+    assert contact.distance == pytest.approx(np.cos(shallow[-1, 0]) + 0.5 - 0.1, abs=0.005)
 
 
 def test_the_arm_at_rest_above_its_own_floor_is_clear():
     home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
-    assert checkers(0.05).first_contact(home) is None
+    assert checkers(0.05).deepest_contact(home) is None
 
 
 def test_every_pair_that_can_meet_is_looked_at():
@@ -198,7 +397,7 @@ def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
     assert ("link_0", "link_2") not in wrist.pairs
     # Four joints between base and tip: always touching is a fault, and is reported as one.
     far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
-    contact = far.first_contact(np.zeros((1, 4)))
+    contact = far.deepest_contact(np.zeros((1, 4)))
     assert contact is not None
     assert (contact.first, contact.second, contact.sample) == ("link_0", "link_3", 0)
     assert contact.distance < 0.0
@@ -237,8 +436,7 @@ def test_a_mesh_counts_as_its_convex_hull(tmp_path):
     q = np.linspace(-2.0, 2.0, 9)[:, None]
     for k in range(len(q)):
         distances = [
-            checker._distance(*checker._pairs[0], checker._paths(q), k)
-            for checker in (meshed, boxed)
+            checker._scene.distance(0, checker._scene.path(q), k) for checker in (meshed, boxed)
         ]
         assert distances[0] == pytest.approx(distances[1], abs=1e-6)
 
@@ -254,7 +452,7 @@ def test_a_description_without_usable_shapes_is_refused(shape):
 
 def test_postures_of_another_arm_are_refused():
     with pytest.raises(ShapeError):
-        checkers(0.05).first_contact(np.zeros((3, 5)))
+        checkers(0.05).deepest_contact(np.zeros((3, 5)))
 
 
 @pytest.mark.parametrize(

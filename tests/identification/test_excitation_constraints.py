@@ -1,18 +1,29 @@
 from __future__ import annotations
 
+import pickle
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from identification import FrictionLaw, RobotModel, ShapeError
-from identification.excitation import (
-    CollisionChecker,
+from identification.excitation.collision import CollisionChecker
+from identification.excitation.constraints import (
+    KINDS,
+    Constraints,
     CurrentModel,
     MotionCheck,
-    Workspace,
+    Violation,
     check_motion,
+    excess_by_kind,
 )
-from identification.excitation.constraints import sampled
-from planner import JointLimits, plan
+from identification.excitation.errors import DesignError
+from identification.excitation.joint_limits import limit_violations
+from identification.excitation.sampling import sampled
+from identification.excitation.workspace import Workspace
+from planner import FourierSeries, JointLimits, LimitExceeded, check_limits, plan
 
 # Two links of 1 m that swing in a vertical plane: known to every textbook.
 URDF = """<robot name="pendulum">
@@ -120,27 +131,54 @@ def test_a_joint_limit_is_checked_besides(swing):
     (violation,) = check_motion(swing, lower).violations
     assert (violation.kind, violation.subject) == ("joint limit", "position of joint 0")
     assert violation.value == pytest.approx(1.5)
+    assert violation.excess == pytest.approx(0.1 / 4.4)  # of the range
 
 
-def test_a_contact_is_reported_with_pair_and_instant():
+def test_every_joint_and_quantity_beyond_its_limit_is_named_with_its_instant(swing):
+    slow = JointLimits([-3.0, -0.5], [1.0, 3.0], [1.0, 3.0], [10.0, 4.0], [100.0, 30.0])
+    violations = {v.subject: v for v in check_motion(swing, slow).violations}
+    assert set(violations) == {
+        "position of joint 0",
+        "position of joint 1",
+        "velocity of joint 0",
+        "acceleration of joint 1",
+        "jerk of joint 1",
+    }
+    lowest = violations["position of joint 1"]
+    assert (lowest.value, lowest.bound) == (pytest.approx(-1.0), -0.5)
+    assert "at least -0.5" in str(lowest)
+    assert lowest.posture == pytest.approx([1.5, -1.0], abs=1e-3)
+    fastest = violations["velocity of joint 0"]
+    assert abs(swing.sample_one(fastest.time)[1][0]) == pytest.approx(fastest.value, rel=1e-3)
+    assert fastest.excess == pytest.approx(fastest.value - 1.0)
+
+
+def test_the_deepest_contact_is_reported_with_pair_and_instant():
     checker = CollisionChecker(URDF, Workspace(floor=-0.5, margin=0.1))
-    down = plan([[0.0, 0.0], [-0.6, 0.0]], LIMITS)
+    down = plan([[0.0, 0.0], [-0.6, 0.0], [0.3, 0.0]], LIMITS, fly=0.0)
     (violation,) = check_motion(down, LIMITS, checker=checker).violations
     assert (violation.kind, violation.subject) == ("collision", "lower and floor")
     assert violation.bound == 0.1
-    assert 0.0 < violation.value < 0.1
     q = down.sample_one(violation.time)[0]
+    np.testing.assert_allclose(q, [-0.6, 0.0], atol=2e-3)
     # the end of the lower link, 1.9 m out, its edge 0.05 m below the centre line
     height = 1.9 * np.sin(q[0]) - 0.05 * np.cos(q[0])
     assert height == pytest.approx(-0.5 + violation.value, abs=1e-6)
     np.testing.assert_allclose(violation.posture, q, atol=1e-9)
+    # 1 m from shoulder to elbow: that much too close would be an excess of 1
+    assert violation.excess == pytest.approx(0.1 - violation.value)
+    text = str(violation)
+    assert text.startswith(f"collision of lower and floor: {violation.value:.4g} m, at least 0.1 m")
+    assert f"at {violation.time:.3f} s" in text
+    assert "joints at (-0." in text
 
 
 def test_a_prediction_that_is_no_number_is_beyond_every_limit(model, values, swing):
     broken = CurrentModel(
         model, values * np.nan, MOTOR_FROM_JOINT, TORQUE_CONSTANT, np.array([1e9, 1e9])
     )
-    assert len(check_motion(swing, LIMITS, currents=broken).violations) == 2
+    violations = check_motion(swing, LIMITS, currents=broken).violations
+    assert [violation.excess for violation in violations] == [np.inf, np.inf]
 
 
 @pytest.mark.parametrize(
@@ -162,3 +200,150 @@ def test_arrays_of_another_arm_are_refused_by_name(model, values, wrong):
     }
     with pytest.raises(ShapeError, match=next(iter(wrong))):
         CurrentModel(model, **{**given, **wrong})
+
+
+def series(seed, *, ramp, scale=1.0):
+    random = np.random.default_rng(seed)
+    return FourierSeries(
+        offset=random.uniform(-0.5, 0.5, 2),
+        amplitude=scale * random.uniform(-0.8, 0.8, (2, 3)),
+        frequency=random.uniform(0.3, 2.5, (2, 3)),
+        length=random.uniform(6.0, 12.0),
+        ramp=ramp,
+    )
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    ramp=st.sampled_from([0.0, 0.01, 1.0, 3.0]),
+    quantity=st.sampled_from(["position", "velocity", "acceleration", "jerk"]),
+    joint=st.integers(0, 1),
+    share=st.sampled_from([0.9, 1 - 1e-5, 1 - 1e-8, 1 + 1e-8, 1 + 1e-5, 1.1]),
+)
+@settings(max_examples=60, deadline=None)
+def test_sines_keep_the_limits_if_and_only_if_their_exact_extremes_do(
+    seed, ramp, quantity, joint, share
+):
+    motion = series(seed, ramp=ramp)
+    exact = motion.extrema()
+    bounds = {
+        "lower": np.full(2, -50.0),
+        "upper": np.full(2, 50.0),
+        "velocity": np.full(2, 1e9),
+        "acceleration": np.full(2, 1e9),
+        "jerk": np.full(2, 1e9),
+    }
+    name = "upper" if quantity == "position" else quantity
+    bounds[name][joint] = getattr(exact, name)[joint] * share
+    limits = JointLimits(**bounds)
+    violations = limit_violations(motion, limits, sampled(motion))
+    try:
+        check_limits(motion, limits)
+        assert violations == []
+    except LimitExceeded:
+        (violation,) = violations
+        assert violation.subject == f"{quantity} of joint {joint}"
+        assert getattr(exact, name)[joint] * 0.98 <= violation.value
+        assert violation.value <= getattr(exact, name)[joint]
+        assert violation.value > violation.bound
+
+
+def test_sines_within_limits_are_accepted_without_their_exact_extremes(monkeypatch):
+    motion = series(3, ramp=2.0, scale=0.1)
+    monkeypatch.setattr(FourierSeries, "extrema", lambda self: pytest.fail("looked at exactly"))
+    assert check_motion(motion, LIMITS).ok
+
+
+def test_a_bare_series_is_refused_with_a_remedy():
+    bare, gentle = (series(3, ramp=ramp, scale=0.1) for ramp in (0.0, 2.0))
+    (violation,) = check_motion(bare, LIMITS).violations
+    assert violation.kind == "joint limit"
+    assert "velocity of joint" in violation.subject
+    assert "start" in violation.subject or "end" in violation.subject
+    assert violation.excess > 0.0
+    assert "ramp" in str(violation)
+    assert check_motion(gentle, LIMITS).ok
+    # A design may look at one all the same.
+    lenient = Constraints(LIMITS, at_rest=False)
+    assert lenient.violations(bare, sampled(bare)) == ()
+
+
+@pytest.mark.parametrize(("shortest", "longest", "side"), [(5.0, 9.0, "least"), (0.0, 1.0, "most")])
+def test_a_motion_too_short_or_too_long_is_named(swing, shortest, longest, side):
+    constraints = Constraints(LIMITS, min_duration=shortest, max_duration=longest)
+    (violation,) = constraints.violations(swing, sampled(swing))
+    bound = shortest or longest
+    assert (violation.kind, violation.value, violation.bound) == ("duration", swing.duration, bound)
+    assert violation.excess == pytest.approx(abs(swing.duration / bound - 1.0))
+    assert f"at {side} {bound:g} s" in str(violation)
+
+
+def test_a_motion_within_everything_has_nothing_against_it(make_currents, swing):
+    constraints = Constraints(
+        LIMITS,
+        min_duration=1.0,
+        checker=CollisionChecker(URDF, Workspace(floor=-2.5)),
+        currents=make_currents([100.0, 100.0]),
+    )
+    assert constraints.violations(swing, sampled(swing)) == ()
+
+
+def test_every_kind_is_told_at_once_and_counts_by_its_worst(make_currents, swing):
+    constraints = Constraints(
+        LIMITS.scaled(velocity=0.5),
+        max_duration=1.0,
+        checker=CollisionChecker(URDF, Workspace(floor=0.0)),
+        currents=make_currents([0.1, 0.1], torque_limit=np.ones(2)),
+    )
+    motion = sampled(swing)
+    violations = constraints.violations(swing, motion)
+    excess = excess_by_kind(violations)
+    assert [kind for kind, e in zip(KINDS, excess, strict=True) if e > 0] == list(KINDS[1:])
+    for kind, worst in zip(KINDS, excess, strict=True):
+        assert worst == max((v.excess for v in violations if v.kind == kind), default=0.0)
+    # the torque may come from elsewhere; it is not asked for again
+    currents = constraints.currents
+    nominal = currents.model.torque(currents.values, *motion[1:])
+    assert constraints.violations(swing, motion, nominal) == violations
+    with pytest.raises(ShapeError, match="nominal"):
+        constraints.violations(swing, motion, nominal[1:])
+
+
+def test_the_worst_excess_of_nothing_is_nothing():
+    np.testing.assert_array_equal(excess_by_kind(()), np.zeros(len(KINDS)))
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 0.0), (3.0, 2.0), (np.nan, 1.0), (0.0, np.nan)])
+def test_durations_that_no_motion_can_have_are_refused(bounds):
+    with pytest.raises(DesignError, match="duration"):
+        Constraints(LIMITS, *bounds)
+
+
+def test_a_deeper_contact_is_a_larger_excess():
+    checker = CollisionChecker(URDF, Workspace(floor=-0.5, margin=0.05))
+    excess = []
+    for low in (-0.3, -0.5, -0.7, -0.9):
+        motion = plan([[0.0, 0.0], [low, 0.0]], LIMITS)
+        constraints = Constraints(LIMITS, checker=checker)
+        found = excess_by_kind(constraints.violations(motion, sampled(motion)))
+        excess.append(found[KINDS.index("collision")])
+    assert all(a < b for a, b in pairwise(excess))
+    assert excess[0] > 0.0
+
+
+def test_constraints_survive_the_way_to_another_process(make_currents, swing):
+    constraints = Constraints(
+        LIMITS,
+        max_duration=1.0,
+        checker=CollisionChecker(URDF, Workspace(floor=0.0)),
+        currents=make_currents([0.1, 0.1]),
+    )
+    again = pickle.loads(pickle.dumps(constraints))
+    motion = sampled(swing)
+    assert again.violations(swing, motion) == constraints.violations(swing, motion)
+
+
+def test_a_motion_that_cannot_be_planned_is_told_without_numbers():
+    assert str(Violation("planning", "the motion (a cusp)", 1.0, 0.0, None)) == (
+        "planning of the motion (a cusp)"
+    )

@@ -142,6 +142,35 @@ def test_the_jump_of_jerk_where_a_ramp_ends_is_counted():
 
 
 @given(series())
+@settings(max_examples=30, deadline=None)
+def test_the_cheap_bound_of_a_derivative_is_never_inside_the_extremes(motion):
+    extrema = motion.extrema()
+    for order, reached in ((1, extrema.velocity), (2, extrema.acceleration), (3, extrema.jerk)):
+        assert np.all(motion.derivative_bound(order) >= reached - 1e-14)
+    # and the fourth bounds how the acceleration curves, ends of ramps apart
+    t = np.linspace(0.0, motion.duration, 2001)
+    h = 1e-4 * motion.duration
+    inside = np.all(
+        np.abs(t[:, None] - [0.0, motion.ramp, motion.duration - motion.ramp, motion.duration])
+        > 2.5 * h,
+        axis=1,
+    )
+    q2 = [motion.sample(t[inside] + k * h)[2] for k in (-1, 0, 1)]
+    second = np.abs(q2[0] - 2.0 * q2[1] + q2[2]).max(axis=0, initial=0.0) / h**2
+    noise = 1e-14 * (1.0 + extrema.acceleration) / h**2
+    assert np.all(motion.derivative_bound(4) >= second - noise)
+
+
+@pytest.mark.parametrize("ramp", [0.0, 2.0])
+def test_the_cheap_bound_of_what_overflows_is_infinite_and_not_unknown(ramp):
+    amplitude, frequency = np.array([[1e200], [0.5]]), np.array([[1e200], [1.0]])
+    motion = FourierSeries(np.zeros(2), amplitude, frequency, 20.0, ramp)
+    for order in range(1, 6):
+        huge, ordinary = motion.derivative_bound(order)
+        assert huge == np.inf and ordinary < 1000.0
+
+
+@given(series())
 def test_storing_and_restoring_keeps_every_bit(motion):
     restored = FourierSeries.from_dict(json.loads(json.dumps(motion.to_dict())))
     for name in ("offset", "amplitude", "frequency"):

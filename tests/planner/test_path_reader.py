@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planner import plan
+from planner import FourierSeries, plan
 from planner.path_reader import PathReader
 
 
@@ -33,6 +33,28 @@ def test_it_reads_at_every_knot_of_every_joint(motions):
             position, velocity = reader.read(float(near))
             np.testing.assert_allclose(position, q, rtol=0, atol=1e-13)
             np.testing.assert_allclose(velocity, qd, rtol=0, atol=1e-12)
+
+
+@given(
+    seed=st.integers(0, 99),
+    share=st.floats(0.0, 1.0),
+    ramp=st.sampled_from([0.0, 1e-3, 1.5, 4.0]),
+)
+def test_it_reads_what_a_sum_of_sines_says(seed, share, ramp):
+    random = np.random.default_rng(seed)
+    series = FourierSeries(
+        offset=random.uniform(-1.0, 1.0, 6),
+        amplitude=random.uniform(-1.0, 1.0, (6, 3)),
+        frequency=random.uniform(0.3, 4.0, (6, 3)),
+        length=8.0,
+        ramp=ramp,
+    )
+    s = share * series.duration
+    position, velocity = PathReader(series).read(s)
+    q, qd, _ = series.sample_one(s)
+    np.testing.assert_allclose(position, q, rtol=0, atol=1e-13)
+    # A slope of rounding in u is one of rounding / ramp in time.
+    np.testing.assert_allclose(velocity, qd, rtol=0, atol=1e-12 / min(ramp or 1.0, 1.0))
 
 
 def test_a_trajectory_of_another_kind_is_asked_itself():

@@ -1,0 +1,103 @@
+"""The plan of a campaign: around a designed excitation, or one found in a few seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import isqrt
+from typing import Final
+
+from hil.cell import Cell
+from hil.design import DesignSettings, preset, run_search
+from hil.motion_checks import MotionChecks
+from hil.progress import Reporter
+from identification.excitation import (
+    RESCORE_PERIOD,
+    DrawnMotion,
+    Excitation,
+    Objective,
+    random_validation_motions,
+)
+from planner import PlanFile
+
+from .plan import CampaignPlan, PlannedMotion
+
+LEAST: Final = 4
+"""Individuals that a genetic search needs."""
+SLOWEST: Final = 0.5
+"""Smallest share of a joint's speed that is tried: slow motions excite little."""
+LONGEST: Final = 60.0
+"""s that the excitation may last."""
+
+
+def design(cell: Cell, reporter: Reporter) -> CampaignPlan:
+    """Search an excitation quickly and draw the validation motions, all within the cell.
+
+    The paper's method B with as few individuals as `[campaign].candidates` allows; `hil design`
+    searches longer and finds better ones.
+
+    Raises:
+        NoExcitationError: says which constraint forbids every motion, where, and by how much.
+        NoFeasibleMotionError: the same of the validation motions.
+    """
+    excitation = run_search(cell, quick_settings(cell), reporter).excitation
+    return plan_around(cell, excitation)
+
+
+def quick_settings(cell: Cell) -> DesignSettings:
+    """Settings of the quick search: its seed, via points and size are those of `[campaign]`.
+
+    It scores at most `candidates` motions (4 at least), in about as many generations as each has
+    individuals.
+    """
+    campaign = cell.campaign
+    motions = max(LEAST, campaign.candidates)
+    population = max(LEAST, isqrt(4 * motions // 3))
+    return preset("b").replaced(
+        seed=campaign.seed,
+        search={"population": population, "generations": motions // population, "polish": 0},
+        via_points={"n_via": campaign.n_via, "fly": campaign.fly, "slowest": SLOWEST},
+        constraints={"closed": True, "collision": True, "current": True, "max_duration": LONGEST},
+    )
+
+
+def plan_around(
+    cell: Cell, excitation: Excitation, checks: MotionChecks | None = None
+) -> CampaignPlan:
+    """Return a plan with this excitation, and validation motions drawn for the cell.
+
+    Args:
+        cell: whose `[campaign]` says how many validation motions, and from which seed.
+        excitation: designed for this cell; a campaign checks it before anything moves.
+        checks: those of the cell, where they are at hand.
+
+    Raises:
+        NoFeasibleMotionError: no validation motion keeps the constraints; says which one.
+    """
+    settings, checks = cell.campaign, checks or MotionChecks.of(cell)
+    # A design may have judged some parameters only, or what it adds to earlier archives; what is
+    # executed is compared with the motion by itself, over all parameters.
+    criteria = Objective(cell.model).criteria(excitation.trajectory, RESCORE_PERIOD)
+    excitation = replace(excitation, criteria=criteria)
+    validation = random_validation_motions(
+        cell.joint_limits,
+        home=cell.home,
+        seed=settings.seed,
+        count=settings.validation_runs,
+        n_via=settings.n_via,
+        fly=settings.fly,
+        checker=checks.checker,
+        currents=checks.currents,
+    )
+    return CampaignPlan(
+        excitation,
+        tuple(PlannedMotion(drawn.trajectory, _moves_of(cell, drawn)) for drawn in validation),
+        _moves_of(cell, excitation),
+    )
+
+
+def _moves_of(cell: Cell, motion: Excitation | DrawnMotion) -> PlanFile | None:
+    """The moves behind a motion through via points; none behind sines."""
+    moves, via_points = motion.moves, motion.via_points
+    if moves is None or via_points is None:
+        return None
+    return PlanFile(cell.joint_names, via_points[0], moves, limits=cell.joint_limits)

@@ -1,0 +1,20 @@
+"""Designing an excitation for a cell: settings, search, and the file that comes of it."""
+
+from .problem import problem_of, search_settings
+from .result import DesignResult, load_design
+from .run import run_search
+from .settings import METHODS, DesignSettings, Method, SettingsError, load_settings, preset
+
+__all__ = [
+    "METHODS",
+    "DesignResult",
+    "DesignSettings",
+    "Method",
+    "SettingsError",
+    "load_design",
+    "load_settings",
+    "preset",
+    "problem_of",
+    "run_search",
+    "search_settings",
+]

@@ -1,0 +1,322 @@
+"""The file a design leaves behind: the motion, how good it is, and all that it came from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.errors import InputError
+from hil.files import write_atomically
+from hil.version import software
+from identification.excitation import (
+    Criteria,
+    Design,
+    Excitation,
+    Objective,
+    coupling_index_max,
+)
+from planner import FourierSeries, PiecewiseCubic, PlannerError
+
+from .fingerprint import DECISIVE, fingerprint
+from .motion_data import joints_of, motion_data, motion_digest, motion_from_data
+from .settings import DesignSettings, SettingsError, settings_of
+from .toml_text import Angles, from_text, to_text
+
+Array = NDArray[np.float64]
+
+FORMAT: Final = "designed excitation"
+VERSION: Final = 1
+RESULT: Final = "excitation.toml"
+RESCORING_PERIOD: Final = 0.001
+"""s between the samples that the criteria in the file were computed from."""
+
+# Planned on another machine a motion may differ in its last digits, at so many instants by no more.
+_SAME = 1e-9  # rad
+_INSTANTS = 9
+_REMEDY = "design it again (`hil design`)"
+_HEAD = """\
+# An excitation that `hil design` found. Names that end in _deg hold degrees, degrees/s,
+# degrees/s^2, degrees/s^3 of the URDF's angles. `hil demo --excitation` runs it. Do not change
+# anything here: the seal at the end would break.
+"""
+_COMMENTS = {
+    "criteria": "Of the motion sampled every millisecond. Compare log10_det only between motions "
+    "of one\n# robot in the same units; coupling_index (0 to coupling_index_max) has none.",
+    "search": "How it was found. Of the motions tried so many broke a constraint of each kind.",
+    "front": "Motions of which none is better than another in both, by rising coupling index;\n"
+    "# chosen counts from 0.",
+    "settings": "As the search was asked; `hil design --settings` takes a file like this table.",
+    "cell": "The cell it was designed for: its name, and a fingerprint of what the design rests "
+    "on.",
+    "plan": "The motion: planning these moves gives it to the last bit.",
+    "sines": "The motion: offset + ramp x sum of amplitude x sin(frequency x t), rad/s.",
+    "earlier": "Archives whose information was added.",
+    "seal": "What the lines above and the motion are recognised by.",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class DesignResult:
+    """What `excitation.toml` says.
+
+    Attributes:
+        cell_name: the cell that the motion was designed for.
+        cell_parts: digest of each part of its description.
+        joint_names: the motion's joints.
+        settings: of the design.
+        excitation: the motion and its criteria.
+        generations: how many generations were finished.
+        complete: whether the search came to its end.
+        n_parameters: how many parameters were judged.
+        parameters: their names, None for all of the model's.
+        front: log10 det, coupling index and duration [s] of each point of the front, (k, 3).
+        chosen: which point of the front the motion was or grew from; None if it is none of them.
+        versions: of the software.
+        archives: name and SHA-256 of the earlier archives it adds to.
+    """
+
+    cell_name: str
+    cell_parts: Mapping[str, str]
+    joint_names: tuple[str, ...]
+    settings: DesignSettings
+    excitation: Excitation
+    generations: int
+    complete: bool
+    n_parameters: int
+    parameters: tuple[str, ...] | None
+    front: Array
+    chosen: int | None
+    versions: Mapping[str, str]
+    archives: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        cell: Cell,
+        settings: DesignSettings,
+        design: Design,
+        objective: Objective,
+        archives: tuple[tuple[str, str], ...] = (),
+    ) -> Self:
+        """Return the record of a design."""
+        names = cell.model.parameter_names
+        chosen = objective.parameters
+        front = design.front
+        return cls(
+            cell_name=cell.name,
+            cell_parts=fingerprint(cell),
+            joint_names=cell.joint_names,
+            settings=settings,
+            excitation=design.excitation,
+            generations=len(design.history),
+            complete=design.complete,
+            n_parameters=objective.n_parameters,
+            parameters=None if chosen is None else tuple(names[k] for k in chosen),
+            front=np.column_stack((front.log10_det, front.coupling_index, front.duration)),
+            chosen=design.chosen,
+            versions=versions(),
+            archives=archives,
+        )
+
+    def save(self, path: Path, cell: Cell) -> None:
+        """Write the file.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        text = _HEAD + to_text(self._data(cell), _COMMENTS)
+        trajectory = self.excitation.trajectory
+        seal = {
+            "sha256": _seal(text),
+            "motion_sha256": motion_digest(trajectory),
+            "positions": Angles(_positions(trajectory).tolist()),
+        }
+        try:
+            write_atomically(path, text + "\n" + to_text({"seal": seal}, _COMMENTS))
+        except OSError as error:
+            raise InputError(path, f"cannot be written ({error.strerror})") from error
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read the file, or that of a folder, and plan its motion again.
+
+        Raises:
+            InputError: it cannot be read, was changed, or its motion does not come out again.
+        """
+        path = path / RESULT if path.is_dir() else path
+        try:
+            text = path.read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(
+                path, f"cannot be read ({error})", remedy="name a file that `hil design` wrote"
+            ) from error
+        try:
+            data = from_text(text)
+            if data.get("format") != FORMAT:
+                raise ValueError(f"format is {data.get('format')!r:.60}")
+            if data.get("version") != VERSION:
+                raise ValueError(f"version is {data.get('version')!r:.60}, this reads {VERSION}")
+            seal = data.pop("seal")
+            if seal["sha256"] != _seal(text):
+                raise InputError(
+                    path, "was changed after it was written", remedy=f"restore it, or {_REMEDY}"
+                )
+            result = cls._from_data(data)
+        except SettingsError as error:
+            raise InputError(path, str(error), remedy=_REMEDY) from error
+        except (PlannerError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+            raise InputError(
+                path, f"is not a designed excitation ({error})", remedy=_REMEDY
+            ) from error
+        if motion_digest(result.excitation.trajectory) != seal["motion_sha256"]:
+            result._require_alike(path, np.array(seal["positions"], dtype=np.float64))
+        return result
+
+    def require_cell(self, cell: Cell, path: Path) -> None:
+        """Refuse a cell whose robot or limits are not those that the motion was designed for.
+
+        Raises:
+            InputError: names the two cells and what differs.
+        """
+        now = fingerprint(cell)
+        different = [part for part in DECISIVE if now[part] != self.cell_parts.get(part)]
+        if different:
+            raise InputError(
+                path,
+                f"was designed for the cell {self.cell_name!r}, whose {' and '.join(different)} "
+                f"{'is' if len(different) == 1 else 'are'} not that of {cell.name!r}",
+                field="cell",
+                remedy=f"name its own cell, or {_REMEDY}",
+            )
+
+    def _require_alike(self, path: Path, positions: Array) -> None:
+        """Refuse a motion that is another than the one that was written down."""
+        again = _positions(self.excitation.trajectory)
+        if positions.shape == again.shape and np.all(np.abs(again - positions) <= _SAME):
+            return
+        now = versions()
+        other = [
+            f"{k} {v} (here {now.get(k)})" for k, v in self.versions.items() if now.get(k) != v
+        ]
+        raise InputError(
+            path,
+            "its moves do not plan to the motion that was designed",
+            remedy=f"{_REMEDY}, or use the software it was designed with"
+            + (f": {', '.join(other)}" if other else ""),
+        )
+
+    def _data(self, cell: Cell) -> dict[str, Any]:
+        excitation = self.excitation
+        criteria = asdict(excitation.criteria)
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "complete": self.complete,
+            "criteria": criteria
+            | {
+                "coupling_index_max": coupling_index_max(self.n_parameters),
+                "duration": float(excitation.trajectory.duration),
+            },
+            "search": {
+                "method": excitation.method,
+                "seed": excitation.seed,
+                "tried": excitation.tried,
+                "generations": self.generations,
+                "n_parameters": self.n_parameters,
+                "parameters": None if self.parameters is None else list(self.parameters),
+                "infeasible": {name: int(n) for name, n in excitation.rejected.items()},
+            },
+            "front": {
+                "chosen": self.chosen,
+                "log10_det": self.front[:, 0].tolist(),
+                "coupling_index": self.front[:, 1].tolist(),
+                "duration": self.front[:, 2].tolist(),
+            },
+            "settings": self.settings.to_dict(),
+            **(
+                {"earlier": {"archives": [list(a) for a in self.archives]}} if self.archives else {}
+            ),
+            "cell": {"name": self.cell_name, **self.cell_parts},
+            "software": dict(self.versions),
+            **motion_data(excitation, self.joint_names, cell.joint_limits),
+        }
+
+    @classmethod
+    def _from_data(cls, data: Mapping[str, Any]) -> Self:
+        settings = settings_of(data["settings"])
+        criteria, search, front = dict(data["criteria"]), data["search"], data["front"]
+        for derived in ("coupling_index_max", "duration"):
+            del criteria[derived]
+        via = settings.via_points
+        excitation = Excitation(
+            criteria=Criteria(**criteria),
+            method=search["method"],
+            seed=search["seed"],
+            tried=search["tried"],
+            rejected=dict(search["infeasible"]),
+            **motion_from_data(data, None if via is None else via.fly),
+        )
+        name, parts = data["cell"]["name"], dict(data["cell"])
+        del parts["name"]
+        columns = [front[column] for column in ("log10_det", "coupling_index", "duration")]
+        return cls(
+            cell_name=name,
+            cell_parts=parts,
+            joint_names=joints_of(data),
+            settings=settings,
+            excitation=excitation,
+            generations=search["generations"],
+            complete=data["complete"],
+            n_parameters=search["n_parameters"],
+            parameters=tuple(search["parameters"]) if "parameters" in search else None,
+            front=np.array(columns, dtype=np.float64).T,
+            chosen=front.get("chosen"),
+            versions=data["software"],
+            archives=tuple(
+                (name, digest) for name, digest in data.get("earlier", {}).get("archives", ())
+            ),
+        )
+
+
+def load_design(path: Path, cell: Cell | None = None) -> Excitation:
+    """Read the motion of a design, from its file or folder, with its criteria.
+
+    Args:
+        path: `excitation.toml`, or the folder it lies in.
+        cell: for which it must have been designed; None for any.
+
+    Raises:
+        InputError: the file cannot be read, was changed, is for another cell, or its motion does
+            not come out again.
+    """
+    result = DesignResult.load(path)
+    if cell is not None:
+        result.require_cell(cell, path)
+    return result.excitation
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what a design depends on."""
+    return software() | {name: version(name) for name in ("pymoo", "cma")}
+
+
+def _positions(trajectory: PiecewiseCubic | FourierSeries) -> Array:
+    """Return where the motion is at some instants from beginning to end (9, n) [rad]."""
+    return trajectory.sample(np.linspace(0.0, trajectory.duration, _INSTANTS))[0]
+
+
+def _seal(text: str) -> str:
+    """Return a digest of what a text says; comments, blanks and the seal itself do not count."""
+    data = tomllib.loads(text, parse_float=str)
+    data.pop("seal", None)
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,159 @@
+"""The solid bodies of a scene: shapes on the links of an arm, and what stands around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from identification.excitation.errors import CollisionModelError
+from identification.excitation.workspace import Workspace
+
+Array = NDArray[np.float64]
+
+
+class Hull(NamedTuple):
+    """A cylinder swollen by a ball, about a shape; a sphere and a capsule are such themselves.
+
+    Attributes:
+        centre: middle of the cylinder, in the frame of the body's joint (3,) [m].
+        axis: unit vector along it (3,).
+        half_length, radius: of the cylinder [m].
+        ball: radius of the ball [m].
+        exact: whether this is the shape itself, not only something around it.
+    """
+
+    centre: Array
+    axis: Array
+    half_length: float
+    radius: float
+    ball: float
+    exact: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A convex shape that moves with a link, or an obstacle.
+
+    Attributes:
+        name: of the link or obstacle.
+        joint: the joint that moves it, -1 for what stands still.
+        shape: its geometry.
+        pose: in the frame of that joint.
+        hull: what holds it.
+        normal: outward normal of a half-space (3,), None for every other shape.
+        half_sides: of a box along the axes of the base (3,) [m], None for every other shape.
+    """
+
+    name: str
+    joint: int
+    shape: coal.CollisionGeometry
+    pose: coal.Transform3s
+    hull: Hull
+    normal: Array | None = None
+    half_sides: Array | None = None
+
+
+def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> list[Body]:
+    """Return the collision shapes of a robot description, ordered by the joint that moves them.
+
+    Meshes are replaced by their convex hulls.
+
+    Raises:
+        CollisionModelError: a mesh is missing, or no moving link has a shape.
+    """
+    try:
+        shapes = pin.buildGeomFromUrdfString(
+            model, urdf, pin.GeometryType.COLLISION, None, list(mesh_folders)
+        )
+    except (ValueError, RuntimeError) as error:
+        raise CollisionModelError(f"collision shapes cannot be loaded: {error}") from error
+    bodies = []
+    for item in shapes.geometryObjects:
+        shape = item.geometry
+        if isinstance(shape, coal.BVHModelBase):
+            shape.buildConvexHull(True, "Qt")
+            shape = shape.convex
+        rotation, translation = item.placement.rotation, item.placement.translation
+        bodies.append(
+            Body(
+                model.frames[item.parentFrame].name,
+                item.parentJoint - 1,
+                shape,
+                coal.Transform3s(rotation, translation),
+                _hull(shape, rotation, translation),
+            )
+        )
+    if not any(body.joint >= 0 for body in bodies):
+        raise CollisionModelError("no moving link of the robot description has a collision shape")
+    return sorted(bodies, key=lambda body: body.joint)
+
+
+def obstacles(workspace: Workspace) -> list[Body]:
+    """Return floor, walls and boxes."""
+    planes = [("floor", (0.0, 0.0, 1.0), workspace.floor)] if workspace.floor is not None else []
+    planes += [(f"wall {i}", wall.normal, wall.offset) for i, wall in enumerate(workspace.walls)]
+    bodies = [
+        _plane(name, np.array(normal, dtype=float), float(offset))
+        for name, normal, offset in planes
+    ]
+    for i, box in enumerate(workspace.boxes):
+        lower, upper = np.array(box.lower, dtype=float), np.array(box.upper, dtype=float)
+        middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
+        shape = coal.Box(*(upper - lower))
+        # To separations from it the box itself counts, not something round about it.
+        hull = Hull(middle, np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 0.0, exact=False)
+        pose = coal.Transform3s(np.eye(3), middle)
+        bodies.append(Body(f"box {i}", -1, shape, pose, hull, half_sides=half))
+    return bodies
+
+
+def _plane(name: str, normal: Array, offset: float) -> Body:
+    length = float(np.linalg.norm(normal))
+    normal = normal / length
+    # coal fills the side opposite to the normal.
+    shape = coal.Halfspace(normal, offset / length)
+    hull = Hull(normal * (offset / length), normal, 0.0, 0.0, 0.0, exact=True)
+    return Body(name, -1, shape, coal.Transform3s(np.eye(3), np.zeros(3)), hull, normal=normal)
+
+
+def _hull(shape: coal.CollisionGeometry, rotation: Array, translation: Array) -> Hull:
+    centre, axis = np.zeros(3), np.array([0.0, 0.0, 1.0])
+    half_length = radius = ball = 0.0
+    exact = True
+    if isinstance(shape, coal.Sphere):
+        ball = shape.radius
+    elif isinstance(shape, coal.Capsule):
+        half_length, ball = shape.halfLength, shape.radius
+    elif isinstance(shape, coal.Cylinder):
+        half_length, radius = shape.halfLength, shape.radius
+    else:
+        centre, axis, half_length, radius = _around(_corners(shape))
+        exact = False
+    return Hull(translation + rotation @ centre, rotation @ axis, half_length, radius, ball, exact)
+
+
+def _around(corners: Array) -> tuple[Array, Array, float, float]:
+    """Return a cylinder that holds points (k, 3), along their longest extent."""
+    lower, upper = corners.min(axis=0), corners.max(axis=0)
+    centre, half = (lower + upper) / 2.0, (upper - lower) / 2.0
+    longest = int(np.argmax(half))
+    across = np.delete(corners - centre, longest, axis=1)
+    radius = float(np.max(np.linalg.norm(across, axis=1)))
+    return centre, np.eye(3)[longest], float(half[longest]), radius
+
+
+def _corners(shape: coal.CollisionGeometry) -> Array:
+    """Return points (k, 3) whose convex hull holds a shape, in its own frame."""
+    if isinstance(shape, coal.ConvexBase):
+        return np.asarray(shape.points(), dtype=np.float64).reshape(-1, 3)
+    shape.computeLocalAABB()
+    box = shape.aabb_local
+    corners: Array = np.array(list(product(*zip(box.min_, box.max_, strict=True))))
+    return corners

@@ -1,0 +1,113 @@
+"""A motion that was chosen because it excites the parameters, and how it was found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.excitation.criteria import Criteria
+from identification.excitation.drawn import moves_through
+from planner import FourierSeries, Move, PiecewiseCubic
+
+Array = NDArray[np.float64]
+
+# Excitations that were written down without a method came from a random search.
+_FIRST_METHOD: Final = "random"
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """The best motion of a search, and how it was found.
+
+    Attributes:
+        trajectory: the motion; pieces planned through via points, or a sum of sines.
+        criteria: how good it is.
+        method: name of the search that found it.
+        seed: of the search.
+        tried: how many motions were looked at.
+        rejected: how many of them were not feasible, by kind of constraint.
+        via_points: (n_points, n) [rad], both ends included; None for sines, as the next two.
+        speed: (n,) share of each joint's velocity limit.
+        fly: how far corners are rounded, 0 to 1.
+    """
+
+    trajectory: PiecewiseCubic | FourierSeries
+    criteria: Criteria
+    method: str
+    seed: int
+    tried: int
+    rejected: Mapping[str, int]
+    via_points: Array | None = None
+    speed: Array | None = None
+    fly: float | None = None
+
+    @property
+    def moves(self) -> tuple[Move, ...] | None:
+        """The moves from the first via point on; they plan to the trajectory, bit for bit.
+
+        None for a motion that was not planned from moves.
+        """
+        if self.via_points is None or self.speed is None or self.fly is None:
+            return None
+        return moves_through(self.via_points, self.speed, self.fly)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data; `from_dict` restores every bit, through JSON too."""
+        planned: dict[str, Any] = {}
+        if self.via_points is not None and self.speed is not None:
+            planned = {
+                "via_points": self.via_points.tolist(),
+                "speed": self.speed.tolist(),
+                "fly": self.fly,
+            }
+        return {
+            "method": self.method,
+            **planned,
+            "trajectory": self.trajectory.to_dict(),
+            "criteria": asdict(self.criteria),
+            "seed": self.seed,
+            "tried": self.tried,
+            "rejected": dict(self.rejected),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Restore what `to_dict` returned.
+
+        Data without a method are those of a random search.
+
+        Raises:
+            KeyError, TypeError, ValueError: the data are no excitation.
+        """
+        trajectory = trajectory_from_dict(data["trajectory"])
+        planned: dict[str, Any] = {}
+        if isinstance(trajectory, PiecewiseCubic):
+            planned = {
+                "via_points": np.array(data["via_points"], dtype=np.float64),
+                "speed": np.array(data["speed"], dtype=np.float64),
+                "fly": float(data["fly"]),
+            }
+        return cls(
+            trajectory=trajectory,
+            criteria=Criteria(**data["criteria"]),
+            method=str(data.get("method", _FIRST_METHOD)),
+            seed=int(data["seed"]),
+            tried=int(data["tried"]),
+            rejected=dict(data["rejected"]),
+            **planned,
+        )
+
+
+def trajectory_from_dict(data: Mapping[str, Any]) -> PiecewiseCubic | FourierSeries:
+    """Restore a motion of either kind from its plain data.
+
+    Raises:
+        ValueError: the data are no motion.
+    """
+    if data.get("type") == "fourier_series":
+        return FourierSeries.from_dict(data)
+    return PiecewiseCubic.from_dict(data)

@@ -1,0 +1,173 @@
+"""Contacts between samples that are all clear.
+
+Two bodies are clear from one sample to the next if they cannot meet for the way they go, or if
+one slab lies between them at both: their points leave straight lines by no more than is allowed
+for. What that leaves open is divided.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.excitation.near import BLOCK, Near, Touch, rows_of
+from identification.excitation.scene import Path, Scene
+from identification.excitation.separation import Indices
+from identification.motion import Motion
+from planner import FourierSeries, PiecewiseCubic
+
+Array = NDArray[np.float64]
+
+# What stays open between two samples is divided by BLOCK, so many times at most.
+_DIVISIONS = 4
+
+
+class _Stretch(NamedTuple):
+    """A pair from one sample to another, and how far it leaves straight lines between samples [m].
+
+    Attributes:
+        bulge: seen from the base.
+        own_bulge: seen from the frame that carries both.
+    """
+
+    pair: int
+    start: int
+    stop: int
+    bulge: float
+    own_bulge: float
+
+    def joined(self, other: _Stretch) -> _Stretch | None:
+        """Return both together if the other one follows immediately."""
+        if self.pair != other.pair or self.stop != other.start:
+            return None
+        bulges = max(self.bulge, other.bulge), max(self.own_bulge, other.own_bulge)
+        return _Stretch(self.pair, self.start, other.stop, *bulges)
+
+    def gap(self, left: int) -> _Stretch:
+        """Return the part between one sample and the next."""
+        return self._replace(start=left, stop=left + 1)
+
+
+def touch_between(
+    scene: Scene,
+    trajectory: PiecewiseCubic | FourierSeries,
+    motion: Motion,
+    path: Path,
+    near: Near,
+) -> tuple[Touch, Motion] | None:
+    """Return a touch between the samples, which are clear, and the samples that show it.
+
+    Args:
+        scene: the bodies.
+        trajectory: the motion.
+        motion: samples of it, both ends included.
+        path: where the bodies are there.
+        near: what may touch.
+    """
+    for division in range(_DIVISIONS + 1):
+        gaps: list[_Stretch] = []
+        for stretch in _open_stretches(scene, path, near):
+            if division == 0 and scene.separation.sharp[stretch.pair]:
+                # looking closer by slabs costs less than distances
+                gaps += [stretch.gap(k) for k in range(stretch.start, stretch.stop)]
+                continue
+            found = _open_gaps(scene, path, stretch)
+            if isinstance(found, Touch):
+                return found, motion
+            gaps += found
+        if not gaps or division == _DIVISIONS:
+            break
+        gaps.sort()
+        pairs, left = (np.array([gap[column] for gap in gaps]) for column in (0, 1))
+        time = np.linspace(motion.time[left], motion.time[left + 1], BLOCK + 1, axis=1)
+        motion = Motion(time.ravel(), *trajectory.sample(time.ravel()))
+        path = scene.path(motion.position)
+        bulge = np.array([(gap.bulge, gap.own_bulge) for gap in gaps]).T / BLOCK**2
+        near = rows_of(scene, path, pairs, np.arange(time.size).reshape(time.shape), bulge)
+    if not gaps:
+        return None
+    # So close to the margin that it cannot be told: not clear.
+    almost = float(np.nextafter(scene.margin, -1.0))
+    return Touch(gaps[0].pair, gaps[0].start, almost), motion
+
+
+def _open_stretches(scene: Scene, path: Path, near: Near) -> list[_Stretch]:
+    """Return where neither the way that is gone nor a slab shows two bodies to be clear."""
+    rows = (-1, BLOCK + 1)
+    sample, lower = near.sample.reshape(rows), near.lower.reshape(rows)
+    pair = near.pair.reshape(rows)[:, :-1].ravel()
+    bulge, own_bulge = np.repeat(near.bulge, BLOCK, axis=1)
+    before, after = sample[:, :-1].ravel(), sample[:, 1:].ravel()
+    bound = lower[:, :-1].ravel(), lower[:, 1:].ravel()
+    gone = path.gone
+    a, b = scene.separation.first[pair], scene.separation.second[pair]
+    way = gone[a, after] - gone[a, before] + gone[b, after] - gone[b, before]
+    margin = scene.margin
+    reach = (bound[0] + bound[1] - way) / 2.0 - bulge
+    open_ = np.flatnonzero((reach < margin) & (after > before))
+    normals = near.normal.reshape(3, *rows)
+    least = np.full(len(open_), -np.inf)
+    for side, (here, there) in ((0, (before, after)), (1, (after, before))):
+        normal = normals[:, :, side : side + BLOCK].reshape(3, -1)[:, open_]
+        seen = _slab(scene, path, pair[open_], here[open_], there[open_], normal)
+        np.maximum(least, np.minimum(bound[side][open_], seen), out=least)
+    stretches: list[_Stretch] = []
+    for k in open_[least - own_bulge[open_] < margin].tolist():
+        ends = int(pair[k]), int(before[k]), int(after[k])
+        stretch = _Stretch(*ends, float(bulge[k]), float(own_bulge[k]))
+        joined = stretches[-1].joined(stretch) if stretches else None
+        if joined is None:
+            stretches.append(stretch)
+        else:
+            stretches[-1] = joined
+    return stretches
+
+
+def _slab(
+    scene: Scene, path: Path, pair: Indices, here: Indices, there: Indices, normal: Array
+) -> Array:
+    """Return how thick slabs (k,) of samples `here` are `there`, [m].
+
+    A slab's direction (3, k) goes with the frame that carries both bodies.
+    """
+    carrier = scene.carrier[pair] + 1
+    local = np.einsum("kij,ik->jk", path.frames.rotation[carrier, :, :, here], normal)
+    turned = np.einsum("kij,jk->ik", path.frames.rotation[carrier, :, :, there], local)
+    return scene.separation.along(path.bodies, pair, there, turned)
+
+
+def _open_gaps(scene: Scene, path: Path, stretch: _Stretch) -> list[_Stretch] | Touch:
+    """Return where one pair may touch between neighbouring samples, or a touch at one.
+
+    Divides the stretch until the bodies cannot meet for the way they go, or for the slab
+    that lies between them at both ends.
+    """
+    a, b = scene.indices(stretch.pair)
+    margin = scene.margin
+    seen: dict[int, tuple[float, Array]] = {}
+    gaps, stack = [], [(stretch.start, stretch.stop)]
+    while stack:
+        left, right = stack.pop()
+        for sample in (left, right):
+            if sample not in seen:
+                seen[sample] = scene.distance(stretch.pair, path, sample), scene.normal(b)
+            if seen[sample][0] < margin:
+                return Touch(stretch.pair, sample, seen[sample][0])
+        way = path.gone[a, right] - path.gone[a, left]
+        way += path.gone[b, right] - path.gone[b, left]
+        if (seen[left][0] + seen[right][0] - way) / 2.0 - stretch.bulge >= margin:
+            continue
+        if right - left > 1:
+            middle = (left + right) // 2
+            stack += [(middle, right), (left, middle)]
+            continue
+        ends = np.array([left, right])
+        normal = np.array([seen[left][1], seen[right][1]]).T
+        pair = np.full(2, stretch.pair)
+        own = scene.separation.along(path.bodies, pair, ends, normal)
+        other = _slab(scene, path, pair, ends, ends[::-1], normal)
+        if np.max(np.minimum(own, other)) - stretch.own_bulge < margin:
+            gaps.append(stretch.gap(left))
+    return gaps

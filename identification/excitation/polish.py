@@ -1,0 +1,236 @@
+"""Improving a motion by CMA-ES, from where a search left it.
+
+A genetic search finds the right region and then wanders in it; a covariance matrix adaptation
+(Hansen 2016, "The CMA Evolution Strategy: A Tutorial") learns how far each gene of a motion can
+still be moved for the better. It looks at nothing but ranks, so constraints need no penalty:
+whatever keeps them all ranks before whatever breaks one.
+
+The covariance is diagonal (Ros and Hansen 2008, "A simple modification in CMA-ES"). A full one
+has thousands of entries to learn for a hundred genes, more than a polish has evaluations; and its
+eigenvectors differ in their last bits with the threads that linear algebra is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import rankdata
+
+from identification.errors import ShapeError
+from identification.excitation.errors import DesignError
+
+if TYPE_CHECKING:
+    from identification.excitation.scale import Scale
+    from identification.excitation.scores import Scores
+
+Array = NDArray[np.float64]
+Fitness = Callable[["Scores"], Array]
+
+# First steps, as a share of each gene's range: the search has left the motion near something good.
+_STEP: Final = 0.03
+# Steps below this change no motion that anybody could tell from the one before.
+_SMALLEST_STEP: Final = 1e-7
+# Whole chunks of a population that is spread over processes.
+_CHUNK: Final = 8
+# Random numbers that are no other search's, whatever the seeds.
+_STREAM: Final = 3
+# How much the better of two gains counts where neither is a loss.
+_SECOND: Final = 1e-3
+
+
+class Scorer(Protocol):
+    """Judges motions by their genes."""
+
+    def score(self, genes: Array) -> Scores:
+        """Return the scores of `genes` (m, n_genes)."""
+        ...
+
+
+class PolishResult(NamedTuple):
+    """What a polish ended with.
+
+    Attributes:
+        genes: (n_genes,), those of the start, bit for bit, where nothing better was found.
+        scores: of this one motion, m = 1.
+        evaluated: how many motions were scored, the start among them.
+        generations: how many generations of them.
+    """
+
+    genes: Array
+    scores: Scores
+    evaluated: int
+    generations: int
+
+
+def polish(
+    population: Scorer,
+    genes: ArrayLike,
+    fitness: Fitness,
+    *,
+    evaluations: int,
+    seed: int,
+    progress: Callable[[int, float], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> PolishResult:
+    """Return the best motion found near a start, never a worse one than the start.
+
+    "Better" is: nearer to keeping the constraints by their summed excess, then the fitness. The
+    same seed gives the same motion to the last bit, whatever else draws random numbers meanwhile.
+
+    Args:
+        population: scores whole generations at once.
+        genes: (n_genes,) of the start, within [0, 1].
+        fitness: (m,) of scores, the larger the better; -inf is the worst there is.
+        evaluations: how many motions may be scored, the start among them.
+        seed: of the random numbers.
+        progress: called with the motions scored and the best fitness after each generation.
+        stop: asked before each generation; true ends the polish with the best so far.
+
+    Raises:
+        ShapeError: the start is no vector of at least two genes.
+        DesignError: genes outside [0, 1], or no evaluation allowed.
+    """
+    start = _checked(genes)
+    if evaluations < 1:
+        raise DesignError("evaluations", evaluations, "at least 1")
+    best = _Best(start, population.score(start[None].copy()), fitness)
+    size = generation_size(len(start))
+    strategy = _strategy(start, size, seed)
+    evaluated, generations = 1, 0
+    while evaluated + size <= evaluations and not stop():
+        asked = np.array(strategy.ask())
+        scores = population.score(asked.copy())
+        merits = _merits(scores, fitness)
+        strategy.tell(list(asked), _ranks(merits).tolist())
+        best.take(asked, scores, merits)
+        evaluated += size
+        generations += 1
+        if progress is not None:
+            progress(evaluated, best.fitness)
+        if not _SMALLEST_STEP < float(np.max(strategy.stds)) < np.inf:
+            break
+    return PolishResult(best.genes, best.scores, evaluated, generations)
+
+
+def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
+    """Return a fitness that no motion can have above 0 unless it is as good as `reference`.
+
+    The smaller of the two gains counts (an achievement function, Wierzbicki 1980); where neither
+    is a loss the other one counts a little too. Polished on this, a motion gets better in both
+    measures or stays.
+
+    Args:
+        reference: scores of one motion, m = 1.
+        scale: units of the gains; without it one decade of the determinant is worth one step of
+            1 in the coupling index.
+
+    Raises:
+        ShapeError: the reference is not one motion.
+        DesignError: it leaves a parameter without excitation: everything is better than that.
+    """
+    if len(reference.log10_det) != 1:
+        raise ShapeError("reference", np.shape(reference.log10_det), "(1,)")
+    log10_det, coupling_index = reference.log10_det[0], reference.coupling_index[0]
+    if not (np.isfinite(log10_det) and np.isfinite(coupling_index)):
+        raise DesignError("reference", (log10_det, coupling_index), "a motion with finite measures")
+    decade, step = (
+        (1.0, 1.0) if scale is None else (scale.log10_det_spread, scale.coupling_index_spread)
+    )
+
+    def fitness(scores: Scores) -> Array:
+        larger = (scores.log10_det - log10_det) / decade
+        less_coupled = (coupling_index - scores.coupling_index) / step
+        smaller_gain = np.minimum(larger, less_coupled)
+        larger_gain = np.maximum(larger, less_coupled)
+        merit: Array = np.where(
+            smaller_gain < 0.0, smaller_gain, smaller_gain + _SECOND * larger_gain
+        )
+        return merit
+
+    return fitness
+
+
+def generation_size(n_genes: int) -> int:
+    """Return how many motions make a generation: the usual 4 + 3 ln n, in whole chunks."""
+    return _CHUNK * int(np.ceil((4.0 + 3.0 * np.log(n_genes)) / _CHUNK))
+
+
+class _Merits(NamedTuple):
+    """What motions are ranked by: `excess` (m,), the less the better, then `fitness` (m,)."""
+
+    excess: Array
+    fitness: Array
+
+
+def _merits(scores: Scores, fitness: Fitness) -> _Merits:
+    excess = np.where(scores.feasible, 0.0, np.sum(scores.excess, axis=1))
+    values = np.asarray(fitness(scores), dtype=np.float64)
+    # A motion that cannot be judged is the worst of its kind.
+    return _Merits(np.nan_to_num(excess, nan=np.inf), np.nan_to_num(values, nan=-np.inf))
+
+
+def _ranks(merits: _Merits) -> Array:
+    """Return ranks from 1 for the best (m,), alike for motions that are alike."""
+    pairs = np.stack((-merits.fitness, merits.excess))
+    order = np.lexsort(pairs)
+    steps = np.any(np.diff(pairs[:, order], axis=1) != 0.0, axis=0)
+    place = np.empty(len(order))
+    place[order] = np.concatenate(([0.0], np.cumsum(steps)))
+    ranks: Array = rankdata(place, method="average")
+    return ranks
+
+
+class _Best:
+    """The best motion so far; only a better one takes its place."""
+
+    def __init__(self, genes: Array, scores: Scores, fitness: Fitness) -> None:
+        self.genes, self.scores = genes, scores
+        merits = _merits(scores, fitness)
+        self._excess, self.fitness = float(merits.excess[0]), float(merits.fitness[0])
+
+    def take(self, genes: Array, scores: Scores, merits: _Merits) -> None:
+        """Take the best of a generation if it is better; the first of those that are alike."""
+        index = int(np.lexsort((-merits.fitness, merits.excess))[0])
+        excess, fitness = float(merits.excess[index]), float(merits.fitness[index])
+        if (excess, -fitness) < (self._excess, -self.fitness):
+            self._excess, self.fitness = excess, fitness
+            self.genes = genes[index].copy()
+            self.scores = scores.take(index)
+
+
+def _checked(genes: ArrayLike) -> Array:
+    start = np.array(genes, dtype=np.float64)
+    if start.ndim != 1 or start.size < 2:
+        raise ShapeError("genes", start.shape, "(n_genes,), at least 2 of them")
+    if not np.all((start >= 0.0) & (start <= 1.0)):
+        raise DesignError("genes", start.tolist(), "numbers within [0, 1]")
+    return start
+
+
+def _strategy(start: Array, size: int, seed: int) -> Any:
+    """Return a CMA-ES that draws from a generator of its own and neither prints nor writes."""
+    import cma  # here, because it takes longer to load than many a command to run
+
+    random = np.random.default_rng([_STREAM, seed])
+
+    def normal(count: int, length: int | None = None) -> Array:
+        return random.standard_normal(count if length is None else (count, length))
+
+    return cma.CMAEvolutionStrategy(
+        start,
+        _STEP,
+        {
+            "bounds": [0.0, 1.0],
+            "popsize": size,
+            "CMA_diagonal": True,
+            "randn": normal,
+            # nan: the package does not touch numpy's global generator
+            "seed": np.nan,
+            # below -9 nothing is shown, and no file of options is looked for
+            "verbose": -10,
+            "verb_log": 0,
+        },
+    )

@@ -1,0 +1,203 @@
+"""Searching for the motion that excites the parameters best: the paper's methods, and others.
+
+Method A and method B of the paper are a genetic search for the largest determinant and for the
+largest fitness of eq. 7; which motions they search among is the genome's affair. The same seed
+gives the same design to the last bit, for any number of processes, and whether or not it was
+interrupted and resumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.excitation.design import Design
+from identification.excitation.errors import DesignError
+from identification.excitation.evolution import Evolution
+from identification.excitation.front import Front
+from identification.excitation.goal import Goal
+from identification.excitation.journal import Journal
+from identification.excitation.ledger import Ledger, Phase, Progress
+from identification.excitation.polish import polish
+from identification.excitation.population import Population
+from identification.excitation.scale import SAMPLE_COUNT, Scale
+from identification.excitation.scores import Scores
+from identification.excitation.settings import SearchSettings
+
+Array = NDArray[np.float64]
+
+RESCORE_PERIOD: Final = 0.001
+"""s; the chosen motion is judged once more at the rate of a servo loop."""
+
+# Random numbers of the first generation, by seed, and of the motions that give the scale. The
+# latter are the same for all seeds, so that a balanced fitness is.
+_FIRST: Final = 4
+_SCALE: Final = (5, 0)
+
+
+def search(
+    population: Population,
+    settings: SearchSettings,
+    *,
+    journal: Journal | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Design:
+    """Return the best motion of a search.
+
+    Args:
+        population: scores motions; its problem says what they are and must keep.
+        settings: how to search, and what for.
+        journal: scores already known, and where new ones are kept.
+        progress: called after each generation.
+        stop: asked before each generation; true ends the search with the best so far.
+
+    Raises:
+        NoFeasibleMotionError: no motion tried keeps every constraint and excites every parameter.
+        PlannerNotStarted: a process could not be started.
+        KeyboardInterrupt: as it comes; the generation under way is lost, no other.
+    """
+    return _Search(population, settings, journal, progress, stop).run()
+
+
+class _Search:
+    """One search under way."""
+
+    def __init__(
+        self,
+        population: Population,
+        settings: SearchSettings,
+        journal: Journal | None,
+        progress: Callable[[Progress], None] | None,
+        stop: Callable[[], bool],
+    ) -> None:
+        self._population, self._settings = population, settings
+        self._genome = population.problem.genome
+        self._progress, self._stop = progress, stop
+        self._stopped = False
+        self._phase: Phase = "sample"
+        self._goal: Goal | None = None
+        self._history: list[tuple[float, float, float]] = []
+        self._ledger = Ledger(population, journal, self._entered)
+
+    def run(self) -> Design:
+        goal = self._goal = self._chosen_goal()
+        self._evolve(goal)
+        front = self._ledger.front
+        if len(front) == 0:
+            raise self._ledger.failure(stopped=self._stopped)
+        winner = goal.choice(front)
+        genes = front.genes[winner]
+        if self._settings.polish > 0 and not self._halted():
+            genes = self._polished(goal, winner)
+        return self._design(genes, front, goal.scale)
+
+    def _chosen_goal(self) -> Goal:
+        """Return what decides, after a look at random motions where it needs a scale."""
+        p = self._population.problem.objective.n_parameters
+        if not self._needs_scale:
+            return Goal(self._settings, p, None)
+        drawn = self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT)
+        scores = self._ledger.score(drawn)
+        try:
+            return Goal(self._settings, p, Scale.of(scores))
+        except DesignError:
+            # Random motions excite hardly anything. A front does without a scale.
+            if self._settings.method == "front":
+                return Goal(self._settings, p, None)
+            raise self._ledger.failure(stopped=False) from None
+
+    def _evolve(self, goal: Goal) -> None:
+        self._phase = "search"
+        random = np.random.default_rng((_FIRST, self._settings.seed))
+        first = self._genome.sample(random, self._settings.population)
+        evolution = Evolution(self._settings, first, n_objectives=1 if goal.single else 2)
+        while len(self._history) < self._settings.generations and not self._halted():
+            genes = evolution.ask()
+            if genes is None:
+                return
+            scores = self._ledger.score(genes)
+            evolution.tell(scores, goal.objectives(scores))
+
+    def _polished(self, goal: Goal, winner: int) -> Array:
+        """Return the genes of the best motion near the winner, or its own."""
+        self._phase = "polish"
+        front = self._ledger.front
+        result = polish(
+            self._ledger,
+            front.genes[winner],
+            goal.polished_by(_scores_on(front, winner)),
+            evaluations=self._settings.polish,
+            seed=self._settings.seed,
+            stop=self._halted,
+        )
+        return result.genes
+
+    def _design(self, genes: Array, front: Front, scale: Scale | None) -> Design:
+        trajectory, criteria = self._population.judged(genes, RESCORE_PERIOD)
+        ledger = self._ledger
+        same = np.flatnonzero(np.all(front.genes == genes, axis=1))
+        return Design(
+            settings=self._settings,
+            genes=genes.copy(),
+            excitation=self._genome.excitation(
+                genes,
+                trajectory,
+                criteria,
+                method=self._settings.method,
+                seed=self._settings.seed,
+                tried=ledger.evaluated,
+                rejected=ledger.infeasible,
+            ),
+            front=front,
+            chosen=int(same[0]) if len(same) else None,
+            history=np.array(self._history).reshape(-1, 3),
+            evaluated=ledger.evaluated,
+            infeasible=dict(ledger.infeasible),
+            complete=not self._stopped,
+            scale=scale,
+        )
+
+    def _entered(self) -> None:
+        """Keep the history and tell how far the search is."""
+        ledger, settings = self._ledger, self._settings
+        if self._phase == "search" and self._goal is not None:
+            self._history.append(self._goal.best(ledger.front))
+        if self._progress is None:
+            return
+        best = (np.nan, np.nan)
+        if self._goal is not None and len(ledger.front) > 0:
+            k = self._goal.choice(ledger.front)
+            best = float(ledger.front.log10_det[k]), float(ledger.front.coupling_index[k])
+        sampled = SAMPLE_COUNT if self._needs_scale else 0
+        total = sampled + settings.population * settings.generations + settings.polish
+        self._progress(
+            Progress(
+                self._phase,
+                len(self._history),
+                settings.generations,
+                ledger.evaluated,
+                total,
+                ledger.feasible,
+                *best,
+            )
+        )
+
+    def _halted(self) -> bool:
+        self._stopped = self._stopped or self._stop()
+        return self._stopped
+
+    @property
+    def _needs_scale(self) -> bool:
+        return self._settings.method in ("balanced", "front")
+
+
+def _scores_on(front: Front, index: int) -> Scores:
+    """Return the scores (m = 1) of a motion of a front, which keeps every constraint."""
+    one = slice(index, index + 1)
+    return Scores.feasible_ones(
+        front.log10_det[one], front.coupling_index[one], front.duration[one]
+    )

@@ -1,0 +1,69 @@
+"""How a search goes about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from identification.excitation.errors import DesignError
+
+Method = Literal["a", "b", "balanced", "front"]
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """What is sought, and with how much effort.
+
+    Attributes:
+        method: "a": the largest log10 det (D-optimal, eq. 9); "b": the largest fitness by eq. 7
+            as printed; "balanced": both measures in units of their spread over random motions;
+            "front": all compromises between the two at once (NSGA-II), the knee is chosen.
+        population: individuals in a generation.
+        generations: how many generations are scored, the first, random one among them:
+            150 x 120 are 18 000 individuals.
+        crossover: probability that a pair of parents is crossed (Table 1: "cross-over rate").
+        mutation: probability that a gene of a child is changed (Table 1: "mutation").
+        weights: lambda_1 of log10 det and lambda_2 of the coupling index ("b" and "balanced").
+        seed: the same seed gives the same design, to the last bit.
+        polish: evaluations of a local search from the winner; 0 for none.
+        crossover_eta: how close children stay to their parents (SBX), the larger the closer.
+        mutation_eta: how close a changed gene stays to what it was, the larger the closer.
+
+    Raises:
+        DesignError: a setting outside its range.
+    """
+
+    method: Method = "front"
+    population: int = 150
+    generations: int = 120
+    crossover: float = 0.9
+    mutation: float = 0.01
+    weights: tuple[float, float] = (0.7, 0.3)
+    seed: int = 0
+    polish: int = 0
+    crossover_eta: float = 15.0
+    mutation_eta: float = 20.0
+
+    def __post_init__(self) -> None:
+        weights = np.array(self.weights, dtype=np.float64)
+        for name, fine, valid in (
+            ("method", self.method in get_args(Method), f"one of {', '.join(get_args(Method))}"),
+            ("population", self.population >= 2, "at least 2"),
+            ("generations", self.generations >= 1, "at least 1"),
+            ("crossover", 0.0 <= self.crossover <= 1.0, "a probability"),
+            ("mutation", 0.0 <= self.mutation <= 1.0, "a probability"),
+            (
+                "weights",
+                weights.shape == (2,) and np.all((weights >= 0.0) & (weights < np.inf)),
+                "two numbers of 0 or more",
+            ),
+            ("weights", np.any(weights > 0.0), "two numbers, not both 0"),
+            ("seed", self.seed >= 0, "0 or more"),
+            ("polish", self.polish >= 0, "0 or more evaluations"),
+            ("crossover_eta", 1.0 <= self.crossover_eta < np.inf, "1 or more"),
+            ("mutation_eta", 1.0 <= self.mutation_eta < np.inf, "1 or more"),
+        ):
+            if not fine:
+                raise DesignError(name, getattr(self, name), valid)

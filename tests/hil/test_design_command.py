@@ -1,0 +1,328 @@
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from importlib.util import find_spec
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+import typer
+from matplotlib.figure import Figure
+from typer.testing import CliRunner
+
+from hil.cell import Cell
+from hil.cli.design import design
+from hil.design import DesignResult, load_design, preset, run_search
+from hil.design.advice import NoExcitationError
+from hil.design.settings import preset_text
+from hil.errors import InputError, OperatorStopError
+from hil.plots import design_picture
+from hil.progress import Silent
+from sim_fixtures.ns16 import CELL_PATH
+
+SETTINGS = """\
+method = "b"
+[search]
+population = 8
+generations = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def drawing():
+    """What draws the page; `made` and Ctrl-C draw the real one, all else saves the seconds."""
+    return design_picture.draw_design
+
+
+@pytest.fixture(scope="module")
+def invoke(drawing):
+    app = typer.Typer()
+    app.command()(design)
+
+    def invoke(*arguments: object, draw=lambda *_, **__: Figure()):
+        design_picture.draw_design = draw
+        try:
+            given = [*arguments, *([] if "--workers" in arguments else ["--workers", 1])]
+            return CliRunner().invoke(app, list(map(str, given)), catch_exceptions=False)
+        finally:
+            design_picture.draw_design = drawing
+
+    return invoke
+
+
+@pytest.fixture(scope="module")
+def bare(invoke, tmp_path_factory):
+    """A design with joint limits only, as JSON; tests only read it."""
+    root = tmp_path_factory.mktemp("bare")
+    (root / "my.toml").write_text(SETTINGS)
+    arguments = ("--settings", root / "my.toml", "--kinematic", "-o", root / "out", "--json")
+    return root / "out", invoke(CELL_PATH, *arguments).stdout
+
+
+@pytest.fixture
+def copied(bare, tmp_path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(bare[0], tmp_path / "copied"))
+
+
+@pytest.fixture
+def settings(tmp_path) -> Path:
+    path = tmp_path / "my.toml"
+    path.write_text(SETTINGS)
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(invoke, drawing, tmp_path_factory):
+    """A design of a real cell's motion: all its constraints on."""
+    root = tmp_path_factory.mktemp("made")
+    (root / "my.toml").write_text(SETTINGS)
+    result = invoke(
+        CELL_PATH,
+        "--settings",
+        root / "my.toml",
+        "-o",
+        root / "out",
+        "--seed",
+        3,
+        draw=drawing,
+    )
+    assert result.exit_code == 0, result.output
+    return root / "out", result.output
+
+
+def test_leaves_motion_picture_settings_and_journal(made):
+    folder, output = made
+    assert {path.name for path in folder.iterdir()} == {
+        "excitation.toml",
+        "excitation.png",
+        "settings.toml",
+        "search.journal",
+    }
+    last = output.splitlines()[-1]
+    assert last.startswith("log det ") and "of 1653" in last
+    assert last.endswith(f"{folder}/excitation.toml")
+
+
+def test_the_motion_keeps_the_constraints_of_the_cell_and_returns_home(made):
+    cell = Cell.load(CELL_PATH)
+    excitation = load_design(made[0], cell)
+    ends = excitation.trajectory.sample(np.array([0.0, excitation.trajectory.duration]))
+    np.testing.assert_allclose(ends[0], [cell.home] * 2, atol=1e-9)
+    np.testing.assert_allclose(ends[1:], 0.0, atol=1e-9)
+    assert excitation.trajectory.duration <= 20.0
+    from hil.motion_checks import MotionChecks  # builds the arm's shapes
+
+    assert MotionChecks.of(cell).refusal(excitation.trajectory) is None
+
+
+def test_says_how_many_motions_were_tried_and_what_they_broke(made):
+    excitation = load_design(made[0])
+    assert f"{excitation.tried} motions tried" in made[1]
+    for kind, count in excitation.rejected.items():
+        assert f"{kind} {count}" in made[1]
+
+
+def test_the_picture_is_not_blank(made):
+    pixels = matplotlib.image.imread(made[0] / "excitation.png")
+    assert pixels.shape[0] > 800 and pixels.shape[1] > 800
+    assert 0.02 < np.mean(np.any(pixels[..., :3] < 0.8, axis=2)) < 0.6
+
+
+def test_one_seed_is_one_file_whatever_the_number_of_processes(invoke, made, settings, tmp_path):
+    arguments = ("--settings", settings, "--seed", 3, "-o", tmp_path / "out", "--workers", 3)
+    assert invoke(CELL_PATH, *arguments).exit_code == 0
+    one, three = (folder / "excitation.toml" for folder in (made[0], tmp_path / "out"))
+    assert one.read_bytes() == three.read_bytes()
+
+
+def test_an_earlier_design_is_not_overwritten_unless_asked_to(invoke, settings, copied):
+    arguments = (CELL_PATH, "--settings", settings, "--kinematic", "-o", copied, "--seed", 5)
+    before = (copied / "excitation.toml").read_bytes()
+    with pytest.raises(InputError, match=r"holds a design already.*--resume.*--force"):
+        invoke(*arguments)
+    assert (copied / "excitation.toml").read_bytes() == before
+    (copied / "notes.txt").write_text("mine")
+    invoke(*arguments, "--force")
+    assert load_design(copied).seed == 5
+    assert (copied / "notes.txt").read_text() == "mine"
+
+
+def test_settings_that_cannot_be_used_cost_no_earlier_design(invoke, settings, copied):
+    settings.write_text(SETTINGS + "[sines]\nfastest = [1.0, 2.0]\n")
+    with pytest.raises(InputError, match="2 entries"):
+        invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", copied, "--force")
+    load_design(copied)
+
+
+def test_what_is_not_a_design_is_never_removed(invoke, settings, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "settings.toml").write_text("mine = true\n")
+    for arguments in ((), ("--force",)):
+        with pytest.raises(InputError, match=r"settings\.toml: is in the way"):
+            invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", out, *arguments)
+    assert (out / "settings.toml").read_text() == "mine = true\n"
+
+
+@pytest.mark.parametrize("method", ["a", "b", "balanced", "front"])
+def test_settings_are_shown_as_a_file_to_begin_with(invoke, method):
+    result = invoke("--show-settings", method)
+    assert result.exit_code == 0
+    assert result.output == preset_text(method)
+    assert tomllib.loads(result.output)["method"] == method
+
+
+def test_json_says_the_same_as_the_file(bare):
+    printed, criteria = json.loads(bare[1]), load_design(bare[0]).criteria
+    assert printed["log10_det"] == criteria.log10_det
+    assert printed["coupling_index"] == criteria.coupling_index
+    assert printed["condition"] == criteria.condition
+    assert printed["complete"] is True
+    assert Path(printed["file"]) == bare[0] / "excitation.toml"
+
+
+def test_a_finished_search_resumed_is_the_same_file_and_quiet_leaves_one_line(invoke, bare, copied):
+    (copied / "excitation.toml").unlink()
+    output = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet").output
+    assert len(output.splitlines()) == 1
+    whole = (bare[0] / "excitation.toml").read_bytes()
+    assert (copied / "excitation.toml").read_bytes() == whole
+
+
+def test_kinematic_keeps_joint_limits_only(bare):
+    kept = DesignResult.load(bare[0]).settings.constraints
+    assert not (kept.closed or kept.collision or kept.current)
+
+
+def test_a_bare_series_is_said_to_be_for_looking_only(invoke, tmp_path):
+    path = tmp_path / "bare.toml"
+    path.write_text('method = "a"\n[search]\npopulation = 8\ngenerations = 1\n[sines]\nramp = 0\n')
+    output = invoke(CELL_PATH, "--settings", path, "--kinematic", "-o", tmp_path / "o").output
+    assert "no controller can run it; give it a ramp" in output
+    assert "not looked at: floor, walls and the arm itself, currents" in output
+
+
+def test_no_feasible_motion_says_what_forbids_it_where_and_what_to_change(
+    invoke, settings, tmp_path
+):
+    settings.write_text(SETTINGS + "[constraints]\nmax_duration = 0.5\n")
+    with pytest.raises(NoExcitationError) as caught:
+        invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
+    said = str(caught.value)
+    assert "duration forbids 16" in said and "0.5" in said
+    assert "What can be changed: allow more time ([constraints] max_duration)" in said
+    assert caught.value.exit_code == 3
+    assert not (tmp_path / "out" / "excitation.toml").exists()
+
+
+def test_a_wall_that_home_touches_is_named_with_depth_before_anything_is_tried(
+    invoke, settings, tmp_path
+):
+    cell = Cell.load(CELL_PATH)
+    wall = "walls = [{lower = [0.3, -2.0, 0.8], upper = [0.4, 2.0, 2.5]}]"
+    (tmp_path / "cell.toml").write_text(cell.text.replace("walls = []", wall))
+    (tmp_path / "ns16.urdf").write_text(cell.urdf)
+    words = r"begin at home: collision of link_\d and box 0: -0\.\d+ m.*home_deg.*cell\.toml"
+    with pytest.raises(NoExcitationError, match=words):
+        invoke(tmp_path / "cell.toml", "--settings", settings, "-o", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(find_spec("viser") is not None, reason="viser is installed")
+def test_a_view_that_cannot_be_shown_is_refused_before_the_search(invoke, settings, tmp_path):
+    with pytest.raises(InputError, match=r"--view: .*viser.*pip install"):
+        invoke(CELL_PATH, "--settings", settings, "-o", tmp_path / "out", "--view")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "for which cell"),
+        ([CELL_PATH, "--method", "b", "--settings", "SETTINGS"], "either --method or --settings"),
+        ([CELL_PATH, "--resume", "--force"], "exclude each other"),
+        ([CELL_PATH, "--resume", "-o", "NOWHERE"], "holds no design to go on with"),
+        ([CELL_PATH, "--settings", "NOWHERE"], "cannot be read"),
+        (["NOWHERE"], "cannot be read"),
+        ([CELL_PATH, "--compare", "NOWHERE"], "cannot be read"),
+        ([CELL_PATH, "--earlier", "NOWHERE"], "nowhere"),
+        ([CELL_PATH, "-o", "SETTINGS"], "cannot be made a folder"),
+    ],
+)
+def test_says_what_is_wrong(invoke, settings, tmp_path, arguments, words):
+    names = {"SETTINGS": settings, "NOWHERE": tmp_path / "nowhere"}
+    given = [names.get(argument, argument) for argument in arguments]
+    if "-o" not in given:
+        given += ["-o", tmp_path / "out"]
+    with pytest.raises(InputError, match=words):
+        invoke(*given)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_search_is_not_resumed_with_other_settings_or_another_cell(invoke, bare, tmp_path):
+    with pytest.raises(InputError, match="seed = 2: was 1 when the search began"):
+        invoke(CELL_PATH, "--resume", "-o", bare[0], "--seed", 2)
+    cell = Cell.load(CELL_PATH)
+    (tmp_path / "cell.toml").write_text(cell.text.replace("[155.0, 155.0,", "[150.0, 155.0,"))
+    (tmp_path / "ns16.urdf").write_text(cell.urdf)
+    with pytest.raises(InputError, match=r"search\.journal: was begun with another problem"):
+        invoke(tmp_path / "cell.toml", "--resume", "-o", bare[0])
+
+
+def test_other_designs_are_named_on_the_front(made, invoke, copied):
+    drawn = {}
+
+    def seen(*_, references, **__):
+        drawn.update(references)
+        return Figure()
+
+    invoke(CELL_PATH, "--resume", "-o", copied, "--compare", made[0], draw=seen)
+    criteria = load_design(made[0]).criteria
+    assert drawn == {"method B": (criteria.log10_det, criteria.coupling_index)}
+
+
+def test_stopped_before_there_is_a_motion_is_a_stop_and_no_refusal():
+    settings = preset("b").kinematic()
+    with pytest.raises(OperatorStopError, match="stopped before there was a motion") as caught:
+        run_search(Cell.load(CELL_PATH), settings, Silent(), workers=1, stop=lambda: True)
+    assert caught.value.exit_code == 130
+
+
+def interrupted(command: list[str], journal: Path) -> tuple[int, str]:
+    """Run a search, interrupt it once it has journalled three generations."""
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        deadline = time.monotonic() + 60.0
+        while not journal.exists() or journal.stat().st_size < 3 * 8 * 51 * 8:
+            assert time.monotonic() < deadline
+            assert run.poll() is None, run.communicate()
+            time.sleep(0.02)
+        run.send_signal(signal.SIGINT)
+        _, said = run.communicate(timeout=60)
+    return run.returncode, said
+
+
+def test_ctrl_c_leaves_the_best_so_far_and_resuming_ends_where_it_would_have(invoke, tmp_path):
+    settings = tmp_path / "my.toml"
+    settings.write_text(SETTINGS.replace("generations = 2", "generations = 25"))
+    arguments = [str(CELL_PATH), "--settings", str(settings), "--kinematic"]
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "hil", "design", *arguments, "-o", str(out)]
+    code, said = interrupted(command, out / "search.journal")
+    assert code == 130, said
+    assert "go on with --resume" in said
+    half = DesignResult.load(out)
+    assert not half.complete and 1 <= half.generations < 25
+    assert invoke(CELL_PATH, "--resume", "-o", out).exit_code == 0
+    invoke(*arguments, "-o", tmp_path / "whole")
+    whole = (tmp_path / "whole" / "excitation.toml").read_bytes()
+    assert (out / "excitation.toml").read_bytes() == whole

@@ -1,0 +1,338 @@
+"""The page of a designed motion: what it shows is what the robot is going to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from hil.arm import Arm, surface_points
+from hil.cell import Cell
+from hil.plots import save, style
+from hil.plots.design_correlation import blocks
+from hil.plots.design_picture import POSTURES, draw_design
+from hil.plots.posture_strip import Strip, posture_times
+from hil.plots.silhouettes import SIDE, TOP, covered, outlines, swept
+from identification.excitation import correlation, information
+from identification.excitation.criteria import Criteria
+from identification.excitation.excitation import Excitation
+from identification.excitation.sampling import sampled
+from identification.factor import Factor
+from planner import FourierSeries, Trajectory, plan
+from sim_fixtures.ns16 import CELL_PATH
+
+pin = pytest.importorskip("pinocchio")
+coal = pytest.importorskip("coal")
+
+TWO_LINK = Path(__file__).parents[1] / "identification" / "two_link.urdf"
+TWO_LINK_CELL = """
+[cell]
+name = "two links"
+urdf = "two_link.urdf"
+[limits]
+frame = "urdf"
+lower_deg = [-150.0, -140.0]
+upper_deg = [150.0, 140.0]
+velocity_deg = [180.0, 200.0]
+acceleration_deg = [600.0, 700.0]
+jerk_deg = [6000.0, 7000.0]
+[workspace]
+floor = "none"
+walls = [{ lower = [0.7, -0.3, -0.2], upper = [0.9, 0.3, 0.6] }]
+"""
+SHAPES = """
+<robot name="shapes"><link name="base"/>
+  <joint name="j" type="revolute"><parent link="base"/><child link="l"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <link name="l"><inertial><mass value="1"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+    <collision><origin xyz="0.3 -0.1 0.2" rpy="0.4 0.5 0.6"/><geometry>{}</geometry></collision>
+  </link></robot>
+"""
+
+
+@dataclass(frozen=True)
+class Points:
+    """A front."""
+
+    log10_det: np.ndarray
+    coupling_index: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def ns16() -> Cell:
+    return Cell.load(CELL_PATH)
+
+
+@pytest.fixture(scope="module")
+def two_link() -> Cell:
+    return Cell.from_texts(TWO_LINK_CELL, TWO_LINK.read_text(), Path("cell.toml"))
+
+
+def excitation(cell: Cell, trajectory: Trajectory) -> Excitation:
+    motion = sampled(trajectory)
+    factor = Factor.from_samples(cell.model, motion, np.zeros_like(motion.position))
+    criteria = Criteria.of_gram(information(factor), motion.n_samples)
+    return Excitation(trajectory, criteria, "front", seed=1, tried=1, rejected={})
+
+
+def wandering(cell: Cell, points: int = 5) -> Trajectory:
+    limits = cell.joint_limits
+    middle, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
+    random = np.random.default_rng(4)
+    via = middle + 0.4 * half * random.uniform(-1.0, 1.0, (points, limits.n_joints))
+    return plan(via, limits, fly=0.5)
+
+
+def texts(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.findobj(Text)]
+
+
+def front_axes(figure: Figure) -> list[Axes]:
+    return [axes for axes in figure.axes if axes.get_xlabel().startswith("coupling index")]
+
+
+class TestSilhouettes:
+    @given(st.integers(0, 1000))
+    def test_an_outline_is_the_convex_hull_but_for_little(self, seed):
+        points = np.random.default_rng(seed).normal(size=(1, 40, 2))
+        hull = ConvexHull(points[0])
+        x, y = outlines(points)[0].T
+        area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+        assert 0.98 * hull.volume < area <= hull.volume * (1.0 + 1e-12)
+
+    def test_a_body_sweeps_all_between_two_samples(self):
+        square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        sweep = swept(np.stack((square, square + np.array([5.0, 0.0]))))
+        grid = covered(sweep, np.array([[-1.0, 7.0], [-1.0, 2.0]]), 801)
+        assert grid.mean() == pytest.approx(6.0 / 24.0, rel=0.02)
+        assert grid[150, 400] == 1.0  # half way, where the body is at no sample
+        assert grid[50, 400] == 0.0
+
+    def test_the_lowest_row_comes_first(self):
+        low = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 0.2], [0.0, 0.2]]])
+        grid = covered(low, np.array([[0.0, 1.0], [0.0, 1.0]]), 101)
+        assert grid[5].all()
+        assert not grid[50].any()
+
+
+class TestArm:
+    @pytest.mark.parametrize(
+        ("shape", "volume"),
+        [
+            (coal.Box(0.2, 0.3, 0.4), 0.024),
+            (coal.Sphere(0.2), 4.0 / 3.0 * np.pi * 0.2**3),
+            (coal.Cylinder(0.2, 0.5), np.pi * 0.2**2 * 0.5),
+            (coal.Cone(0.2, 0.5), np.pi * 0.2**2 * 0.5 / 3.0),
+            (coal.Capsule(0.1, 0.5), np.pi * (0.1**2 * 0.5 + 4.0 / 3.0 * 0.1**3)),
+            (coal.Ellipsoid(0.1, 0.2, 0.3), 4.0 / 3.0 * np.pi * 0.1 * 0.2 * 0.3),
+        ],
+    )
+    def test_a_polyhedron_inside_a_shape_fills_nearly_all_of_it(self, shape, volume):
+        hull = ConvexHull(surface_points(shape))
+        assert 0.93 * volume < hull.volume < 1.0001 * volume
+
+    def test_a_shape_is_placed_as_the_description_says(self):
+        (solid,) = Arm.from_urdf(SHAPES.format('<box size="0.2 0.3 0.4"/>')).solids
+        np.testing.assert_allclose(solid.vertices.mean(axis=0), [0.3, -0.1, 0.2], atol=1e-12)
+        turned = Rotation.from_euler("xyz", [0.4, 0.5, 0.6])  # fixed axes, as URDF has it
+        corner = turned.apply([0.1, 0.15, 0.2]) + np.array([0.3, -0.1, 0.2])
+        assert np.min(np.linalg.norm(solid.vertices - corner, axis=1)) < 1e-9
+
+    def test_faces_close_the_body_and_look_outwards(self, ns16):
+        for solid in Arm.from_urdf(ns16.urdf).solids:
+            a, b, c = (solid.vertices[solid.faces[:, k]] for k in range(3))
+            volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0  # divergence theorem
+            assert volume == pytest.approx(ConvexHull(solid.vertices).volume, rel=1e-9)
+
+    @settings(max_examples=20)
+    @given(st.integers(0, 1000))
+    def test_bodies_move_as_pinocchio_moves_them(self, seed):
+        urdf = Cell.load(CELL_PATH).urdf
+        arm, model = Arm.from_urdf(urdf), pin.buildModelFromXML(urdf)
+        data, q = model.createData(), np.random.default_rng(seed).uniform(-3.0, 3.0, 6)
+        pin.framesForwardKinematics(model, data, q)
+        flange = data.oMf[model.getFrameId("flange")].translation
+        np.testing.assert_allclose(arm.tips(q[None])[0], flange, atol=1e-12)
+        for solid, corners in zip(arm.solids, arm.corners(q[None]), strict=True):
+            pose = data.oMi[solid.joint + 1]
+            expected = solid.vertices @ pose.rotation.T + pose.translation
+            np.testing.assert_allclose(corners[0], expected, atol=1e-12)
+
+    def test_an_arm_without_shapes_becomes_bars_from_joint_to_joint(self):
+        arm = Arm.from_urdf(TWO_LINK.read_text())
+        assert not arm.has_shapes
+        np.testing.assert_allclose(
+            arm.bones(np.zeros((1, 2)))[0],
+            [[[0.0, 0.0, 0.5], [0.0, 0.0, 1.0]], [[0.0, 0.0, 1.0], [0.01, 0.0, 1.2]]],
+            atol=1e-12,
+        )
+
+    def test_a_mesh_that_is_not_there_leaves_bars(self):
+        arm = Arm.from_urdf(SHAPES.format('<mesh filename="package://nowhere/link.stl"/>'))
+        assert not arm.has_shapes
+
+
+class TestPostures:
+    def test_a_closed_motion_does_not_show_its_beginning_twice(self, ns16):
+        away = ns16.home + 0.3
+        there = plan(np.array([ns16.home, away]), ns16.joint_limits)
+        back = plan(np.array([ns16.home, away, ns16.home]), ns16.joint_limits)
+        assert posture_times(there, 5)[-1] == there.duration
+        times = posture_times(back, 5)
+        assert times[-1] < back.duration
+        np.testing.assert_allclose(np.diff(times), back.duration / 5.0)
+
+    def test_all_that_the_arm_does_is_on_the_paper(self, ns16):
+        motion = wandering(ns16)
+        strip = Strip.of(Arm.from_urdf(ns16.urdf), motion, ns16.workspace, 7)
+        fine = Arm.from_urdf(ns16.urdf).corners(
+            motion.sample(np.arange(0, motion.duration, 0.01))[0]
+        )
+        for axis in range(3):
+            low, high = strip.extents[axis]
+            assert all(low < c[..., axis].min() and c[..., axis].max() < high for c in fine)
+        assert strip.extents[2][0] < ns16.workspace.floor
+
+    def test_an_obstacle_nearby_is_shown_and_a_far_one_does_not_shrink_the_arm(self, two_link):
+        arm, motion = Arm.from_urdf(two_link.urdf), wandering(two_link)
+        near = Strip.of(arm, motion, two_link.workspace, 5).extents
+        assert near[0][1] > 0.7
+        far_away = TWO_LINK_CELL.replace("0.7, -0.3", "7.7, -0.3").replace("0.9, 0.3", "8.9, 0.3")
+        far = Cell.from_texts(far_away, two_link.urdf, Path("cell.toml"))
+        assert Strip.of(arm, motion, far.workspace, 5).extents[0][1] < 3.0
+
+    def test_both_views_share_what_is_across(self):
+        assert SIDE.across == TOP.across
+        assert {SIDE.depth, TOP.depth} == {1, 2}
+
+
+class TestCorrelations:
+    def test_parameters_are_grouped_by_joint(self):
+        names = ("I1yy", "I2xx", "mc2x", "I3m", "m12", "I12xy")
+        assert blocks(names) == [("1", 0, 1), ("2", 1, 3), ("3", 3, 4), ("12", 4, 6)]
+
+    def test_the_matrix_is_that_of_the_motion_without_friction(self, ns16):
+        designed = excitation(ns16, wandering(ns16))
+        figure = draw_design(designed, ns16)
+        shown = np.asarray(
+            next(a for a in figure.axes if a.get_xlabel().startswith("parameters"))
+            .images[0]
+            .get_array()
+        )
+        motion = sampled(designed.trajectory, 0.001)
+        factor = Factor.from_samples(ns16.model, motion, np.zeros_like(motion.position))
+        inverse = np.linalg.inv(information(factor))
+        deviation = np.sqrt(np.diag(inverse))
+        expected = np.abs(inverse / np.outer(deviation, deviation))[:40, :40]
+        assert shown.shape == (40, 40)
+        np.testing.assert_allclose(shown, expected, atol=1e-5)
+        assert np.all(np.isfinite(correlation(information(factor))))
+
+    def test_a_motion_that_leaves_parameters_unexcited_says_so(self, ns16):
+        still = plan(np.array([ns16.home, ns16.home + 0.4 * np.eye(6)[0]]), ns16.joint_limits)
+        figure = draw_design(excitation(ns16, still), ns16)
+        said = " ".join(texts(figure))
+        assert "leaves a parameter" in said
+        assert "I_c ∞" in said
+        assert "nan" not in said
+
+
+class TestFront:
+    def draw(self, cell: Cell, count: int, chosen: int | None, **references) -> Figure:
+        share = np.linspace(0.0, 1.0, count)
+        front = Points(100.0 + 8.0 * np.sqrt(share), 70.0 + 40.0 * share**2)
+        designed = excitation(cell, wandering(cell))
+        return draw_design(designed, cell, front=front, chosen=chosen, references=references)
+
+    @pytest.mark.parametrize("count", [0, 1, 2, 60])
+    def test_any_number_of_motions(self, two_link, count):
+        figure = self.draw(two_link, count, count // 2 if count else None)
+        (axes,) = front_axes(figure)
+        points = [line for line in axes.lines if line.get_label().startswith("front")]
+        assert [len(line.get_xdata()) for line in points] == ([count] if count > 1 else [])
+
+    def test_the_chosen_motion_and_what_it_is_compared_with_carry_their_figures(self, two_link):
+        figure = self.draw(two_link, 3, 1, A=(104.0, 90.5), B=(101.2, 80.9))
+        said = texts(figure)
+        for label in ("chosen (105.7, 80.0)", "A (104.0, 90.5)", "B (101.2, 80.9)"):
+            assert label in said
+
+    def test_a_motion_beside_the_front_is_drawn_where_its_criteria_are(self, two_link):
+        (axes,) = front_axes(self.draw(two_link, 3, None))
+        criteria = excitation(two_link, wandering(two_link)).criteria
+        star = next(line for line in axes.lines if line.get_marker() == "*")
+        assert float(star.get_xdata()[0]) == pytest.approx(criteria.coupling_index)
+
+    def test_there_is_no_room_for_it_where_there_is_none(self, two_link):
+        figure = draw_design(excitation(two_link, wandering(two_link)), two_link)
+        assert front_axes(figure) == []
+
+
+class TestPage:
+    def test_joints_are_drawn_between_their_limits_in_the_angles_of_the_cell(self, ns16):
+        figure = draw_design(excitation(ns16, wandering(ns16)), ns16)
+        (position,) = (a for a in figure.axes if a.get_ylabel() == "joint_2")
+        assert position.get_yticks() == pytest.approx([-50.0, 0.0, 95.0])  # as in the file
+        assert "position [deg, controller angles]" in texts(figure)
+
+    def test_every_posture_is_seen_from_the_side_and_from_above(self, ns16):
+        figure = draw_design(excitation(ns16, wandering(ns16)), ns16)
+        equal = [axes for axes in figure.axes if axes.get_aspect() == 1.0]
+        strip = [axes for axes in equal if not axes.images]
+        assert len(strip) == 2 * POSTURES
+
+    def test_sines_can_be_drawn_bare_and_ramped(self, two_link, tmp_path):
+        for ramp in (0.0, 1.0):
+            sines = FourierSeries(
+                np.zeros(2), np.full((2, 2), 0.4), np.array([[1.0, 2.0], [1.3, 2.9]]), 6.0, ramp
+            )
+            save(draw_design(excitation(two_link, sines), two_link), tmp_path / "sines.pdf")
+
+    def test_the_same_motion_gives_the_same_bytes(self, two_link, tmp_path):
+        designed = excitation(two_link, wandering(two_link))
+        for name in ("a.png", "b.png"):
+            save(draw_design(designed, two_link, title="twice"), tmp_path / name)
+        assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+    @pytest.mark.parametrize("title", ["", "a $\\frac{title}{}$ <of> a person\n" * 3])
+    def test_nothing_is_cut_and_no_text_lies_upon_another(self, ns16, title):
+        figure = draw_design(
+            excitation(ns16, wandering(ns16)),
+            ns16,
+            front=Points(np.array([100.0, 105.0]), np.array([70.0, 95.0])),
+            chosen=0,
+            title=title,
+        )
+        with style.page():
+            renderer = FigureCanvasAgg(figure).get_renderer()
+            drawn = figure.get_tightbbox(renderer)
+            width, height = figure.get_size_inches()
+            assert drawn.x0 >= 0.0
+            assert drawn.y0 >= 0.0
+            assert drawn.x1 <= width
+            assert drawn.y1 <= height
+            heads = [*figure.texts, *(axes.title for axes in figure.axes)]
+            heads += [axes._left_title for axes in figure.axes]
+            boxes = [
+                (text.get_text(), text.get_window_extent(renderer))
+                for text in heads
+                if text.get_text()
+            ]
+        for (first, a), (second, b) in combinations(boxes, 2):
+            assert not a.overlaps(b), f"{first!r} upon {second!r}"
+
+    def test_a_description_without_shapes_is_named_on_the_page(self, two_link):
+        said = " ".join(texts(draw_design(excitation(two_link, wandering(two_link)), two_link)))
+        assert "bars from joint to joint" in said

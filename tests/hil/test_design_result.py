@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from hil.cell import Cell
+from hil.cell.text import replaced_value
+from hil.design import DesignResult, load_design, preset, problem_of
+from hil.design.fingerprint import fingerprint
+from hil.design.folder import DesignFolder
+from hil.design.run import Designed, run_design
+from hil.errors import InputError
+from hil.progress import Silent
+from identification.excitation import Objective
+from planner import FourierSeries
+from sim_fixtures.ns16 import CELL_PATH
+
+TINY = {"population": 8, "generations": 2, "polish": 0}
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    return Cell.load(CELL_PATH)
+
+
+@pytest.fixture(scope="module", params=["a", "b"])
+def made(request, cell, tmp_path_factory) -> tuple[DesignFolder, Designed]:
+    folder = DesignFolder(tmp_path_factory.mktemp("design") / request.param)
+    settings = preset(request.param).kinematic().replaced(search=TINY)
+    return folder, run_design(folder, cell, settings, Silent(), workers=1)
+
+
+@pytest.fixture
+def text(made) -> str:
+    return made[0].result.read_text()
+
+
+def written(folder, text):
+    path = folder / "excitation.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_file_restores_the_excitation_to_the_last_bit(made, cell):
+    folder, done = made
+    again = load_design(folder.result, cell)
+    assert again.to_dict() == done.design.excitation.to_dict()
+    assert load_design(folder.root).to_dict() == again.to_dict()
+
+
+def test_the_file_restores_everything_else(made):
+    folder, done = made
+    again = DesignResult.load(folder.result)
+    front = done.design.front
+    np.testing.assert_array_equal(again.front[:, 0], front.log10_det)
+    np.testing.assert_array_equal(again.front[:, 1], front.coupling_index)
+    np.testing.assert_array_equal(again.front[:, 2], front.duration)
+    assert again.chosen == done.design.chosen
+    assert again.settings == done.result.settings
+    assert again.complete and again.generations == 2
+    assert again.n_parameters == 58 and again.parameters is None
+    assert again.versions == done.result.versions
+    assert {"hil", "ruckig", "pymoo", "cma", "numpy"} <= again.versions.keys()
+
+
+def test_its_criteria_are_those_of_the_motion_at_a_millisecond(made, cell):
+    excitation = load_design(made[0].result)
+    again = Objective(cell.model).criteria(excitation.trajectory, 0.001)
+    assert again == excitation.criteria
+    assert excitation.criteria.n_samples == pytest.approx(
+        1000 * excitation.trajectory.duration, abs=2
+    )
+    assert excitation.criteria.condition is not None
+    assert excitation.criteria.scaled_condition is not None
+
+
+def test_it_is_small_and_says_what_it_is(text):
+    assert len(text) < 20_000
+    for line in (
+        "coupling_index_max = 1653.0",
+        'name = "NS 16 (simulated)"',
+        "complete = true",
+        "seed = 1",
+        "population = 8",
+    ):
+        assert line in text
+
+
+def test_a_motion_through_via_points_shows_its_moves_and_sines_their_amplitudes(made, text):
+    sines = isinstance(made[1].design.excitation.trajectory, FourierSeries)
+    assert ("amplitude_deg" in text) == sines
+    assert ("[[plan.moves]]" in text) == (not sines)
+    assert ("target_deg" in text) == (not sines)
+
+
+def changed_digit(text: str, name: str) -> str:
+    """The text with the last digit of the first number of a list replaced."""
+
+    def other(match: re.Match[str]) -> str:
+        return match[1] + match[2] + ("1" if match[3] != "1" else "2")
+
+    new, count = re.subn(rf"({name} = \[+)(-?[\d.]*\d)(\d)", other, text, count=1)
+    assert count == 1
+    return new
+
+
+def test_a_motion_that_was_changed_is_refused(made, text, tmp_path):
+    sines = "amplitude_deg" in text
+    for name in ("amplitude_deg" if sines else "target_deg", "coupling_index"):
+        path = written(tmp_path, changed_digit(text, name))
+        with pytest.raises(InputError, match=r"excitation\.toml: was changed after.*restore it"):
+            load_design(path)
+
+
+def test_comments_and_blank_lines_may_be_changed(text, tmp_path, made):
+    path = written(tmp_path, "# mine\n\n" + re.sub(r"(?m)^#.*\n", "", text))
+    assert load_design(path).to_dict() == made[1].design.excitation.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('format = "designed excitation"', 'format = "joint motion plan"', "format is"),
+        ("version = 1", "version = 2", "version is 2, this reads 1"),
+        ("[seal]", "[seals]", "'seal'"),
+        ("[criteria]", "[criteria", "not a designed excitation"),
+    ],
+)
+def test_another_file_is_refused(text, tmp_path, old, new, words):
+    with pytest.raises(InputError, match=words) as caught:
+        load_design(written(tmp_path, text.replace(old, new, 1)))
+    assert "design it again" in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"excitation\.toml: cannot be read"):
+        load_design(tmp_path)
+
+
+def test_another_planner_may_differ_in_the_last_digits_and_no_more(made, text, tmp_path):
+    other = re.sub(r'motion_sha256 = "\w+"', 'motion_sha256 = "0"', text)
+    assert load_design(written(tmp_path, other)).to_dict() == made[1].design.excitation.to_dict()
+    elsewhere = re.sub(r"(positions_deg = \[\[)[^,]+", r"\g<1>45.0", other)
+    with pytest.raises(InputError, match="do not plan to the motion that was designed"):
+        load_design(written(tmp_path, elsewhere))
+
+
+def test_a_cell_with_other_limits_is_refused_by_name(made, cell):
+    slower = replaced_value(
+        cell.text, "limits", "velocity_deg", "[100.0, 155.0, 170.0, 360.0, 350.0, 550.0]"
+    )
+    other = Cell.from_texts(
+        replaced_value(slower, "cell", "name", '"the slow one"'), cell.urdf, cell.path
+    )
+    with pytest.raises(InputError) as caught:
+        load_design(made[0].result, other)
+    for word in ("'NS 16 (simulated)'", "'the slow one'", "limits"):
+        assert word in str(caught.value)
+
+
+def test_a_cell_with_another_campaign_link_or_wall_is_the_same_robot(made, cell):
+    other = cell.with_campaign(repetitions=3).with_link(transport="udp", host="127.0.0.1")
+    assert fingerprint(other) == fingerprint(cell)
+    wall = "[{lower = [2.0, 2.0, 0.0], upper = [2.1, 2.1, 1.0]}]"
+    walled = Cell.from_texts(
+        replaced_value(cell.text, "workspace", "walls", wall), cell.urdf, cell.path
+    )
+    assert fingerprint(walled) != fingerprint(cell)
+    for each in (other, walled):
+        load_design(made[0].result, each)
+
+
+def test_spelling_and_comments_of_a_cell_do_not_count(cell):
+    respelled = cell.text.replace("margin = 0.05", "margin = 5e-2  # m")
+    assert respelled != cell.text
+    assert fingerprint(Cell.from_texts(respelled, cell.urdf, cell.path)) == fingerprint(cell)
+
+
+def test_a_subset_of_parameters_is_named(cell, tmp_path):
+    names = list(cell.model.parameter_names[:12])
+    settings = preset("b").kinematic().replaced(search=TINY, objective={"parameters": names})
+    folder = DesignFolder(tmp_path / "few")
+    done = run_design(folder, cell, settings, Silent(), workers=1)
+    again = DesignResult.load(folder.result)
+    assert list(again.parameters or ()) == names and again.n_parameters == 12
+    objective = problem_of(cell, settings).objective
+    assert objective.criteria(done.design.excitation.trajectory, 0.001) == (
+        again.excitation.criteria
+    )

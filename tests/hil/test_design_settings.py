@@ -1,0 +1,267 @@
+from __future__ import annotations
+
+import math
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.cell import Cell
+from hil.cell.text import replaced_value
+from hil.design import METHODS, load_settings, preset, problem_of, search_settings
+from hil.design.knowledge import Knowledge
+from hil.design.settings import SettingsError, preset_text, settings_of
+from hil.design.toml_text import Angles, from_text, to_text
+from identification.excitation import SineGenome, ViaPointGenome
+from sim_fixtures.ns16 import CELL_PATH
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    return Cell.load(CELL_PATH)
+
+
+def test_method_a_has_the_papers_figures():
+    a = preset("a")
+    assert (a.search.population, a.search.generations) == (100, 120)
+    assert (a.search.mutation, a.search.crossover, a.search.polish) == (0.01, 0.7, 0)
+    assert a.sines is not None and a.sines.harmonics == 3
+    assert a.sines.fastest == [0.94, 2.38, 0.53, 0.44, 0.89, 0.44]
+    assert a.sines.slowest == [0.314]
+
+
+def test_method_b_has_the_papers_figures():
+    b = preset("b")
+    assert (b.search.population, b.search.generations) == (150, 120)
+    assert (b.search.mutation, b.search.crossover, b.search.polish) == (0.01, 0.9, 0)
+    assert b.search.weights == (0.7, 0.3)
+    assert b.via_points is not None and b.via_points.n_via == 6
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_is_shown_is_what_is_used(method, tmp_path):
+    path = tmp_path / "my.toml"
+    path.write_text(preset_text(method))
+    assert load_settings(path) == preset(method)
+    assert preset(method).method == method
+    assert search_settings(preset(method)).method == method
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_real_cell_gets_all_its_constraints_unless_asked_otherwise(method):
+    kept = preset(method).constraints
+    assert kept.closed and kept.collision and kept.current
+    bare = preset(method).kinematic().constraints
+    assert not (bare.closed or bare.collision or bare.current)
+    assert bare.max_duration == kept.max_duration == 20.0
+
+
+def test_a_file_may_leave_out_what_its_method_says_already():
+    assert settings_of({"method": "b"}) == preset("b")
+    assert settings_of({}) == preset("front")
+    mine = settings_of({"method": "b", "via_points": {"n_via": 9}})
+    assert mine.via_points is not None and mine.via_points.n_via == 9
+    assert mine.via_points.fly == 0.5 and mine.search == preset("b").search
+
+
+def test_sines_can_be_searched_by_any_method_and_via_points_by_method_a():
+    front = settings_of({"method": "front", "sines": {"harmonics": 5}})
+    assert front.via_points is None
+    assert front.sines is not None and front.sines.harmonics == 5 and front.sines.length == 20.0
+    a = settings_of({"method": "a", "via_points": {}})
+    assert a.sines is None and a.via_points == preset("b").via_points
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('metod = "b"', ["metod", "is not a field", "known are", "method"]),
+        ('method = "c"', ["method = 'c'", "a, b, balanced, front"]),
+        ("[search]\npopulation = 2", ["search.population = 2", "4 to 10000"]),
+        ('[search]\npopulation = "many"', ["search.population = 'many'", "4 to 10000"]),
+        ("[search]\nmutation = 1.5", ["search.mutation = 1.5", "0 to 1"]),
+        ("[search]\nmutation = nan", ["search.mutation", "0 to 1"]),
+        ("[search]\nweights = [0.7, 0.7]", ["search", "1.4", "add up to 1"]),
+        ("[search]\nweights = [1.0]", ["search.weights", "log det"]),
+        ("[via_points]\nn = 6", ["via_points.n", "known are", "n_via"]),
+        ("[via_points]\nslowest = 0.0", ["via_points.slowest = 0.0", "above 0, at most 1"]),
+        ("[via_points]\n[sines]", ["both", "[via_points]", "[sines]", "give one"]),
+        ("[sines]\nramp = 11.0", ["sines", "two ramps of 11 s", "20 s"]),
+        ("[sines]\nfastest = [1.0, -1.0]", ["sines.fastest", "rad/s"]),
+        ('[sines]\noffset = "nowhere"', ["sines.offset = 'nowhere'", '"middle"', '"home"']),
+        ("[constraints]\nmin_duration = 30.0", ["min_duration = 30 s", "max_duration = 20 s"]),
+        ("[constraints]\nmax_duration = inf", ["constraints.max_duration", "above 0"]),
+        ("constraints = 3", ["constraints = 3", "a table [constraints]"]),
+        ("seed = -1", ["seed = -1", "0 or more"]),
+        ("[objective]\nparameters = []", ["objective.parameters", '"all"', "hil identify"]),
+        (
+            '[objective]\nparameters = ["mc2y"]\nmax_relative_std = 30.0',
+            ["objective", "leave one of them out"],
+        ),
+        ("[search\n", ["is not TOML", "--show-settings"]),
+    ],
+)
+def test_nonsense_is_refused_with_file_field_value_and_remedy(text, words, tmp_path):
+    path = tmp_path / "my.toml"
+    path.write_text(text)
+    with pytest.raises(SettingsError) as caught:
+        load_settings(path)
+    for word in ["my.toml", *words]:
+        assert word in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(SettingsError, match=r"none\.toml: cannot be read.*name a TOML file"):
+        load_settings(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_settings_written_down_read_back_the_same(method, tmp_path):
+    settings = preset(method).replaced(seed=7, search={"mutation": 1 / 3})
+    path = tmp_path / "settings.toml"
+    path.write_text(to_text(settings.to_dict(), {"search": "how"}))
+    assert load_settings(path) == settings
+
+
+def test_via_points_lead_home_unless_the_path_is_open(cell):
+    closed = problem_of(cell, preset("b")).genome
+    assert isinstance(closed, ViaPointGenome) and closed.home is not None
+    np.testing.assert_array_equal(closed.home, cell.home)
+    open_path = problem_of(cell, preset("b").kinematic())
+    assert isinstance(open_path.genome, ViaPointGenome) and open_path.genome.home is None
+    assert open_path.constraints.checker is None and open_path.constraints.currents is None
+    assert open_path.genome.n_genes == (6 + 1) * 6  # K via points and a speed, for each joint
+
+
+def test_the_papers_frequencies_are_those_of_the_genome(cell):
+    genome = problem_of(cell, preset("a").kinematic()).genome
+    assert isinstance(genome, SineGenome)
+    slowest, fastest = genome.frequency_range
+    np.testing.assert_array_equal(slowest, np.full(6, 0.314))
+    np.testing.assert_array_equal(fastest, [0.94, 2.38, 0.53, 0.44, 0.89, 0.44])
+
+
+def test_frequencies_from_the_limits_are_the_appendixs(cell):
+    settings = preset("a").kinematic().replaced(sines={"fastest": "from limits"})
+    genome = problem_of(cell, settings).genome
+    assert isinstance(genome, SineGenome)
+    limits = cell.joint_limits
+    room = (limits.upper - limits.lower) / 2.0
+    np.testing.assert_allclose(genome.frequency_range[1], np.sqrt(limits.acceleration / room))
+
+
+def test_an_offset_is_read_in_the_frame_of_the_limits(cell):
+    settings = preset("a").kinematic()
+    home = problem_of(cell, settings.replaced(sines={"offset": "home"})).genome
+    typed = problem_of(
+        cell, settings.replaced(sines={"offset": [0.0, 0.0, -90.0, 0.0, 90.0, 0.0]})
+    ).genome
+    assert isinstance(home, SineGenome) and isinstance(typed, SineGenome)
+    np.testing.assert_array_equal(home.centre, cell.home)
+    np.testing.assert_array_equal(typed.centre, cell.home)
+
+
+def test_a_bare_series_is_not_asked_to_rest(cell):
+    settings = preset("a").kinematic()
+    assert problem_of(cell, settings).constraints.at_rest
+    assert not problem_of(cell, settings.replaced(sines={"ramp": 0.0})).constraints.at_rest
+
+
+def test_lists_must_have_one_entry_per_joint(cell):
+    settings = preset("a").kinematic().replaced(sines={"fastest": [1.0, 2.0]})
+    with pytest.raises(SettingsError, match=r"sines\.fastest.*2 entries.*6 joints.*joint_6"):
+        problem_of(cell, settings)
+
+
+def test_named_parameters_are_the_ones_that_count(cell):
+    names = cell.model.parameter_names
+    settings = preset("b").kinematic()
+    chosen = settings.replaced(objective={"parameters": [names[9], names[2]]})
+    objective = problem_of(cell, chosen).objective
+    np.testing.assert_array_equal(objective.parameters, [2, 9])
+    for wrong, words in ((["m9"], "no parameter.*I1yy"), ([names[0]] * 2, "named twice")):
+        with pytest.raises(SettingsError, match=words):
+            problem_of(cell, settings.replaced(objective={"parameters": wrong}))
+
+
+def test_a_cell_without_drives_can_be_designed_for_as_far_as_its_joints_go():
+    cell = Cell.load(CELL_PATH)
+    start, end = cell.text.index("[nominal]"), cell.text.index("[limits]")
+    without = Cell.from_texts(cell.text[:start] + cell.text[end:], cell.urdf, cell.path)
+    assert problem_of(without, preset("b").kinematic()).constraints.currents is None
+    with pytest.raises(Exception, match=r"add a table \[nominal\]"):
+        problem_of(without, preset("b"))
+
+
+def test_what_is_known_too_badly_is_left_out(cell):
+    p = cell.model.n_parameters
+    known = Knowledge(
+        names=cell.model.parameter_names,
+        values=np.full(p, -2.0),
+        std=np.linspace(0.01, 3.0, p),
+        joint_weights=np.ones(6),
+        gram=np.eye(p),
+        samples=100,
+        repetitions=30,
+    )
+    settings = preset("b").kinematic().replaced(objective={"max_relative_std": 30.0})
+    objective = problem_of(cell, settings, known).objective
+    np.testing.assert_array_equal(objective.parameters, np.flatnonzero(known.std <= 0.6))
+    assert objective.repetitions == 30 and objective.earlier_samples == 100
+    with pytest.raises(SettingsError, match=r"max_relative_std = 30.*--earlier"):
+        problem_of(cell, settings)
+    too_good = settings.replaced(objective={"max_relative_std": 0.1})
+    with pytest.raises(SettingsError, match="leaves 0 parameters"):
+        problem_of(cell, too_good, known)
+
+
+def test_a_value_of_zero_is_never_known_well():
+    known = Knowledge(
+        names=("a", "b"),
+        values=np.array([0.0, 1.0]),
+        std=np.array([0.1, math.inf]),
+        joint_weights=np.ones(1),
+        gram=np.eye(2),
+        samples=1,
+        repetitions=1,
+    )
+    assert np.all(np.isinf(known.relative_std))
+
+
+@given(
+    angles=st.lists(st.floats(-1e3, 1e3), max_size=8),
+    numbers=st.lists(st.floats(allow_nan=False), max_size=4),
+    words=st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
+    key=st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=6).filter(
+        lambda name: not name.endswith("_deg")
+    ),
+)
+def test_text_restores_every_bit(angles, numbers, words, key):
+    data = {
+        "turn": Angles(angles),
+        "rows": Angles([angles, angles]),
+        "numbers": numbers,
+        "inner": {key: words, "below": {"yes": True, "count": 3}},
+        "many": [{"angle": Angles(angle), "name": words} for angle in angles],
+    }
+    text = to_text(data, {"inner": "what it is"})
+    tomllib.loads(text)
+    back = from_text(text)
+    assert repr(back["turn"]) == repr(angles) and repr(back["rows"]) == repr([angles, angles])
+    assert repr(back["numbers"]) == repr(numbers)
+    assert back["inner"] == data["inner"]
+    assert [row["name"] for row in back["many"]] == [words] * len(angles)
+
+
+def test_an_angle_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match=r"turn_deg.*'far'"):
+        from_text('turn_deg = [1.0, "far"]')
+
+
+def test_seeds_and_repetitions_of_the_cell_play_no_part_in_the_problem(cell):
+    other = Cell.from_texts(
+        replaced_value(cell.text, "campaign", "repetitions", 3), cell.urdf, cell.path
+    )
+    assert problem_of(other, preset("b").kinematic()).objective.repetitions == 1

@@ -1,0 +1,89 @@
+"""A small arm whose searches take a second, and a genome some of whose motions are deadly."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from identification import RobotModel
+from identification.excitation import Constraints, Design, Objective, Problem, ViaPointGenome
+from planner import JointLimits, PlanningError
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+VELOCITY = np.array([3.0, 4.0])
+LIMITS = JointLimits([-2.0, -2.5], [2.0, 2.5], VELOCITY, VELOCITY / 0.3, VELOCITY / 0.03)
+
+
+def problem(genome: Any = None, **constraints: Any) -> Problem:
+    """Three via points of a two-joint arm, 13 parameters."""
+    return Problem(
+        genome or ViaPointGenome(LIMITS, n_via=3),
+        Objective(RobotModel.from_urdf(URDF)),
+        Constraints(**{"limits": LIMITS, "max_duration": 20.0, **constraints}),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class MoodyGenome:
+    """Via points, but some values of the first gene are bad for the process that plans them."""
+
+    plain: ViaPointGenome
+    crash: tuple[float, float] = (2.0, 2.0)
+    hang: tuple[float, float] = (2.0, 2.0)
+    refuse: tuple[float, float] = (2.0, 2.0)
+    still: bool = False
+
+    @property
+    def n_genes(self) -> int:
+        return self.plain.n_genes
+
+    def motions(self, genes: np.ndarray) -> list[Any]:
+        if np.any(self.within(genes, self.crash)):
+            os.abort()
+        if np.any(self.within(genes, self.hang)):
+            time.sleep(60.0)
+        if self.still:  # the elbow at least
+            genes = genes.copy()
+            genes[:, 1:-2:2] = 0.5
+        motions: list[Any] = self.plain.motions(genes)
+        for index in np.flatnonzero(self.within(genes, self.refuse)):
+            motions[index] = PlanningError("this motion cannot be")
+        return motions
+
+    def sample(self, random: np.random.Generator, count: int) -> np.ndarray:
+        return self.plain.sample(random, count)
+
+    def excitation(self, *args: Any, **kwargs: Any) -> Any:
+        return self.plain.excitation(*args, **kwargs)
+
+    @staticmethod
+    def within(genes: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:
+        return (genes[:, 0] >= bounds[0]) & (genes[:, 0] <= bounds[1])
+
+
+def moody(**moods: Any) -> MoodyGenome:
+    return replace(MoodyGenome(ViaPointGenome(LIMITS, n_via=3)), **moods)
+
+
+def bits(design: Design) -> dict[str, Any]:
+    """Everything that a design says, arrays as bytes."""
+    front = design.front
+    return {
+        "genes": design.genes.tobytes(),
+        "excitation": design.excitation.to_dict(),
+        "front": [
+            array.tobytes()
+            for array in (front.genes, front.log10_det, front.coupling_index, front.duration)
+        ],
+        "chosen": design.chosen,
+        "history": design.history.tobytes(),
+        "evaluated": design.evaluated,
+        "infeasible": dict(design.infeasible),
+        "complete": design.complete,
+        "scale": design.scale,
+    }

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from identification.excitation import Excitation
+from identification.excitation.criteria import Criteria
+from identification.excitation.excitation import trajectory_from_dict
+from planner import FourierSeries, JointLimits, PiecewiseCubic, plan, plan_moves
+
+LIMITS = JointLimits(
+    lower=np.array([-2.0, -1.0, -3.0]),
+    upper=np.array([2.0, 1.5, 3.0]),
+    velocity=np.array([1.0, 2.0, 3.0]),
+    acceleration=np.array([4.0, 5.0, 9.0]),
+    jerk=np.array([40.0, 50.0, 90.0]),
+)
+
+
+def planned(seed: int, fly: float = 0.5) -> Excitation:
+    random = np.random.default_rng(seed)
+    points = random.uniform(LIMITS.lower, LIMITS.upper, (5, 3))
+    speed = random.uniform(0.2, 1.0, 3)
+    return Excitation(
+        trajectory=plan(points, LIMITS, speed=speed, fly=fly),
+        criteria=Criteria(*random.normal(size=3).tolist(), 700, 1e5, 12.25),
+        method="b",
+        seed=seed,
+        tried=12,
+        rejected={"duration": 3, "collision": 1},
+        via_points=points,
+        speed=speed,
+        fly=fly,
+    )
+
+
+def sines(seed: int) -> Excitation:
+    random = np.random.default_rng(seed)
+    amplitude, frequency = random.uniform(0.1, 1.0, (2, 3, 2))
+    return Excitation(
+        trajectory=FourierSeries(np.zeros(3), amplitude, frequency, 20.0, 2.0),
+        criteria=Criteria(*random.normal(size=3).tolist(), 2501),
+        method="a",
+        seed=seed,
+        tried=100,
+        rejected={},
+    )
+
+
+def through_json(excitation: Excitation) -> Excitation:
+    return Excitation.from_dict(json.loads(json.dumps(excitation.to_dict())))
+
+
+@given(
+    make=st.sampled_from([planned, sines]),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=30, deadline=None)
+def test_an_excitation_survives_being_written_down_to_the_last_bit(make, seed):
+    excitation = make(seed)
+    restored = through_json(excitation)
+    assert restored.to_dict() == excitation.to_dict()
+    assert restored.criteria == excitation.criteria
+    assert (restored.method, restored.seed, restored.tried, dict(restored.rejected)) == (
+        excitation.method,
+        excitation.seed,
+        excitation.tried,
+        excitation.rejected,
+    )
+    times = np.linspace(0.0, excitation.trajectory.duration, 101)
+    assert type(restored.trajectory) is type(excitation.trajectory)
+    for ours, theirs in zip(
+        restored.trajectory.sample(times), excitation.trajectory.sample(times), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("fly", [0.0, 0.3, 1.0])
+def test_its_moves_plan_to_its_motion_bit_for_bit_even_after_being_written_down(fly):
+    excitation = through_json(planned(3, fly))
+    assert excitation.fly == fly
+    again = plan_moves(excitation.via_points[0], excitation.moves, LIMITS)
+    assert again.trajectory.to_dict() == excitation.trajectory.to_dict()
+
+
+def test_sines_have_no_moves_and_say_nothing_of_via_points():
+    excitation = through_json(sines(1))
+    assert excitation.moves is None
+    assert (excitation.via_points, excitation.speed, excitation.fly) == (None, None, None)
+    assert not {"via_points", "speed", "fly"} & excitation.to_dict().keys()
+
+
+def test_what_was_written_down_before_there_were_methods_still_loads():
+    excitation = planned(5)
+    old = excitation.to_dict()
+    del old["method"]
+    for name in ("condition", "scaled_condition"):
+        del old["criteria"][name]
+    restored = Excitation.from_dict(old)
+    assert restored.method == "random"
+    assert (restored.criteria.condition, restored.criteria.scaled_condition) == (None, None)
+    assert restored.criteria.log10_det == excitation.criteria.log10_det
+    np.testing.assert_array_equal(restored.via_points, excitation.via_points)
+
+
+def test_a_motion_of_either_kind_is_restored_by_its_type():
+    for excitation, kind in ((planned(1), PiecewiseCubic), (sines(1), FourierSeries)):
+        assert isinstance(trajectory_from_dict(excitation.trajectory.to_dict()), kind)
+    with pytest.raises(ValueError, match="type"):
+        trajectory_from_dict({"type": "spline"})
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"trajectory": {"type": "fourier_series"}},
+        {"trajectory": {"type": "fourier_series", "length": "long"}},
+        {"criteria": {"log10_det": 1.0}},
+        {"criteria": {**sines(1).to_dict()["criteria"], "beauty": 1.0}},
+        {"seed": "first"},
+        {"rejected": 3},
+    ],
+)
+def test_data_that_are_no_excitation_are_refused(damage):
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        Excitation.from_dict({**sines(1).to_dict(), **damage})
+
+
+@pytest.mark.parametrize("missing", ["trajectory", "criteria", "seed", "tried", "rejected"])
+def test_data_that_lack_something_are_refused(missing):
+    data = sines(1).to_dict()
+    del data[missing]
+    with pytest.raises(KeyError, match=missing):
+        Excitation.from_dict(data)
+
+
+def test_a_planned_motion_without_its_via_points_is_refused():
+    data = planned(1).to_dict()
+    del data["via_points"]
+    with pytest.raises(KeyError, match="via_points"):
+        Excitation.from_dict(data)

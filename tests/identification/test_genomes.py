@@ -1,0 +1,406 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.stats import kstest
+
+from identification import ShapeError
+from identification.excitation import (
+    Box,
+    CollisionChecker,
+    DesignError,
+    Workspace,
+    check_motion,
+)
+from identification.excitation.criteria import Criteria
+from identification.excitation.sines import SineGenome
+from identification.excitation.via_points import ViaPointGenome
+from planner import (
+    FourierSeries,
+    JointLimits,
+    PiecewiseCubic,
+    PlanningChild,
+    check_limits,
+    plan,
+    plan_moves,
+)
+from sim_fixtures.ns16 import urdf_text
+
+DEG = np.pi / 180.0
+HOME = DEG * np.array([0.0, -90.0, 180.0, 0.0, 90.0, 0.0])
+CRITERIA = Criteria(100.0, 90.0, 75.5, 1000)
+RECORD = {"method": "b", "seed": 1, "tried": 2, "rejected": {"duration": 1}}
+
+
+def ns16_limits() -> JointLimits:
+    velocity = DEG * np.array([155.0, 155.0, 170.0, 360.0, 350.0, 550.0])
+    return JointLimits(
+        lower=DEG * np.array([-180.0, -140.0, -20.0, -360.0, -120.0, -360.0]),
+        upper=DEG * np.array([180.0, 5.0, 260.0, 360.0, 120.0, 360.0]),
+        velocity=velocity,
+        acceleration=velocity / 0.3,
+        jerk=velocity / 0.03,
+    )
+
+
+LIMITS = ns16_limits()
+OPEN = ViaPointGenome(LIMITS, n_via=6, slowest=0.3)
+CLOSED = ViaPointGenome(LIMITS, n_via=4, fly=0.7, slowest=0.2, range_share=0.9, home=HOME)
+BARE = SineGenome(LIMITS, length=20.0)
+RAMPED = SineGenome(
+    LIMITS, length=15.0, harmonics=2, ramp=2.0, offset=HOME, fastest=np.full(6, 2.0)
+)
+GENOMES = pytest.mark.parametrize(
+    "genome", [OPEN, CLOSED, BARE, RAMPED], ids=lambda g: repr(g)[:20]
+)
+
+
+def genes_of(genome, rows: int = 1) -> st.SearchStrategy[np.ndarray]:
+    """Any genes, ends included more often than chance would have it."""
+    one = st.one_of(st.sampled_from([0.0, 0.5, 1.0]), st.floats(0.0, 1.0))
+    return arrays(np.float64, (rows, genome.n_genes), elements=one)
+
+
+def some_genes(genome, rows: int, seed: int = 5) -> np.ndarray:
+    return np.random.default_rng(seed).random((rows, genome.n_genes))
+
+
+def bits(motion: PiecewiseCubic | FourierSeries) -> bytes:
+    if isinstance(motion, FourierSeries):
+        return motion.amplitude.tobytes() + motion.frequency.tobytes()
+    return b"".join(array.tobytes() for array in motion.knots + motion.coefficients)
+
+
+# Both kinds
+
+
+def test_a_motion_of_the_papers_size_has_so_many_genes():
+    assert OPEN.n_genes == 6 * 6 + 6  # K = 6 via points and a speed for each joint
+    assert CLOSED.n_genes == 4 * 6 + 6  # home is no gene
+    assert BARE.n_genes == 6 * 3 * 2  # W = 3 amplitudes and frequencies
+
+
+@GENOMES
+@given(data=st.data())
+@settings(max_examples=30, deadline=None)
+def test_decoded_genes_encode_to_themselves(genome, data):
+    genes = data.draw(genes_of(genome))
+    first, second = (each[0] for each in genome.decode(genes))
+    np.testing.assert_allclose(genome.encode(first, second), genes[0], rtol=0.0, atol=1e-12)
+
+
+@GENOMES
+def test_company_changes_no_bit_of_a_motion(genome):
+    genes = some_genes(genome, 5)
+    together = genome.motions(genes)
+    for index in range(5):
+        (alone,) = genome.motions(genes[[index]])
+        assert bits(alone) == bits(together[index])
+
+
+def test_a_motion_is_the_same_in_another_process():
+    with PlanningChild(timeout=60.0) as child:
+        for genome in (OPEN, CLOSED, BARE, RAMPED):
+            genes = some_genes(genome, 2)
+            theirs = child.call(genome.motions, genes)
+            assert [bits(m) for m in theirs] == [bits(m) for m in genome.motions(genes)]
+
+
+@GENOMES
+def test_a_first_population_is_uniform_and_its_seed_decides_it(genome):
+    genes = genome.sample(np.random.default_rng(7), 50)
+    assert genes.shape == (50, genome.n_genes)
+    assert kstest(genes.ravel(), "uniform").pvalue > 0.001
+    np.testing.assert_array_equal(genome.sample(np.random.default_rng(7), 50), genes)
+    assert not np.array_equal(genome.sample(np.random.default_rng(8), 50), genes)
+
+
+@GENOMES
+@pytest.mark.parametrize("stray", [-1e-9, 1.0 + 1e-9, np.nan, np.inf])
+def test_genes_outside_their_range_are_refused(genome, stray):
+    genes = some_genes(genome, 3)
+    genes[1, 4] = stray
+    with pytest.raises(DesignError, match="from 0 to 1"):
+        genome.motions(genes)
+
+
+@GENOMES
+def test_genes_of_another_genome_are_refused(genome):
+    with pytest.raises(ShapeError, match="genes"):
+        genome.motions(np.zeros((3, genome.n_genes + 1)))
+    with pytest.raises(ShapeError):
+        genome.encode(np.zeros((2, 2)), np.zeros(6))
+
+
+def test_a_genome_does_not_change_with_the_array_it_was_made_of():
+    posture, rates = HOME.copy(), np.full(6, 2.0)
+    closed = ViaPointGenome(LIMITS, n_via=2, home=posture)
+    swinging = SineGenome(LIMITS, length=20.0, ramp=2.0, offset=posture, fastest=rates)
+    before = [genome.decode(np.ones(genome.n_genes)) for genome in (closed, swinging)]
+    posture += 0.1
+    rates *= 0.5
+    for genome, expected in zip((closed, swinging), before, strict=True):
+        for ours, theirs in zip(genome.decode(np.ones(genome.n_genes)), expected, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+# Via points
+
+
+@pytest.mark.parametrize("genome", [OPEN, CLOSED])
+def test_genes_at_their_ends_reach_the_ends_of_range_and_speed(genome):
+    lower, upper = LIMITS.lower, LIMITS.upper
+    spare = (1.0 - genome.range_share) / 2.0 * (upper - lower)
+    own = slice(None) if genome.home is None else slice(1, -1)
+    for gene, end, share in ((0.0, lower + spare, genome.slowest), (1.0, upper - spare, 1.0)):
+        points, speed = genome.decode(np.full((1, genome.n_genes), gene))
+        np.testing.assert_array_equal(points[0, own], np.tile(end, (genome.n_via, 1)))
+        np.testing.assert_array_equal(speed, np.full((1, 6), share))
+
+
+@pytest.mark.parametrize("genome", [OPEN, CLOSED])
+@given(data=st.data())
+@settings(max_examples=50, deadline=None)
+def test_no_genes_lead_via_points_or_speeds_beyond_their_range(genome, data):
+    points, speed = genome.decode(data.draw(genes_of(genome, rows=2)))
+    assert np.all((points >= LIMITS.lower) & (points <= LIMITS.upper))
+    assert np.all((speed >= genome.slowest) & (speed <= 1.0))
+
+
+def test_each_gene_moves_one_coordinate_or_one_speed():
+    genes = some_genes(OPEN, 1)
+    points, speed = OPEN.decode(genes)
+    for index in range(OPEN.n_genes):
+        moved = genes.copy()
+        moved[0, index] = 1.0 - moved[0, index]
+        other_points, other_speed = OPEN.decode(moved)
+        changed = np.concatenate(((other_points != points).ravel(), (other_speed != speed).ravel()))
+        assert np.flatnonzero(changed).tolist() == [index]
+
+
+@pytest.mark.parametrize("genome", [OPEN, CLOSED])
+def test_motions_are_the_planners_and_keep_its_limits(genome):
+    genes = some_genes(genome, 6)
+    for motion, points, speed in zip(genome.motions(genes), *genome.decode(genes), strict=True):
+        check_limits(motion, LIMITS.scaled(velocity=speed))
+        alone = plan(points, LIMITS, speed=speed, fly=genome.fly)
+        times = np.linspace(0.0, alone.duration, 300)
+        for ours, theirs in zip(motion.sample(times), alone.sample(times), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_with_a_home_the_path_is_closed_and_without_it_leads_from_first_to_last():
+    for genome, ends in ((CLOSED, (HOME, HOME)), (OPEN, None)):
+        genes = some_genes(genome, 1)
+        points, _ = genome.decode(genes)
+        first, last = ends or points[0, [0, -1]]
+        (motion,) = genome.motions(genes)
+        q, qd, _ = motion.sample(np.array([0.0, motion.duration]))
+        np.testing.assert_allclose(q, [first, last], atol=1e-12)
+        np.testing.assert_allclose(qd, 0.0, atol=1e-9)
+
+
+def test_a_motion_that_cannot_be_planned_is_told_in_its_place(monkeypatch):
+    # No legal genes are known to fail; so the second's via points leave the range on the way.
+    genes = some_genes(OPEN, 3)
+    points, speed = OPEN.decode(genes)
+    points[1, 2, 3] += 100.0
+    monkeypatch.setattr(ViaPointGenome, "decode", lambda self, genes: (points, speed))
+    kinds = [type(motion).__name__ for motion in OPEN.motions(genes)]
+    assert kinds == ["PiecewiseCubic", "ViaPointOutOfLimits", "PiecewiseCubic"]
+
+
+@pytest.mark.parametrize("genome", [OPEN, CLOSED])
+def test_the_record_of_via_points_plans_to_its_motion_bit_for_bit(genome):
+    genes = some_genes(genome, 1)
+    (motion,) = genome.motions(genes)
+    record = genome.excitation(genes[0], motion, CRITERIA, **RECORD)
+    again = plan_moves(record.via_points[0], record.moves, LIMITS)
+    assert again.trajectory.to_dict() == record.trajectory.to_dict()
+    times = np.arange(0.0, motion.duration, 0.001)
+    for ours, theirs in zip(record.trajectory.sample(times), motion.sample(times), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert (record.criteria, record.method, record.seed) == (CRITERIA, "b", 1)
+    assert (record.tried, record.rejected, record.fly) == (2, {"duration": 1}, genome.fly)
+
+
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        ("n_via", {"n_via": 1}),
+        ("n_via", {"n_via": 0, "home": HOME}),
+        ("fly", {"fly": 1.1}),
+        ("fly", {"fly": np.nan}),
+        ("slowest", {"slowest": 0.0}),
+        ("slowest", {"slowest": 1.1}),
+        ("range_share", {"range_share": 0.0}),
+        ("range_share", {"range_share": 1.01}),
+        ("home", {"home": HOME + 10.0}),
+        ("home", {"home": HOME[:5]}),
+        ("home", {"home": HOME * np.nan}),
+    ],
+)
+def test_settings_of_via_points_outside_their_range_are_refused(name, setting):
+    with pytest.raises(DesignError) as refusal:
+        ViaPointGenome(LIMITS, **{"n_via": 6, **setting})
+    assert refusal.value.name == name
+
+
+# Via points among obstacles
+
+
+@pytest.fixture(scope="module")
+def checker():
+    return CollisionChecker(urdf_text(), Workspace(margin=0.05))
+
+
+def feasible(genome, genes, checker) -> float:
+    """Share of genes whose whole motion keeps the clearance, rounded corners and all."""
+    motions = genome.motions(genes)
+    return float(np.mean([check_motion(m, LIMITS, checker=checker).ok for m in motions]))
+
+
+@pytest.mark.parametrize("home", [HOME, None], ids=["closed", "open"])
+def test_the_ways_of_a_first_population_among_obstacles_are_free(checker, home):
+    genome = ViaPointGenome(LIMITS, n_via=5, home=home, checker=checker)
+    points, _ = genome.decode(genome.sample(np.random.default_rng(2), 12))
+    for path in points:
+        for start, end in pairwise(path):
+            steps = int(np.ceil(np.max(np.abs(end - start)) / 0.1)) + 1
+            assert checker.clear(np.linspace(start, end, steps + 1)).all()
+
+
+def test_a_first_population_among_obstacles_is_mostly_feasible(checker):
+    free = ViaPointGenome(LIMITS, n_via=6, home=HOME, checker=checker)
+    blind = ViaPointGenome(LIMITS, n_via=6, home=HOME)
+    random = np.random.default_rng
+    assert feasible(free, free.sample(random(3), 25), checker) >= 0.9
+    assert feasible(blind, blind.sample(random(3), 25), checker) <= 0.7
+
+
+def test_it_is_as_wide_as_the_obstacles_allow_and_its_seed_decides_it(checker):
+    genome = ViaPointGenome(LIMITS, n_via=6, home=HOME, checker=checker)
+    genes = genome.sample(np.random.default_rng(4), 30)
+    np.testing.assert_array_equal(genome.sample(np.random.default_rng(4), 30), genes)
+    coordinates = genes[:, :36].reshape(-1, 6)
+    assert kstest(coordinates[:, 5], "uniform").pvalue > 0.001  # the flange turns in place
+    postures = np.random.default_rng(5).random((500, 6))
+    clear = checker.clear(LIMITS.lower + postures * (LIMITS.upper - LIMITS.lower))
+    assert np.all(np.ptp(coordinates, axis=0) > 0.9 * np.ptp(postures[clear], axis=0))
+
+
+def test_where_nothing_is_free_there_is_a_first_population_all_the_same(checker):
+    everywhere = Workspace(boxes=(Box((-0.5, -0.5, 0.3), (0.5, 0.5, 3.0)),), margin=0.0)
+    buried = CollisionChecker(urdf_text(), everywhere)
+    genome = ViaPointGenome(LIMITS, n_via=1, home=HOME, checker=buried)
+    genes = genome.sample(np.random.default_rng(1), 2)
+    assert genes.shape == (2, 12)
+    assert feasible(genome, genes, buried) == 0.0
+
+
+# Sines
+
+
+def test_genes_at_their_ends_reach_the_papers_bounds():
+    room = np.minimum(LIMITS.upper - HOME, HOME - LIMITS.lower)
+    for gene, side, rates in ((0.0, -1.0, np.full(6, 2 * np.pi / 15.0)), (1.0, 1.0, np.full(6, 2))):
+        amplitude, frequency = RAMPED.decode(np.full((1, RAMPED.n_genes), gene))
+        for sine in range(2):
+            np.testing.assert_array_equal(amplitude[0, :, sine], side * room / 2)
+            np.testing.assert_array_equal(frequency[0, :, sine], rates)
+    amplitude, frequency = BARE.decode(np.ones(BARE.n_genes))
+    half = (LIMITS.upper - LIMITS.lower) / 2.0
+    np.testing.assert_allclose(amplitude[0], np.tile(half[:, None] / 3.0, 3), rtol=1e-15)
+    largest = np.sqrt(LIMITS.acceleration / half)
+    np.testing.assert_allclose(frequency[0], np.tile(largest[:, None], 3), rtol=1e-15)
+
+
+@pytest.mark.parametrize("genome", [BARE, RAMPED])
+@given(data=st.data())
+@settings(max_examples=50, deadline=None)
+def test_no_genes_lead_sines_beyond_the_papers_bounds(genome, data):
+    (motion,) = genome.motions(data.draw(genes_of(genome)))
+    reach = np.abs(motion.amplitude).sum(axis=1)
+    rounding = 1e-12 * np.abs(LIMITS.upper)
+    assert np.all(motion.offset + reach <= LIMITS.upper + rounding)
+    assert np.all(motion.offset - reach >= LIMITS.lower - rounding)
+    slowest, fastest = genome.frequency_range
+    assert np.all(motion.frequency >= slowest[:, None])
+    assert np.all(motion.frequency <= fastest[:, None])
+
+
+@given(genes=genes_of(BARE))
+@settings(max_examples=25, deadline=None)
+def test_bare_sines_keep_the_limits_of_position_and_acceleration(genes):
+    (motion,) = BARE.motions(genes)
+    q, _, qdd = motion.sample(np.linspace(0.0, 20.0, 4001))
+    assert np.all((q >= LIMITS.lower - 1e-12) & (q <= LIMITS.upper + 1e-12))
+    assert np.all(np.abs(qdd) <= LIMITS.acceleration * (1.0 + 1e-12))
+
+
+def test_a_bare_motion_is_equation_8_about_the_middle_of_the_range():
+    genes = some_genes(BARE, 1)
+    amplitude, frequency = (each[0] for each in BARE.decode(genes))
+    (motion,) = BARE.motions(genes)
+    t = np.linspace(0.0, 20.0, 101)
+    middle = (LIMITS.lower + LIMITS.upper) / 2.0
+    expected = middle + np.sum(amplitude * np.sin(frequency * t[:, None, None]), axis=2)
+    np.testing.assert_allclose(motion.sample(t)[0], expected, atol=1e-13)
+    assert np.all(np.abs(motion.sample(t[:1])[1]) > 0.0)
+
+
+def test_with_a_ramp_it_starts_and_ends_at_rest_in_its_offset():
+    (motion,) = RAMPED.motions(some_genes(RAMPED, 1))
+    q, qd, qdd = motion.sample(np.array([0.0, 15.0]))
+    np.testing.assert_array_equal(q, [HOME, HOME])
+    assert not np.any(qd) and not np.any(qdd)
+    assert np.ptp(motion.sample(np.linspace(0.0, 15.0, 500))[0], axis=0).min() > 0.05
+
+
+def test_the_slowest_sine_makes_one_period_which_is_the_papers_figure_for_20_s():
+    slowest, _ = BARE.frequency_range
+    np.testing.assert_allclose(slowest, 0.314, atol=5e-4)  # Table 1
+
+
+def test_genes_of_one_half_are_a_standstill():
+    (motion,) = RAMPED.motions(np.full((1, RAMPED.n_genes), 0.5))
+    assert not np.any(motion.amplitude)
+
+
+def test_the_record_of_sines_is_the_series_itself():
+    genes = some_genes(RAMPED, 1)
+    (motion,) = RAMPED.motions(genes)
+    record = RAMPED.excitation(genes[0], motion, CRITERIA, **{**RECORD, "method": "a"})
+    assert record.trajectory is motion
+    assert (record.via_points, record.speed, record.fly, record.moves) == (None,) * 4
+    assert (record.method, record.tried, record.rejected) == ("a", 2, {"duration": 1})
+
+
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        ("length", {"length": 0.0}),
+        ("length", {"length": np.inf}),
+        ("ramp", {"ramp": -1.0}),
+        ("ramp", {"ramp": 10.1}),
+        ("ramp", {"ramp": np.nan}),
+        ("harmonics", {"harmonics": 0}),
+        ("offset", {"offset": LIMITS.lower}),
+        ("offset", {"offset": HOME[:5]}),
+        ("slowest", {"slowest": np.full(5, 0.3)}),
+        ("slowest", {"slowest": np.zeros(6)}),
+        ("slowest", {"slowest": np.full(6, 5.0)}),
+        ("slowest", {"slowest": np.full(6, np.nan)}),
+        ("slowest", {"length": 1.0}),  # one period is faster than the limits allow
+        ("fastest", {"fastest": np.full(7, 2.0)}),
+    ],
+)
+def test_settings_of_sines_outside_their_range_are_refused(name, setting):
+    with pytest.raises(DesignError) as refusal:
+        SineGenome(LIMITS, **{"length": 20.0, **setting})
+    assert refusal.value.name == name

@@ -1,0 +1,535 @@
+from __future__ import annotations
+
+import io
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identification.excitation import (
+    KINDS,
+    DesignError,
+    Excitation,
+    Front,
+    Journal,
+    NoFeasibleMotionError,
+    Population,
+    Scores,
+    SearchSettings,
+    SineGenome,
+    check_motion,
+    coupling_index_max,
+    midpoints,
+    search,
+)
+from planner import FourierSeries, JointLimits, plan_moves
+from tests.identification.searching import LIMITS, bits, moody, problem
+
+SETTINGS = SearchSettings(population=12, generations=4, seed=3)
+METHODS = ("a", "b", "balanced", "front")
+
+
+class Watched(Population):
+    """Remembers everything that was scored, and can be interrupted.
+
+    What it has scored before it does not score again: many tests ask for the same motions.
+    """
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self._known = {}
+        self.begin()
+
+    def begin(self, interrupted_after: int | None = None):
+        self.genes, self.rows = [], []
+        self.interrupted_after = interrupted_after
+        return self
+
+    def score(self, genes):
+        if len(self.genes) == self.interrupted_after:
+            raise KeyboardInterrupt
+        new = {row.tobytes(): row for row in genes if row.tobytes() not in self._known}
+        if new:
+            rows = super().score(np.array(list(new.values()))).rows
+            self._known.update(zip(new, rows, strict=True))
+        self.genes.append(genes.copy())
+        self.rows.append(np.array([self._known[row.tobytes()] for row in genes]))
+        return Scores.of_rows(self.rows[-1])
+
+    @property
+    def everything(self) -> Scores:
+        return Scores.of_rows(np.concatenate(self.rows))
+
+
+class Stop:
+    """True once it was asked so many times."""
+
+    def __init__(self, after: int):
+        self.left = after
+
+    def __call__(self) -> bool:
+        self.left -= 1
+        return self.left < 0
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch):
+    """A child finds the genomes of these tests under the name that they have here."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
+
+
+@pytest.fixture(scope="module")
+def shared():
+    with Watched(problem()) as population:
+        yield population
+
+
+@pytest.fixture
+def population(shared):
+    return shared.begin()
+
+
+def settings(method, **others) -> SearchSettings:
+    return replace(SETTINGS, method=method, **others)
+
+
+def eq7(scores, p: int) -> np.ndarray:
+    return 0.7 * scores.log10_det + 0.3 * coupling_index_max(p) / scores.coupling_index
+
+
+# ------------------------------------------------------------------ what wins
+
+
+def test_method_a_chooses_the_largest_determinant_of_all_that_was_scored(population):
+    design = search(population, settings("a"))
+    scores = population.everything
+    assert design.front.log10_det[design.chosen] == scores.log10_det.max()
+    assert np.concatenate(population.genes)[np.argmax(scores.log10_det)].tobytes() == (
+        design.genes.tobytes()
+    )
+
+
+def test_method_b_chooses_the_largest_fitness_of_the_paper_s_equation_7(population):
+    design = search(population, settings("b"))
+    scores = population.everything
+    fitness = eq7(scores, 13)
+    np.testing.assert_array_equal(
+        np.concatenate(population.genes)[np.argmax(fitness)], design.genes
+    )
+    np.testing.assert_allclose(design.history[-1, 0], fitness.max(), rtol=1e-12)
+
+
+def test_weights_say_what_counts(population):
+    """All weight on the coupling: the least coupled motion of everything scored."""
+    for method in ("b", "balanced"):
+        design = search(population.begin(), settings(method, weights=(0.0, 1.0)))
+        assert design.front.coupling_index[design.chosen] == (
+            population.everything.coupling_index.min()
+        )
+
+
+def test_balanced_fitness_is_in_units_of_random_motions(population):
+    design = search(population, settings("balanced", weights=(0.5, 0.5)))
+    random = Scores.of_rows(population.rows[0])
+    assert len(random.duration) == 200
+    scores = population.everything
+    gain = (scores.log10_det - np.median(random.log10_det)) / np.subtract(
+        *np.quantile(random.log10_det, (0.75, 0.25))
+    ) + (np.median(random.coupling_index) - scores.coupling_index) / np.subtract(
+        *np.quantile(random.coupling_index, (0.75, 0.25))
+    )
+    np.testing.assert_array_equal(np.concatenate(population.genes)[np.argmax(gain)], design.genes)
+
+
+def test_the_front_is_what_nothing_that_was_scored_beats(population):
+    design = search(population, settings("front"))
+    ld, ic = population.everything.log10_det, population.everything.coupling_index
+    beaten = np.any(
+        (ld >= ld[:, None]) & (ic <= ic[:, None]) & ((ld > ld[:, None]) | (ic < ic[:, None])),
+        axis=1,
+    )
+    front = sorted(zip(ic[~beaten].tolist(), ld[~beaten].tolist(), strict=True))
+    found = zip(design.front.coupling_index.tolist(), design.front.log10_det.tolist(), strict=True)
+    assert front == list(found)
+    assert design.chosen is not None
+    np.testing.assert_array_equal(design.front.genes[design.chosen], design.genes)
+
+
+def test_a_polish_leaves_the_front_as_the_search_found_it(population):
+    plain = search(population, settings("front")).front
+    design = search(population, settings("front", polish=50))
+    for attribute in ("genes", "log10_det", "coupling_index", "duration"):
+        np.testing.assert_array_equal(getattr(design.front, attribute), getattr(plain, attribute))
+    assert design.chosen is None, "the polish found a better one"
+    assert not np.any(np.all(design.front.genes == design.genes, axis=1))
+
+
+def test_without_a_polish_the_knee_of_the_front_is_chosen(population):
+    design = search(population, settings("front"))
+    assert design.chosen == design.front.knee(design.scale)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_polish_never_costs_anything(population, method):
+    plain = search(population, settings(method))
+    polished = search(population, settings(method, polish=60))
+    assert polished.evaluated > plain.evaluated
+    before, after = (population.problem.score(design.genes[None]) for design in (plain, polished))
+    if method == "front":
+        assert after.log10_det[0] >= before.log10_det[0]
+        assert after.coupling_index[0] <= before.coupling_index[0]
+    else:
+        assert _fitness(polished, after) >= _fitness(plain, before)
+
+
+def _fitness(design, scores) -> float:
+    ld, ic = scores.log10_det[0], scores.coupling_index[0]
+    if design.settings.method == "a":
+        return float(ld)
+    weights = design.settings.weights
+    if design.settings.method == "balanced":
+        return float(design.scale.fitness(ld, ic, weights))
+    return float(weights[0] * ld + weights[1] * 78.0 / ic)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_more_generations_never_give_less_and_begin_alike(population, method):
+    short = search(population, settings(method, generations=3)).history
+    long = search(population, settings(method, generations=6)).history
+    assert (len(short), len(long)) == (3, 6)
+    np.testing.assert_array_equal(long[:3], short)
+    if method == "front":
+        assert np.all(np.diff(long[:, 1]) >= 0.0)
+        assert np.all(np.diff(long[:, 2]) <= 0.0)
+    else:
+        assert np.all(np.diff(long[:, 0]) >= 0.0)
+
+
+def test_a_search_finds_more_than_chance_does(population):
+    """Among as many motions: a larger determinant, or more room under the front."""
+    sought = {"population": 30, "generations": 25, "mutation": 0.1}
+    design = search(population, settings("a", **sought))
+    chance = population.score(np.random.default_rng(8).random((design.evaluated, 8)))
+    assert design.excitation.criteria.log10_det > chance.log10_det.max() + 0.5
+    design = search(population, settings("front", **sought))
+    genes = np.random.default_rng(8).random((design.evaluated, 8))
+    by_chance = Front.of(genes, population.score(genes))
+    assert _room_under(design.front) > 1.03 * _room_under(by_chance)
+
+
+def _room_under(front: Front) -> float:
+    """The area that a front beats, above log10 det = 0 and below I_c = 30."""
+    assert front.log10_det[0] > 0.0
+    assert front.coupling_index[-1] < 30.0
+    steps = np.diff(front.coupling_index, append=30.0)
+    return float(front.log10_det @ steps)
+
+
+# ------------------------------------------------------------------ the result
+
+
+def test_generations_count_the_first_random_one(population):
+    design = search(population, settings("b"))
+    assert [len(genes) for genes in population.genes] == [12] * 4
+    assert design.evaluated == design.excitation.tried == 48
+
+
+def test_the_result_is_judged_at_1_ms_by_brute_force(population):
+    design = search(population, settings("b"))
+    model, excitation = population.problem.objective.model, design.excitation
+    motion = midpoints(excitation.trajectory, 0.001)
+    phi = model.regressor(motion.position, motion.velocity, motion.acceleration).dense(13)
+    phi = phi.reshape(-1, 13)
+    _, log_det = np.linalg.slogdet(phi.T @ phi / motion.n_samples)
+    np.testing.assert_allclose(excitation.criteria.log10_det, log_det / np.log(10.0), rtol=1e-9)
+    np.testing.assert_allclose(excitation.criteria.condition, np.linalg.cond(phi), rtol=1e-6)
+    assert excitation.criteria.n_samples == motion.n_samples
+    # what the search saw every 8 ms is nearly that
+    seen = design.front.log10_det[design.chosen]
+    assert abs(excitation.criteria.log10_det - seen) < 0.1
+
+
+def test_the_result_keeps_the_constraints_and_plans_from_its_moves(population):
+    design = search(population, settings("front"))
+    excitation = design.excitation
+    assert check_motion(excitation.trajectory, LIMITS).ok
+    assert excitation.moves is not None
+    again = plan_moves(excitation.via_points[0], excitation.moves, LIMITS).trajectory
+    assert again.to_dict() == excitation.trajectory.to_dict()
+    restored = Excitation.from_dict(excitation.to_dict())
+    assert (restored.method, restored.seed, restored.tried) == ("front", 3, design.evaluated)
+
+
+def test_sums_of_sines_are_searched_like_via_points():
+    """Method A of the paper, eq. 8, with a ramp so that it can be run."""
+    sines = problem(SineGenome(LIMITS, length=6.0, ramp=1.0))
+    with Population(sines) as population:
+        design = search(population, settings("a"))
+    assert isinstance(design.excitation.trajectory, FourierSeries)
+    assert design.excitation.method == "a"
+    assert check_motion(design.excitation.trajectory, LIMITS).ok
+
+
+# ------------------------------------------------------------------ the same every time
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_seed_is_one_design_to_the_last_bit(population, method, capsys):
+    chosen = settings(method, polish=40)
+    np.random.seed(1)  # noqa: NPY002  the generator that everybody shares
+    first = search(population, chosen)
+    between = np.random.get_state()  # noqa: NPY002
+    np.random.seed(2)  # noqa: NPY002
+    np.random.random(5)  # noqa: NPY002
+    again = search(population, chosen, progress=lambda _: np.random.random(3))  # noqa: NPY002
+    assert bits(again) == bits(first)
+    np.random.seed(1)  # noqa: NPY002
+    np.testing.assert_array_equal(np.random.get_state()[1], between[1])  # noqa: NPY002
+    assert capsys.readouterr() == ("", "")
+
+
+def test_another_seed_is_another_design(population):
+    one, other = (search(population, settings("b", seed=seed)) for seed in (3, 4))
+    assert one.genes.tobytes() != other.genes.tobytes()
+
+
+def test_the_number_of_processes_changes_no_bit(population):
+    chosen = settings("front", polish=30)
+    with Population(problem(), workers=3) as three:
+        assert bits(search(three, chosen)) == bits(search(population, chosen))
+
+
+# ------------------------------------------------------------------ stopped and resumed
+
+
+def opened(file, chosen) -> Journal:
+    return Journal(file, problem(), chosen)
+
+
+@pytest.mark.parametrize("method", ["b", "front"])
+@pytest.mark.parametrize("after", [1, 3, 5, 6])
+def test_a_search_that_was_stopped_and_resumed_is_one_that_was_not(population, method, after):
+    chosen = settings(method, polish=60)
+    whole = bits(search(population.begin(), chosen))
+    everything = sum(map(len, population.genes))
+    file = io.BytesIO()
+    half = search(population.begin(), chosen, journal=opened(file, chosen), stop=Stop(after))
+    assert not half.complete
+    assert len(half.history) == min(after, 4)
+    first = sum(map(len, population.genes))
+    journal = opened(file, chosen)
+    resumed = search(population.begin(), chosen, journal=journal)
+    assert bits(resumed) == whole
+    assert resumed.complete
+    assert journal.recalled == first
+    assert sum(map(len, population.genes)) == everything - first
+
+
+@pytest.mark.parametrize("after", [0, 2, 6])
+def test_an_interrupt_loses_the_generation_under_way_and_no_other(population, after):
+    chosen = settings("front", polish=60)
+    whole = bits(search(population, chosen))
+    file = io.BytesIO()
+    with pytest.raises(KeyboardInterrupt):
+        search(population.begin(after), chosen, journal=opened(file, chosen))
+    journal = opened(file, chosen)
+    assert bits(search(population.begin(), chosen, journal=journal)) == whole
+    first = [200, 12, 12, 12, 12, 1, 16]
+    assert journal.recalled == sum(first[:after])
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_search_and_its_processes_and_the_journal_is_whole(population, tmp_path):
+    chosen = settings("front", generations=40, polish=60)
+    path = tmp_path / "search.journal"
+    script = f"""
+import sys
+from identification.excitation import Journal, Population, SearchSettings, search
+from tests.identification.searching import problem
+chosen = {chosen!r}
+def say(progress):
+    print(progress.evaluated, flush=True)
+with open({str(path)!r}, "xb+") as file, Population(problem(), workers=2) as population:
+    print(*(child.pid for child in population._children), flush=True)
+    search(population, chosen, journal=Journal(file, problem(), chosen), progress=say)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    ) as running:
+        pids = [int(pid) for pid in running.stdout.readline().split()]
+        told = [int(running.stdout.readline()) for _ in range(6)]
+        os.killpg(running.pid, signal.SIGINT)
+        rest, said = running.communicate(timeout=20.0)
+    told += [int(line) for line in rest.split()]
+    assert said.rstrip().endswith("KeyboardInterrupt")
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+    with path.open("rb+") as file:
+        journal = opened(file, chosen)
+        resumed = search(population, chosen, journal=journal)
+    assert journal.recalled in (told[-1], told[-1] + 12)  # it may come before that was told
+    assert bits(resumed) == bits(search(population.begin(), chosen))
+
+
+def test_a_finished_search_is_read_again_without_scoring_anything(population):
+    chosen = settings("front", polish=40)
+    file = io.BytesIO()
+    whole = bits(search(population, chosen, journal=opened(file, chosen)))
+    size = len(file.getvalue())
+    again = search(population.begin(), chosen, journal=opened(file, chosen))
+    assert bits(again) == whole
+    assert population.genes == []
+    assert len(file.getvalue()) == size
+
+
+def test_a_journal_that_lost_its_tail_costs_only_that(population):
+    chosen = settings("b")
+    file = io.BytesIO()
+    whole = bits(search(population, chosen, journal=opened(file, chosen)))
+    torn = io.BytesIO(file.getvalue()[:-100])
+    assert bits(search(population.begin(), chosen, journal=opened(torn, chosen))) == whole
+    assert [len(genes) for genes in population.genes] == [12]
+    assert torn.getvalue() == file.getvalue()
+
+
+def test_progress_tells_how_far_it_is_and_what_the_best_is(population):
+    told = []
+    design = search(population, settings("front", polish=40), progress=told.append)
+    assert [each.phase for each in told] == ["sample"] + 4 * ["search"] + 3 * ["polish"]
+    assert [each.generation for each in told] == [0, 1, 2, 3, 4, 4, 4, 4]
+    assert [each.evaluated for each in told][:5] == [200, 212, 224, 236, 248]
+    assert told[-1].evaluated == design.evaluated <= told[-1].total == 200 + 48 + 40
+    assert all(each.feasible == each.evaluated for each in told)
+    knee = told[4]
+    assert np.isfinite(knee.log10_det)
+    before = search(population, settings("front"))
+    assert knee.log10_det == before.front.log10_det[before.chosen]
+
+
+def test_a_polish_can_be_stopped_and_gives_what_it_has(population):
+    chosen = settings("b", polish=200)
+    half = search(population, chosen, stop=Stop(4 + 1 + 2))
+    assert not half.complete
+    assert len(half.history) == 4
+    assert half.evaluated == 48 + 1 + 2 * 16
+
+
+# ------------------------------------------------------------------ constraints
+
+
+def test_a_search_comes_to_what_no_motion_of_its_first_generation_keeps(population):
+    """Infeasible motions lead to feasible ones by how little they miss them."""
+    random = population.problem.score(np.random.default_rng(5).random((400, 8)))
+    bound = float(np.quantile(random.duration, 0.005))
+    told = []
+    with Population(problem(max_duration=bound)) as narrow:
+        design = search(narrow, settings("b", generations=25, mutation=0.1), progress=told.append)
+    assert told[0].feasible == 0
+    assert np.isnan(design.history[0]).all()
+    assert design.excitation.trajectory.duration <= bound
+    assert design.infeasible["duration"] == design.evaluated - told[-1].feasible
+    assert design.excitation.rejected == design.infeasible
+    assert np.all(design.front.duration <= bound)
+
+
+def test_when_nothing_is_feasible_it_says_what_forbids_it_where_and_by_how_much(shared):
+    slow = JointLimits(
+        LIMITS.lower, LIMITS.upper, LIMITS.velocity * [1.0, 0.2], LIMITS.acceleration, LIMITS.jerk
+    )
+    with Watched(problem(limits=slow, max_duration=0.5)) as impossible:
+        with pytest.raises(NoFeasibleMotionError) as caught:
+            search(impossible, settings("front"))
+        scores = impossible.everything
+    error = caught.value
+    assert error.tried == len(scores.duration)
+    assert error.rejected == {
+        "joint limit": int(np.count_nonzero(scores.excess[:, 1])),
+        "duration": error.tried,
+    }
+    assert not error.stopped
+    duration = error.nearest["duration"]
+    assert (duration.value, duration.bound) == (scores.duration.min(), 0.5)
+    limit = error.nearest["joint limit"]
+    assert limit.bound == slow.velocity[1]
+    assert limit.value > limit.bound
+    assert limit.excess == scores.excess[scores.excess[:, 1] > 0.0, 1].min()
+    assert limit.time is not None
+    closest = int(np.argmin(scores.excess.sum(axis=1)))
+    assert {violation.kind: violation.excess for violation in error.closest} == {
+        kind: excess for kind, excess in zip(KINDS, scores.excess[closest], strict=True) if excess
+    }
+    for part in (f"none of {error.tried}", "joint limit", "velocity", f"at {limit.time:.3f} s"):
+        assert part in str(error)
+
+
+def test_a_search_stopped_too_early_says_so(population):
+    with pytest.raises(NoFeasibleMotionError, match=r"no motion was tried.*stopped") as caught:
+        search(population, settings("a"), stop=lambda: True)
+    assert (caught.value.tried, caught.value.stopped) == (0, True)
+    assert population.genes == []
+    with (
+        Population(problem(max_duration=0.5)) as impossible,
+        pytest.raises(NoFeasibleMotionError, match=r"none of 12 .*stopped before its end"),
+    ):
+        search(impossible, settings("a"), stop=Stop(1))
+
+
+def test_motions_that_excite_too_little_are_no_result():
+    """The elbow stands still: every constraint is kept, and its friction cannot be identified."""
+    with Population(problem(moody(still=True))) as population:
+        for method in METHODS:
+            with pytest.raises(NoFeasibleMotionError, match="without excitation") as caught:
+                search(population, settings(method, generations=2))
+            assert caught.value.unexciting == caught.value.tried
+            assert caught.value.rejected == {}
+
+
+def test_a_motion_that_crashes_its_process_is_counted_and_does_not_win(population):
+    small = settings("b", population=6, generations=1)
+    best = search(population, small).genes[0]
+    deadly = moody(crash=(best - 0.01, best + 0.01))
+    with Population(problem(deadly), workers=2) as others:
+        design = search(others, small)
+    assert design.infeasible == {"planning": 1}
+    assert abs(design.genes[0] - best) > 0.01
+
+
+def test_a_search_that_mates_nothing_new_ends_and_is_whole(population):
+    design = search(population, settings("b", population=2, crossover=0.0, mutation=0.0))
+    assert design.complete
+    assert len(design.history) == 1
+    assert design.evaluated == 2
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("method", "c"),
+        ("population", 1),
+        ("generations", 0),
+        ("crossover", 1.1),
+        ("mutation", -0.1),
+        ("mutation", float("nan")),
+        ("weights", (0.0, 0.0)),
+        ("weights", (1.0, -1.0)),
+        ("weights", (1.0,)),
+        ("seed", -1),
+        ("polish", -1),
+        ("crossover_eta", 0.0),
+        ("mutation_eta", float("inf")),
+    ],
+)
+def test_a_setting_outside_its_range_is_refused_by_name(setting, value):
+    with pytest.raises(DesignError, match=setting):
+        SearchSettings(**{setting: value})

@@ -1,0 +1,235 @@
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from identification import RobotModel
+from identification.excitation import (
+    Box,
+    CollisionChecker,
+    CurrentModel,
+    DesignError,
+    Drawing,
+    NoFeasibleMotionError,
+    Workspace,
+    check_motion,
+    random_validation_motions,
+)
+from identification.excitation.collision import joint_poses
+from planner import JointLimits, PlannerCrashed, plan, plan_moves
+from sim_fixtures.ns16 import load_truth, urdf_text
+
+DEG = np.pi / 180.0
+HOME = DEG * np.array([0.0, -90.0, 180.0, 0.0, 90.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def limits():
+    velocity = DEG * np.array([155.0, 155.0, 170.0, 360.0, 350.0, 550.0])
+    return JointLimits(
+        lower=DEG * np.array([-180.0, -140.0, -20.0, -360.0, -120.0, -360.0]),
+        upper=DEG * np.array([180.0, 5.0, 260.0, 360.0, 120.0, 360.0]),
+        velocity=velocity,
+        acceleration=velocity / 0.3,
+        jerk=velocity / 0.03,
+    )
+
+
+@pytest.fixture(scope="module")
+def model():
+    return RobotModel.from_urdf(urdf_text())
+
+
+@pytest.fixture(scope="module")
+def checker():
+    return CollisionChecker(urdf_text(), Workspace(margin=0.05))
+
+
+@pytest.fixture(scope="module")
+def make_currents(model):
+    def make(share):
+        truth = load_truth()
+        friction = np.concatenate((truth.coulomb, truth.viscous, np.zeros(6)))
+        return CurrentModel(
+            model=model,
+            values=np.concatenate((model.base.grouping @ model.nominal, friction)),
+            motor_from_joint=np.diag([116.0, 116.0, 106.0, 50.0, 51.5, 33.0]),
+            torque_constant=np.array([1.1, 1.1, 0.75, 0.36, 0.42, 0.42]),
+            current_limit=share * np.array([16.5, 22.0, 9.5, 3.5, 7.0, 10.0]),
+        )
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def drawn(limits, checker, make_currents):
+    return random_validation_motions(
+        limits, home=HOME, seed=3, count=6, checker=checker, currents=make_currents(1)
+    )
+
+
+def test_they_are_feasible_wide_and_all_different(drawn, limits, checker, make_currents):
+    motions = [each.trajectory for each in drawn]
+    assert len(motions) == 6
+    for motion in motions:
+        assert check_motion(motion, limits, checker=checker, currents=make_currents(1)).ok
+        ends, rates, _ = motion.sample(np.array([0.0, motion.duration]))
+        np.testing.assert_allclose(ends, [HOME, HOME], atol=1e-12)
+        np.testing.assert_allclose(rates, 0.0, atol=1e-9)
+    assert len({motion.duration for motion in motions}) == 6
+    low = np.min([motion.extrema().lower for motion in motions], axis=0)
+    high = np.max([motion.extrema().upper for motion in motions], axis=0)
+    assert np.all((high - low) / (limits.upper - limits.lower) > 0.7)
+
+
+def test_a_seed_gives_the_same_ones_however_many_are_asked_for(
+    drawn, limits, checker, make_currents
+):
+    again = random_validation_motions(
+        limits, home=HOME, seed=3, count=2, checker=checker, currents=make_currents(1)
+    )
+    assert [m.trajectory.to_dict() for m in again] == [m.trajectory.to_dict() for m in drawn[:2]]
+    other = random_validation_motions(limits, home=HOME, seed=4, count=1)
+    assert not np.array_equal(other[0].via_points, drawn[0].via_points)
+
+
+def test_what_was_drawn_plans_to_the_motion_bit_for_bit(limits, checker, make_currents):
+    (motion,) = random_validation_motions(
+        limits, home=HOME, seed=3, count=1, fly=0.3, checker=checker, currents=make_currents(1)
+    )
+    assert motion.fly == 0.3
+    np.testing.assert_array_equal(motion.via_points[[0, -1]], [HOME, HOME])
+    again = plan_moves(motion.via_points[0], motion.moves, limits)
+    assert again.trajectory.to_dict() == motion.trajectory.to_dict()
+
+
+def test_via_points_and_speeds_stay_in_the_share_they_are_given(limits):
+    drawing = Drawing(range_share=0.2, speed=(0.3, 0.3))
+    centre = (limits.lower + limits.upper) / 2
+    (motion,) = random_validation_motions(limits, home=centre, seed=1, count=1, drawing=drawing)
+    reach = np.abs(motion.via_points - centre) / (limits.upper - limits.lower)
+    assert np.all(reach <= 0.1)
+    np.testing.assert_array_equal(motion.speed, 0.3)
+
+
+def test_archives_can_be_repeated_the_motions_of_a_seed_never_change(limits):
+    # Taken when campaigns were first recorded; plans of old archives name these seeds.
+    drawn = random_validation_motions(limits, home=HOME, seed=7, count=2)
+    text = json.dumps([[m.via_points.tolist(), m.speed.tolist()] for m in drawn])
+    assert (
+        hashlib.sha256(text.encode()).hexdigest()
+        == "81044cb7520ca0aff3077b96846fdaf58ac975ee6ca4b7021a38891c0c794bf7"
+    )
+
+
+def test_motions_that_ask_for_too_much_current_are_not_chosen(limits, checker, make_currents):
+    modest = make_currents(0.5)
+    free = random_validation_motions(limits, home=HOME, seed=3, count=6, checker=checker)
+    kept = random_validation_motions(
+        limits, home=HOME, seed=3, count=6, checker=checker, currents=modest
+    )
+    assert not all(check_motion(m.trajectory, limits, currents=modest).ok for m in free)
+    assert all(check_motion(m.trajectory, limits, currents=modest).ok for m in kept)
+
+
+def test_a_motion_whose_planning_kills_its_process_is_passed_over(limits, monkeypatch):
+    first, second = random_validation_motions(limits, home=HOME, seed=3, count=2)
+    calls = []
+
+    def crash_once(*args, **kwargs):
+        calls.append(1)
+        if len(calls) == 1:
+            raise PlannerCrashed(-11)
+        return plan(*args, **kwargs)
+
+    monkeypatch.setattr("identification.excitation.validation_motions.plan_in_child", crash_once)
+    other, same = random_validation_motions(limits, home=HOME, seed=3, count=2)
+    assert not np.array_equal(other.via_points, first.via_points)
+    np.testing.assert_array_equal(same.via_points, second.via_points)
+
+
+def test_when_nothing_is_feasible_the_error_says_what_forbids_it_where_and_by_how_much(
+    limits, make_currents
+):
+    with pytest.raises(NoFeasibleMotionError) as refusal:
+        random_validation_motions(limits, home=HOME, seed=3, count=1, currents=make_currents(0.01))
+    error = refusal.value
+    assert error.rejected == {"current": 100}
+    mildest = error.nearest["current"]
+    assert mildest.subject.startswith("motor of joint_")
+    assert mildest.value > mildest.bound
+    assert str(mildest) in str(error)
+
+
+def test_a_home_posture_in_collision_is_refused_by_the_pair(limits):
+    low = CollisionChecker(urdf_text(), Workspace(floor=1.2, margin=0.0))
+    with pytest.raises(NoFeasibleMotionError, match="floor at home") as refusal:
+        random_validation_motions(limits, home=HOME, seed=1, count=1, checker=low)
+    assert refusal.value.nearest["collision"].value < 0.0
+
+
+def test_a_cell_that_is_full_where_the_arm_should_go_is_refused_by_the_obstacle(
+    model, limits, monkeypatch
+):
+    tries = "identification.excitation.validation_motions._TRIES_PER_MOTION"
+    monkeypatch.setattr(tries, 3)  # each looks at fifty ways
+    middle = (limits.lower + limits.upper) / 2
+    wrist = joint_poses(model.chain, middle[None])[1][5, 0]
+    crate = Box(tuple(wrist - 0.15), tuple(wrist + 0.15))
+    checker = CollisionChecker(urdf_text(), Workspace(boxes=(crate,)))
+    assert checker.clear(HOME[None]).all()
+    with pytest.raises(NoFeasibleMotionError) as refusal:
+        random_validation_motions(
+            limits, home=HOME, seed=1, count=1, drawing=Drawing(range_share=0.02), checker=checker
+        )
+    error = refusal.value
+    assert error.rejected == {"collision": 3}
+    assert error.nearest["collision"].subject.endswith("and box 0")
+    assert len(error.nearest["collision"].posture) == 6
+    assert error.nearest["collision"].value < 0.05
+
+
+@pytest.mark.parametrize(
+    ("drawing", "bound"),
+    [(Drawing(max_duration=2.0), 2.0), (Drawing(min_duration=50.0), 50.0)],
+)
+def test_durations_outside_their_range_are_refused(limits, drawing, bound):
+    with pytest.raises(NoFeasibleMotionError) as refusal:
+        random_validation_motions(limits, home=HOME, seed=1, count=1, drawing=drawing)
+    assert refusal.value.rejected == {"duration": 100}
+    assert refusal.value.nearest["duration"].bound == bound
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("n_via", {"n_via": 0}),
+        ("home", {"home": HOME + 10.0}),
+        ("home", {"home": HOME[:5]}),
+        ("home", {"home": HOME * np.nan}),
+    ],
+)
+def test_settings_outside_their_range_are_refused(limits, name, settings):
+    with pytest.raises(DesignError) as refusal:
+        random_validation_motions(limits, **{"home": HOME, "seed": 1, "count": 1, **settings})
+    assert refusal.value.name == name
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"speed": (0.0, 1.0)},
+        {"speed": (0.9, 0.5)},
+        {"speed": (0.5, 1.1)},
+        {"range_share": 0.0},
+        {"range_share": 1.1},
+        {"min_duration": 5.0, "max_duration": 4.0},
+        {"max_duration": -1.0, "min_duration": -2.0},
+    ],
+)
+def test_drawings_outside_their_range_are_refused(settings):
+    with pytest.raises(DesignError):
+        Drawing(**settings)
