@@ -36,6 +36,7 @@ bench: $(STAMP)  ## every benchmark that needs no data beside the project
 	$(BIN)/python -m benchmarks.regressor
 	$(BIN)/python -m benchmarks.session
 	$(BIN)/python -m benchmarks.planner
+	$(BIN)/python -m benchmarks.design
 	$(BIN)/python -m benchmarks.live_motion
 	$(BIN)/python -m benchmarks.turnaround --busy
 

@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from identification.excitation.poses import joint_poses
+from identification.excitation.collision.poses import joint_poses
 from identification.kinematics import Chain, chain_from_urdf
 
 Array = NDArray[np.float64]

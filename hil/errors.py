@@ -4,6 +4,7 @@
 HilError                   exit status 1
 ├── UnsafeError            3: a motion was refused before anything was sent
 │   ├── MotionRefusedError      limits, current or collision
+│   ├── NoExcitationError       every motion of a design would be refused
 │   └── NotRehearsedError       the controller may be a real one
 ├── ControllerFault        4: the controller, the link or the guard ended a motion
 │   └── MotionFailedError       and what was recorded of it is archived
@@ -14,6 +15,7 @@ HilError                   exit status 1
     │   ├── ArchiveVersionError     written by a newer version of the archive profile
     │   └── ArchiveWriteError       the file cannot be created or the disk refuses
     ├── CellError          the cell file
+    ├── SettingsError      the settings of a design
     ├── CampaignFolderError     the campaign folder
     └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
 ```

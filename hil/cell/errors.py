@@ -38,7 +38,7 @@ def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> 
     if detail["type"] == "extra_forbidden":
         known = ", ".join(sorted(_fields_at(schema, location[:-1])))
         return CellError(
-            path, field, detail["input"], "is not a field of a cell file", f"known are: {known}"
+            path, field, detail["input"], "is not a field that is known here", f"known are: {known}"
         )
     value = None if isinstance(detail["input"], dict) else detail["input"]
     problem, _, remedy = detail["msg"].removeprefix("Value error, ").partition("; ")

@@ -7,7 +7,6 @@ import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -124,7 +123,7 @@ class DesignResult:
             parameters=None if chosen is None else tuple(names[k] for k in chosen),
             front=np.column_stack((front.log10_det, front.coupling_index, front.duration)),
             chosen=design.chosen,
-            versions=versions(),
+            versions=software(),
             archives=archives,
         )
 
@@ -204,7 +203,7 @@ class DesignResult:
         again = _positions(self.excitation.trajectory)
         if positions.shape == again.shape and np.all(np.abs(again - positions) <= _SAME):
             return
-        now = versions()
+        now = software()
         other = [
             f"{k} {v} (here {now.get(k)})" for k, v in self.versions.items() if now.get(k) != v
         ]
@@ -303,11 +302,6 @@ def load_design(path: Path, cell: Cell | None = None) -> Excitation:
     if cell is not None:
         result.require_cell(cell, path)
     return result.excitation
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what a design depends on."""
-    return software() | {name: version(name) for name in ("pymoo", "cma")}
 
 
 def _positions(trajectory: PiecewiseCubic | FourierSeries) -> Array:

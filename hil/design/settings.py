@@ -298,7 +298,7 @@ def _validated(path: Path | None, raw: Mapping[str, Any]) -> DesignSettings:
         found = "" if value is None else f" = {value!r:.60}"
         raise SettingsError(
             path,
-            complaint.problem.replace("of a cell file", "of the settings of a design"),
+            complaint.problem,
             field=f"{complaint.field}{found}",
             remedy=complaint.remedy,
         ) from error

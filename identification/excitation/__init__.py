@@ -1,6 +1,7 @@
 """Choosing motions that excite the parameters: criteria, constraints, searches."""
 
-from identification.excitation.collision import CollisionChecker, Contact
+from identification.excitation.collision.checker import CollisionChecker, Contact
+from identification.excitation.collision.workspace import Box, Wall, Workspace
 from identification.excitation.constraints import (
     KINDS,
     Constraints,
@@ -21,7 +22,6 @@ from identification.excitation.criteria import (
     information,
     log10_det,
 )
-from identification.excitation.design import Design
 from identification.excitation.drawn import DrawnMotion
 from identification.excitation.errors import (
     CollisionModelError,
@@ -32,23 +32,23 @@ from identification.excitation.errors import (
     WorkspaceError,
 )
 from identification.excitation.excitation import Excitation
-from identification.excitation.front import Front
 from identification.excitation.genome import Genome
-from identification.excitation.journal import Journal
-from identification.excitation.ledger import Progress
 from identification.excitation.objective import Measures, Objective
-from identification.excitation.polish import PolishResult, dominating, polish
-from identification.excitation.population import Population
-from identification.excitation.problem import Problem
 from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
-from identification.excitation.scale import SAMPLE_COUNT, Scale
-from identification.excitation.scores import Scores
-from identification.excitation.search import RESCORE_PERIOD, search
-from identification.excitation.settings import Method, SearchSettings
+from identification.excitation.searches.design import Design
+from identification.excitation.searches.front import Front
+from identification.excitation.searches.journal import Journal
+from identification.excitation.searches.ledger import Progress
+from identification.excitation.searches.polish import PolishResult, dominating, polish
+from identification.excitation.searches.population import Population
+from identification.excitation.searches.problem import Problem
+from identification.excitation.searches.run import RESCORE_PERIOD, search
+from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
+from identification.excitation.searches.scores import Scores
+from identification.excitation.searches.settings import Method, SearchSettings
 from identification.excitation.sines import SineGenome
 from identification.excitation.validation_motions import Drawing, random_validation_motions
 from identification.excitation.via_points import ViaPointGenome
-from identification.excitation.workspace import Box, Wall, Workspace
 
 __all__ = [
     # criteria

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.collision import CollisionChecker, PathContact
+from identification.excitation.collision.checker import CollisionChecker, PathContact
 from identification.excitation.current_model import CurrentModel
 from identification.excitation.errors import DesignError
 from identification.excitation.joint_limits import limit_violations, rest_violations

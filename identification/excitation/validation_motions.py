@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.collision import CollisionChecker
+from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.constraints import (
     CurrentModel,
     Violation,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from identification.errors import ShapeError
-from identification.excitation.collision import CollisionChecker
+from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from identification.excitation.collision import CollisionChecker
+from identification.excitation.collision.checker import CollisionChecker
 from planner import JointLimits
 
 Array = NDArray[np.float64]

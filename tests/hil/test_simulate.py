@@ -22,13 +22,13 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from hil.campaign.plan import MotionChecks
 from hil.cell import Cell, CellError
 from hil.cell.text import replaced_value
 from hil.cli import main
 from hil.cli.simulate import simulate
 from hil.cli.simulation_status import WORDS, Status
 from hil.errors import InputError
+from hil.motion_checks import MotionChecks
 from hil.serving import Buttons, open_far_end
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
 from sim_fixtures.ns16 import CELL_PATH

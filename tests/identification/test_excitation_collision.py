@@ -19,7 +19,7 @@ from identification.excitation import (
     Workspace,
     WorkspaceError,
 )
-from identification.excitation.collision import joint_poses
+from identification.excitation.collision.checker import joint_poses
 from identification.excitation.sampling import sampled
 from identification.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, plan

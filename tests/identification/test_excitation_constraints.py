@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification import FrictionLaw, RobotModel, ShapeError
-from identification.excitation.collision import CollisionChecker
+from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.collision.workspace import Workspace
 from identification.excitation.constraints import (
     KINDS,
     Constraints,
@@ -22,7 +23,6 @@ from identification.excitation.constraints import (
 from identification.excitation.errors import DesignError
 from identification.excitation.joint_limits import limit_violations
 from identification.excitation.sampling import sampled
-from identification.excitation.workspace import Workspace
 from planner import FourierSeries, JointLimits, LimitExceeded, check_limits, plan
 
 # Two links of 1 m that swing in a vertical plane: known to every textbook.

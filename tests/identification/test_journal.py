@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import identification.excitation.journal
+import identification.excitation.searches.journal
 from identification import FrictionLaw, RobotModel
 from identification.excitation import (
     ForeignJournalError,
@@ -24,8 +24,8 @@ from identification.excitation import (
     SineGenome,
     ViaPointGenome,
 )
-from identification.excitation.digest import digest
-from identification.excitation.scores import ROW, unplanned
+from identification.excitation.searches.digest import digest
+from identification.excitation.searches.scores import ROW, unplanned
 from planner.remote import load, pack
 from tests.identification.searching import LIMITS, URDF, problem
 
@@ -134,9 +134,9 @@ def test_the_journal_of_another_search_is_refused_by_name(problem_, settings, na
 
 def test_so_is_one_that_another_release_wrote(monkeypatch):
     file, _ = written(1)
-    ours = identification.excitation.journal.versions()
+    ours = identification.excitation.searches.journal.versions()
     monkeypatch.setattr(
-        identification.excitation.journal, "versions", lambda: {**ours, "pymoo": "0.5.0"}
+        identification.excitation.searches.journal, "versions", lambda: {**ours, "pymoo": "0.5.0"}
     )
     with pytest.raises(ForeignJournalError, match=f"pymoo {ours['pymoo']}, installed is 0.5.0"):
         opened(file)
@@ -169,7 +169,7 @@ def test_a_problem_has_one_fingerprint_however_it_was_made():
 def test_a_problem_has_the_same_fingerprint_in_every_process():
     root = Path(__file__).parents[2]
     script = """
-from identification.excitation.digest import digest
+from identification.excitation.searches.digest import digest
 from tests.identification.searching import problem
 print(digest(problem()))
 """

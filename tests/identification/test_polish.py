@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from identification import ShapeError
 from identification.excitation.constraints import KINDS
 from identification.excitation.errors import DesignError
-from identification.excitation.polish import dominating, generation_size, polish
-from identification.excitation.scale import Scale
-from identification.excitation.scores import Scores
+from identification.excitation.searches.polish import dominating, generation_size, polish
+from identification.excitation.searches.scale import Scale
+from identification.excitation.searches.scores import Scores
 
 N = 12
 TARGET = np.linspace(0.2, 0.8, N)
@@ -309,8 +309,8 @@ def test_nonsense_is_refused(genes, evaluations, error):
 
 ON_ITS_OWN = """
 import numpy as np
-from identification.excitation.polish import polish
-from identification.excitation.scores import Scores
+from identification.excitation.searches.polish import polish
+from identification.excitation.searches.scores import Scores
 
 class Bowl:
     def score(self, genes):

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.errors import NoFeasibleMotionError
-from identification.excitation.front import Front
-from identification.excitation.journal import Journal
-from identification.excitation.population import Population
-from identification.excitation.scores import Scores
+from identification.excitation.searches.front import Front
+from identification.excitation.searches.journal import Journal
+from identification.excitation.searches.population import Population
+from identification.excitation.searches.scores import Scores
 from identification.excitation.violation import KINDS, Violation
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.bodies import Body
+from identification.excitation.collision.bodies import Body
 from identification.kinematics import Chain
 
 Array = NDArray[np.float64]

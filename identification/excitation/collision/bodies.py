@@ -12,8 +12,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.excitation.collision.workspace import Workspace
 from identification.excitation.errors import CollisionModelError
-from identification.excitation.workspace import Workspace
 
 Array = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.criteria import fitness_of
-from identification.excitation.front import Front
-from identification.excitation.polish import dominating
-from identification.excitation.scale import Scale
-from identification.excitation.scores import Scores
-from identification.excitation.settings import SearchSettings
+from identification.excitation.searches.front import Front
+from identification.excitation.searches.polish import dominating
+from identification.excitation.searches.scale import Scale
+from identification.excitation.searches.scores import Scores
+from identification.excitation.searches.settings import SearchSettings
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from pymoo.operators.mutation.pm import PM
 from pymoo.operators.selection.tournament import TournamentSelection
 from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
 
-from identification.excitation.scores import Scores
-from identification.excitation.settings import SearchSettings
+from identification.excitation.searches.scores import Scores
+from identification.excitation.searches.settings import SearchSettings
 from identification.excitation.violation import KINDS
 
 Array = NDArray[np.float64]

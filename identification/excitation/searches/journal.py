@@ -21,11 +21,11 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.digest import digest, versions
 from identification.excitation.errors import ForeignJournalError, JournalError
-from identification.excitation.problem import Problem
-from identification.excitation.scores import ROW, Scores
-from identification.excitation.settings import SearchSettings
+from identification.excitation.searches.digest import digest, versions
+from identification.excitation.searches.problem import Problem
+from identification.excitation.searches.scores import ROW, Scores
+from identification.excitation.searches.settings import SearchSettings
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from identification.errors import ShapeError
 from identification.excitation.errors import DesignError
 
 if TYPE_CHECKING:
-    from identification.excitation.scale import Scale
-    from identification.excitation.scores import Scores
+    from identification.excitation.searches.scale import Scale
+    from identification.excitation.searches.scores import Scores
 
 Array = NDArray[np.float64]
 Fitness = Callable[["Scores"], Array]

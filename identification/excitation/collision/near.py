@@ -7,9 +7,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.excitation.collision.scene import Path, Scene
+from identification.excitation.collision.separation import Indices
 from identification.excitation.joint_limits import RateBounds
-from identification.excitation.scene import Path, Scene
-from identification.excitation.separation import Indices
 from identification.motion import Motion
 
 Array = NDArray[np.float64]

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.bodies import Body
-from identification.excitation.poses import Bodies
+from identification.excitation.collision.bodies import Body
+from identification.excitation.collision.poses import Bodies
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

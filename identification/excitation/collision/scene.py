@@ -12,11 +12,18 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.excitation.bodies import link_bodies, obstacles
-from identification.excitation.curvature import Curvature, carrier
-from identification.excitation.poses import Bodies, Frames, frames, placed, travel, turning
-from identification.excitation.separation import Indices, Separation
-from identification.excitation.workspace import Workspace
+from identification.excitation.collision.bodies import link_bodies, obstacles
+from identification.excitation.collision.curvature import Curvature, carrier
+from identification.excitation.collision.poses import (
+    Bodies,
+    Frames,
+    frames,
+    placed,
+    travel,
+    turning,
+)
+from identification.excitation.collision.separation import Indices, Separation
+from identification.excitation.collision.workspace import Workspace
 from identification.kinematics import Chain, chain_from_urdf
 
 Array = NDArray[np.float64]

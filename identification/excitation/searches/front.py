@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from identification.errors import ShapeError
-from identification.excitation.scale import Scale
+from identification.excitation.searches.scale import Scale
 
 if TYPE_CHECKING:
-    from identification.excitation.scores import Scores
+    from identification.excitation.searches.scores import Scores
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.near import BLOCK, Near, Touch, rows_of
-from identification.excitation.scene import Path, Scene
-from identification.excitation.separation import Indices
+from identification.excitation.collision.near import BLOCK, Near, Touch, rows_of
+from identification.excitation.collision.scene import Path, Scene
+from identification.excitation.collision.separation import Indices
 from identification.motion import Motion
 from planner import FourierSeries, PiecewiseCubic
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.excitation import Excitation
-from identification.excitation.front import Front
-from identification.excitation.scale import Scale
-from identification.excitation.settings import SearchSettings
+from identification.excitation.searches.front import Front
+from identification.excitation.searches.scale import Scale
+from identification.excitation.searches.settings import SearchSettings
 
 Array = NDArray[np.float64]
 

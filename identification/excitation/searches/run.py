@@ -14,18 +14,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.design import Design
 from identification.excitation.errors import DesignError
-from identification.excitation.evolution import Evolution
-from identification.excitation.front import Front
-from identification.excitation.goal import Goal
-from identification.excitation.journal import Journal
-from identification.excitation.ledger import Ledger, Phase, Progress
-from identification.excitation.polish import polish
-from identification.excitation.population import Population
-from identification.excitation.scale import SAMPLE_COUNT, Scale
-from identification.excitation.scores import Scores
-from identification.excitation.settings import SearchSettings
+from identification.excitation.searches.design import Design
+from identification.excitation.searches.evolution import Evolution
+from identification.excitation.searches.front import Front
+from identification.excitation.searches.goal import Goal
+from identification.excitation.searches.journal import Journal
+from identification.excitation.searches.ledger import Ledger, Phase, Progress
+from identification.excitation.searches.polish import polish
+from identification.excitation.searches.population import Population
+from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
+from identification.excitation.searches.scores import Scores
+from identification.excitation.searches.settings import SearchSettings
 
 Array = NDArray[np.float64]
 

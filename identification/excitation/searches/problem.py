@@ -12,7 +12,7 @@ from identification.excitation.criteria import Criteria
 from identification.excitation.genome import Genome
 from identification.excitation.objective import Objective
 from identification.excitation.sampling import SAMPLE_PERIOD, sampled
-from identification.excitation.scores import Scores, unplanned
+from identification.excitation.searches.scores import Scores, unplanned
 from identification.excitation.violation import Violation, excess_by_kind
 from planner import FourierSeries, PiecewiseCubic, PlannerError
 

@@ -9,13 +9,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.gaps import touch_between
+from identification.excitation.collision.gaps import touch_between
+from identification.excitation.collision.near import Near, Touch, bulges_of, what_is_near
+from identification.excitation.collision.poses import joint_poses
+from identification.excitation.collision.scene import Path, Scene
+from identification.excitation.collision.separation import Indices
+from identification.excitation.collision.workspace import Workspace
 from identification.excitation.joint_limits import RateBounds, rate_bounds
-from identification.excitation.near import Near, Touch, bulges_of, what_is_near
-from identification.excitation.poses import joint_poses
-from identification.excitation.scene import Path, Scene
-from identification.excitation.separation import Indices
-from identification.excitation.workspace import Workspace
 from identification.motion import Motion
 from planner import FourierSeries, PiecewiseCubic
 
