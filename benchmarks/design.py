@@ -8,9 +8,12 @@ Run with ``python -m benchmarks.design [--json] [--search]``: the NS 16 (6 joint
   friction and rotor columns and the criteria besides; pinocchio makes 60 columns.
 - ``log10_det_difference``: criteria of the columns that both have, ours at 8 ms less those of
   pinocchio's regressor by numpy's QR at 8 ms; ``..._to_1_khz``: less those at 1 kHz.
-- ``individual_ms``: plan, sample, regressor, Gram and criteria of random motions through six via
-  points as a search scores them, their mean; ``individual_worst_ms`` the slowest one,
-  ``individual_20_s_ms`` one that is as long as a motion may be.
+- ``individual_ms``: plan, sample, regressor, Gram and criteria of random motions of method B
+  with its preset, planned eight together as a search does; their mean, and
+  ``individual_worst_ms`` the slowest one, ``individual_20_s_ms`` one that is as long as a motion
+  may be. ``scoring_ms`` and ``scoring_worst_ms``: all that a search does with each, joint limits
+  included. The same of the default search, with ``_front``: 14 via points, and in its scoring
+  floor, self-collision and motor currents as well.
 - with ``--search``: wall time of the paper's whole method B (150 individuals, 120 generations) by
   one worker process and by two, kinematic limits only; and the processor time of all processes in
   it, which is the fairer figure where others use the machine. Some minutes.
@@ -41,18 +44,12 @@ import pinocchio as pin
 
 from benchmarks.regressor import common_columns, pinocchio_gram, timed
 from hil import Cell
-from identification import Motion, RobotModel
-from identification.excitation import (
-    Constraints,
-    Objective,
-    Population,
-    Problem,
-    SearchSettings,
-    ViaPointGenome,
-    search,
-)
-from identification.excitation.sampling import SAMPLE_PERIOD, midpoints
-from planner import JointLimits, PiecewiseCubic, PlannerError
+from hil.design.problem import problem_of, search_settings
+from hil.design.settings import preset
+from identification import Motion
+from identification.excitation import Objective, Population, Problem, search
+from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
+from planner import FourierSeries, JointLimits, PiecewiseCubic, PlannerError
 from planner.arrays import Array
 from planner.batch import plan_chunk
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
@@ -60,45 +57,38 @@ from sim_fixtures.ns16 import CELL_PATH, urdf_text
 N_VIA = 6
 FLY = 0.5
 LONGEST = 20.0
-CHUNK = 32  # motions planned together, as a search does
+CHUNK = 8  # motions planned together, as a search does
 FINE = 1e-3
 
 
-class Individuals(NamedTuple):
-    """Motions by what they are planned from.
+class Times(NamedTuple):
+    """What motions took [s], (m,).
 
     Attributes:
-        via_points: (m, K, n) [rad].
-        speed: (m, n) shares of the joints' velocity limits.
+        judging: plan, sample, regressor, Gram and criteria.
+        scoring: that, and looking after what a motion must keep.
+        planning: the share of planning in both, mean.
+        duration: of the motions themselves.
     """
 
-    via_points: Array
-    speed: Array
-
-
-def random_individuals(limits: JointLimits, count: int, seed: int) -> Individuals:
-    """Draw via points over all of the joints' range, and speeds from 0.3 to 1."""
-    random = np.random.default_rng(seed)
-    shape = (count, N_VIA, limits.n_joints)
-    return Individuals(
-        random.uniform(limits.lower, limits.upper, shape),
-        random.uniform(0.3, 1.0, (count, limits.n_joints)),
-    )
-
-
-def planned(individuals: Individuals, limits: JointLimits) -> list[PiecewiseCubic]:
-    """Plan together what can be planned."""
-    results = plan_chunk([*individuals.via_points], individuals.speed, limits, FLY)
-    return [motion for motion in results if not isinstance(motion, PlannerError)]
+    judging: Array
+    scoring: Array
+    planning: float
+    duration: Array
 
 
 def of_length(limits: JointLimits, seconds: float) -> PiecewiseCubic:
     """Return a random motion, run at the one speed that makes it last so long."""
-    via_points = random_individuals(limits, 1, seed=3).via_points
+    random = np.random.default_rng(3)
+    via_points = [random.uniform(limits.lower, limits.upper, (N_VIA, limits.n_joints))]
     slow, fast = 0.01, 1.0
     for _ in range(40):
         middle = math.sqrt(slow * fast)
-        (motion,) = planned(Individuals(via_points, np.full((1, limits.n_joints), middle)), limits)
+        speed = np.full((1, limits.n_joints), middle)
+        (planned,) = plan_chunk(via_points, speed, limits, FLY)
+        if isinstance(planned, PlannerError):
+            raise planned
+        motion = planned
         slow, fast = (middle, fast) if motion.duration > seconds else (slow, middle)
     return motion
 
@@ -136,48 +126,58 @@ def compare(
     }
 
 
-def time_individuals(
-    objective: Objective, limits: JointLimits, count: int, repetitions: int
-) -> dict[str, float]:
+def time_individuals(cell: Cell, count: int, repetitions: int) -> dict[str, float]:
+    """Time random individuals of method B and of the default search."""
+    result: dict[str, float] = {}
+    b = problem_of(cell, preset("b").kinematic())
+    front = problem_of(cell, preset("front"))
+    for name, problem in (("", b), ("_front", front)):
+        times = time_problem(problem, count, repetitions)
+        for kind, each in (("individual", times.judging), ("scoring", times.scoring)):
+            result[f"{kind}{name}_ms"] = round(float(each.mean()) * 1e3, 3)
+            result[f"{kind}{name}_worst_ms"] = round(float(each.max()) * 1e3, 3)
+        result[f"individuals{name}"] = len(times.judging)
+        result[f"individual{name}_duration_s"] = round(float(times.duration.mean()), 3)
+        if problem is b:
+            longest = of_length(cell.joint_limits, LONGEST)
+            alone = [timed(partial(_judge, b.objective, longest)) for _ in range(3 * repetitions)]
+            result["individual_20_s_ms"] = round(
+                (float(np.median(alone)) + times.planning) * 1e3, 3
+            )
+    return result
+
+
+def time_problem(problem: Problem, count: int, repetitions: int) -> Times:
     """Time random individuals one by one; planning is shared by those planned together."""
-    individuals = random_individuals(limits, count, seed=1)
-    totals: list[Array] = []
+    genes = problem.genome.sample(np.random.default_rng(1), count)
+    judging: list[float] = []
+    scoring: list[float] = []
+    plannings: list[float] = []
     durations: list[float] = []
     for begin in range(0, count, CHUNK):
-        part = Individuals(*(array[begin : begin + CHUNK] for array in individuals))
-        planning = np.median(
-            [timed(partial(planned, part, limits)) for _ in range(repetitions)]
-        ) / len(part.via_points)
-        motions = planned(part, limits)
-        durations += [motion.duration for motion in motions]
-        times = [
-            [timed(partial(_judge, objective, m)) for m in motions] for _ in range(repetitions)
-        ]
-        totals.append(planning + np.median(times, axis=0))
-    longest = of_length(limits, LONGEST)
-    alone = [timed(partial(_judge, objective, longest)) for _ in range(3 * repetitions)]
-    each = np.concatenate(totals) * 1e3
-    return {
-        "individual_ms": round(float(each.mean()), 3),
-        "individual_worst_ms": round(float(each.max()), 3),
-        "individual_20_s_ms": round(float(np.median(alone)) * 1e3 + float(planning) * 1e3, 3),
-        "individuals": len(each),
-        "individual_duration_s": round(float(np.mean(durations)), 3),
-    }
+        part = genes[begin : begin + CHUNK]
+        together = [timed(partial(problem.genome.motions, part)) for _ in range(repetitions)]
+        planning = float(np.median(together)) / len(part)
+        for motion in problem.genome.motions(part):
+            if isinstance(motion, PlannerError):
+                continue
+            tasks = partial(_judge, problem.objective, motion), partial(_check, problem, motion)
+            measured = [[timed(task) for task in tasks] for _ in range(repetitions)]
+            judged, checked = np.median(measured, axis=0).tolist()
+            judging.append(planning + judged)
+            scoring.append(planning + judged + checked)
+            plannings.append(planning)
+            durations.append(motion.duration)
+    return Times(
+        np.array(judging), np.array(scoring), float(np.mean(plannings)), np.array(durations)
+    )
 
 
-def time_search(
-    model: RobotModel, limits: JointLimits, population: int, generations: int
-) -> dict[str, float]:
+def time_search(cell: Cell, population: int, generations: int) -> dict[str, float]:
     """Run the paper's method B by one worker and by two; their results are equal."""
-    problem = Problem(
-        ViaPointGenome(limits, n_via=N_VIA, fly=FLY),
-        Objective(model),
-        Constraints(limits, max_duration=LONGEST),
-    )
-    settings = SearchSettings(
-        method="b", population=population, generations=generations, crossover=0.9, mutation=0.01
-    )
+    asked = preset("b").kinematic()
+    asked = asked.replaced(search={"population": population, "generations": generations})
+    problem, settings = problem_of(cell, asked), search_settings(asked)
     found: dict[str, float] = {}
     fitness = []
     for workers, name in ((1, "ga_one_worker_s"), (2, "ga_two_workers_s")):
@@ -205,17 +205,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--generations", type=int, default=120, help="of the search")
     options = parser.parse_args(arguments)
 
-    limits = Cell.load(CELL_PATH).joint_limits
-    model = RobotModel.from_urdf(urdf_text())
-    objective = Objective(model)
+    cell = Cell.load(CELL_PATH)
+    objective = Objective(cell.model)
     reference = pin.buildModelFromXML(urdf_text())
+    motion = of_length(cell.joint_limits, 16.0)
     result: dict[str, object] = {
-        **compare(objective, reference, of_length(limits, 16.0), options.repetitions),
-        **time_individuals(objective, limits, options.individuals, options.repetitions),
+        **compare(objective, reference, motion, options.repetitions),
+        **time_individuals(cell, options.individuals, options.repetitions),
     }
     if options.search:
-        result |= time_search(model, limits, options.population, options.generations)
-    result["columns"] = model.n_parameters
+        result |= time_search(cell, options.population, options.generations)
+    result["columns"] = cell.model.n_parameters
     result["repetitions"] = options.repetitions
     result["clock"] = "processor time of one thread; searches: wall time"
     if not options.json:
@@ -230,8 +230,12 @@ def _processor_time() -> float:
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
-def _judge(objective: Objective, motion: PiecewiseCubic) -> None:
+def _judge(objective: Objective, motion: PiecewiseCubic | FourierSeries) -> None:
     objective.measures(midpoints(motion, SAMPLE_PERIOD))
+
+
+def _check(problem: Problem, motion: PiecewiseCubic | FourierSeries) -> None:
+    problem.constraints.violations(motion, sampled(motion, SAMPLE_PERIOD))
 
 
 def _room(reference: pin.Model, motion: Motion) -> Array:

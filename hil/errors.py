@@ -3,7 +3,7 @@
 ```
 HilError                   exit status 1
 ├── UnsafeError            3: a motion was refused before anything was sent
-│   ├── MotionRefusedError      limits, current or collision
+│   ├── MotionRefusedError      limits, current, collision, or too long
 │   ├── NoExcitationError       every motion of a design would be refused
 │   └── NotRehearsedError       the controller may be a real one
 ├── ControllerFault        4: the controller, the link or the guard ended a motion

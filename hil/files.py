@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from hil.errors import InputError
@@ -24,11 +25,27 @@ def make_folder(path: Path) -> None:
         raise InputError(path, "cannot be written to", remedy="name another folder")
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace `path` by `text`: a crash leaves the old or the new file, never half of one."""
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Replace `path` by `content`: a crash leaves the old or the new file, never half of one."""
     temporary = path.with_suffix(path.suffix + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(path: Path) -> None:
+    """Have the names in a folder outlive a loss of power, where its file system can do that."""
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -3,12 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Final, Self
 
-from hil.cell import Cell
-from identification.excitation import CollisionChecker, CurrentModel, check_motion
+import numpy as np
+
+from hil.cell import AngleFrame, Cell, CellError
+from hil.violation_text import always_so, violation_text
+from identification.excitation import (
+    CollisionChecker,
+    CollisionModelError,
+    CurrentModel,
+    MissingMeshError,
+    Violation,
+    check_motion,
+)
+from identification.excitation.collision.built_in import told
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic
 from planner.verify import check_rest, check_smooth
+
+LONGEST: Final = 600.0
+"""s; a longer motion is refused. Checking takes time and memory as the motion is long, and an
+interval that fails has to be repeated whole."""
+MOST_SINES: Final = 20
+"""For each joint, as a design may have at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,27 +36,40 @@ class MotionChecks:
         limits: joint limits.
         checker: floor, walls and the arm itself.
         currents: motor currents by the nominal model, with its uncertainty.
+        frame: of the angles in which refusals are worded.
     """
 
     limits: JointLimits
     checker: CollisionChecker
     currents: CurrentModel
+    frame: AngleFrame
 
     @classmethod
     def of(cls, cell: Cell) -> Self:
         """The checks of a cell."""
         return cls(
             limits=cell.joint_limits,
-            checker=CollisionChecker(cell.urdf, cell.workspace),
+            checker=collision_checker(cell),
             currents=current_model(cell),
+            frame=AngleFrame.of(cell),
         )
+
+    @property
+    def not_checked(self) -> str | None:
+        """What is left out, in a sentence: shapes that are always too close; None for nothing."""
+        return told(self.checker.built_in)
 
     def refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> str | None:
         """Why a motion must not be sent, or None if it may be."""
         if trajectory.n_joints != self.limits.n_joints:
             return f"it is for {trajectory.n_joints} joints, the arm has {self.limits.n_joints}"
-        if isinstance(trajectory, FourierSeries) and trajectory.ramp == 0.0:
-            return "its sines begin and end at full speed; give them a ramp"
+        unwieldy = _unwieldy(trajectory)
+        if unwieldy is not None:
+            return unwieldy
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+            return self._refusal(trajectory)
+
+    def _refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> str | None:
         try:
             if isinstance(trajectory, FourierSeries):
                 check_rest(trajectory, self.limits)
@@ -47,8 +77,49 @@ class MotionChecks:
                 check_smooth(trajectory, self.limits)
         except NotSmooth as error:
             return str(error)
+        # First what is quick to tell: nothing else can be told of a motion that is beyond limits.
+        result = check_motion(trajectory, self.limits)
+        if not result.ok:
+            return self._told(result.violations[0])
         result = check_motion(trajectory, self.limits, checker=self.checker, currents=self.currents)
-        return None if result.ok else str(result.violations[0])
+        return None if result.ok else self._told(result.violations[0])
+
+    def _told(self, violation: Violation) -> str:
+        text, remedy = violation_text(violation, self.frame), always_so(violation, self.checker)
+        return text if remedy is None else f"{text}; {remedy}"
+
+
+def collision_checker(cell: Cell) -> CollisionChecker:
+    """Floor, walls and the arm itself, as the limits in use let it move.
+
+    Raises:
+        CellError: its URDF has no collision shapes, or one of its meshes is not to be found.
+    """
+    folders, urdf = cell.mesh_folders, cell.file.cell.urdf
+    try:
+        return CollisionChecker(
+            cell.urdf, cell.workspace, limits=cell.joint_limits, mesh_folders=folders
+        )
+    except MissingMeshError as error:
+        raise CellError(
+            cell.path,
+            "cell.mesh_folders",
+            cell.file.cell.mesh_folders,
+            f"the mesh {error.mesh} of {urdf} is in none of them",
+            "add the folder in which its package:// path begins, or name that folder in "
+            "ROS_PACKAGE_PATH"
+            if error.mesh.startswith("package://")
+            else "write its path in the URDF as package://, or with all folders from the root on",
+        ) from error
+    except CollisionModelError as error:
+        raise CellError(
+            cell.path,
+            "cell.urdf",
+            urdf,
+            str(error),
+            "add <collision> shapes (boxes, cylinders and spheres will do); only a design can do "
+            "without, with collision = false in its [constraints]",
+        ) from error
 
 
 def current_model(cell: Cell) -> CurrentModel:
@@ -62,3 +133,21 @@ def current_model(cell: Cell) -> CurrentModel:
         current_limit=drives.current_limit,
         uncertainty=cell.nominal.uncertainty,
     )
+
+
+def _unwieldy(trajectory: PiecewiseCubic | FourierSeries) -> str | None:
+    """Why a motion cannot even be looked at, or None."""
+    if not trajectory.duration <= LONGEST:
+        return f"it lasts {trajectory.duration:.6g} s; at most {LONGEST:g} s are allowed"
+    if not isinstance(trajectory, FourierSeries):
+        return None
+    if trajectory.ramp == 0.0:
+        return "its sines begin and end at full speed; give them a ramp"
+    sines = trajectory.amplitude.shape[1]
+    if sines > MOST_SINES:
+        return f"it has {sines} sines for each joint; at most {MOST_SINES} are allowed"
+    for quantity, order in (("velocity", 1), ("acceleration", 2), ("jerk", 3)):
+        endless = np.flatnonzero(~np.isfinite(trajectory.derivative_bound(order)))
+        if len(endless):
+            return f"the {quantity} of joint {int(endless[0])} is beyond all numbers"
+    return None

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
+from rich.text import Text
+
+# Columns that a bar takes at least.
+_NARROWEST = 8
 
 
 class Reporter(Protocol):
@@ -99,19 +105,34 @@ class Bar:
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
         """A bar with what is done, the time taken and the time left."""
-        progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
+        progress = _WithNote(
+            _whole(TextColumn, "{task.description}"),
+            BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=_NARROWEST)),
+            _whole(MofNCompleteColumn),
+            _whole(TimeElapsedColumn),
+            _whole(TextColumn, "left"),
+            _whole(TimeRemainingColumn),
             console=self._console,
             transient=True,
+            expand=True,
         )
         with progress:
             yield _BarTask(progress, progress.add_task(title, total=round(total), note=""))
+
+
+class _WithNote(Progress):
+    """Each bar with its note in a line of its own: a terminal of 80 columns holds no more."""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Return bar and note of each task."""
+        for task in self.tasks:
+            yield self.make_tasks_table([task])
+            yield Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
+
+
+def _whole(column: Callable[..., ProgressColumn], *arguments: str) -> ProgressColumn:
+    """Return a column that gives up none of its text for others."""
+    return column(*arguments, table_column=Column(no_wrap=True))
 
 
 class _BarTask:

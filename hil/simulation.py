@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drivers.transports import SimulatedTransport
 from hil.campaign import Link
 from hil.cell import Cell, CellError
-from identification.excitation import CollisionChecker
+from hil.motion_checks import collision_checker
 from sim_fixtures import (
     ControllerSettings,
     PlantTruth,
@@ -118,7 +118,7 @@ def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
     rng = np.random.default_rng(cell.simulation.seed)
     limits, home = cell.joint_limits, cell.home
     reach = np.minimum(0.25 * (limits.upper - limits.lower), np.pi)
-    checker = CollisionChecker(cell.urdf, cell.workspace)
+    checker = collision_checker(cell)
 
     def clear(start: Array, end: Array) -> bool:
         share = np.linspace(0.0, 1.0, _CHECKED)[:, np.newaxis]

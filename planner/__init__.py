@@ -8,7 +8,7 @@ set-point per controller cycle, at an override that may change, and stops it on 
 from __future__ import annotations
 
 from planner.batch import PlanningPool, plan_many
-from planner.children import map_in_children
+from planner.children import chunks_of, map_in_children
 from planner.commands import FlyDistance, FlyPercent, Move, Overrides, Stop
 from planner.errors import (
     InvalidLimits,
@@ -43,6 +43,7 @@ from planner.piecewise_cubic import Extrema, PiecewiseCubic
 from planner.plan import plan
 from planner.plan_file import PlanFile
 from planner.player import TrajectoryPlayer
+from planner.remote import load, pack
 from planner.sampled import SampledTrajectory
 from planner.trajectory import Trajectory
 from planner.verify import check_limits, check_rest
@@ -64,6 +65,9 @@ __all__ = [
     "close_child",
     "PlanningChild",
     "map_in_children",
+    "chunks_of",
+    "pack",
+    "load",
     "check_limits",
     "check_rest",
     "JointLimits",

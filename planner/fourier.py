@@ -162,12 +162,13 @@ class FourierSeries:
             )
         return Extrema(lower, upper, velocity, acceleration, jerk)
 
-    def derivative_bound(self, order: int) -> Array:
+    def derivative_bound(self, order: int, *, ramps: bool = True) -> Array:
         """Bound a derivative's magnitude over all time, order 1 to 5, (n,); far cheaper than tight.
 
-        It is what all sines and ramps of a joint would make, each at its worst at once.
+        It is what all sines and ramps of a joint would make, each at its worst at once. Without
+        `ramps` it holds between them only, where it may be far lower.
         """
-        return self._bounds(order, self.ramp > 0.0)
+        return self._bounds(order, ramps and self.ramp > 0.0)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists; `from_dict` restores every bit, through JSON too."""

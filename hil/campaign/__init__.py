@@ -1,6 +1,6 @@
 """Campaign: plan, run, archive; resumable."""
 
-from .campaign import Campaign, Interval
+from .campaign import Campaign
 from .errors import (
     CampaignFolderError,
     MotionFailedError,
@@ -8,6 +8,7 @@ from .errors import (
     NotRehearsedError,
 )
 from .folder import CampaignFolder
+from .intervals import Interval, require_runnable
 from .link import Link
 from .live_link import LiveLink
 from .motion_link import MotionLink, Progress, Recorded
@@ -33,5 +34,6 @@ __all__ = [
     "Stop",
     "design",
     "plan_around",
+    "require_runnable",
     "stop_on_interrupt",
 ]

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive import ArchiveSpec
 from hil.cell import Cell
@@ -17,46 +14,22 @@ from hil.files import make_folder
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter
 from hil.version import software
-from planner import (
-    FourierSeries,
-    Move,
-    PiecewiseCubic,
-    PlanFile,
-    TrajectoryPlayer,
-    in_child,
-    plan_moves,
-)
+from planner import TrajectoryPlayer
 
-from .errors import (
-    CampaignFolderError,
-    MotionFailedError,
-    MotionRefusedError,
-    NotRehearsedError,
-)
+from .errors import CampaignFolderError, MotionFailedError, NotRehearsedError
 from .folder import CampaignFolder
+from .intervals import (
+    START_TOLERANCE,
+    Interval,
+    require_joined,
+    require_runnable,
+    require_sound,
+    wanted,
+    with_ways,
+)
 from .motion_link import MotionLink
 from .plan import CampaignPlan, moves_to_dict
 from .stop import Stop
-
-Array = NDArray[np.float64]
-
-AT_REST_TOLERANCE = 1e-6
-"""rad; a move shorter than this is not worth an interval."""
-START_TOLERANCE = 1e-3
-"""rad by which a motion may begin elsewhere than where the arm is."""
-
-
-@dataclass(frozen=True, eq=False)
-class Interval:
-    """One interval of motion: what kind it is, the trajectory to run, and the moves behind it."""
-
-    kind: str
-    index: int
-    trajectory: PiecewiseCubic | FourierSeries
-    moves: PlanFile | None = None
-
-    def __str__(self) -> str:
-        return f"{self.kind} {self.index}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +41,22 @@ class Campaign:
     plan: CampaignPlan
 
     @classmethod
-    def create(cls, root: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
+    def create(
+        cls, root: Path, cell: Cell, plan: CampaignPlan, checks: MotionChecks | None = None
+    ) -> Campaign:
         """A new campaign folder with its own copies of cell, URDF and plan.
+
+        Args:
+            root: the folder to make.
+            cell: the cell.
+            plan: excitation and validation motions.
+            checks: those of the cell, where they are at hand.
 
         Raises:
             CampaignFolderError: the folder holds something already.
+            MotionRefusedError: the plan can never run on the cell; no folder was made.
         """
+        require_runnable(cell, plan, checks)
         make_folder(root)
         if any(root.iterdir()):
             raise CampaignFolderError(root, "is not empty", "name a new folder")
@@ -132,8 +115,17 @@ class Campaign:
             raise NotRehearsedError
         with self.folder.locked():
             self.folder.require_unchanged()
-            intervals = self._missing(link.connect(stop))
-            self._check(intervals)
+            intervals = self._missing()
+            checks = MotionChecks.of(self.cell)
+            if checks.not_checked is not None:
+                reporter.say(checks.not_checked)
+            # What is wrong with a motion itself is told before anything is connected.
+            require_sound(intervals, checks)
+            where = link.connect(stop)
+            if intervals:
+                intervals = with_ways(self.cell, intervals, where)
+                require_sound([way for way in intervals if way.kind == "move"], checks)
+                require_joined(intervals)
             total = sum(interval.trajectory.duration for interval in intervals)
             with reporter.task("running the campaign (s of motion)", total) as task:
                 for interval in intervals:
@@ -143,75 +135,13 @@ class Campaign:
                     task.advance(interval.trajectory.duration, str(interval))
             link.close()
 
-    def _check(self, intervals: list[Interval]) -> None:
-        """Refuse the campaign if one of its motions must not be sent.
-
-        Each motion is checked once, and that each begins where the one before ends.
-        """
-        checks = MotionChecks.of(self.cell)
-        checked: set[int] = set()
-        before: Interval | None = None
-        for interval in intervals:
-            problem = None
-            if id(interval.trajectory) not in checked:
-                problem = checks.refusal(interval.trajectory)
-                checked.add(id(interval.trajectory))
-            if problem is None and before is not None:
-                problem = _jump(before, interval)
-            if problem is not None:
-                raise MotionRefusedError(
-                    str(interval), problem, "jog the arm or design another motion"
-                )
-            before = interval
-
-    def _missing(self, where: Array) -> list[Interval]:
-        """What is still to be run with the arm at `where` (n,), there and back in the end."""
-        settings, home, archived = self.cell.campaign, self.cell.home, self.folder
-        excitation, moves = self.plan.excitation.trajectory, self.plan.moves
-        wanted = [
-            Interval("standstill", 0, hold(home, settings.standstill_s)),
-            *(Interval("excitation", i, excitation, moves) for i in range(settings.repetitions)),
-            *(
-                Interval("validation", i, motion.trajectory, motion.moves)
-                for i, motion in enumerate(self.plan.validation)
-            ),
+    def _missing(self) -> list[Interval]:
+        """What is still to be run."""
+        return [
+            interval
+            for interval in wanted(self.cell, self.plan)
+            if self.folder.whole(interval.kind, interval.index) is None
         ]
-        missing = [w for w in wanted if archived.whole(w.kind, w.index) is None]
-        return self._with_ways(missing, where) if missing else []
-
-    def _with_ways(self, intervals: list[Interval], where: Array) -> list[Interval]:
-        """Put moves between: from `where` (n,) to home, from home to an excitation, and back.
-
-        An excitation may begin and end elsewhere than at home; whatever else does is not met.
-        """
-        home, at = self.cell.home, where
-        joined: list[Interval] = []
-        ways: dict[bytes, Interval] = {}
-
-        def go(target: Array) -> None:
-            nonlocal at
-            if np.max(np.abs(target - at)) > AT_REST_TOLERANCE:
-                key = at.tobytes() + target.tobytes()
-                if key not in ways:
-                    ways[key] = self._way(at, target)
-                index = sum(interval.kind == "move" for interval in joined)
-                joined.append(replace(ways[key], index=index))
-            at = target
-
-        for interval in intervals:
-            start, end = _ends(interval) if interval.kind == "excitation" else (home, home)
-            go(start)
-            joined.append(interval)
-            at = end
-        go(home)
-        go(where)
-        return joined
-
-    def _way(self, start: Array, end: Array) -> Interval:
-        """The straight way between two postures; planned where a crash does not end us."""
-        move = Move(end, speed=self.cell.campaign.approach_speed)
-        motion = in_child(plan_moves, start, (move,), self.cell.joint_limits)
-        return Interval("move", 0, motion.trajectory, PlanFile.of(motion, self.cell.joint_names))
 
     def _run_one(
         self,
@@ -271,30 +201,3 @@ class Campaign:
             "cell": self.cell.name,
             **{f"software.{name}": version for name, version in software().items()},
         }
-
-
-def _jump(before: Interval, after: Interval) -> str | None:
-    """Why `after` cannot follow `before`, or None if it begins where that ends."""
-    (_, end), (start, _) = _ends(before), _ends(after)
-    distance = np.abs(start - end)
-    if np.max(distance) <= START_TOLERANCE:
-        return None
-    joint = int(np.argmax(distance))
-    return (
-        f"it begins with joint {joint + 1} at {start[joint]:.6g} rad, but {before} ends at "
-        f"{end[joint]:.6g} rad"
-    )
-
-
-def _ends(interval: Interval) -> tuple[Array, Array]:
-    """Where a motion begins and where it ends, (n,) [rad] each."""
-    start, end = interval.trajectory.sample(np.array([0.0, interval.trajectory.duration]))[0]
-    return start, end
-
-
-def hold(position: Array, duration: float) -> PiecewiseCubic:
-    """Rest at `position` (n,) [rad] for `duration` [s]."""
-    return PiecewiseCubic(
-        knots=tuple(np.array([0.0, duration]) for _ in position),
-        coefficients=tuple(np.array([[q, 0.0, 0.0, 0.0]]) for q in position),
-    )

@@ -8,17 +8,20 @@ from typing import Final
 
 from hil.cell import Cell
 from hil.design import DesignSettings, preset, run_search
+from hil.design.advice import NoExcitationError, forbidden
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter
 from identification.excitation import (
     RESCORE_PERIOD,
     DrawnMotion,
     Excitation,
+    NoFeasibleMotionError,
     Objective,
     random_validation_motions,
 )
 from planner import PlanFile
 
+from .errors import MotionRefusedError
 from .plan import CampaignPlan, PlannedMotion
 
 LEAST: Final = 4
@@ -36,8 +39,8 @@ def design(cell: Cell, reporter: Reporter) -> CampaignPlan:
     searches longer and finds better ones.
 
     Raises:
-        NoExcitationError: says which constraint forbids every motion, where, and by how much.
-        NoFeasibleMotionError: the same of the validation motions.
+        NoExcitationError: says which constraint forbids every motion, where, and by how much;
+            of the validation motions as well.
     """
     excitation = run_search(cell, quick_settings(cell), reporter).excitation
     return plan_around(cell, excitation)
@@ -67,32 +70,45 @@ def plan_around(
 
     Args:
         cell: whose `[campaign]` says how many validation motions, and from which seed.
-        excitation: designed for this cell; a campaign checks it before anything moves.
+        excitation: designed for this cell.
         checks: those of the cell, where they are at hand.
 
     Raises:
-        NoFeasibleMotionError: no validation motion keeps the constraints; says which one.
+        MotionRefusedError: the excitation must not be sent to this cell's arm.
+        NoExcitationError: no validation motion keeps the constraints; says which one.
     """
-    settings, checks = cell.campaign, checks or MotionChecks.of(cell)
+    checks = checks or MotionChecks.of(cell)
+    problem = checks.refusal(excitation.trajectory)
+    if problem is not None:
+        raise MotionRefusedError("the excitation", problem, "design another motion")
     # A design may have judged some parameters only, or what it adds to earlier archives; what is
     # executed is compared with the motion by itself, over all parameters.
     criteria = Objective(cell.model).criteria(excitation.trajectory, RESCORE_PERIOD)
     excitation = replace(excitation, criteria=criteria)
-    validation = random_validation_motions(
-        cell.joint_limits,
-        home=cell.home,
-        seed=settings.seed,
-        count=settings.validation_runs,
-        n_via=settings.n_via,
-        fly=settings.fly,
-        checker=checks.checker,
-        currents=checks.currents,
-    )
+    validation = _validation_motions(cell, checks)
     return CampaignPlan(
         excitation,
         tuple(PlannedMotion(drawn.trajectory, _moves_of(cell, drawn)) for drawn in validation),
         _moves_of(cell, excitation),
     )
+
+
+def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[DrawnMotion, ...]:
+    settings = cell.campaign
+    try:
+        return random_validation_motions(
+            cell.joint_limits,
+            home=cell.home,
+            seed=settings.seed,
+            count=settings.validation_runs,
+            n_via=settings.n_via,
+            fly=settings.fly,
+            checker=checks.checker,
+            currents=checks.currents,
+        )
+    except NoFeasibleMotionError as error:
+        told = forbidden(error, checks.frame)
+        raise NoExcitationError(f"no motion to test the result with: {told}") from error
 
 
 def _moves_of(cell: Cell, motion: Excitation | DrawnMotion) -> PlanFile | None:

@@ -2,5 +2,6 @@
 
 from .cell import Cell
 from .errors import CellError
+from .frame import AngleFrame
 
-__all__ = ["Cell", "CellError"]
+__all__ = ["AngleFrame", "Cell", "CellError"]

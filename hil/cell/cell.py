@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tomllib
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +23,7 @@ from identification.model import RobotModel
 from planner import JointLimits
 
 from . import link
-from .checks import check_built, check_lengths
+from .checks import check_assumed, check_built, check_lengths, check_turning
 from .errors import CellError, first_error
 from .schema import (
     BoundsTable,
@@ -110,6 +111,8 @@ class Cell:
             raise CellError(
                 path, "cell.urdf", cell.file.cell.urdf, str(error), "correct the URDF"
             ) from error
+        check_assumed(cell)
+        check_turning(cell)
         check_lengths(cell)
         check_built(cell)
         return cell
@@ -118,6 +121,11 @@ class Cell:
     def name(self) -> str:
         """The cell's short name."""
         return self.file.cell.name
+
+    @property
+    def mesh_folders(self) -> tuple[str, ...]:
+        """Where `package://` paths of the URDF's meshes begin, on this computer."""
+        return tuple(str(self.path.parent / name) for name in self.file.cell.mesh_folders)
 
     @cached_property
     def model(self) -> RobotModel:
@@ -283,8 +291,15 @@ class Cell:
         return Cell.from_texts(text, self.urdf, self.path)
 
     def with_urdf(self, path: Path, name: str) -> Cell:
-        """This cell as a file `path` whose URDF is called `name`."""
+        """This cell as a file `path` whose URDF is called `name`; meshes stay where they are."""
         text = replaced_value(self.text, "cell", "urdf", json.dumps(name))  # JSON is TOML here
+        named = self.file.cell.mesh_folders
+        if named:
+            moved = [
+                folder if Path(folder).is_absolute() else os.path.relpath(place, path.parent)
+                for folder, place in zip(named, self.mesh_folders, strict=True)
+            ]
+            text = replaced_value(text, "cell", "mesh_folders", json.dumps(moved))
         return Cell.from_texts(text, self.urdf, path)
 
     @property
@@ -299,7 +314,7 @@ class Cell:
             rotor_inertia=np.array(table.rotor_inertia),
             coulomb=np.array(table.coulomb),
             viscous=np.array(table.viscous),
-            third=np.array(table.third),
+            third=np.array(table.third) if table.third else np.zeros(len(self.joint_names)),
         )
 
     def parameter_values(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drivers.errors import DriverError
+from identification.kinematics import chain_from_urdf
 
 from .errors import CellError
 from .urdf import urdf_limits
@@ -17,24 +18,43 @@ if TYPE_CHECKING:
 URDF_ROUNDING = 1e-5
 """Relative; a data sheet's degrees and a URDF's radians are rounded differently."""
 
-_NOT_PER_JOINT = {"gravity", "assumed", "elasticity"}
+_MAY_BE_EMPTY = {"nominal.third", "simulation.elasticity"}
+_TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
 
 
 def check_lengths(cell: Cell) -> None:
     """Every list that has one entry per joint has as many as the URDF has joints."""
     n_joints = cell.model.n_joints
-    simulation = cell.file.simulation
-    if simulation is not None and len(simulation.elasticity) not in (0, n_joints):
-        raise CellError(
-            cell.path,
-            "simulation.elasticity",
-            simulation.elasticity,
-            f"has {len(simulation.elasticity)} entries, the URDF {n_joints} joints",
-            "give one for each joint, or none",
-        )
+    for table_name in ("nominal", "limits", "drive_train", "campaign", "simulation"):
+        for name, value in getattr(cell.file, table_name) or ():
+            field = f"{table_name}.{name}"
+            if not isinstance(value, list) or len(value) == n_joints:
+                continue
+            if value or field not in _MAY_BE_EMPTY:
+                or_none = " or none" if field in _MAY_BE_EMPTY else ""
+                raise CellError(
+                    cell.path,
+                    field,
+                    value,
+                    f"has {len(value)} entries but the URDF has {n_joints} joints",
+                    f"give one entry for each of {', '.join(cell.joint_names)}{or_none}",
+                )
+
+
+def check_assumed(cell: Cell) -> None:
+    """What is called assumed stands in the file."""
     for name in cell.file.cell.assumed:
         table, _, field = name.partition(".")
-        if field not in getattr(type(getattr(cell.file, table, None)), "model_fields", {}):
+        known = table in type(cell.file).model_fields
+        if known and getattr(cell.file, table) is None:
+            raise CellError(
+                cell.path,
+                table,
+                None,
+                f"is missing, though cell.assumed names {name}",
+                f"add a table [{table}], or take that name out",
+            )
+        if not known or field not in type(getattr(cell.file, table)).model_fields:
             raise CellError(
                 cell.path,
                 "cell.assumed",
@@ -42,17 +62,22 @@ def check_lengths(cell: Cell) -> None:
                 "names no field of this file",
                 'name fields as "table.field"',
             )
-    for table_name in ("nominal", "limits", "drive_train", "campaign", "simulation"):
-        table = getattr(cell.file, table_name)
-        for name, value in table or ():
-            if isinstance(value, list) and name not in _NOT_PER_JOINT and len(value) != n_joints:
-                raise CellError(
-                    cell.path,
-                    f"{table_name}.{name}",
-                    value,
-                    f"has {len(value)} entries but the URDF has {n_joints} joints",
-                    f"give one entry for each of {', '.join(cell.joint_names)}",
-                )
+
+
+def check_turning(cell: Cell) -> None:
+    """What is given in degrees and revolutions is given for joints that turn."""
+    tables = [name for name in _TURNING_ONLY if getattr(cell.file, name) is not None]
+    revolute = chain_from_urdf(cell.urdf).revolute
+    for name, turns in zip(cell.joint_names, revolute, strict=True):
+        if tables and not turns:
+            raise CellError(
+                cell.path,
+                tables[0],
+                None,
+                f"is in degrees and revolutions, but joint {name} slides",
+                'fix it in the URDF (type = "fixed"); an arm with sliding joints can be '
+                "identified from recordings, but not moved",
+            )
 
 
 def check_built(cell: Cell) -> None:
@@ -61,10 +86,13 @@ def check_built(cell: Cell) -> None:
     _build(cell, "workspace", "workspace")
     if file.drive_train is not None:
         _build(cell, "drive_train", "drive_train")
-    if file.drive_train is not None and file.limits is not None:
+    if file.limits is None:
+        return
+    if file.drive_train is not None or file.limits.frame == "urdf":
         _build(cell, "limits", "joint_limits")
         _check_against_urdf(cell)
         _check_postures(cell)
+    if file.drive_train is not None:
         _build(cell, "bounds", "guard_limits")
 
 

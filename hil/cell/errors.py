@@ -54,7 +54,7 @@ def _dotted(location: list[Any]) -> str:
 
 
 def _is_union_tag(part: object) -> bool:
-    return isinstance(part, str) and ("[" in part or part in {"none", "str", "list"})
+    return isinstance(part, str) and ("[" in part or part in {"none", "str", "list", "float"})
 
 
 def _walk(schema: type[BaseModel], location: list[Any]) -> tuple[type[BaseModel] | None, str]:

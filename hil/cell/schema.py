@@ -11,15 +11,19 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-NonNegative = Annotated[FiniteFloat, Field(ge=0)]
-Vector = list[FiniteFloat]
+# Strict: TOML has numbers and truth values of its own, so "yes" and "3" are slips of the pen.
+Number = Annotated[FiniteFloat, Field(strict=True)]
+Whole = Annotated[int, Field(strict=True)]
+Choice = Annotated[bool, Field(strict=True)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+Vector = list[Number]
 PositiveVector = list[Positive]
-Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Point = tuple[Number, Number, Number]
 
 
-ArmAxis = tuple[Annotated[int, Field(ge=1, le=4)], Annotated[int, Field(ge=1, le=10)]]
-Factor = Annotated[FiniteFloat, Field(gt=1, le=5)]
+ArmAxis = tuple[Annotated[Whole, Field(ge=1, le=4)], Annotated[Whole, Field(ge=1, le=10)]]
+Factor = Annotated[Number, Field(gt=1, le=5)]
 
 
 class _Table(BaseModel):
@@ -36,17 +40,22 @@ class CellTable(_Table):
         default_factory=list,
         description="dotted names of fields whose values are assumed, not measured",
     )
+    mesh_folders: list[str] = Field(
+        default_factory=list,
+        description="folders, relative to this cell file, in which package:// paths of the URDF's "
+        "meshes begin",
+    )
 
 
 class FrictionTable(_Table):
     """`[robot] friction`: which friction columns each joint gets."""
 
-    coulomb: bool = Field(default=True, description="true or false: f0 sgn(qd)")
-    viscous: bool = Field(default=True, description="true or false: f1 qd")
+    coulomb: Choice = Field(default=True, description="true or false: f0 sgn(qd)")
+    viscous: Choice = Field(default=True, description="true or false: f1 qd")
     third: Literal["quadratic", "cubic", "none"] = Field(
         default="quadratic", description='"quadratic" (sgn(qd) qd²), "cubic" (qd³) or "none"'
     )
-    offset: bool = Field(default=False, description="true or false: a constant torque per joint")
+    offset: Choice = Field(default=False, description="true or false: a constant torque per joint")
     standstill: NonNegative = Field(
         default=0.02, description="speed in rad/s below which a joint's row is not used for fitting"
     )
@@ -58,7 +67,7 @@ class RobotTable(_Table):
     gravity: Annotated[Vector, Field(min_length=3, max_length=3)] = Field(
         default=[0.0, 0.0, -9.81], description="gravity in the base frame, three figures in m/s²"
     )
-    rotor_inertia: bool = Field(
+    rotor_inertia: Choice = Field(
         default=True, description="true or false: one rotor inertia per joint"
     )
     friction: FrictionTable = Field(
@@ -72,7 +81,10 @@ class NominalTable(_Table):
     rotor_inertia: list[NonNegative] = Field(description="kg·m² at the joint, one per joint")
     coulomb: list[NonNegative] = Field(description="Coulomb friction in N·m, one per joint")
     viscous: list[NonNegative] = Field(description="viscous friction in N·m·s/rad, one per joint")
-    third: Vector = Field(description="third friction coefficient, one per joint; 0 if unknown")
+    third: Vector = Field(
+        default_factory=list,
+        description="third friction coefficient, one per joint; nothing for zeros",
+    )
     uncertainty: NonNegative = Field(
         default=0.1, description="relative uncertainty of the nominal torque, e.g. 0.1 for 10 %"
     )
@@ -128,9 +140,9 @@ class DriveTrainTable(_Table):
         description="signed motor revolutions per joint revolution, none of them 0"
     )
     calibration: Vector = Field(description="motor revolutions at controller angle 0")
-    k54: FiniteFloat = Field(default=0.0, description="wrist coupling of axis 4 into motor 5")
-    k64: FiniteFloat = Field(default=0.0, description="wrist coupling of axis 4 into motor 6")
-    k65: FiniteFloat = Field(default=0.0, description="wrist coupling of axis 5 into motor 6")
+    k54: Number = Field(default=0.0, description="wrist coupling of axis 4 into motor 5")
+    k64: Number = Field(default=0.0, description="wrist coupling of axis 4 into motor 6")
+    k65: Number = Field(default=0.0, description="wrist coupling of axis 5 into motor 6")
     joint_sign: list[Literal[-1, 1]] = Field(
         description="1 or -1: sense of the controller's angle against the URDF's"
     )
@@ -140,7 +152,7 @@ class DriveTrainTable(_Table):
     torque_constant: PositiveVector = Field(description="N·m/A at the motor, all above 0")
     current_limit: PositiveVector = Field(description="A at the motor, one per joint")
     following_error: PositiveVector = Field(description="threshold in motor revolutions")
-    encoder_counts_per_revolution: int = Field(gt=0, description="encoder counts per motor turn")
+    encoder_counts_per_revolution: Whole = Field(gt=0, description="encoder counts per motor turn")
 
     @model_validator(mode="after")
     def _nonzero(self) -> DriveTrainTable:
@@ -161,8 +173,8 @@ class CanTable(_Table):
     )
     channel: str = Field(min_length=1, description='channel of it, e.g. "can0" or "/dev/ttyACM0"')
     profile: Literal["fd", "classic"] = Field(default="fd", description='"fd" or "classic"')
-    bitrate: int | None = Field(default=None, gt=0, description="bit/s, where we have to set it")
-    data_bitrate: int | None = Field(
+    bitrate: Whole | None = Field(default=None, gt=0, description="bit/s, where we have to set it")
+    data_bitrate: Whole | None = Field(
         default=None, gt=0, description="bit/s of the data phase, where we have to set it"
     )
 
@@ -176,13 +188,13 @@ class ControllerTable(_Table):
         default=4, description="the open mode of campaigns: 4 (absolute position)"
     )
     host: str = Field(default="10.2.12.150", description="address of the controller")
-    port: int = Field(default=1000, gt=0, lt=65536, description="UDP port, 1 to 65535")
+    port: Whole = Field(default=1000, gt=0, lt=65536, description="UDP port, 1 to 65535")
     bind: str = Field(
         default="0.0.0.0", description="address of this PC to listen on, 0.0.0.0 for all of them"
     )
     can: CanTable | None = Field(default=None, description="a table that names the CAN adapter")
-    arm: int = Field(default=1, ge=1, le=4, description="arm of the controller, 1 to 4")
-    max_gap: int = Field(
+    arm: Whole = Field(default=1, ge=1, le=4, description="arm of the controller, 1 to 4")
+    max_gap: Whole = Field(
         default=2,
         ge=0,
         le=5,
@@ -193,7 +205,7 @@ class ControllerTable(_Table):
         description="pairs [arm, axis], both from 1, of axes that may be open though they are no "
         "joints of this cell, e.g. [[1, 7]]",
     )
-    current_delay_cycles: FiniteFloat = Field(
+    current_delay_cycles: Number = Field(
         default=0.0,
         description="cycles by which the position of a packet is newer than its target current",
     )
@@ -217,7 +229,7 @@ class BoxTable(_Table):
 class WorkspaceTable(_Table):
     """`[workspace]`: what the arm must not touch, in the base frame."""
 
-    floor: FiniteFloat | Literal["none"] = Field(
+    floor: Number | Literal["none"] = Field(
         default=0.0, description='height of the floor in m, or "none"'
     )
     walls: list[BoxTable] = Field(
@@ -229,14 +241,14 @@ class WorkspaceTable(_Table):
 class CampaignTable(_Table):
     """`[campaign]`: how the excitation is designed and executed."""
 
-    repetitions: int = Field(default=30, ge=1, le=1000, description="repetitions, 1 to 1000")
-    validation_runs: int = Field(
+    repetitions: Whole = Field(default=30, ge=1, le=1000, description="repetitions, 1 to 1000")
+    validation_runs: Whole = Field(
         default=10, ge=1, le=1000, description="validation runs, 1 to 1000"
     )
     home_deg: Vector = Field(
         description="start posture of every excitation, in degrees, in the frame of [limits]"
     )
-    approach_speed: Annotated[FiniteFloat, Field(gt=0, le=1)] = Field(
+    approach_speed: Annotated[Number, Field(gt=0, le=1)] = Field(
         default=0.1,
         description="fraction of the joint speeds for moves to the start, above 0, at most 1",
     )
@@ -246,16 +258,18 @@ class CampaignTable(_Table):
     standstill_s: Positive = Field(
         default=5.0, description="seconds of standstill for the noise variance"
     )
-    n_via: int = Field(default=6, ge=2, le=60, description="via points of the excitation, 2 to 60")
-    fly: Annotated[FiniteFloat, Field(ge=0, le=1)] = Field(
+    n_via: Whole = Field(
+        default=6, ge=2, le=60, description="via points of the excitation, 2 to 60"
+    )
+    fly: Annotated[Number, Field(ge=0, le=1)] = Field(
         default=0.5, description="fly-by fraction, 0 (stop at every via point) to 1"
     )
-    candidates: int = Field(
+    candidates: Whole = Field(
         default=300,
         ge=1,
         description="motions that the quick search of a campaign without a design may try",
     )
-    seed: int = Field(
+    seed: Whole = Field(
         default=1, ge=0, description="seed of the search and of the validation motions"
     )
 
@@ -263,7 +277,7 @@ class CampaignTable(_Table):
 class SimulationTable(_Table):
     """`[simulation]`: what the simulated cell really is; ignored on hardware."""
 
-    seed: int = Field(default=1, ge=0, description="one seed is one bit-identical run")
+    seed: Whole = Field(default=1, ge=0, description="one seed is one bit-identical run")
     initial_deg: Vector = Field(
         description="where the simulated arm stands at first, degrees, in the frame of [limits]"
     )
@@ -276,7 +290,7 @@ class SimulationTable(_Table):
     torque_ripple: NonNegative = Field(
         default=0.0, description="size of an unmodelled effect: share of the Coulomb torque"
     )
-    friction_drift: Annotated[FiniteFloat, Field(ge=0, lt=1)] = Field(
+    friction_drift: Annotated[Number, Field(ge=0, lt=1)] = Field(
         default=0.0,
         description="size of an unmodelled effect: fall of the friction from cold to hot",
     )

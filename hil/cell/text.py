@@ -18,7 +18,9 @@ def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
     start = found.end()
     following = re.search(r"^[ \t]*\[", text[start:], re.MULTILINE)
     end = start + following.start() if following else len(text)
-    setting = rf"(?m)^([ \t]*{key}[ \t]*=[ \t]*)(?:\"[^\"\n]*\"|[^\n#]*)"
+    # A list may go over several lines, and may hold lists.
+    a_list = r"\[(?:[^\[\]]|\[[^\[\]]*\])*\]"
+    setting = rf"(?m)^([ \t]*{key}[ \t]*=[ \t]*)(?:\"[^\"\n]*\"|{a_list}|[^\n#]*)"
     body, count = re.subn(setting, lambda match: f"{match[1]}{value}", text[start:end], count=1)
     if not count:
         body = f"\n{key} = {value}{text[start:end]}"

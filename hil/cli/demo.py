@@ -19,18 +19,20 @@ from hil.campaign import (
     MotionLink,
     design,
     plan_around,
+    require_runnable,
     stop_on_interrupt,
 )
 from hil.cell import Cell
 from hil.cli.verdict import finish
 from hil.demo_link import CAN, LOOPBACK, loopback_link
-from hil.design import load_design
+from hil.design import DesignResult
 from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.identify import identify_campaign
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.report import write_report
 from hil.simulation import simulated_link, simulated_provenance
+from identification.excitation import Excitation
 from sim_fixtures.ns16 import CELL_PATH
 
 PATIENCE = 0.5
@@ -40,7 +42,7 @@ computer need not be fit for a robot."""
 
 def demo(
     output: Annotated[
-        Path, typer.Option(help="Campaign folder to make.", show_default=True)
+        Path, typer.Option("--output", "-o", help="Campaign folder to make.", show_default=True)
     ] = Path("runs/demo"),
     repetitions: Annotated[
         int | None, typer.Option(min=2, help="Repetitions; 30 as in the paper if left out.")
@@ -117,8 +119,9 @@ def demo(
         plan = (
             design(cell, reporter)
             if excitation is None
-            else plan_around(cell, load_design(excitation, cell))
+            else plan_around(cell, _designed(excitation, cell, reporter))
         )
+        require_runnable(cell, plan)  # before what is there is removed
         _make_room(output)
         campaign = Campaign.create(output, cell, plan)
     _run(campaign, reporter, effects=effects)
@@ -173,6 +176,22 @@ def _link(cell: Cell, *, effects: bool) -> Iterator[MotionLink]:
     options = ("--patience", str(PATIENCE), *(("--effects",) if effects else ()))
     with loopback_link(cell, options=options) as link:
         yield link
+
+
+def _designed(path: Path, cell: Cell, reporter: Reporter) -> Excitation:
+    """The motion of a design; what it was searched without is said before it runs."""
+    result = DesignResult.load(path)
+    result.require_cell(cell, path)
+    constraints = result.settings.constraints
+    lacking = [] if constraints.collision else ["contacts were not looked at (collision = false)"]
+    lacking += [] if constraints.current else ["currents were not looked at (current = false)"]
+    lacking += [] if result.complete else ["it was stopped before its end (complete = false)"]
+    if lacking:
+        reporter.say(
+            f"note: in the search for {path} {' and '.join(lacking)}; the motion itself is checked "
+            "against the whole cell before it runs"
+        )
+    return result.excitation
 
 
 _OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "results.json"}

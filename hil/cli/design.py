@@ -4,30 +4,44 @@ from __future__ import annotations
 
 import json as json_format
 import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from types import FrameType
+from typing import Annotated
 
 import typer
 
-from hil.campaign.stop import stop_on_interrupt
+from hil.campaign.stop import Stop, stop_on_interrupt
 from hil.cell import Cell
 from hil.design import DesignSettings, Method, load_settings, preset
+from hil.design.compare import references
 from hil.design.earlier import known_from
 from hil.design.folder import DesignFolder, require_same
-from hil.design.result import DesignResult
 from hil.design.run import Designed, run_design
 from hil.design.settings import preset_text
 from hil.errors import InputError, OperatorStopError
-from hil.plots import save
-from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
+
+from . import design_words as words
+
+
+def _folder(given: str) -> Path:
+    """Return the folder named; a name that is empty would be the working directory."""
+    if not given:
+        raise InputError(None, "is empty", field="--output", remedy="name a folder")
+    return Path(given)
 
 
 def design(
     cell: Annotated[Path | None, typer.Argument(help="The cell file.", show_default=False)] = None,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the result.")] = Path(
-        "runs/design"
-    ),
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="Folder for the result.", parser=_folder, metavar="<path>"
+        ),
+    ] = Path("runs/design"),
     method: Annotated[
         Method | None,
         typer.Option(
@@ -40,7 +54,8 @@ def design(
     settings: Annotated[
         Path | None,
         typer.Option(
-            help="Settings of your own (TOML) instead of a method's; begin with --show-settings.",
+            help="Settings of your own (TOML) instead of a method's, or those of an earlier "
+            "excitation.toml; begin with --show-settings.",
             show_default=False,
         ),
     ] = None,
@@ -83,7 +98,8 @@ def design(
     compare: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Earlier results to draw on the front, e.g. those of methods a and b.",
+            help="Earlier results to draw on the front, e.g. those of methods a and b; of the same "
+            "robot, judged by the same parameters, without --earlier.",
             show_default=False,
         ),
     ] = None,
@@ -108,8 +124,9 @@ def design(
     of different parameters get into each other's way.
 
     Leaves `excitation.toml` (motion, criteria, settings), `excitation.png` (what the robot is
-    going to do), and a journal to resume from in OUTPUT. Ctrl-C ends the search with the best
-    motion so far; a second one leaves at once. `hil demo --excitation OUTPUT` runs the motion.
+    going to do), and a journal to resume from in OUTPUT. Ctrl-C (or SIGTERM) ends the search with
+    the best motion so far once the generation under way is scored: seconds, a few minutes if a
+    motion hangs. A second one leaves at once. `hil demo --excitation OUTPUT` runs the motion.
 
     **Examples:**
 
@@ -136,10 +153,21 @@ def design(
         _require_view()
     reporter = make_reporter(quiet=quiet or json)
     loaded, folder = Cell.load(cell), DesignFolder(output)
-    references = _references(compare or [])
     asked = _settings(folder, method, settings, seed, kinematic=kinematic, resume=resume)
-    with stop_on_interrupt() as stop:
-        known = known_from(earlier, loaded, reporter) if earlier else None
+    beside = references(compare or [], loaded, asked, together=bool(earlier))
+    known = known_from(earlier, loaded, reporter) if earlier else None
+
+    def finish(done: Designed) -> None:
+        """Say what was found, then draw it, while no other search may enter the folder."""
+        words.say(reporter, done)
+        words.warn_of_unchecked(done, loaded)
+        summary = words.summary(done, folder)
+        typer.echo(
+            json_format.dumps(summary, allow_nan=False) if json else words.line(done, folder)
+        )
+        words.draw(folder, done, loaded, beside, together=known is not None)
+
+    with _stoppable(folder) as stop:
         done = run_design(
             folder,
             loaded,
@@ -150,10 +178,8 @@ def design(
             stop=lambda: stop.requested,
             resume=resume,
             force=force,
+            then=finish,
         )
-        _say(reporter, done, loaded)
-        _draw(folder, done, loaded, references)
-    typer.echo(json_format.dumps(_summary(done, folder)) if json else _line(done, folder))
     if not done.design.complete:
         raise OperatorStopError(
             f"stopped before the end of the search; the best motion so far is in {folder.result}; "
@@ -161,6 +187,26 @@ def design(
         )
     if view:
         _show(done, loaded)
+
+
+@contextmanager
+def _stoppable(folder: DesignFolder) -> Iterator[Stop]:
+    """Turn Ctrl-C and SIGTERM into a request to stop; a second one leaves with a sentence."""
+
+    def terminated(signum: int, frame: FrameType | None) -> None:
+        del signum, frame
+        signal.raise_signal(signal.SIGINT)
+
+    previous = signal.signal(signal.SIGTERM, terminated)
+    try:
+        with stop_on_interrupt() as stop:
+            yield stop
+    except KeyboardInterrupt:
+        raise OperatorStopError(
+            f"left at once; what was scored is in {folder.journal}; go on with --resume"
+        ) from None
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def _settings(
@@ -202,94 +248,3 @@ def _show(done: Designed, cell: Cell) -> None:
     with show(done.result.excitation, cell) as opened:
         typer.echo(f"3D view: {opened.address} (Ctrl-C ends it)", err=True)
         opened.run()
-
-
-def _references(paths: list[Path]) -> dict[str, tuple[float, float]]:
-    """Return log det and coupling index of earlier results, by method."""
-    found: dict[str, tuple[float, float]] = {}
-    for path in paths:
-        excitation = DesignResult.load(path).excitation
-        name = f"method {excitation.method.upper()}" if len(excitation.method) == 1 else ""
-        name = name or excitation.method
-        if name in found:
-            name = f"{name} ({path})"
-        found[name] = excitation.criteria.log10_det, excitation.criteria.coupling_index
-    return found
-
-
-def _draw(
-    folder: DesignFolder, done: Designed, cell: Cell, references: dict[str, tuple[float, float]]
-) -> None:
-    from hil.plots.design_picture import draw_design  # loads the arm's shapes
-
-    figure = draw_design(
-        done.result.excitation,
-        cell,
-        front=done.design.front,
-        chosen=done.design.chosen,
-        references=references,
-        title=cell.name,
-    )
-    save(figure, folder.picture)
-
-
-def _say(reporter: Reporter, done: Designed, cell: Cell) -> None:
-    """Say what the criteria are and what stood in the way."""
-    excitation = done.result.excitation
-    criteria = excitation.criteria
-    broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
-    reporter.say(
-        f"{excitation.tried} motions tried; broken constraints: {broken or 'none'}; "
-        f"{len(done.design.front.log10_det)} on the front"
-    )
-    if criteria.condition is not None and criteria.scaled_condition is not None:
-        reporter.say(
-            f"condition number of the regressor {criteria.condition:.0f}, "
-            f"{criteria.scaled_condition:.1f} with columns of unit length"
-        )
-    kept = done.result.settings.constraints
-    unlooked = [
-        name
-        for name, looked in (
-            ("floor, walls and the arm itself", kept.collision),
-            ("currents", kept.current),
-        )
-        if not looked
-    ]
-    if unlooked:
-        reporter.say(f"not looked at: {', '.join(unlooked)}; {cell.name} may refuse this motion")
-    sines = done.result.settings.sines
-    if sines is not None and sines.ramp == 0.0:
-        reporter.say(
-            "this motion begins and ends at full speed: no controller can run it; give it a ramp"
-        )
-
-
-def _line(done: Designed, folder: DesignFolder) -> str:
-    excitation, n = done.result.excitation, done.result.n_parameters
-    criteria = excitation.criteria
-    return (
-        f"log det {criteria.log10_det:.2f}, I_c {criteria.coupling_index:.2f} of "
-        f"{n * (n - 1) // 2}, {excitation.trajectory.duration:.2f} s: {folder.result}"
-    )
-
-
-def _summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
-    excitation = done.result.excitation
-    criteria = excitation.criteria
-    return {
-        "method": excitation.method,
-        "seed": excitation.seed,
-        "complete": done.design.complete,
-        "log10_det": criteria.log10_det,
-        "coupling_index": criteria.coupling_index,
-        "fitness": criteria.fitness,
-        "condition": criteria.condition,
-        "scaled_condition": criteria.scaled_condition,
-        "duration": float(excitation.trajectory.duration),
-        "tried": excitation.tried,
-        "infeasible": dict(excitation.rejected),
-        "front": len(done.design.front.log10_det),
-        "file": str(folder.result),
-        "picture": str(folder.picture),
-    }

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.cli.plan_input import (
     PLAN_FILES,
     isolated,
@@ -21,7 +21,7 @@ from hil.cli.plan_input import (
 )
 from hil.errors import InputError
 from hil.files import write_atomically
-from hil.plots import AngleFrame, check_format, draw_plan, save
+from hil.plots import check_format, draw_plan, save
 from planner.motion_csv import to_csv
 from planner.moves import Fly, FlyDistance, FlyPercent, MotionPlan, plan_moves
 from planner.plan_file import PlanFile

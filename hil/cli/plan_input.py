@@ -12,9 +12,8 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.errors import InputError
-from hil.plots import AngleFrame
 from planner.errors import (
     InvalidPlanFile,
     InvalidViaPoints,

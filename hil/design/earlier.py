@@ -1,7 +1,9 @@
 """What earlier archives say already, for a design that concentrates on what is still uncertain.
 
 The paper designs one motion. Information adds up: the Gram matrix of what was recorded joins that
-of the motion to be designed, each joint weighted by what its torque noise turned out to be.
+of the motion to be designed, each joint weighted by what its torque noise turned out to be. What
+an identification holds out to test itself on says as much as what it fits, so everything counts
+here that the arm moved in.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +20,19 @@ from hil.archive import open_archive
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import InputError
-from hil.identify import Identification, identify_archives, identify_campaign
-from hil.identify.sources import cell_of
+from hil.identify import Identification, identify_archives
+from hil.identify.sources import Source, Sources, cell_of, gather_sources
 from hil.progress import Reporter
-from hil.recordings import recording_of
 from identification.excitation import SAMPLE_PERIOD
+from identification.preprocessing import prepare
 
 from .fingerprint import fingerprint
 from .knowledge import Knowledge
 
 Array = NDArray[np.float64]
 
-_KINDS = ("excitation", "validation", "standstill")
+_MOTIONS: Final = ("excitation", "imported", "validation")
+_KINDS: Final = (*_MOTIONS, "standstill")
 
 
 def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowledge:
@@ -37,31 +41,59 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
     Args:
         paths: one campaign folder, or archives.
         cell: for which a motion is going to be designed.
-        reporter: is told how far it is.
+        reporter: is told how far it is, and of joints about whose noise nothing is known.
 
     Raises:
         InputError: archives that cannot be identified from, or of another robot.
     """
     archives = _archives(paths)
     _refuse_another_robot(archives, cell)
-    if len(paths) == 1 and paths[0].is_dir() and CampaignFolder(paths[0]).manifest():
-        found = identify_campaign(paths[0], reporter)
-    else:
-        found = identify_archives(archives, reporter)
-    pooled, weights = found.estimate.pooled, _weights(found, archives[0])
-    # A search samples its motions every SAMPLE_PERIOD; a second of either is to count alike.
-    share = _period(archives[0]) / SAMPLE_PERIOD
-    factor = found.estimate.factor
+    found = identify_archives(archives, reporter)
+    # The whole of a single recording: nothing has to be predicted here.
+    sources = gather_sources(archives, split=1.0)
+    pooled, weights = found.estimate.pooled, _weights(found, cell, reporter)
+    gram, samples = _information(sources, weights, reporter)
     return Knowledge(
         names=pooled.names,
         values=pooled.values,
         std=pooled.std,
         joint_weights=weights,
-        gram=share * factor.weighted(weights).A,
-        samples=max(1, round(share * float(factor.samples.max()))),
+        gram=gram,
+        samples=samples,
         repetitions=cell.campaign.repetitions,
-        archives=tuple((path.name, _digest(path)) for path in archives),
+        archives=tuple(
+            (path.name, _digest(path)) for path in archives if open_archive(path).kind in _MOTIONS
+        ),
     )
+
+
+def _information(sources: Sources, weights: Array, reporter: Reporter) -> tuple[Array, int]:
+    """Return the information (p, p) of all motions as if sampled every SAMPLE_PERIOD, and their N.
+
+    It is that of the motion itself, as that of a motion to be designed: what the torque's channel
+    does to it (delay, filter) has no part in it.
+    """
+    model = sources.cell.model
+    gram, samples = np.zeros((model.n_parameters, model.n_parameters)), 0.0
+    motions = [source for source in (*sources.training, *sources.held_out) if _any(source)]
+    with reporter.task("adding up earlier information", len(motions)) as task:
+        for source in motions:
+            recording = source.recording
+            prepared = prepare(
+                recording, model, noise_variance=sources.noise_variance, origin=source.origin
+            )
+            # A second is to count alike, whatever the rate of an archive.
+            share = float(np.median(np.diff(recording.time))) / SAMPLE_PERIOD
+            factor = prepared.factor(model)
+            gram += share * factor.weighted(weights).A
+            samples += share * float(factor.samples.max())
+            task.advance(1, source.name)
+    return gram, max(1, round(samples))
+
+
+def _any(source: Source) -> bool:
+    """Whether there is anything in it; nothing is left where all of a recording is fitted."""
+    return source.recording.n_samples > 1
 
 
 def _archives(paths: Sequence[Path]) -> list[Path]:
@@ -97,22 +129,35 @@ def _refuse_another_robot(archives: Sequence[Path], cell: Cell) -> None:
             )
 
 
-def _weights(found: Identification, path: Path) -> Array:
-    """Return 1 / variance of each joint's residual (n,)."""
-    deviation = found.estimate.pooled.noise_std
-    if not np.all(np.isfinite(deviation) & (deviation > 0.0)):
-        raise InputError(
-            path,
-            "a joint never moves in the earlier archives, so that nothing is known of its noise",
-            field="--earlier",
-            remedy="name archives in which every joint moves",
+def _weights(found: Identification, cell: Cell, reporter: Reporter) -> Array:
+    """Return 1 / variance of each joint's torque residual (n,).
+
+    Of a joint that stood in all archives no residual tells. It is taken to be as noisy as the
+    others: by the median, as a share of the torque that its motors can give.
+    """
+    noise = np.array(found.estimate.pooled.noise_std)
+    known = np.isfinite(noise) & (noise > 0.0)
+    if not known.all():
+        strength = _strength(cell)
+        noise[~known] = strength[~known] * np.median(noise[known] / strength[known])
+        names = [
+            name for name, is_known in zip(cell.joint_names, known, strict=True) if not is_known
+        ]
+        reporter.say(
+            f"warning: {', '.join(names)} never moved in the earlier archives: its torque noise is "
+            "taken to be that of the others, in proportion to what its motors can give"
         )
-    return np.asarray(deviation**-2.0)
+    return np.asarray(noise**-2.0)
 
 
-def _period(path: Path) -> float:
-    """Return the time between the samples of an archive [s]."""
-    return float(np.median(np.diff(recording_of(open_archive(path)).time)))
+def _strength(cell: Cell) -> Array:
+    """Return what each joint's motors can give (n,) [N·m]; ones where the cell does not say."""
+    if cell.file.drive_train is None:
+        return np.ones(len(cell.joint_names))
+    drives = cell.drive_train
+    return np.asarray(
+        np.abs(drives.motor_from_joint.T) @ (drives.torque_constant * drives.current_limit)
+    )
 
 
 def _digest(path: Path) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically
@@ -45,14 +46,44 @@ class DesignFolder:
         """What was scored so far."""
         return self.root / "search.journal"
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Make the folder, and keep every other search out of it until this is left.
+
+        The lock is on the folder itself, which no search removes, and goes with this process.
+
+        Raises:
+            InputError: another search is at work in it, it cannot be made, or not be locked.
+        """
+        make_folder(self.root)
+        with self._written():
+            descriptor = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise InputError(
+                    self.root,
+                    "a search is running in it",
+                    remedy="wait for its end, stop it (Ctrl-C), or name another folder (-o)",
+                ) from error
+            except OSError as error:
+                raise InputError(
+                    self.root,
+                    f"cannot be locked against a second search ({error.strerror})",
+                    remedy="name a folder on a disk of this PC (-o)",
+                ) from error
+            yield
+        finally:
+            os.close(descriptor)
+
     def begin(self, settings: DesignSettings, *, force: bool) -> None:
-        """Make room for a new design, and write down what is asked for.
+        """Make room for a new design, and write down what is asked for; the folder is held.
 
         Raises:
             InputError: there is a design already and it is not to be replaced, or the folder
                 cannot be written to.
         """
-        make_folder(self.root)
         ours = [path for path in (self.result, self.journal) if path.exists()]
         if self._begun():
             ours.append(self.settings)
@@ -97,23 +128,16 @@ class DesignFolder:
 
     @contextmanager
     def opened_journal(self) -> Iterator[BinaryIO]:
-        """Open the journal, a new one if there is none, and keep every other search out of it.
+        """Open the journal, a new one if there is none; the folder is held.
 
         Raises:
-            InputError: another search is at work on it, or the disk refuses.
+            InputError: the disk refuses.
         """
         with self._written():
-            file = self.journal.open("r+b" if self.journal.exists() else "x+b")
+            # Without a buffer nothing is left that closing the file would fail to write.
+            file = self.journal.open("r+b" if self.journal.exists() else "x+b", buffering=0)
         with file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise InputError(
-                    self.root,
-                    "another search is at work on it",
-                    remedy="wait for its end, or stop it",
-                ) from error
-            yield file
+            yield cast(BinaryIO, file)
 
     @contextmanager
     def _written(self) -> Iterator[None]:

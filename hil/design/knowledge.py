@@ -19,11 +19,11 @@ class Knowledge:
         values: their estimates (p,).
         std: their standard deviations (p,), infinite for one that was not determined.
         joint_weights: 1 / variance of each joint's torque residual (n,).
-        gram: information (p, p), weighted by these, as if the motions had been sampled every
-            `identification.excitation.SAMPLE_PERIOD`, as those of a search are.
+        gram: information (p, p) of all that was moved, held out or not, weighted by these, as if
+            sampled every `identification.excitation.SAMPLE_PERIOD`, as motions of a search are.
         samples: time samples in it, counted alike.
         repetitions: how often the new motion is going to be run.
-        archives: name and SHA-256 of each file it came from.
+        archives: name and SHA-256 of each file whose motion is in it.
     """
 
     names: tuple[str, ...]

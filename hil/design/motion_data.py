@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 
 from identification.excitation import Excitation
-from planner import FourierSeries, JointLimits, PiecewiseCubic
-from planner.isolation import in_child
-from planner.plan_file import PlanFile
+from planner import FourierSeries, JointLimits, PiecewiseCubic, PlanFile, in_child
 
 from .toml_text import Angles
 

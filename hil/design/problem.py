@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.cell import Cell
-from hil.motion_checks import current_model
+from hil.cell import AngleFrame, Cell
+from hil.motion_checks import collision_checker, current_model
+from hil.violation_text import always_so, violation_text
 from identification.excitation import (
     CollisionChecker,
     Constraints,
+    CurrentModel,
     Objective,
     Problem,
     SearchSettings,
@@ -19,6 +22,7 @@ from identification.excitation import (
     ViaPointGenome,
 )
 from identification.excitation.constraints import clearance
+from identification.motion import Motion
 
 from .advice import NoExcitationError
 from .settings import DesignSettings, SettingsError, SineTable
@@ -40,34 +44,57 @@ def problem_of(cell: Cell, settings: DesignSettings, known: Knowledge | None = N
     Raises:
         SettingsError: settings that do not fit the cell.
         CellError: the cell file lacks a table that the settings need.
-        NoExcitationError: home itself, where the motion is to begin, is not clear.
+        NoExcitationError: where the motion is to begin, home or the middle of sines, is not clear,
+            or the motors cannot hold the arm there.
     """
     constraints = settings.constraints
-    checker = CollisionChecker(cell.urdf, cell.workspace) if constraints.collision else None
-    if checker is not None and constraints.closed and settings.via_points is not None:
-        _require_clear_home(cell, checker)
+    checker = collision_checker(cell) if constraints.collision else None
+    currents = current_model(cell) if constraints.current else None
+    genome = _genome(cell, settings, checker)
+    _require_beginning(cell, genome, checker, currents)
     return Problem(
-        genome=_genome(cell, settings, checker),
+        genome=genome,
         objective=_objective(cell, settings, known),
         constraints=Constraints(
             limits=cell.joint_limits,
             min_duration=constraints.min_duration,
             max_duration=constraints.max_duration,
             checker=checker,
-            currents=current_model(cell) if constraints.current else None,
+            currents=currents,
             # A series without a ramp rests nowhere; whoever asks for one wants to look at it.
             at_rest=settings.sines is None or settings.sines.ramp > 0.0,
         ),
     )
 
 
-def _require_clear_home(cell: Cell, checker: CollisionChecker) -> None:
-    contact = clearance(checker, cell.home[None])
-    if contact is not None:
-        raise NoExcitationError(
-            f"no motion can begin at home: {contact}; correct [workspace] or home_deg in "
-            f"[campaign] of {cell.path}"
-        )
+def _require_beginning(
+    cell: Cell,
+    genome: ViaPointGenome | SineGenome,
+    checker: CollisionChecker | None,
+    currents: CurrentModel | None,
+) -> None:
+    """Refuse, before any motion is tried, a posture in which every one of them begins."""
+    if isinstance(genome, SineGenome):
+        where, posture, elsewhere = "where the sines swing about", genome.centre, "[sines] offset"
+    elif genome.home is not None:
+        where, posture, elsewhere = "at home", genome.home, "home_deg in [campaign]"
+    else:
+        return
+    frame = AngleFrame.of(cell)
+    contact = None if checker is None else clearance(checker, posture[None])
+    if checker is not None and contact is not None:
+        remedy = always_so(contact, checker) or f"correct [workspace] or {elsewhere}"
+        _refuse_beginning(cell, where, violation_text(contact, frame), remedy)
+    still = np.zeros_like(posture[None])
+    too_much = currents.check(Motion(np.zeros(1), posture[None], still, still)) if currents else []
+    if too_much:
+        worst = replace(max(too_much, key=lambda violation: violation.excess), time=None)
+        remedy = f"correct [drive_train], [nominal] with its uncertainty, or {elsewhere}"
+        _refuse_beginning(cell, where, f"standing there, {violation_text(worst, frame)}", remedy)
+
+
+def _refuse_beginning(cell: Cell, where: str, reason: str, remedy: str) -> NoReturn:
+    raise NoExcitationError(f"no motion can begin {where}: {reason}; {remedy} ({cell.path})")
 
 
 def search_settings(settings: DesignSettings) -> SearchSettings:
@@ -121,9 +148,19 @@ def _offset(cell: Cell, sines: SineTable) -> Array | None:
         return None
     if sines.offset == "home":
         return cell.home
-    angles = np.radians(_listed(cell, "sines.offset", sines.offset))
-    limits = cell.file.limits
-    return cell.urdf_angles(angles) if limits and limits.frame == "controller" else angles
+    frame, limits = AngleFrame.of(cell), cell.joint_limits
+    shown = _listed(cell, "sines.offset", sines.offset)
+    angles = frame.urdf(shown)
+    for joint in np.flatnonzero(~((angles > limits.lower) & (angles < limits.upper))).tolist():
+        ends = sorted(float(frame.shown(end)[joint]) for end in (limits.lower, limits.upper))
+        raise SettingsError(
+            None,
+            f"{cell.joint_names[joint]} is not inside its limits, {ends[0]:g} to {ends[1]:g} deg, "
+            f"at {shown[joint]:g} deg ({frame.whose})",
+            field=f"sines.offset = {sines.offset}",
+            remedy="swing about a posture inside the limits",
+        )
+    return angles
 
 
 def _per_joint(cell: Cell, field: str, values: list[float]) -> Array:

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,16 +28,20 @@ from planner import FourierSeries, PiecewiseCubic, PlannerError
 
 from .fingerprint import DECISIVE, fingerprint
 from .motion_data import joints_of, motion_data, motion_digest, motion_from_data
-from .settings import DesignSettings, SettingsError, settings_of
+from .settings import RESULT_FORMAT, DesignSettings, SettingsError, settings_of
 from .toml_text import Angles, from_text, to_text
 
 Array = NDArray[np.float64]
 
-FORMAT: Final = "designed excitation"
 VERSION: Final = 1
 RESULT: Final = "excitation.toml"
-RESCORING_PERIOD: Final = 0.001
-"""s between the samples that the criteria in the file were computed from."""
+
+_FRONT = (
+    "Motions of which none is better than another in both, by rising coupling index, as the\n"
+    "# search sampled them. "
+)
+_CHOSEN = "chosen, counting from 0, is the motion of this file."
+_POLISHED = "The motion of this file is none of them: a polish made it from one, see polished_from."
 
 # Planned on another machine a motion may differ in its last digits, at so many instants by no more.
 _SAME = 1e-9  # rad
@@ -52,9 +56,9 @@ _COMMENTS = {
     "criteria": "Of the motion sampled every millisecond. Compare log10_det only between motions "
     "of one\n# robot in the same units; coupling_index (0 to coupling_index_max) has none.",
     "search": "How it was found. Of the motions tried so many broke a constraint of each kind.",
-    "front": "Motions of which none is better than another in both, by rising coupling index;\n"
-    "# chosen counts from 0.",
-    "settings": "As the search was asked; `hil design --settings` takes a file like this table.",
+    "polished_from": "The point of the front, counting from 0, that the motion grew from, and its "
+    "criteria by\n# the millisecond.",
+    "settings": "As the search was asked; `hil design --settings` takes them from this file.",
     "cell": "The cell it was designed for: its name, and a fingerprint of what the design rests "
     "on.",
     "plan": "The motion: planning these moves gives it to the last bit.",
@@ -62,6 +66,20 @@ _COMMENTS = {
     "earlier": "Archives whose information was added.",
     "seal": "What the lines above and the motion are recognised by.",
 }
+
+
+class Origin(NamedTuple):
+    """Which point of the front a polish began with, and its criteria at 1 ms."""
+
+    point: int
+    log10_det: float
+    coupling_index: float
+
+    @classmethod
+    def of(cls, design: Design) -> Self:
+        """Return the origin of a design."""
+        criteria = design.origin_criteria
+        return cls(design.origin, criteria.log10_det, criteria.coupling_index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +97,8 @@ class DesignResult:
         n_parameters: how many parameters were judged.
         parameters: their names, None for all of the model's.
         front: log10 det, coupling index and duration [s] of each point of the front, (k, 3).
-        chosen: which point of the front the motion was or grew from; None if it is none of them.
+        chosen: which point of the front the motion is; None where a polish found a better one.
+        polished_from: the point that it grew from then, else None.
         versions: of the software.
         archives: name and SHA-256 of the earlier archives it adds to.
     """
@@ -95,6 +114,7 @@ class DesignResult:
     parameters: tuple[str, ...] | None
     front: Array
     chosen: int | None
+    polished_from: Origin | None
     versions: Mapping[str, str]
     archives: tuple[tuple[str, str], ...] = ()
 
@@ -123,6 +143,7 @@ class DesignResult:
             parameters=None if chosen is None else tuple(names[k] for k in chosen),
             front=np.column_stack((front.log10_det, front.coupling_index, front.duration)),
             chosen=design.chosen,
+            polished_from=None if design.chosen is not None else Origin.of(design),
             versions=software(),
             archives=archives,
         )
@@ -133,7 +154,8 @@ class DesignResult:
         Raises:
             InputError: it cannot be written.
         """
-        text = _HEAD + to_text(self._data(cell), _COMMENTS)
+        front = _FRONT + (_CHOSEN if self.polished_from is None else _POLISHED)
+        text = _HEAD + to_text(self._data(cell), {**_COMMENTS, "front": front})
         trajectory = self.excitation.trajectory
         seal = {
             "sha256": _seal(text),
@@ -143,7 +165,12 @@ class DesignResult:
         try:
             write_atomically(path, text + "\n" + to_text({"seal": seal}, _COMMENTS))
         except OSError as error:
-            raise InputError(path, f"cannot be written ({error.strerror})") from error
+            raise InputError(
+                path,
+                f"the motion is found but cannot be written ({error.strerror})",
+                remedy="make room, then repeat the command with --resume: what was scored is in "
+                "the journal",
+            ) from error
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -161,7 +188,7 @@ class DesignResult:
             ) from error
         try:
             data = from_text(text)
-            if data.get("format") != FORMAT:
+            if data.get("format") != RESULT_FORMAT:
                 raise ValueError(f"format is {data.get('format')!r:.60}")
             if data.get("version") != VERSION:
                 raise ValueError(f"version is {data.get('version')!r:.60}, this reads {VERSION}")
@@ -218,7 +245,7 @@ class DesignResult:
         excitation = self.excitation
         criteria = asdict(excitation.criteria)
         return {
-            "format": FORMAT,
+            "format": RESULT_FORMAT,
             "version": VERSION,
             "complete": self.complete,
             "criteria": criteria
@@ -241,6 +268,7 @@ class DesignResult:
                 "coupling_index": self.front[:, 1].tolist(),
                 "duration": self.front[:, 2].tolist(),
             },
+            **({"polished_from": self.polished_from._asdict()} if self.polished_from else {}),
             "settings": self.settings.to_dict(),
             **(
                 {"earlier": {"archives": [list(a) for a in self.archives]}} if self.archives else {}
@@ -280,6 +308,7 @@ class DesignResult:
             parameters=tuple(search["parameters"]) if "parameters" in search else None,
             front=np.array(columns, dtype=np.float64).T,
             chosen=front.get("chosen"),
+            polished_from=Origin(**data["polished_from"]) if "polished_from" in data else None,
             versions=data["software"],
             archives=tuple(
                 (name, digest) for name, digest in data.get("earlier", {}).get("archives", ())

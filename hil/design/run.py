@@ -6,11 +6,12 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.errors import InputError, OperatorStopError, UnsafeError
 from hil.progress import Reporter, Task
+from hil.violation_text import violation_text
 from identification.excitation import (
     Design,
     ForeignJournalError,
@@ -21,22 +22,27 @@ from identification.excitation import (
     Problem,
     Progress,
     SearchSettings,
+    most_evaluations,
     sampled,
     search,
 )
+from identification.excitation.collision.built_in import told
 
-from .advice import no_excitation
-from .folder import DesignFolder
+from .advice import exhausted, forbidden, no_excitation
+from .folder import DesignFolder, require_same
 from .knowledge import Knowledge
 from .problem import problem_of, search_settings
 from .result import DesignResult
 from .settings import DesignSettings
+
+_TITLE: Final = "designing (motions)"
 
 
 @dataclass(frozen=True, eq=False)
 class Designed:
     """A search that came to an end, and what was written down of it."""
 
+    problem: Problem
     design: Design
     result: DesignResult
 
@@ -60,17 +66,19 @@ def run_search(
         workers: processes that score motions; the result does not depend on how many.
         known: an earlier estimate, to which the motion is to add.
         journal: file that keeps what was scored, to resume from; None to keep nothing.
-        stop: asked between generations; true ends the search with the best motion so far.
+        stop: asked between generations; true ends the search with the best motion so far. A
+            motion that hangs holds a generation up for a minute or two.
 
     Raises:
         NoExcitationError: no motion keeps every constraint: which forbids it, where, by how much.
         OperatorStopError: it was stopped before there was one.
-        InputError: the journal is of another search.
+        InputError: the journal is of another search, or cannot be read or begun.
         SettingsError, CellError: settings and cell do not fit together.
     """
     return _searched(
         problem_of(cell, settings, known),
-        search_settings(settings),
+        settings,
+        AngleFrame.of(cell),
         reporter,
         workers=workers,
         journal=journal,
@@ -89,77 +97,132 @@ def run_design(
     stop: Callable[[], bool] = lambda: False,
     resume: bool = False,
     force: bool = False,
+    then: Callable[[Designed], None] = lambda _: None,
 ) -> Designed:
     """Search a motion for a cell as :func:`run_search` does, and write it into a folder.
 
     A search that was stopped leaves its best motion, marked as incomplete, and a journal to go on
     from. With `resume` it goes on with the journal in the folder; with `force` it replaces a
-    design that is there.
+    design that is there. No other search gets into the folder until `then`, called with what was
+    written, has returned.
 
     Raises:
-        InputError: there is a design in the folder and it is neither to be replaced nor resumed.
+        InputError: there is a design in the folder and it is neither to be replaced nor resumed,
+            another search is at work in it, or the disk refuses.
         UnsafeError: the motion found does not pass the check before it is written down.
         HilError: see :func:`run_search`.
     """
     problem = problem_of(cell, settings, known)  # before anything is replaced by what cannot be
-    if not resume:
-        folder.begin(settings, force=force)
-    with folder.opened_journal() as journal:
-        design = _searched(
-            problem,
-            search_settings(settings),
-            reporter,
-            workers=workers,
-            journal=journal,
-            stop=stop,
-        )
-    _check_once_more(problem, design)
-    archives = () if known is None else known.archives
-    result = DesignResult.of(cell, settings, design, problem.objective, archives)
-    result.save(folder.result, cell)
-    return Designed(design, result)
+    with folder.held():
+        if resume:  # another search may have been there since they were read
+            require_same(settings, folder.interrupted(), folder.settings)
+        else:
+            folder.begin(settings, force=force)
+        with folder.opened_journal() as journal:
+            design = _searched(
+                problem,
+                settings,
+                AngleFrame.of(cell),
+                reporter,
+                workers=workers,
+                journal=journal,
+                stop=stop,
+            )
+        _check_once_more(problem, design, AngleFrame.of(cell))
+        archives = () if known is None else known.archives
+        result = DesignResult.of(cell, settings, design, problem.objective, archives)
+        result.save(folder.result, cell)
+        done = Designed(problem, design, result)
+        then(done)
+    return done
 
 
 def _searched(
     problem: Problem,
-    settings: SearchSettings,
+    asked: DesignSettings,
+    frame: AngleFrame,
     reporter: Reporter,
     *,
     workers: int,
     journal: BinaryIO | None,
     stop: Callable[[], bool],
 ) -> Design:
-    bar: _Bar | None = None
+    settings, checker = search_settings(asked), problem.constraints.checker
+    not_checked = None if checker is None else told(checker.built_in)
+    if not_checked is not None:
+        reporter.say(not_checked)
     with ExitStack() as stack:
+        task = stack.enter_context(reporter.task(_TITLE, most_evaluations(settings)))
+        bar = _Bar(task, reporter)
         population = stack.enter_context(Population(problem, workers))
-        kept = None if journal is None else _journal(journal, problem, settings)
-
-        def told(progress: Progress) -> None:
-            nonlocal bar
-            if bar is None:
-                title = "designing the excitation (motions)"
-                bar = _Bar(stack.enter_context(reporter.task(title, progress.total)))
-            bar.show(progress)
-
+        if journal is not None:
+            bar.journal = kept = _journal(journal, problem, settings, reporter)
+            stack.callback(kept.close)
         try:
-            return search(population, settings, journal=kept, progress=told, stop=stop)
+            design = search(
+                population,
+                settings,
+                journal=bar.journal,
+                progress=bar.entered,
+                scored=bar.scored,
+                stop=stop,
+            )
         except NoFeasibleMotionError as error:
             if error.stopped:
                 raise OperatorStopError(
-                    f"stopped before there was a motion that keeps every constraint: {error}"
+                    "stopped before there was a motion that keeps every constraint: "
+                    f"{forbidden(error, frame)}"
                 ) from error
-            raise no_excitation(error) from error
+            raise no_excitation(error, frame, checker, asked) from error
+        bar.end(design)
+    return design
 
 
 class _Bar:
-    """Shows a search's progress on a running task."""
+    """Shows a search's progress on a running task, and says what a person should know."""
 
-    def __init__(self, task: Task) -> None:
-        self._task, self._done = task, 0
+    def __init__(self, task: Task, reporter: Reporter) -> None:
+        self.journal: Journal | None = None
+        self._task, self._reporter = task, reporter
+        self._done, self._note = 0, "scoring the first motions"
+        self._troubled = False
+        task.advance(0, self._note)
 
-    def show(self, progress: Progress) -> None:
-        self._task.advance(progress.evaluated - self._done, _note(progress))
-        self._done = progress.evaluated
+    def scored(self, count: int) -> None:
+        """So many more motions of a generation are scored."""
+        self._done += count
+        self._task.advance(count, self._note)
+
+    def entered(self, progress: Progress) -> None:
+        """A generation is scored, or was in the journal."""
+        more, self._done = progress.evaluated - self._done, progress.evaluated
+        self._note = _note(progress)
+        self._task.advance(more, self._note)
+        if self.journal is not None and self.journal.trouble is not None and not self._troubled:
+            self._troubled = True
+            self._reporter.say(
+                f"the journal cannot be written ({self.journal.trouble.strerror}); the search goes "
+                "on, and writes it as soon as there is room"
+            )
+
+    def end(self, design: Design) -> None:
+        """The search has ended."""
+        journal = self.journal
+        if design.complete:  # a polish that settled, or mating that did, needed fewer
+            rest = most_evaluations(design.settings) - self._done
+            self._task.advance(rest, "done")
+        if design.exhausted:
+            self._reporter.say(exhausted(len(design.history), design.settings))
+        if journal is None:
+            return
+        journal.close()
+        if journal.recalled:
+            self._reporter.say(f"{journal.recalled} motions were known from the journal")
+        if journal.trouble is not None:
+            self._reporter.say(
+                f"the journal lacks the last motions ({journal.trouble.strerror}); a search "
+                "resumed from it scores them anew"
+            )
 
 
 def _note(progress: Progress) -> str:
@@ -173,9 +236,11 @@ def _note(progress: Progress) -> str:
     return f"{where}, log det {progress.log10_det:.1f}, I_c {progress.coupling_index:.1f}"
 
 
-def _journal(file: BinaryIO, problem: Problem, settings: SearchSettings) -> Journal:
+def _journal(
+    file: BinaryIO, problem: Problem, settings: SearchSettings, reporter: Reporter
+) -> Journal:
     try:
-        return Journal(file, problem, settings)
+        journal = Journal(file, problem, settings)
     except ForeignJournalError as error:
         raise InputError(
             file.name,
@@ -184,11 +249,23 @@ def _journal(file: BinaryIO, problem: Problem, settings: SearchSettings) -> Jour
         ) from error
     except JournalError as error:
         raise InputError(file.name, str(error), remedy="begin anew (--force)") from error
+    except OSError as error:
+        raise InputError(
+            file.name,
+            f"cannot be read or written ({error.strerror})",
+            remedy="make room or mend the disk, then try again (--resume)",
+        ) from error
+    if journal.damaged:
+        reporter.say(
+            f"{journal.damaged} bytes of the journal are damaged; what they held is scored anew"
+        )
+    return journal
 
 
-def _check_once_more(problem: Problem, design: Design) -> None:
+def _check_once_more(problem: Problem, design: Design, frame: AngleFrame) -> None:
     """Refuse to write down a motion that, as it is going to be run, breaks a constraint."""
     trajectory = design.excitation.trajectory
     found = problem.constraints.violations(trajectory, sampled(trajectory))
     if found:
-        raise UnsafeError(f"the motion found does not pass its last check: {found[0]}")
+        reason = violation_text(found[0], frame)
+        raise UnsafeError(f"the motion found does not pass its last check: {reason}")

@@ -19,6 +19,7 @@ from pydantic import (
     Field,
     FiniteFloat,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
@@ -28,11 +29,19 @@ from hil.errors import InputError
 Method = Literal["a", "b", "balanced", "front"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 
-Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
-Eta = Annotated[FiniteFloat, Field(ge=1, le=1000)]
-AboveZero = Annotated[FiniteFloat, Field(gt=0)]
+# A text or a truth value is no number: pydantic would read "24" as 24 and true as 1.
+Number = Annotated[FiniteFloat, Field(strict=True)]
+Whole = Annotated[int, Field(strict=True)]
+Choice = Annotated[bool, Field(strict=True)]
+Share = Annotated[Number, Field(ge=0, le=1)]
+Eta = Annotated[Number, Field(ge=1, le=1000)]
+AboveZero = Annotated[Number, Field(gt=0)]
 Frequencies = Annotated[list[AboveZero], Field(min_length=1)]
 _MOTIONS = ("via_points", "sines")
+RESULT_FORMAT: Final = "designed excitation"
+"""What the file that a design leaves calls itself; the settings are a table in it."""
+SHORTEST_RAMP: Final = 0.05
+"""s; sines that grow faster are a blow to any arm, and their contacts cannot be told."""
 
 
 class SettingsError(InputError):
@@ -50,8 +59,8 @@ class _Table(BaseModel):
 class SearchTable(_Table):
     """`[search]`: how hard is searched, and for what."""
 
-    population: int = Field(ge=4, le=10_000, description="a number of individuals, 4 to 10000")
-    generations: int = Field(
+    population: Whole = Field(ge=4, le=10_000, description="a number of individuals, 4 to 10000")
+    generations: Whole = Field(
         ge=1, le=100_000, description="a number of generations, the first one included, 1 to 100000"
     )
     crossover: Share = Field(description="the probability that two parents are mixed, 0 to 1")
@@ -67,7 +76,7 @@ class SearchTable(_Table):
         description="the weights of log det and of I_c,max / I_c, two shares from 0 to 1 that add "
         "up to 1; methods b and balanced",
     )
-    polish: int = Field(
+    polish: Whole = Field(
         default=0,
         ge=0,
         le=10_000_000,
@@ -87,12 +96,12 @@ class SearchTable(_Table):
 class ViaPointTable(_Table):
     """`[via_points]`: a motion through via points, as the controller's interpolator runs it."""
 
-    n_via: int = Field(ge=2, le=60, description="a number of via points to search, 2 to 60")
+    n_via: Whole = Field(ge=2, le=60, description="a number of via points to search, 2 to 60")
     fly: Share = Field(description="a fly-by fraction, 0 (stop at every via point) to 1")
-    slowest: Annotated[FiniteFloat, Field(gt=0, le=1)] = Field(
+    slowest: Annotated[Number, Field(gt=0, le=1)] = Field(
         description="the smallest share of a joint's speed that is tried, above 0, at most 1"
     )
-    range_share: Annotated[FiniteFloat, Field(gt=0, le=1)] = Field(
+    range_share: Annotated[Number, Field(gt=0, le=1)] = Field(
         default=1.0,
         description="the share of each joint's range, about its middle, that via points lie in, "
         "above 0, at most 1",
@@ -102,9 +111,9 @@ class ViaPointTable(_Table):
 class SineTable(_Table):
     """`[sines]`: a sum of sines for each joint (eq. 8 of the paper)."""
 
-    harmonics: int = Field(ge=1, le=20, description="a number of sines for each joint, 1 to 20")
+    harmonics: Whole = Field(ge=1, le=20, description="a number of sines for each joint, 1 to 20")
     length: AboveZero = Field(description="the time from beginning to end in s, above 0")
-    ramp: Annotated[FiniteFloat, Field(ge=0)] = Field(
+    ramp: Annotated[Number, Field(ge=0)] = Field(
         description="the time in s in which the sines grow at the beginning and fade at the end, "
         "0 for none (which no controller can execute)"
     )
@@ -116,7 +125,7 @@ class SineTable(_Table):
         description='the highest angular frequency in rad/s, one for each joint, or "from limits": '
         "the square root of acceleration limit over room, as in the paper's appendix"
     )
-    offset: Literal["middle", "home"] | list[FiniteFloat] = Field(
+    offset: Literal["middle", "home"] | list[Number] = Field(
         default="middle",
         description='"middle" of the joints\' ranges, "home" of the cell, or angles in degrees, '
         "one for each joint, in the frame of the cell's [limits]: where the joints swing about",
@@ -124,6 +133,11 @@ class SineTable(_Table):
 
     @model_validator(mode="after")
     def _ramps_fit(self) -> SineTable:
+        if 0.0 < self.ramp < SHORTEST_RAMP:
+            raise ValueError(
+                f"a ramp of {self.ramp:g} s is a blow, not a ramp; make it {SHORTEST_RAMP:g} s or "
+                "longer, or 0 for none"
+            )
         if 2.0 * self.ramp > self.length:
             raise ValueError(
                 f"two ramps of {self.ramp:g} s do not fit into {self.length:g} s; make the ramp "
@@ -135,21 +149,21 @@ class SineTable(_Table):
 class ConstraintTable(_Table):
     """`[constraints]`: what the motion must keep beside the joint limits."""
 
-    min_duration: Annotated[FiniteFloat, Field(ge=0)] = Field(
+    min_duration: Annotated[Number, Field(ge=0)] = Field(
         default=0.0, description="the duration of the shortest motion in s, 0 for any"
     )
     max_duration: AboveZero = Field(
         default=20.0, description="the duration of the longest motion in s, above 0"
     )
-    closed: bool = Field(
+    closed: Choice = Field(
         default=True,
         description="true or false: a motion through via points begins and ends in the cell's home",
     )
-    collision: bool = Field(
+    collision: Choice = Field(
         default=True,
         description="true or false: keep clear of floor, walls and the arm itself ([workspace])",
     )
-    current: bool = Field(
+    current: Choice = Field(
         default=True,
         description="true or false: keep the motors' current limits by the nominal model",
     )
@@ -167,15 +181,27 @@ class ConstraintTable(_Table):
 class ObjectiveTable(_Table):
     """`[objective]`: which parameters count."""
 
-    parameters: Literal["all"] | Annotated[list[str], Field(min_length=1)] = Field(
+    parameters: Literal["all"] | list[str] = Field(
         default="all",
-        description='"all", or a list of names of parameters as `hil identify` reports them',
+        description='"all", or a list of at least two names of parameters as `hil identify` '
+        "reports them",
     )
-    max_relative_std: Annotated[FiniteFloat, Field(gt=0)] | None = Field(
+    max_relative_std: Annotated[Number, Field(gt=0)] | None = Field(
         default=None,
         description="a percentage: parameters whose standard deviation in the earlier estimate is "
         "a larger share of their value are left out; needs --earlier",
     )
+
+    @field_validator("parameters")
+    @classmethod
+    def _two_at_least(cls, parameters: str | list[str]) -> str | list[str]:
+        if isinstance(parameters, list) and len(parameters) < 2:
+            named = "one parameter" if parameters else "no parameter"
+            raise ValueError(
+                f'names {named}, and a design needs two; give "all", or at least two names as '
+                "`hil identify` reports them"
+            )
+        return parameters
 
     @model_validator(mode="after")
     def _one_choice(self) -> ObjectiveTable:
@@ -190,7 +216,7 @@ class DesignSettings(_Table):
     """The whole file."""
 
     method: Method = Field(description='"a", "b", "balanced" or "front"')
-    seed: int = Field(
+    seed: Whole = Field(
         default=1, ge=0, lt=2**63, description="a whole number, 0 or more; one seed is one result"
     )
     search: SearchTable = Field(description="a table [search]")
@@ -208,6 +234,24 @@ class DesignSettings(_Table):
             )
         return self
 
+    @model_validator(mode="after")
+    def _length_is_allowed(self) -> DesignSettings:
+        """Sines last as long as they are told to: what is not allowed needs no search."""
+        if self.sines is None:
+            return self
+        length, kept = self.sines.length, self.constraints
+        if length > kept.max_duration:
+            raise ValueError(
+                f"[sines] length = {length:g} s is longer than [constraints] max_duration = "
+                f"{kept.max_duration:g} s; shorten the one or raise the other"
+            )
+        if length < kept.min_duration:
+            raise ValueError(
+                f"[sines] length = {length:g} s is shorter than [constraints] min_duration = "
+                f"{kept.min_duration:g} s; lengthen the one or lower the other"
+            )
+        return self
+
     def replaced(self, **changes: Any) -> DesignSettings:
         """These settings with some replaced, tables merged field by field, all checked again.
 
@@ -220,6 +264,17 @@ class DesignSettings(_Table):
         """These settings with nothing but joint limits and durations to keep, the path open."""
         return self.replaced(
             constraints={"closed": False, "collision": False, "current": False},
+        )
+
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """What a search with these settings does not look at; empty for a robot's motion."""
+        kept = self.constraints
+        bare = self.sines is not None and self.sines.ramp == 0.0
+        return (
+            *(() if kept.collision else ("floor", "walls", "the arm itself")),
+            *(() if kept.current else ("motor currents",)),
+            *(("rest at both ends",) if bare else ()),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -240,6 +295,8 @@ def preset_text(method: Method) -> str:
 def load_settings(path: Path) -> DesignSettings:
     """Read settings; what the file leaves out is as in the preset of its method ("front").
 
+    Of a file that a design left behind, its table of settings is read.
+
     Raises:
         SettingsError: names file, field, value and remedy.
     """
@@ -253,6 +310,8 @@ def load_settings(path: Path) -> DesignSettings:
         raise SettingsError(
             path, f"is not TOML ({error})", remedy="see `hil design --show-settings front`"
         ) from error
+    if raw.get("format") == RESULT_FORMAT and isinstance(raw.get("settings"), dict):
+        raw = raw["settings"]
     return settings_of(raw, path)
 
 
@@ -296,9 +355,10 @@ def _validated(path: Path | None, raw: Mapping[str, Any]) -> DesignSettings:
         complaint = first_error(path or Path(), error, DesignSettings)
         value = complaint.value
         found = "" if value is None else f" = {value!r:.60}"
+        no_table = error.errors(include_url=False)[0]["type"] == "model_type"
         raise SettingsError(
             path,
-            complaint.problem,
+            "is no table" if no_table else complaint.problem,
             field=f"{complaint.field}{found}",
             remedy=complaint.remedy,
         ) from error

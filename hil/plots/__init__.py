@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from hil.plots.frame import AngleFrame
 from hil.plots.plan_picture import check_format, draw_plan, save
 
-__all__ = ["AngleFrame", "check_format", "draw_plan", "save"]
+__all__ = ["check_format", "draw_plan", "save"]

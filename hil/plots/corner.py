@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from hil.cell import AngleFrame
 from hil.plots import style
-from hil.plots.frame import AngleFrame
 from hil.plots.joints import corner_times
 from planner.isolation import in_child
 from planner.moves import FlyPercent, MotionPlan, TargetPassage, plan_moves

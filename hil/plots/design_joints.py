@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from hil.cell import AngleFrame
 from hil.plots import style
-from hil.plots.frame import AngleFrame
 from hil.report.figures.canvas import thinned
-from hil.report.figures.svg import label
 from planner import JointLimits, Trajectory
 
 Array = NDArray[np.float64]
 
 _SAMPLES = 4000
 _MARGIN = 0.1
+_LETTERS = 12
+"""As many as a line along a row's height takes."""
+_NAME = 0.4
+"""inch from the axes to the name, which leaves room for the limits' numbers."""
 
 
 def draw_motion(
@@ -55,14 +59,42 @@ def draw_motion(
             axes.tick_params(labelbottom=joint == len(rows) - 1, length=2.0, pad=2.0)
             style.bare(axes)
             axes.grid(False, axis="x")
-        position.set_ylabel(label(name), color=style.INK)
-        position.yaxis.set_label_coords(-0.16, 0.5)
+        _name(position, broken(name))
     titles = (f"position [deg, {frame.name} angles]", "velocity [deg/s]")
     for axes, title in zip(rows[0], titles, strict=True):
         axes.set_title(title, loc="left", color=style.MUTED, pad=13.0)
         _number(axes, postures)
     for axes in rows[-1]:
         axes.set_xlabel("time [s]")
+
+
+def _name(axes: Axes, name: str) -> None:
+    """Write a name as far from the axes as all others, whatever their width."""
+    size = style.TEXT if "\n" not in name else style.TEXT - 1.0
+    axes.set_ylabel(name, color=style.INK, fontsize=size)
+    width = axes.bbox.width / axes.figure.dpi
+    axes.yaxis.set_label_coords(-_NAME / width, 0.5)
+
+
+def broken(name: str) -> str:
+    """Return a joint's name in at most two lines, none longer than a row of the page is high.
+
+    What does not fit is left out of the middle: beginnings and ends tell joints apart.
+    """
+    name = "".join(c if c.isprintable() else " " for c in name).strip()
+    if len(name) <= _LETTERS:
+        return name
+    ends = [match.end() for match in re.finditer(r"[_\W]+", name)]
+    fitting = [end for end in ends if end <= _LETTERS and end < len(name)]
+    if not fitting:
+        return _shortened(name)
+    at = fitting[-1]
+    return f"{name[:at].rstrip()}\n{_shortened(name[at:])}"
+
+
+def _shortened(text: str) -> str:
+    half = (_LETTERS - 1) // 2
+    return text if len(text) <= _LETTERS else f"{text[:half]}…{text[half + 1 - _LETTERS :]}"
 
 
 def _against_limits(axes: Axes, values: Array, low: float, high: float) -> None:

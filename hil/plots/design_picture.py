@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,14 +12,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil.arm import Arm
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.plots import style
 from hil.plots.design_correlation import draw_correlation
-from hil.plots.design_front import FrontPoints, draw_front
+from hil.plots.design_front import FrontPoints, FrontView, Measures, draw_front
+from hil.plots.design_heading import Line, Remarks, heading, number
 from hil.plots.design_joints import draw_motion
-from hil.plots.frame import AngleFrame
 from hil.plots.posture_strip import VIEWS, Strip, draw_strip
-from hil.report.figures.svg import label
 from identification.excitation import correlation, coupling_index, coupling_index_max, information
 from identification.excitation.excitation import Excitation
 from identification.excitation.sampling import sampled
@@ -32,17 +31,17 @@ Array = NDArray[np.float64]
 POSTURES: Final = 7
 _PERIOD = 0.001
 """s between samples of the correlations; the criteria are those of the same rate."""
-_BARS = "the arm (bars from joint to joint: its shapes are not known here)"
-_NO_REFERENCES: Mapping[str, tuple[float, float]] = MappingProxyType({})
+_NO_REFERENCES: Mapping[str, Measures] = MappingProxyType({})
 
 # All in inches.
 _WIDTH = 11.8
 _LEFT, _RIGHT = 0.78, 0.2
-_HEAD, _GAP, _FOOT = 1.12, 0.92, 0.5
+_TITLE_AT, _BETWEEN_LINES, _HEAD = 0.36, 0.23, 0.53
+_GAP, _FOOT = 0.92, 0.5
 _ROW, _BETWEEN_ROWS, _BETWEEN_COLUMNS = 0.98, 0.1, 0.56
 _AXIS, _SHADES = 0.78, 0.5
 _CELL, _SMALLEST, _LARGEST = 0.1, 2.6, 4.0
-_FRONT, _ABOVE_FRONT = 2.3, 0.85
+_FRONT, _ABOVE_FRONT = 2.3, 0.62
 _BETWEEN_VIEWS, _BETWEEN_POSTURES = 0.1, 0.07
 
 
@@ -52,7 +51,13 @@ def draw_design(
     *,
     front: FrontPoints | None = None,
     chosen: int | None = None,
-    references: Mapping[str, tuple[float, float]] = _NO_REFERENCES,
+    knee: Measures | None = None,
+    references: Mapping[str, Measures] = _NO_REFERENCES,
+    kinematic: Collection[str] = (),
+    unchecked: Sequence[str] = (),
+    complete: bool = True,
+    together: bool = False,
+    margins: str = "",
     title: str = "",
 ) -> Figure:
     """Draw a designed motion, so that a person sees what the robot is going to do.
@@ -62,33 +67,64 @@ def draw_design(
         cell: where it is going to run.
         front: what the search found beside it.
         chosen: index of this motion on the front, None where it is not one of its points.
+        knee: (log10 det, I_c) of the point of the front that it grew from, if it did.
         references: (log10 det, I_c) of other motions to compare with, by name.
+        kinematic: names of references that kept joint limits only.
+        unchecked: what the search did not look at ("floor", "the arm itself", ...).
+        complete: whether the search came to its end.
+        together: whether all measures, but those of the matrix, add earlier archives, weighted.
+        margins: how close the motion comes to its limits, in words.
         title: stands above the page; the cell's name if empty.
     """
-    trajectory, model = excitation.trajectory, cell.model
+    strip, arm = _strip(excitation.trajectory, cell)
+    remarks = Remarks(unchecked, complete, together, margins)
+    lines = heading(
+        excitation,
+        title or cell.name,
+        remarks,
+        shapes=arm.has_shapes,
+        outlined=strip.has_outlines,
+    )
+    view = None
+    if front is not None or references:
+        measures = _chosen(excitation, front, chosen)
+        view = FrontView(front, measures, chosen is not None, knee, references, kinematic, together)
+    with style.page():
+        return _page(excitation.trajectory, cell, strip, lines, view)
+
+
+def _strip(trajectory: Trajectory, cell: Cell) -> tuple[Strip, Arm]:
     arm = Arm.from_urdf(cell.urdf)
-    strip = Strip.of(arm, trajectory, cell.workspace, POSTURES)
+    return Strip.of(arm, trajectory, cell.workspace, POSTURES), arm
+
+
+def _page(
+    trajectory: Trajectory, cell: Cell, strip: Strip, lines: list[Line], front: FrontView | None
+) -> Figure:
+    """Place everything from top to bottom."""
+    model = cell.model
     side = float(np.clip(_CELL * len(model.base.names), _SMALLEST, _LARGEST))
-    with_front = front is not None or bool(references)
-    beside = side + (_ABOVE_FRONT + _FRONT if with_front else 0.0)
+    head = _TITLE_AT + _BETWEEN_LINES * (len(lines) - 1) + _HEAD
+    beside = side
+    if front is not None:
+        beside += _ABOVE_FRONT + front.legend_height(side + _SHADES) + _FRONT
     upper = max(_ROW * model.n_joints, beside)
+    gap = _GAP + (_BETWEEN_LINES if front is not None and front.together else 0.0)
     width = (_WIDTH - _LEFT - _RIGHT + _BETWEEN_POSTURES) / POSTURES - _BETWEEN_POSTURES
     views = [width * strip.shape(view) for view in VIEWS]
-    height = _HEAD + upper + _GAP + sum(views) + _BETWEEN_VIEWS * (len(views) - 1) + _FOOT
-    with style.page():
-        sheet = _Sheet(height)
-        matrix = _WIDTH - _RIGHT - _SHADES - side
-        rows = sheet.rows((_LEFT, _HEAD, matrix - _AXIS - _LEFT, upper), model.n_joints)
-        frame = AngleFrame.of(cell)
-        draw_motion(rows, trajectory, cell.joint_limits, cell.joint_names, frame, strip.postures)
-        axes = sheet.axes(matrix, _HEAD, side, side)
-        shades = sheet.axes(matrix + side + 0.1, _HEAD, 0.13, min(side, 1.6))
-        _correlations(axes, shades, trajectory, model)
-        if with_front:
-            at = sheet.axes(matrix, _HEAD + upper - _FRONT, side + _SHADES, _FRONT)
-            draw_front(at, front, _chosen(excitation, front, chosen), references)
-        draw_strip(sheet.strip(_HEAD + upper + _GAP, width, views), strip)
-        _headings(sheet, excitation, title or cell.name, arm)
+    sheet = _Sheet(head + upper + gap + sum(views) + _BETWEEN_VIEWS * (len(views) - 1) + _FOOT)
+    matrix = _WIDTH - _RIGHT - _SHADES - side
+    rows = sheet.rows((_LEFT, head, matrix - _AXIS - _LEFT, upper), model.n_joints)
+    limits, frame = cell.joint_limits, AngleFrame.of(cell)
+    draw_motion(rows, trajectory, limits, cell.joint_names, frame, strip.postures)
+    axes = sheet.axes(matrix, head, side, side)
+    shades = sheet.axes(matrix + side + 0.1, head, 0.13, min(side, 1.6))
+    _correlations(axes, shades, trajectory, model)
+    if front is not None:
+        at = sheet.axes(matrix, head + upper - _FRONT, side + _SHADES, _FRONT)
+        draw_front(at, front, side + _SHADES)
+    draw_strip(sheet.strip(head + upper + gap, width, views), strip)
+    sheet.head(lines)
     return sheet.figure
 
 
@@ -136,8 +172,17 @@ class _Sheet:
             top += height + _BETWEEN_VIEWS
         return rows
 
-    def text(self, left: float, top: float, text: str, **options: Any) -> None:
-        self.figure.text(left / _WIDTH, 1.0 - top / self.height, text, **options)
+    def head(self, lines: list[Line]) -> None:
+        """Write lines above everything else."""
+        for k, line in enumerate(lines):
+            self.figure.text(
+                _LEFT / _WIDTH,
+                1.0 - (_TITLE_AT + k * _BETWEEN_LINES) / self.height,
+                line.text,
+                fontsize=line.size,
+                color=line.colour,
+                fontweight=line.weight,
+            )
 
 
 def _correlations(axes: Axes, shades: Axes, trajectory: Trajectory, model: RobotModel) -> None:
@@ -147,7 +192,7 @@ def _correlations(axes: Axes, shades: Axes, trajectory: Trajectory, model: Robot
     b = len(model.base.names)
     draw_correlation(axes, shades, correlation(gram)[:b, :b], model.base.names)
     p = model.n_parameters
-    index = _number(coupling_index(gram), 1)
+    index = number(coupling_index(gram), 1)
     axes.set_title(
         f"|correlation| from this motion alone\n"
         f"all {p} parameters: I_c {index} of {coupling_index_max(p):.0f}",
@@ -157,36 +202,8 @@ def _correlations(axes: Axes, shades: Axes, trajectory: Trajectory, model: Robot
     )
 
 
-def _chosen(
-    excitation: Excitation, front: FrontPoints | None, chosen: int | None
-) -> tuple[float, float]:
+def _chosen(excitation: Excitation, front: FrontPoints | None, chosen: int | None) -> Measures:
     """Return the measures of the motion, those by which it lies on the front if it does."""
     if front is None or chosen is None:
         return excitation.criteria.log10_det, excitation.criteria.coupling_index
     return float(front.log10_det[chosen]), float(front.coupling_index[chosen])
-
-
-def _headings(sheet: _Sheet, excitation: Excitation, title: str, arm: Arm) -> None:
-    criteria = excitation.criteria
-    parts = [
-        label(title),
-        f"method {excitation.method}",
-        f"{excitation.trajectory.duration:.2f} s",
-        f"log₁₀(det ΦᵀΦ / Nᵖ) {_number(criteria.log10_det, 2)}",
-        f"I_c {_number(criteria.coupling_index, 1)}",
-    ]
-    sheet.text(_LEFT, 0.36, " · ".join(parts), fontsize=style.TITLE, color=style.INK)
-    sheet.text(
-        _LEFT,
-        0.6,
-        "red dashes: limits; grey lines: the postures numbered below; "
-        f"blue: all that {'the arm' if arm.has_shapes else _BARS} sweeps; "
-        "brown: the way of its end to the next posture",
-        fontsize=style.SMALL + 0.5,
-        color=style.MUTED,
-    )
-
-
-def _number(value: float, digits: int) -> str:
-    """Return a criterion as text; a motion that leaves a parameter unexcited has infinite ones."""
-    return f"{value:.{digits}f}" if np.isfinite(value) else ("∞" if value > 0.0 else "−∞")

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from hil.cell import AngleFrame
 from hil.plots import style
-from hil.plots.frame import AngleFrame
 from hil.report.figures.canvas import thinned
 from planner.moves import MotionPlan
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from hil.cell import AngleFrame
 from hil.errors import InputError
+from hil.files import write_atomically
 from hil.plots import style
 from hil.plots.corner import draw_corner, flown_corners, sharpest_corner
-from hil.plots.frame import AngleFrame
 from hil.plots.joints import draw_joints
 from planner.moves import MotionPlan
 
@@ -90,7 +92,7 @@ def check_format(path: Path) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture in the format of its name.
+    """Write a picture in the format of its name, the whole of it or nothing.
 
     Raises:
         InputError: the format is unknown, or the file cannot be written.
@@ -99,7 +101,10 @@ def save(figure: Figure, path: Path) -> None:
     metadata = {"Date": None} if path.suffix.lower() == ".svg" else {}
     try:
         with style.page():
-            figure.savefig(path, dpi=_DOTS_PER_INCH, metadata=metadata)
+            content = BytesIO()
+            kind = path.suffix.lower().removeprefix(".")
+            figure.savefig(content, format=kind, dpi=_DOTS_PER_INCH, metadata=metadata)
+        write_atomically(path, content.getvalue())
     except OSError as error:
         raise InputError(path, f"cannot be written ({error.strerror})") from error
 

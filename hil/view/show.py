@@ -63,7 +63,8 @@ def show(
     from hil.view.scene import View
 
     trajectory = motion.trajectory if isinstance(motion, Excitation) else motion
-    view = View(Arm.from_urdf(cell.urdf), trajectory, cell, host=host, port=port)
+    arm = Arm.from_urdf(cell.urdf, mesh_folders=cell.mesh_folders)
+    view = View(arm, trajectory, cell, host=host, port=port)
     if open_browser and _has_screen():
         webbrowser.open(view.address)
     return view

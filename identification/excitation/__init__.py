@@ -28,7 +28,9 @@ from identification.excitation.errors import (
     DesignError,
     ForeignJournalError,
     JournalError,
+    MissingMeshError,
     NoFeasibleMotionError,
+    PostureError,
     WorkspaceError,
 )
 from identification.excitation.excitation import Excitation
@@ -42,7 +44,11 @@ from identification.excitation.searches.ledger import Progress
 from identification.excitation.searches.polish import PolishResult, dominating, polish
 from identification.excitation.searches.population import Population
 from identification.excitation.searches.problem import Problem
-from identification.excitation.searches.run import RESCORE_PERIOD, search
+from identification.excitation.searches.run import (
+    RESCORE_PERIOD,
+    most_evaluations,
+    search,
+)
 from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
 from identification.excitation.searches.scores import Scores
 from identification.excitation.searches.settings import Method, SearchSettings
@@ -94,6 +100,7 @@ __all__ = [
     "Method",
     "PolishResult",
     "Population",
+    "PostureError",
     "Problem",
     "Progress",
     "RESCORE_PERIOD",
@@ -102,10 +109,12 @@ __all__ = [
     "Scores",
     "SearchSettings",
     "dominating",
+    "most_evaluations",
     "polish",
     "search",
     # errors
     "CollisionModelError",
+    "MissingMeshError",
     "DesignError",
     "ForeignJournalError",
     "JournalError",

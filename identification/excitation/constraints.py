@@ -75,31 +75,33 @@ class Constraints:
             raise DesignError("min_duration", self.min_duration, "at most max_duration")
 
     def violations(
-        self,
-        trajectory: PiecewiseCubic | FourierSeries,
-        motion: Motion,
-        torque: Array | None = None,
+        self, trajectory: PiecewiseCubic | FourierSeries, motion: Motion
     ) -> tuple[Violation, ...]:
         """Return what a motion breaks: of each kind and subject the worst, of contacts the deepest.
 
-        Joint limits and contacts are looked at between the samples too, the rest at them.
+        Joint limits and contacts are looked at between the samples too, the rest at them; contacts
+        of a motion that breaks a joint limit at its samples only, and a motion so violent that its
+        samples are no finite numbers for joint limits alone.
 
         Args:
             trajectory: the motion.
             motion: samples of it, both ends included.
-            torque: (m, n) nominal joint torque at the samples [N·m], where it is known already.
 
         Raises:
-            ShapeError: samples or torque of another arm.
+            ShapeError: samples of another arm.
         """
         found = rest_violations(trajectory, self.limits) if self.at_rest else []
-        found += limit_violations(trajectory, self.limits, motion)
+        beyond = limit_violations(trajectory, self.limits, motion)
+        found += beyond
         found += self._wrong_duration(trajectory.duration)
+        if beyond and not all(np.all(np.isfinite(column)) for column in motion):
+            return tuple(found)
         if self.checker is not None:
-            contact = self.checker.deepest_along(trajectory, motion)
+            # Rates beyond all limits leave everything open between samples, at any price.
+            contact = self.checker.deepest_along(trajectory, motion, between=not beyond)
             found += [] if contact is None else [_collision(self.checker, contact)]
         if self.currents is not None:
-            found += self.currents.check(motion, torque)
+            found += self.currents.check(motion)
         return tuple(found)
 
     def _wrong_duration(self, duration: float) -> list[Violation]:

@@ -39,7 +39,9 @@ class Criteria:
         log10_det: log10 of det(Phi^T Phi) / N^p; depends on units.
         coupling_index: I_c, the smaller the better.
         fitness: eq. 7 as printed, with the paper's weights 0.7 and 0.3.
-        n_samples: N, time samples that they were computed from.
+        n_samples: N of eq. 9, the time samples of the motion. Of a motion that adds to earlier
+            archives it is theirs alone, counted every 8 ms: what divides the determinant must not
+            depend on the motion then (see :class:`~identification.excitation.Objective`).
         condition: condition number of Phi; depends on units.
         scaled_condition: the same with columns of unit length. Both are None where nobody
             computed them.

@@ -68,22 +68,9 @@ class CurrentModel:
         motor_torque = np.linalg.solve(self.motor_from_joint.T, torque.T).T
         return np.asarray(motor_torque / self.torque_constant, dtype=np.float64)
 
-    def check(self, motion: Motion, nominal: Array | None = None) -> list[Violation]:
-        """Return for each joint and motor its largest excess, if there is any.
-
-        Args:
-            motion: samples.
-            nominal: (m, n) nominal joint torque there [N·m], where it is known already.
-
-        Raises:
-            ShapeError: torque of other samples.
-        """
-        if nominal is None:
-            torque = self.torque(motion)
-        elif np.shape(nominal) != motion.position.shape:
-            raise ShapeError("nominal", np.shape(nominal), str(motion.position.shape))
-        else:
-            torque = (1.0 + self.uncertainty) * nominal
+    def check(self, motion: Motion) -> list[Violation]:
+        """Return for each joint and motor its largest excess in the samples, if there is any."""
+        torque = self.torque(motion)
         joints = self.model.joint_names
         motors = tuple(f"motor of {name}" for name in joints)
         found = _beyond("current", motors, self.current(torque), self.current_limit, motion)

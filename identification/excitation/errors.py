@@ -3,6 +3,8 @@
 ```
 IdentificationError
 ├── CollisionModelError    no collision shapes can be had from a robot description
+│   └── MissingMeshError       a mesh that it names is not to be found
+├── PostureError           a joint position that is no finite number (also a ValueError)
 ├── WorkspaceError         obstacles or a margin that mean nothing (also a ValueError)
 ├── DesignError            a setting outside its range (also a ValueError)
 ├── NoFeasibleMotionError  every motion tried breaks a constraint
@@ -13,7 +15,7 @@ IdentificationError
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from identification.errors import IdentificationError
@@ -24,6 +26,32 @@ if TYPE_CHECKING:
 
 class CollisionModelError(IdentificationError):
     """A robot description from which collisions cannot be computed."""
+
+
+class MissingMeshError(CollisionModelError):
+    """A mesh that a robot description names is not to be found.
+
+    Attributes:
+        mesh: as the description names it.
+    """
+
+    def __init__(self, mesh: str) -> None:
+        self.mesh = mesh
+        super().__init__(f"the collision mesh {mesh} cannot be found")
+
+
+class PostureError(IdentificationError, ValueError):
+    """A posture with a position that is no finite number.
+
+    Attributes:
+        sample: which posture, from 0.
+        joint: which joint, from 0.
+    """
+
+    def __init__(self, sample: int, joint: int, value: float) -> None:
+        super().__init__(f"joint {joint} is at {value} rad in posture {sample}; it must be finite")
+        self.sample = sample
+        self.joint = joint
 
 
 class WorkspaceError(IdentificationError, ValueError):
@@ -72,15 +100,16 @@ class NoFeasibleMotionError(IdentificationError):
         self.tried = sum(self.rejected.values()) if tried is None else tried
         self.unexciting = unexciting
         self.stopped = stopped
-        super().__init__(self._sentence())
+        super().__init__(self.sentence())
 
-    def _sentence(self) -> str:
+    def sentence(self, told: Callable[[Violation], str] = str) -> str:
+        """In words; `told` puts a violation into the words and units of the reader."""
         reasons = [
-            f"{kind} forbids {count}, the mildest: {self.nearest[kind]}"
+            f"{kind} forbids {count}, the mildest: {told(self.nearest[kind])}"
             for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])
         ]
         if len(self.closest) > 1:
-            all_of_it = " and ".join(map(str, self.closest))
+            all_of_it = " and ".join(map(told, self.closest))
             reasons.append(f"the motion that comes closest breaks {all_of_it}")
         if self.unexciting:
             reasons.append(

@@ -29,11 +29,13 @@ from planner.verify import position_rounding
 
 Array = NDArray[np.float64]
 
+# Samples within a ramp that is shorter than the motion's own.
+_IN_RAMP = 17
 _RATES = ("velocity", "acceleration", "jerk")
 
 
 class RateBounds(NamedTuple):
-    """Bounds of the magnitudes of each joint's rates over all time, (n,) each."""
+    """Bounds of the magnitudes of each joint's rates in g parts of a motion, (n, g) each."""
 
     velocity: Array
     acceleration: Array
@@ -63,6 +65,8 @@ def limit_violations(
         return _beyond(trajectory.extrema(), limits, motion)
     attained = _attained(motion)
     found = _beyond(attained, limits, motion)
+    for ramp in _short_ramps(trajectory, motion):
+        found = found or _beyond(_attained(ramp), limits, ramp)
     if found or _kept(attained, _swing(trajectory, motion), limits):
         return found
     return _beyond(trajectory.extrema(), limits, motion)
@@ -161,6 +165,21 @@ def _attained(motion: Motion) -> Extrema:
     )
 
 
+def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
+    """Return samples within ramps that are too short for the motion's own samples to show them.
+
+    What such ramps break is seen there at once; looking at it exactly would cost seconds.
+    """
+    step = float(np.max(np.diff(motion.time)))
+    if not 0.0 < series.ramp < 3.0 * step:
+        return []
+    shares = np.linspace(0.0, series.ramp, _IN_RAMP)
+    parts = (shares, series.length - shares[::-1])
+    return [
+        Motion(time, *series.sample(time)) for time in parts if bool(np.all(np.diff(time) > 0.0))
+    ]
+
+
 def _kept(attained: Extrema, swing: _Swing, limits: JointLimits) -> bool:
     return bool(
         np.all(attained.lower - swing.position >= limits.lower)
@@ -183,9 +202,34 @@ def _swing(series: FourierSeries, motion: Motion) -> _Swing:
     return _Swing(second * step**2 / 8.0, third * step**2 / 8.0, acceleration, jerk)
 
 
-def rate_bounds(trajectory: PiecewiseCubic | FourierSeries) -> RateBounds:
-    """Return bounds of the rates of a table or a series, sound and quick rather than tight."""
+def rate_bounds(
+    trajectory: PiecewiseCubic | FourierSeries, start: Array, stop: Array
+) -> RateBounds:
+    """Return bounds of the rates in parts of a motion, sound and quick rather than tight.
+
+    Args:
+        trajectory: a table, or a series: short ramps count only in the parts they reach into.
+        start: of each part (g,) [s].
+        stop: of each part (g,) [s].
+    """
     if isinstance(trajectory, FourierSeries):
-        return RateBounds(*(trajectory.derivative_bound(order) for order in (1, 2, 3)))
+        ramp, length = trajectory.ramp, trajectory.length
+        between = (start >= ramp) & (stop <= length - ramp)
+        return RateBounds(
+            *(
+                np.where(
+                    between,
+                    trajectory.derivative_bound(order, ramps=False)[:, None],
+                    trajectory.derivative_bound(order)[:, None],
+                )
+                for order in (1, 2, 3)
+            )
+        )
     extrema = trajectory.extrema()
-    return RateBounds(extrema.velocity, extrema.acceleration, extrema.jerk)
+    everywhere = np.ones(len(start))
+    return RateBounds(
+        *(
+            rate[:, None] * everywhere
+            for rate in (extrema.velocity, extrema.acceleration, extrema.jerk)
+        )
+    )

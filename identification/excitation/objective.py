@@ -13,7 +13,6 @@ from identification.errors import ShapeError
 from identification.excitation.criteria import Criteria, log10_det_and_coupling
 from identification.excitation.errors import DesignError
 from identification.excitation.sampling import SAMPLE_PERIOD, midpoints
-from identification.factor import Factor
 from identification.model import RobotModel
 from identification.motion import Motion
 from identification.regressor import joint_arrays
@@ -28,12 +27,10 @@ class Measures(NamedTuple):
     Attributes:
         log10_det: log10 of det / N^p, -inf where a parameter is not excited.
         coupling_index: I_c, inf where a parameter is not excited.
-        torque: nominal joint torque (m, n) [N·m, N], None without nominal values.
     """
 
     log10_det: float
     coupling_index: float
-    torque: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +38,13 @@ class Objective:
     """Judges motions by the information on a model's parameters.
 
     The paper's criteria are those of all parameters, unweighted (section 3.1) and without
-    anything known before. For a sequential design the information of earlier archives is added
-    to that of the new motion, which then does best where the earlier ones said least.
+    anything known before: information per sample, so that motions of any length compare
+    (section 3.2). For a sequential design the information of earlier archives is added to that
+    of the new motion, which then does best where the earlier ones said least. It is the
+    information of both together and not per second: what is known already is spent, so N is
+    theirs alone, and a motion that says more about everything never counts for less. Its
+    duration is bounded by the constraints instead. As a fit leaves out what stands
+    (:meth:`RobotModel.moving`), so do the rows of a motion beside `earlier`.
 
     Attributes:
         model: the robot, with p parameters.
@@ -50,8 +52,8 @@ class Objective:
             their columns are left out. None for all.
         joint_weights: 1 / variance of each joint's torque (n,). None leaves joints unweighted.
         earlier: Gram matrix (p, p) of earlier archives, all parameters, weighted alike, and as
-            if sampled every SAMPLE_PERIOD: one of 1 kHz is to be divided by 8. It is scaled to
-            the sampling of each motion, so that a second of either counts alike.
+            if sampled every SAMPLE_PERIOD: one of 1 kHz is to be divided by 8. A second of the
+            new motion counts like one of theirs, however densely it is sampled.
         earlier_samples: N, the time samples in it, at the same rate.
         repetitions: how often the new motion is going to be run. It matters beside `earlier`
             only: repeating everything changes neither criterion (section 3.2).
@@ -95,79 +97,56 @@ class Objective:
         """Number e of parameters that are judged: the p of the coupling index's maximum."""
         return self.model.n_parameters if self.parameters is None else len(self.parameters)
 
-    def gram(self, factor: Factor, period: float = SAMPLE_PERIOD) -> Array:
+    def information(self, motion: Motion) -> Array:
         """Return the information (e, e) on the essential parameters, earlier archives included.
 
         Args:
-            factor: of the new motion.
-            period: between its samples [s].
-        """
-        each = factor.gram[:, :-1, :-1]
-        weights = self.joint_weights
-        new: Array = each.sum(axis=0) if weights is None else np.tensordot(weights, each, axes=1)
-        return self._with_earlier(new, period)
-
-    def n_samples(self, new: int, period: float = SAMPLE_PERIOD) -> int:
-        """Return N of :meth:`gram` for a motion of `new` time samples, `period` [s] apart."""
-        if self.earlier is None:
-            return new
-        return self.repetitions * new + round(SAMPLE_PERIOD / period * self.earlier_samples)
-
-    def measures(self, motion: Motion, values: Array | None = None) -> Measures:
-        """Judge a sampled motion in one pass over its regressor.
-
-        Args:
             motion: m samples, uniform in time; `midpoints` of a planned motion.
-            values: nominal values (p,) of all parameters; the torque is computed from them.
 
         Raises:
             ShapeError: an array does not have the shape it should have.
         """
-        new, torque = self._reduced(motion, values)
-        step = _step(motion)
-        gram, n = self._with_earlier(new, step), self.n_samples(motion.n_samples, step)
-        return Measures(*log10_det_and_coupling(gram, n), torque)
+        total = self._gram(motion)
+        if self.earlier is not None:
+            total *= self.repetitions * _step(motion) / SAMPLE_PERIOD
+            total += self.earlier
+        return total if self.parameters is None else total[np.ix_(self.parameters, self.parameters)]
+
+    def n_samples(self, motion: Motion) -> int:
+        """Return N of the criteria: the motion's own samples, or those of the earlier archives."""
+        return motion.n_samples if self.earlier is None else self.earlier_samples
+
+    def measures(self, motion: Motion) -> Measures:
+        """Judge a sampled motion (see :meth:`information`) in one pass over its regressor."""
+        return Measures(*log10_det_and_coupling(self.information(motion), self.n_samples(motion)))
 
     def criteria(self, trajectory: Trajectory, period: float) -> Criteria:
-        """Return all criteria of a planned motion, in N = duration / `period` samples."""
+        """Return all criteria of a planned motion, sampled every `period` [s]."""
         motion = midpoints(trajectory, period)
-        new, _ = self._reduced(motion, None)
-        step = _step(motion)
-        return Criteria.of_gram(
-            self._with_earlier(new, step), self.n_samples(motion.n_samples, step)
-        )
+        return Criteria.of_gram(self.information(motion), self.n_samples(motion))
 
-    def _reduced(self, motion: Motion, values: Array | None) -> tuple[Array, Array | None]:
-        """Return the weighted Gram matrix (p, p), and the torque (m, n) if values are given."""
+    def _gram(self, motion: Motion) -> Array:
+        """Return the weighted Gram matrix (p, p) of the motion alone."""
         model = self.model
         n, p = model.n_joints, model.n_parameters
-        if values is not None and np.shape(values) != (p,):
-            raise ShapeError("values", np.shape(values), f"({p},)")
         states = joint_arrays(
             n,
             position=motion.position,
             velocity=motion.velocity,
             acceleration=motion.acceleration,
         )
-        columns = model.plan.columns
-        sums = [np.zeros((len(used), len(used))) for used in columns]
-        torque = None if values is None else np.empty((n, len(states[0])))
+        standing = None if self.earlier is None else ~model.moving(states[1])
+        sums = [np.zeros((len(used), len(used))) for used in model.plan.columns]
         for part, rows in model.plan.chunks(*states):
             for joint, block in enumerate(rows):
+                if standing is not None:
+                    np.copyto(block, 0.0, where=standing[part, joint])
                 sums[joint] += block @ block.T
-                if torque is not None and values is not None:
-                    np.matmul(values[columns[joint]], block, out=torque[joint, part])
         total = np.zeros((p, p))
         weights = np.ones(n) if self.joint_weights is None else self.joint_weights
         for joint, place in enumerate(self._places):
             total[place] += weights[joint] * sums[joint]
-        return total, None if torque is None else torque.T
-
-    def _with_earlier(self, new: Array, period: float) -> Array:
-        total = new
-        if self.earlier is not None:
-            total = self.repetitions * new + SAMPLE_PERIOD / period * self.earlier
-        return total if self.parameters is None else total[np.ix_(self.parameters, self.parameters)]
+        return total
 
     @cached_property
     def _places(self) -> list[tuple[NDArray[np.intp], ...]]:

@@ -69,14 +69,24 @@ class Violation:
         return excess if np.isfinite(excess) else np.inf
 
     def __str__(self) -> str:
-        unit = _UNITS[self.kind]
+        joints = ", ".join(f"{q:.3f}" for q in self.posture)
+        return self.sentence(f"({joints}) rad" if joints else "")
+
+    def sentence(self, joints: str, unit: str | None = None) -> str:
+        """In words.
+
+        Args:
+            joints: where the joints are, in words; empty to leave that out.
+            unit: of value and bound, with a space before it, where they are not in SI.
+        """
+        unit = _UNITS[self.kind] if unit is None else unit
         text = f"{self.kind} of {self.subject}"
         if self.kind != "planning":  # where there is no motion, there are no numbers either
             text += f": {self.value:.4g}{unit}, {self._wanted(unit)}"
         if self.time is not None:
             text += f", at {self.time:.3f} s"
-        if self.posture:
-            text += f", joints at ({', '.join(f'{q:.3f}' for q in self.posture)}) rad"
+        if joints:
+            text += f", joints at {joints}"
         return f"{text}; {self.remedy}" if self.remedy else text
 
     def _wanted(self, unit: str) -> str:

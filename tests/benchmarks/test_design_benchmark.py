@@ -47,9 +47,12 @@ def test_ratios_are_those_of_the_times_told(figures: dict) -> None:
     )
 
 
-def test_the_slowest_individual_is_no_faster_than_their_mean(figures: dict) -> None:
-    assert 0.0 < figures["individual_ms"] <= figures["individual_worst_ms"]
-    assert figures["individuals"] == 6
+@pytest.mark.parametrize("search", ["", "_front"])
+def test_the_slowest_individual_is_no_faster_than_their_mean(figures: dict, search: str) -> None:
+    assert 0.0 < figures[f"individual{search}_ms"] <= figures[f"individual{search}_worst_ms"]
+    assert figures[f"scoring{search}_ms"] <= figures[f"scoring{search}_worst_ms"]
+    assert figures[f"individual{search}_ms"] < figures[f"scoring{search}_ms"]
+    assert figures[f"individuals{search}"] == 6
     assert figures["individual_20_s_ms"] > 0.0
 
 

@@ -27,8 +27,11 @@ from hil.campaign import (
     PlannedMotion,
     Stop,
 )
+from hil.campaign import campaign as campaign_module
+from hil.campaign.intervals import Interval, hold, require_sound, wanted, with_ways
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerFault, InputError
+from hil.motion_checks import MotionChecks
 from hil.progress import Silent, Task
 from hil.simulation import simulated_controller, simulated_link, simulated_provenance
 from planner import (
@@ -277,10 +280,9 @@ def test_motions_that_do_not_join_are_refused_before_anything_moves(
     good = plan.validation[0].trajectory
     shifted = tuple(np.column_stack([c[:, 0] + 0.01, c[:, 1:]]) for c in good.coefficients)
     bad = replace(plan, validation=(PlannedMotion(PiecewiseCubic(good.knots, shifted)),))
-    campaign = Campaign.create(tmp_path / "jump", cell.with_campaign(validation_runs=1), bad)
     with pytest.raises(MotionRefusedError, match="validation 0 was not sent: it begins with joint"):
-        execute(campaign)
-    assert not list(campaign.folder.archives.iterdir())
+        Campaign.create(tmp_path / "jump", cell.with_campaign(validation_runs=1), bad)
+    assert not list(tmp_path.iterdir()), "no folder is made for what can never run"
 
 
 def test_a_motion_for_another_arm_is_refused(
@@ -289,9 +291,9 @@ def test_a_motion_for_another_arm_is_refused(
     good = plan.validation[0].trajectory
     five = PiecewiseCubic(good.knots[:5], good.coefficients[:5])
     bad = replace(plan, validation=(PlannedMotion(five),))
-    campaign = Campaign.create(tmp_path / "five", cell.with_campaign(validation_runs=1), bad)
     with pytest.raises(MotionRefusedError, match="for 5 joints, the arm has 6"):
-        execute(campaign)
+        Campaign.create(tmp_path / "five", cell.with_campaign(validation_runs=1), bad)
+    assert not list(tmp_path.iterdir()), "no folder is made for what can never run"
 
 
 def test_a_torn_archive_is_not_among_the_completed(
@@ -354,20 +356,18 @@ def test_a_motion_outside_the_limits_is_refused_before_anything_moves(
         for j, c in enumerate(good.coefficients)
     )
     bad = replace(plan, validation=(PlannedMotion(PiecewiseCubic(good.knots, far)),))
-    campaign = Campaign.create(tmp_path / "far", cell.with_campaign(validation_runs=1), bad)
-    with pytest.raises(MotionRefusedError, match=r"validation 0 was not sent: .*position of joint"):
-        execute(campaign)
-    assert not list(campaign.folder.archives.iterdir())
+    with pytest.raises(MotionRefusedError, match=r"validation 0 was not sent: .*position of J2"):
+        Campaign.create(tmp_path / "far", cell.with_campaign(validation_runs=1), bad)
+    assert not list(tmp_path.iterdir()), "no folder is made for what can never run"
 
 
 def test_a_motion_into_the_floor_is_refused_before_anything_moves(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
     raised = Cell.from_texts(cell.text.replace("floor = 0.0", "floor = 1.0"), cell.urdf, cell.path)
-    campaign = Campaign.create(tmp_path / "floor", raised, plan)
     with pytest.raises(MotionRefusedError, match=r"collision of .*floor"):
-        execute(campaign)
-    assert not list(campaign.folder.archives.iterdir())
+        Campaign.create(tmp_path / "floor", raised, plan)
+    assert not list(tmp_path.iterdir()), "no folder is made for what can never run"
 
 
 def test_motors_that_are_too_weak_are_named_before_anything_moves(
@@ -378,9 +378,37 @@ def test_motors_that_are_too_weak_are_named_before_anything_moves(
         cell.urdf,
         cell.path,
     )
-    campaign = Campaign.create(tmp_path / "weak", weak, plan)
     with pytest.raises(MotionRefusedError, match="current of motor of joint_2"):
+        Campaign.create(tmp_path / "weak", weak, plan)
+    assert not list(tmp_path.iterdir()), "no folder is made for what can never run"
+
+
+def test_an_older_folder_with_a_motion_that_must_not_be_sent_is_refused_before_anything_moves(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raised = Cell.from_texts(cell.text.replace("floor = 0.0", "floor = 1.0"), cell.urdf, cell.path)
+    with monkeypatch.context() as once:
+        once.setattr(campaign_module, "require_runnable", lambda *arguments: None)
+        campaign = Campaign.create(tmp_path / "floor", raised, plan)
+    with pytest.raises(MotionRefusedError, match=r"standstill 0 .*collision of .*floor.*home_deg"):
         execute(campaign)
+    assert not list(campaign.folder.archives.iterdir())
+
+
+def test_only_where_the_way_from_the_arm_is_not_free_is_it_to_be_jogged(
+    cell: Cell, plan: CampaignPlan
+) -> None:
+    low = cell.home + np.array([0.0, 1.6, -1.5, 0.0, 0.0, 0.0])
+    ways = with_ways(cell, wanted(cell, plan), low)
+    assert [way.from_arm for way in ways if way.kind == "move"] == [True, True]
+    buried = MotionChecks.of(
+        Cell.from_texts(cell.text.replace("floor = 0.0", "floor = 0.3"), cell.urdf, cell.path)
+    )
+    with pytest.raises(MotionRefusedError, match=r"move 0 .*jog the arm"):
+        require_sound(ways, buried)
+    wild = Interval("excitation", 0, hold(cell.home + 10.0, 1.0))
+    with pytest.raises(MotionRefusedError, match=r"excitation 0 .*; design another motion\."):
+        require_sound([wild], buried)
 
 
 def test_a_folder_in_use_is_not_overwritten(campaign: Campaign) -> None:
@@ -491,7 +519,7 @@ def test_a_solver_that_crashes_on_the_way_home_ends_the_campaign_and_not_the_pro
     def crashing(*arguments: object, **settings: object) -> None:
         raise PlannerCrashed(-11)
 
-    monkeypatch.setattr("hil.campaign.campaign.in_child", crashing)
+    monkeypatch.setattr("hil.campaign.intervals.in_child", crashing)
     campaign = Campaign.create(tmp_path / "crash", *one_repetition(cell, plan))
     with pytest.raises(PlannerCrashed, match="signal 11"):
         execute(campaign)

@@ -96,7 +96,7 @@ def test_nominal_values_are_the_manufacturers_column_of_table_2(folder: Path) ->
         (r"^stop = .*", "stop = { acceleration = 1.1, jerk = 3 }", "bounds", "correct that table"),
         (r"^home_deg = \[0.0, 0.0", "home_deg = [0.0, 99.0", "campaign.home_deg", "posture"),
         (r"^initial_deg = \[10.0", "initial_deg = [900.0", "initial_deg", "posture"),
-        (r"^elasticity = .*", "elasticity = [1e-6]", "simulation.elasticity", "each joint"),
+        (r"^elasticity = .*", "elasticity = [1e-6]", "simulation.elasticity", "or none"),
         (r'"limits.jerk_deg"', '"limits.jrk_deg"', "cell.assumed", "table.field"),
         (
             r"^walls = .*",
@@ -226,3 +226,66 @@ def test_the_session_is_set_up_as_the_cell_says() -> None:
         "other_axes": frozenset({(1, 7), (2, 1)}),
         "settle_cycles": round(cell.campaign.settle_s / cell.period),
     }
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        (r"^rotor_inertia = true", 'rotor_inertia = "yes"', "robot.rotor_inertia = 'yes'"),
+        (r"^offset = false", "offset = 0", "robot.friction.offset = 0"),
+        (r"^margin = 0.05", 'margin = "0.05"', "workspace.margin = '0.05'"),
+        (r"^floor = 0.0", 'floor = "0.0"', "workspace.floor = '0.0'"),
+        (r"^fly = 0.5", "fly = true", "campaign.fly = True"),
+        (r"^repetitions = 30", 'repetitions = "30"', "campaign.repetitions = '30'"),
+        (r"^gear_ratio = \[-116.0", 'gear_ratio = ["-116.0"', "drive_train.gear_ratio[0]"),
+    ],
+)
+def test_text_is_no_number_and_no_truth_value(folder: Path, old: str, new: str, field: str) -> None:
+    assert field in complaint(folder, old, new)
+
+
+def test_a_whole_number_is_a_number(folder: Path) -> None:
+    path = folder / "cell.toml"
+    path.write_text(path.read_text("utf-8").replace("margin = 0.05", "margin = 1"), "utf-8")
+    assert Cell.load(path).workspace.margin == 1.0
+
+
+def test_the_third_nominal_coefficient_may_be_left_out(folder: Path) -> None:
+    path = folder / "cell.toml"
+    whole = Cell.load(path)
+    text = re.sub(r"^third = \[0.*\n", "", whole.text, count=1, flags=re.M)
+    without = Cell.from_texts(text, whole.urdf, path)
+    assert without.nominal.third == []
+    np.testing.assert_array_equal(without.nominal_values(), whole.nominal_values())
+    assert "or none" in complaint(folder, r"^third = \[0.*", "third = [0.0]")
+
+
+@pytest.mark.parametrize("table", ["limits", "drive_train"])
+def test_a_table_that_is_missing_is_named_itself(folder: Path, table: str) -> None:
+    sentence = complaint(folder, rf"^\[{table}\]\n(?:[^\[].*\n|\n)*", "")
+    assert f"cell.toml: {table}: is missing" in sentence
+    assert f"add a table [{table}]" in sentence
+
+
+def test_limits_without_a_drive_train_are_held_against_the_urdf_too(folder: Path) -> None:
+    cell = Cell.load(folder / "cell.toml")
+    limits = cell.text[cell.text.index("[limits]") : cell.text.index("[drive_train]")]
+    limits = limits.replace('"controller"', '"urdf"').replace(
+        "upper_deg = [180.0", "upper_deg = [999"
+    )
+    with pytest.raises(CellError, match="beyond the URDF's"):
+        Cell.from_texts(f'[cell]\nname = "x"\nurdf = "u"\n{limits}', cell.urdf, Path("cell.toml"))
+
+
+def test_a_sliding_joint_is_refused_by_name_where_degrees_are_given(folder: Path) -> None:
+    urdf = folder / "ns16.urdf"
+    text = urdf.read_text("utf-8")
+    sliding = re.sub(r'(name="joint_3"\s+type=)"revolute"', r'\1"prismatic"', text)
+    assert sliding != text
+    urdf.write_text(sliding, "utf-8")
+    sentence = complaint(folder, "^margin = 0.05", "margin = 0.04")
+    assert "cell.toml: limits: is in degrees" in sentence
+    assert "joint_3 slides" in sentence
+    assert 'type = "fixed"' in sentence
+    (folder / "cell.toml").write_text('[cell]\nname = "x"\nurdf = "ns16.urdf"\n', "utf-8")
+    assert Cell.load(folder / "cell.toml").model.n_joints == 6  # recordings of it can be used

@@ -1,14 +1,20 @@
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
+import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 import tomllib
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib.image
 import numpy as np
@@ -19,8 +25,10 @@ from typer.testing import CliRunner
 
 from hil.cell import Cell
 from hil.cli.design import design
+from hil.cli.design_words import summary
 from hil.design import DesignResult, load_design, preset, run_search
 from hil.design.advice import NoExcitationError
+from hil.design.folder import DesignFolder
 from hil.design.settings import preset_text
 from hil.errors import InputError, OperatorStopError
 from hil.plots import design_picture
@@ -41,10 +49,15 @@ def drawing():
     return design_picture.draw_design
 
 
+def app_of(command) -> typer.Typer:
+    app = typer.Typer()
+    app.command()(command)
+    return app
+
+
 @pytest.fixture(scope="module")
 def invoke(drawing):
-    app = typer.Typer()
-    app.command()(design)
+    app = app_of(design)
 
     def invoke(*arguments: object, draw=lambda *_, **__: Figure()):
         design_picture.draw_design = draw
@@ -172,6 +185,97 @@ def test_what_is_not_a_design_is_never_removed(invoke, settings, tmp_path):
     assert (out / "settings.toml").read_text() == "mine = true\n"
 
 
+@pytest.mark.parametrize("option", [(), ("--force",), ("--resume",)])
+def test_a_folder_in_which_a_search_is_running_is_left_alone(invoke, settings, copied, option):
+    def content():
+        return {path.name: path.read_bytes() for path in copied.iterdir()}
+
+    before = content()
+    given = () if option == ("--resume",) else ("--settings", settings, "--kinematic")
+    with (
+        DesignFolder(copied).held(),
+        pytest.raises(InputError, match=r"copied: a search is running in it; wait") as caught,
+    ):
+        invoke(CELL_PATH, *given, "-o", copied, *option)
+    assert "--force" not in str(caught.value)
+    assert content() == before
+    invoke(CELL_PATH, "--resume", "-o", copied)  # nobody is there any more
+
+
+def test_the_folder_is_held_until_the_picture_is_drawn(invoke, copied):
+    def meanwhile(*_, **__):
+        with pytest.raises(InputError, match="a search is running"), DesignFolder(copied).held():
+            pass
+        return Figure()
+
+    invoke(CELL_PATH, "--resume", "-o", copied, draw=meanwhile)
+
+
+def test_a_file_system_without_locks_is_no_other_search(invoke, settings, tmp_path, monkeypatch):
+    def refused(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refused)
+    with pytest.raises(InputError, match=r"cannot be locked.*No locks available.*disk of this PC"):
+        invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
+
+
+def test_a_result_that_cannot_be_written_names_file_and_remedy(invoke, copied, monkeypatch):
+    def full(path, _):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr("hil.design.result.write_atomically", full)
+    words = r"excitation\.toml: the motion is found but cannot be written \(No space.*--resume"
+    with pytest.raises(InputError, match=words):
+        invoke(CELL_PATH, "--resume", "-o", copied)
+
+
+def test_a_picture_that_cannot_be_written_is_a_warning(invoke, copied):
+    before = (copied / "excitation.toml").read_bytes()
+    (copied / "excitation.png").unlink()
+    (copied / "excitation.png").mkdir()
+    result = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("log det ")
+    assert "warning: " in result.stderr and "excitation.png: cannot be written" in result.stderr
+    assert (copied / "excitation.toml").read_bytes() == before
+    assert not list(copied.glob("*.tmp"))
+
+
+def test_a_disk_that_is_full_costs_journal_and_picture_but_no_motion(tmp_path):
+    """As full for every file as it can be made without a disk of its own."""
+    settings = tmp_path / "my.toml"
+    settings.write_text(SETTINGS.replace("generations = 2", "generations = 12"))
+    script = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (25000, 25000)); "
+    script += "from hil.__main__ import main; main()"
+    out = tmp_path / "out"
+    given = [CELL_PATH, "--settings", settings, "--kinematic", "-o", out, "--workers", 1]
+    done = subprocess.run(
+        [sys.executable, "-c", script, "design", *map(str, given)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "the journal cannot be written (File too large); the search goes on" in done.stdout
+    assert "the journal lacks the last motions" in done.stdout
+    assert "warning: " in done.stderr and "Traceback" not in done.stderr
+    assert {path.name for path in out.iterdir()} == {
+        "excitation.toml",
+        "settings.toml",
+        "search.journal",
+    }
+    half = (out / "excitation.toml").read_bytes()
+    again = CliRunner().invoke(app_of(design), [str(CELL_PATH), "--resume", "-o", str(out)])
+    assert again.exit_code == 0
+    assert (out / "excitation.toml").read_bytes() == half
+
+
+def test_a_search_that_ends_early_says_why(invoke, settings, tmp_path):
+    settings.write_text(SETTINGS + "crossover = 0.0\nmutation = 0.0\n")
+    given = (CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
+    output = invoke(*given).output
+    assert "ended after 1 of 2 generations: mating brought no motion" in output
+    assert "100 %" in output
+
+
 @pytest.mark.parametrize("method", ["a", "b", "balanced", "front"])
 def test_settings_are_shown_as_a_file_to_begin_with(invoke, method):
     result = invoke("--show-settings", method)
@@ -191,8 +295,8 @@ def test_json_says_the_same_as_the_file(bare):
 
 def test_a_finished_search_resumed_is_the_same_file_and_quiet_leaves_one_line(invoke, bare, copied):
     (copied / "excitation.toml").unlink()
-    output = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet").output
-    assert len(output.splitlines()) == 1
+    output = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet")
+    assert len(output.stdout.splitlines()) == 1
     whole = (bare[0] / "excitation.toml").read_bytes()
     assert (copied / "excitation.toml").read_bytes() == whole
 
@@ -207,7 +311,8 @@ def test_a_bare_series_is_said_to_be_for_looking_only(invoke, tmp_path):
     path.write_text('method = "a"\n[search]\npopulation = 8\ngenerations = 1\n[sines]\nramp = 0\n')
     output = invoke(CELL_PATH, "--settings", path, "--kinematic", "-o", tmp_path / "o").output
     assert "no controller can run it; give it a ramp" in output
-    assert "not looked at: floor, walls and the arm itself, currents" in output
+    unchecked = "floor, walls, the arm itself, motor currents, rest at both ends"
+    assert f"warning: not looked at: {unchecked}" in output
 
 
 def test_no_feasible_motion_says_what_forbids_it_where_and_what_to_change(
@@ -218,7 +323,9 @@ def test_no_feasible_motion_says_what_forbids_it_where_and_what_to_change(
         invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
     said = str(caught.value)
     assert "duration forbids 16" in said and "0.5" in said
-    assert "What can be changed: allow more time ([constraints] max_duration)" in said
+    ratio = r"What can be changed: the shortest motion tried is \d\d times too long: allow more "
+    assert re.search(ratio + r"time \(\[constraints\] max_duration\)", said)
+    assert "search longer" not in said
     assert caught.value.exit_code == 3
     assert not (tmp_path / "out" / "excitation.toml").exists()
 
@@ -255,6 +362,7 @@ def test_a_view_that_cannot_be_shown_is_refused_before_the_search(invoke, settin
         ([CELL_PATH, "--compare", "NOWHERE"], "cannot be read"),
         ([CELL_PATH, "--earlier", "NOWHERE"], "nowhere"),
         ([CELL_PATH, "-o", "SETTINGS"], "cannot be made a folder"),
+        ([CELL_PATH, "-o", ""], "--output: is empty; name a folder"),
     ],
 )
 def test_says_what_is_wrong(invoke, settings, tmp_path, arguments, words):
@@ -277,16 +385,78 @@ def test_a_search_is_not_resumed_with_other_settings_or_another_cell(invoke, bar
         invoke(tmp_path / "cell.toml", "--resume", "-o", bare[0])
 
 
-def test_other_designs_are_named_on_the_front(made, invoke, copied):
-    drawn = {}
+class Seen:
+    """What the page is asked to show."""
 
-    def seen(*_, references, **__):
-        drawn.update(references)
+    def __init__(self) -> None:
+        self.drawn: dict = {}
+
+    def __call__(self, *_, **asked) -> Figure:
+        self.drawn.update(asked)
         return Figure()
 
-    invoke(CELL_PATH, "--resume", "-o", copied, "--compare", made[0], draw=seen)
-    criteria = load_design(made[0]).criteria
-    assert drawn == {"method B": (criteria.log10_det, criteria.coupling_index)}
+
+def test_other_designs_are_named_on_the_front(made, bare, invoke, copied):
+    seen, compare = Seen(), ("--compare", made[0], "--compare", bare[0])
+    invoke(CELL_PATH, "--resume", "-o", copied, *compare, draw=seen)
+    whole, kinematic = (load_design(folder).criteria for folder in (made[0], bare[0]))
+    second = f"method B ({bare[0]})"
+    assert seen.drawn["references"] == {
+        "method B": (whole.log10_det, whole.coupling_index),
+        second: (kinematic.log10_det, kinematic.coupling_index),
+    }
+    assert seen.drawn["kinematic"] == {second}
+
+
+def test_what_was_not_looked_at_is_in_picture_json_and_stderr_however_quiet(invoke, bare, copied):
+    unchecked = ["floor", "walls", "the arm itself", "motor currents"]
+    seen = Seen()
+    said = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
+    assert list(seen.drawn["unchecked"]) == unchecked
+    assert f"warning: not looked at: {', '.join(unchecked)}" in said.stderr
+    assert json.loads(bare[1])["unchecked"] == unchecked
+    assert seen.drawn["margins"] == "" and not seen.drawn["together"]
+
+
+def test_a_real_cells_motion_is_drawn_with_its_margins(invoke, made, tmp_path):
+    seen, copied = Seen(), Path(shutil.copytree(made[0], tmp_path / "copied"))
+    said = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
+    assert seen.drawn["unchecked"] == () and seen.drawn["complete"]
+    assert seen.drawn["margins"].startswith("current at most ")
+    assert said.stderr == ""
+
+
+@pytest.mark.parametrize("name", ["excitation.toml", "settings.toml"])
+def test_the_settings_of_an_earlier_design_are_taken_from_its_file(invoke, bare, tmp_path, name):
+    out = tmp_path / "out"
+    assert invoke(CELL_PATH, "--settings", bare[0] / name, "-o", out).exit_code == 0
+    one, two = (folder / "excitation.toml" for folder in (bare[0], out))
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_what_is_no_finite_number_is_null(bare):
+    result = DesignResult.load(bare[0])
+    criteria = replace(
+        result.excitation.criteria, log10_det=-np.inf, coupling_index=np.inf, condition=np.nan
+    )
+    excitation = replace(result.excitation, criteria=criteria)
+    found = SimpleNamespace(complete=True, exhausted=False, front=SimpleNamespace(log10_det=[]))
+    done = SimpleNamespace(result=replace(result, excitation=excitation), design=found)
+    printed = json.dumps(summary(done, DesignFolder(bare[0])), allow_nan=False)
+    names = ("log10_det", "coupling_index", "condition")
+    assert [json.loads(printed)[name] for name in names] == [None, None, None]
+
+
+def test_parameters_that_are_hardly_told_apart_are_named(invoke, copied, monkeypatch):
+    monkeypatch.setattr(
+        "hil.cli.design_words.weakest", lambda *_: pytest.fail("named for a fine motion")
+    )
+    invoke(CELL_PATH, "--resume", "-o", copied)
+    monkeypatch.setattr("hil.cli.design_words.WEAK", 1.0)
+    monkeypatch.setattr("hil.cli.design_words.weakest", lambda *_: ("I6zz", "f1_6"))
+    assert "hardly tells apart I6zz, f1_6: take more via points" in (
+        invoke(CELL_PATH, "--resume", "-o", copied).output
+    )
 
 
 def test_stopped_before_there_is_a_motion_is_a_stop_and_no_refusal():
@@ -296,7 +466,9 @@ def test_stopped_before_there_is_a_motion_is_a_stop_and_no_refusal():
     assert caught.value.exit_code == 130
 
 
-def interrupted(command: list[str], journal: Path) -> tuple[int, str]:
+def interrupted(
+    command: list[str], journal: Path, kind: signal.Signals = signal.SIGINT
+) -> tuple[int, str]:
     """Run a search, interrupt it once it has journalled three generations."""
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -306,7 +478,7 @@ def interrupted(command: list[str], journal: Path) -> tuple[int, str]:
             assert time.monotonic() < deadline
             assert run.poll() is None, run.communicate()
             time.sleep(0.02)
-        run.send_signal(signal.SIGINT)
+        run.send_signal(kind)
         _, said = run.communicate(timeout=60)
     return run.returncode, said
 
@@ -326,3 +498,28 @@ def test_ctrl_c_leaves_the_best_so_far_and_resuming_ends_where_it_would_have(inv
     invoke(*arguments, "-o", tmp_path / "whole")
     whole = (tmp_path / "whole" / "excitation.toml").read_bytes()
     assert (out / "excitation.toml").read_bytes() == whole
+
+
+def test_whoever_ends_the_process_gets_the_best_so_far(tmp_path):
+    settings, out = tmp_path / "my.toml", tmp_path / "out"
+    settings.write_text(SETTINGS.replace("generations = 2", "generations = 2000"))
+    arguments = [str(CELL_PATH), "--settings", str(settings), "--kinematic", "-o", str(out)]
+    command = [sys.executable, "-m", "hil", "design", *arguments]
+    code, said = interrupted(command, out / "search.journal", signal.SIGTERM)
+    assert code == 130, said
+    assert not DesignResult.load(out).complete
+
+
+def test_ctrl_c_while_it_is_still_loading_leaves_no_traceback():
+    script = """
+import os, signal, sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "numpy":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+from hil.__main__ import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "error: interrupted\n")

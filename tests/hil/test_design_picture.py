@@ -21,6 +21,8 @@ from hil.arm import Arm, surface_points
 from hil.cell import Cell
 from hil.plots import save, style
 from hil.plots.design_correlation import blocks
+from hil.plots.design_front import FrontView
+from hil.plots.design_joints import broken
 from hil.plots.design_picture import POSTURES, draw_design
 from hil.plots.posture_strip import Strip, posture_times
 from hil.plots.silhouettes import SIDE, TOP, covered, outlines, swept
@@ -213,6 +215,23 @@ class TestPostures:
         far = Cell.from_texts(far_away, two_link.urdf, Path("cell.toml"))
         assert Strip.of(arm, motion, far.workspace, 5).extents[0][1] < 3.0
 
+    def test_a_box_that_a_view_lays_over_the_arm_is_outlined_only(self, two_link):
+        beside = "{ lower = [0.7, -0.3, -0.2], upper = [0.9, 0.3, 0.6] }"
+        behind = "{ lower = [-3.0, 0.9, 0.0], upper = [3.0, 1.0, 3.0] }"
+        text = TWO_LINK_CELL.replace(beside, f"{beside}, {behind}")
+        cell = Cell.from_texts(text, two_link.urdf, Path("cell.toml"))
+        motion = wandering(cell)
+        strip = Strip.of(Arm.from_urdf(cell.urdf), motion, cell.workspace, POSTURES)
+        assert strip.overlaid == ((False, True), (False, False))
+        figure = draw_design(excitation(cell, motion), cell)
+        hatched = [
+            sum(bool(patch.get_hatch()) for patch in axes.patches)
+            for axes in figure.axes
+            if axes.get_aspect() == 1.0 and not axes.images
+        ]
+        assert hatched == [1] * POSTURES + [2] * POSTURES  # from the side, from above
+        assert "in front of or behind" in " ".join(texts(figure))
+
     def test_both_views_share_what_is_across(self):
         assert SIDE.across == TOP.across
         assert {SIDE.depth, TOP.depth} == {1, 2}
@@ -269,6 +288,83 @@ class TestFront:
         for label in ("chosen (105.7, 80.0)", "A (104.0, 90.5)", "B (101.2, 80.9)"):
             assert label in said
 
+    def page(self, cell: Cell, front: Points, **options) -> tuple[Figure, Axes]:
+        figure = draw_design(excitation(cell, wandering(cell)), cell, front=front, **options)
+        (axes,) = front_axes(figure)
+        return figure, axes
+
+    def test_a_polished_motion_shows_where_it_grew_from(self, two_link):
+        criteria = excitation(two_link, wandering(two_link)).criteria
+        measures = np.array([criteria.log10_det, criteria.coupling_index])
+        front = Points(measures[0] - np.array([3.0, 1.0]), measures[1] + np.array([1.0, 3.0]))
+        knee = (float(front.log10_det[1]), float(front.coupling_index[1]))
+        figure, axes = self.page(two_link, front, knee=knee)
+        said = " ".join(texts(figure))
+        assert "chosen, polished (" in said
+        assert f"grew from ({knee[0]:.1f}, {knee[1]:.1f})" in said
+        (arrow,) = (text for text in axes.texts if getattr(text, "arrow_patch", None))
+        np.testing.assert_allclose(arrow.xy, measures[::-1])
+        np.testing.assert_allclose(arrow.xyann, knee[::-1])
+
+    def test_a_motion_on_the_front_is_not_called_polished(self, two_link):
+        assert "polished" not in " ".join(texts(self.draw(two_link, 3, 1)))
+
+    def test_a_reference_far_away_does_not_flatten_the_front(self, two_link):
+        front = Points(np.array([100.0, 102.0, 103.0]), np.array([70.0, 74.0, 80.0]))
+        far = {"A": (103.0, 400.0), "B": (20.0, 75.0), "C": (101.0, 85.0)}
+        figure, axes = self.page(two_link, front, chosen=1, references=far)
+        assert np.ptp(axes.get_xlim()) < 3.0 * 10.0
+        assert np.ptp(axes.get_ylim()) < 3.0 * 3.0
+        assert len(axes.texts) == 2  # an arrow each towards A and B
+        said = texts(figure)
+        for label in ("A (103.0, 400.0), beyond the edge", "B (20.0, 75.0), beyond the edge"):
+            assert label in said
+        assert "C (101.0, 85.0)" in said
+
+    def test_a_single_parameter_has_no_coupling_and_a_page_all_the_same(self):
+        view = FrontView(Points(np.array([1.0, 2.0]), np.zeros(2)), (2.0, 0.0))
+        assert np.all(np.diff(view.window, axis=1) > 0.0)
+
+    def test_what_is_far_in_one_measure_has_its_place_in_the_other(self):
+        front = Points(np.array([100.0, 103.0]), np.array([70.0, 80.0]))
+        view = FrontView(front, (101.0, 75.0), references={"A": (105.0, 400.0)})
+        (mark,) = (mark for mark in view.marks if mark.compared)
+        across, up = view.placed(mark)
+        assert across > 1.0
+        assert 0.0 < up < 1.0
+
+    def test_no_legend_lies_on_the_front(self, two_link, ns16):
+        names = ("A", "B", "C", "balanced", "an older one with a long name", "E")
+        references = {name: (101.0 + k, 90.0) for k, name in enumerate(names)}
+        front = Points(np.linspace(100.0, 103.0, 60), np.linspace(70.0, 90.0, 60))
+        for cell in (two_link, ns16):
+            figure, axes = self.page(cell, front, chosen=20, references=references, kinematic=names)
+            renderer = FigureCanvasAgg(figure).get_renderer()
+            legend = axes.get_legend().get_window_extent(renderer)
+            matrix = next(a for a in figure.axes if a.get_xlabel().startswith("parameters"))
+            assert not legend.overlaps(axes.get_window_extent(renderer))
+            assert not legend.overlaps(matrix.get_tightbbox(renderer))
+            assert legend.x1 < figure.bbox.x1
+
+    def test_references_of_joint_limits_only_are_told_from_the_others(self, two_link):
+        front = Points(np.array([100.0, 105.0]), np.array([70.0, 95.0]))
+        references = {"A": (101.0, 90.0), "B": (102.0, 91.0)}
+        figure, _ = self.page(two_link, front, chosen=0, references=references, kinematic=("B",))
+        said = texts(figure)
+        assert "A (101.0, 90.0)" in said
+        assert "B (kinematic) (102.0, 91.0)" in said
+
+    def test_what_earlier_archives_add_is_told_from_the_motion_alone(self, two_link):
+        front = Points(np.array([100.0, 105.0]), np.array([70.0, 95.0]))
+        figure, axes = self.page(two_link, front, chosen=0, together=True)
+        head = figure.texts[0].get_text()
+        assert "together with earlier archives, weighted" in head
+        assert "I_c" not in head
+        assert "not comparable" in figure.texts[1].get_text()
+        assert "together with earlier archives, weighted" in axes.get_xlabel()
+        assert "together" in axes.get_ylabel()
+        assert "from this motion alone" in " ".join(texts(figure))
+
     def test_a_motion_beside_the_front_is_drawn_where_its_criteria_are(self, two_link):
         (axes,) = front_axes(self.draw(two_link, 3, None))
         criteria = excitation(two_link, wandering(two_link)).criteria
@@ -286,6 +382,45 @@ class TestPage:
         (position,) = (a for a in figure.axes if a.get_ylabel() == "joint_2")
         assert position.get_yticks() == pytest.approx([-50.0, 0.0, 95.0])  # as in the file
         assert "position [deg, controller angles]" in texts(figure)
+
+    @pytest.mark.parametrize(
+        ("name", "shown"),
+        [
+            ("joint_2", "joint_2"),
+            ("shoulder_pan_joint", "shoulder_\npan_joint"),
+            ("wrist_3_joint", "wrist_3_\njoint"),
+            ("aVeryLongNameWithoutBreaks7", "aVery…reaks7"),
+            ("left_arm_shoulder_lift_joint_4", "left_arm_\nshoul…oint_4"),
+        ],
+    )
+    def test_long_names_of_joints_are_broken(self, name, shown):
+        assert broken(name) == shown
+
+    def test_names_of_joints_do_not_run_into_each_other(self, two_link):
+        long = two_link.urdf.replace('name="shoulder"', 'name="shoulder_pan_and_lift_joint_1"')
+        long = long.replace('name="elbow"', 'name="shoulder_pan_and_lift_joint_2"')
+        assert long != two_link.urdf
+        cell = Cell.from_texts(TWO_LINK_CELL, long, Path("cell.toml"))
+        figure = draw_design(excitation(cell, wandering(cell)), cell)
+        renderer = FigureCanvasAgg(figure).get_renderer()
+        for axes in figure.axes:
+            if axes.get_ylabel().startswith("shoulder"):
+                label, own = axes.yaxis.label.get_window_extent(renderer), axes.bbox
+                assert label.height < own.height * 1.05
+                assert label.x0 > 0.0
+
+    def test_what_was_not_checked_stands_in_red(self, two_link):
+        designed = excitation(two_link, wandering(two_link))
+        unchecked = ("floor", "walls", "the arm itself")
+        page = draw_design(designed, two_link, unchecked=unchecked, complete=False)
+        red = [text.get_text() for text in page.texts if text.get_color() == style.LIMIT]
+        assert red == [
+            "NOT CHECKED: floor, walls, the arm itself; not for a robot",
+            "search stopped early: it may have missed better motions",
+        ]
+        calm = draw_design(designed, two_link, margins="current at most 71 % (motor of joint_2)")
+        assert not [text for text in calm.texts if text.get_color() == style.LIMIT]
+        assert "current at most 71 % (motor of joint_2)" in texts(calm)
 
     def test_every_posture_is_seen_from_the_side_and_from_above(self, ns16):
         figure = draw_design(excitation(ns16, wandering(ns16)), ns16)
@@ -306,14 +441,26 @@ class TestPage:
             save(draw_design(designed, two_link, title="twice"), tmp_path / name)
         assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
+    @pytest.mark.parametrize("said", [False, True])
     @pytest.mark.parametrize("title", ["", "a $\\frac{title}{}$ <of> a person\n" * 3])
-    def test_nothing_is_cut_and_no_text_lies_upon_another(self, ns16, title):
+    def test_nothing_is_cut_and_no_text_lies_upon_another(self, ns16, title, said):
+        nearest = "nearest 0.112 m (" + "a_link_with_a_long_name, " * 6 + "floor)"
+        more = {
+            "unchecked": ("floor", "walls", "the arm itself", "currents"),
+            "complete": False,
+            "together": True,
+            "margins": f"current at most 71 % (motor of joint_2); {nearest}",
+            "knee": (102.0, 70.0),
+            "references": {"method B": (99.0, 118.2), "method A": (101.0, 500.0)},
+            "kinematic": ("method B",),
+        }
         figure = draw_design(
             excitation(ns16, wandering(ns16)),
             ns16,
             front=Points(np.array([100.0, 105.0]), np.array([70.0, 95.0])),
-            chosen=0,
+            chosen=None if said else 0,
             title=title,
+            **(more if said else {}),
         )
         with style.page():
             renderer = FigureCanvasAgg(figure).get_renderer()

@@ -189,3 +189,27 @@ def test_a_subset_of_parameters_is_named(cell, tmp_path):
     assert objective.criteria(done.design.excitation.trajectory, 0.001) == (
         again.excitation.criteria
     )
+
+
+def test_a_polished_motion_is_told_with_what_it_grew_from(cell, tmp_path):
+    settings = preset("front").kinematic().replaced(search={**TINY, "polish": 80})
+    folder = DesignFolder(tmp_path / "polished")
+    design = run_design(folder, cell, settings, Silent(), workers=2).design
+    again = DesignResult.load(folder.result)
+    assert again.chosen is None and again.polished_from is not None
+    text = folder.result.read_text()
+    assert "a polish made it from one, see polished_from" in text
+    assert "chosen, counting" not in text
+    assert again.polished_from.point == design.origin
+    assert again.polished_from.log10_det == design.origin_criteria.log10_det
+    assert again.polished_from.coupling_index == design.origin_criteria.coupling_index
+    # never worse in either, by the millisecond
+    criteria = again.excitation.criteria
+    assert criteria.log10_det >= again.polished_from.log10_det
+    assert criteria.coupling_index <= again.polished_from.coupling_index
+
+
+def test_an_unpolished_one_grew_from_nothing(made, text):
+    assert DesignResult.load(made[0].result).polished_from is None
+    assert "polished_from" not in text
+    assert "chosen, counting from 0, is the motion of this file" in text

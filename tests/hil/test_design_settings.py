@@ -81,6 +81,10 @@ def test_sines_can_be_searched_by_any_method_and_via_points_by_method_a():
         ('method = "c"', ["method = 'c'", "a, b, balanced, front"]),
         ("[search]\npopulation = 2", ["search.population = 2", "4 to 10000"]),
         ('[search]\npopulation = "many"', ["search.population = 'many'", "4 to 10000"]),
+        ('[search]\npopulation = "24"', ["search.population = '24'", "4 to 10000"]),
+        ('[search]\nmutation = "0.1"', ["search.mutation = '0.1'", "0 to 1"]),
+        ("[search]\npopulation = true", ["search.population = True", "4 to 10000"]),
+        ('[constraints]\nclosed = "yes"', ["constraints.closed = 'yes'", "true or false"]),
         ("[search]\nmutation = 1.5", ["search.mutation = 1.5", "0 to 1"]),
         ("[search]\nmutation = nan", ["search.mutation", "0 to 1"]),
         ("[search]\nweights = [0.7, 0.7]", ["search", "1.4", "add up to 1"]),
@@ -93,11 +97,24 @@ def test_sines_can_be_searched_by_any_method_and_via_points_by_method_a():
         ('[sines]\noffset = "nowhere"', ["sines.offset = 'nowhere'", '"middle"', '"home"']),
         ("[constraints]\nmin_duration = 30.0", ["min_duration = 30 s", "max_duration = 20 s"]),
         ("[constraints]\nmax_duration = inf", ["constraints.max_duration", "above 0"]),
-        ("constraints = 3", ["constraints = 3", "a table [constraints]"]),
+        ("constraints = 3", ["constraints = 3: is no table", "a table [constraints]"]),
+        ("[[search]]\n", ["search", "is no table", "a table [search]"]),
+        (
+            'method = "a"\n[constraints]\nmax_duration = 10.0',
+            ["[sines] length = 20 s is longer than [constraints] max_duration = 10 s", "shorten"],
+        ),
+        (
+            "[sines]\nlength = 5.0\nramp = 1.0\n[constraints]\nmin_duration = 6.0",
+            ["[sines] length = 5 s is shorter than [constraints] min_duration = 6 s", "lengthen"],
+        ),
         ("seed = -1", ["seed = -1", "0 or more"]),
         ("[objective]\nparameters = []", ["objective.parameters", '"all"', "hil identify"]),
         (
-            '[objective]\nparameters = ["mc2y"]\nmax_relative_std = 30.0',
+            '[objective]\nparameters = ["mc2y"]',
+            ["names one parameter", "hil identify"],
+        ),
+        (
+            '[objective]\nparameters = ["mc2y", "mc2z"]\nmax_relative_std = 30.0',
             ["objective", "leave one of them out"],
         ),
         ("[search\n", ["is not TOML", "--show-settings"]),
@@ -108,8 +125,11 @@ def test_nonsense_is_refused_with_file_field_value_and_remedy(text, words, tmp_p
     path.write_text(text)
     with pytest.raises(SettingsError) as caught:
         load_settings(path)
+    said = str(caught.value)
     for word in ["my.toml", *words]:
-        assert word in str(caught.value)
+        assert word in said
+    for word in ("Value error", "value error", "dictionary", "instance of"):
+        assert word not in said
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
@@ -163,6 +183,25 @@ def test_an_offset_is_read_in_the_frame_of_the_limits(cell):
     np.testing.assert_array_equal(typed.centre, cell.home)
 
 
+@pytest.mark.parametrize("angle", [120.0, -170.0])
+def test_an_offset_outside_the_limits_is_told_as_it_was_written(cell, angle):
+    offset = [0.0, 0.0, angle, 0.0, 90.0, 0.0]
+    with pytest.raises(SettingsError) as caught:
+        problem_of(cell, preset("a").kinematic().replaced(sines={"offset": offset}))
+    said = str(caught.value)
+    assert f"sines.offset = {offset}" in said
+    assert f"joint_3 is not inside its limits, -170 to 110 deg, at {angle:g} deg" in said
+    assert "teach pendant angles" in said and "rad" not in said
+
+
+def test_what_is_not_looked_at_is_named():
+    assert preset("b").unchecked == preset("a").unchecked == ()
+    everything = ("floor", "walls", "the arm itself", "motor currents")
+    assert preset("b").kinematic().unchecked == everything
+    bare = preset("a").replaced(sines={"ramp": 0.0}, constraints={"current": False})
+    assert bare.unchecked == ("motor currents", "rest at both ends")
+
+
 def test_a_bare_series_is_not_asked_to_rest(cell):
     settings = preset("a").kinematic()
     assert problem_of(cell, settings).constraints.at_rest
@@ -181,7 +220,7 @@ def test_named_parameters_are_the_ones_that_count(cell):
     chosen = settings.replaced(objective={"parameters": [names[9], names[2]]})
     objective = problem_of(cell, chosen).objective
     np.testing.assert_array_equal(objective.parameters, [2, 9])
-    for wrong, words in ((["m9"], "no parameter.*I1yy"), ([names[0]] * 2, "named twice")):
+    for wrong, words in (([names[0], "m9"], "no parameter.*I1yy"), ([names[0]] * 2, "named twice")):
         with pytest.raises(SettingsError, match=words):
             problem_of(cell, settings.replaced(objective={"parameters": wrong}))
 

@@ -11,11 +11,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.cli.plan import plan
 from hil.cli.plan_input import read_plan_file
 from hil.errors import InputError
-from hil.plots import AngleFrame, draw_plan
+from hil.plots import draw_plan
 from hil.plots.corner import flown_corners, sharpest_corner
 from hil.plots.joints import corner_times
 from planner.motion_csv import from_csv

@@ -34,6 +34,19 @@ def test_a_bar_shows_the_note_and_the_time_left() -> None:
     assert "left" in shown
 
 
+@pytest.mark.parametrize("title", ["designing (motions)", "running the campaign (s of motion)"])
+def test_eighty_columns_hold_count_times_and_note(title: str) -> None:
+    screen = io.StringIO()
+    bar = Bar(Console(file=screen, force_terminal=True, width=80, color_system=None))
+    note = "generation 112 of 120, log det 104.1, I_c 80.1"
+    with bar.task(title, 23000) as task:
+        task.advance(11500, note)
+    lines = [line.rstrip() for line in screen.getvalue().splitlines()]
+    (shown,) = [line for line in lines if "11500/23000" in line]
+    assert title in shown and "0:00:0" in shown and " left " in shown and "━" in shown
+    assert note in lines
+
+
 def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     quiet = reporter(quiet=True)
     assert isinstance(quiet, Silent)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +23,7 @@ from hil.identify import Identification, identify_campaign
 from hil.motion_checks import MotionChecks
 from hil.progress import Silent
 from hil.report.overview import facts
-from hil.simulation import simulated_link
-from identification.excitation import Criteria, Excitation
+from identification.excitation import Constraints, Criteria, Excitation, sampled
 from planner import FourierSeries, TrajectoryPlayer
 
 Run = Callable[..., Campaign]
@@ -148,15 +149,58 @@ def test_bare_sines_are_refused_before_anything_moves(
     tmp_path: Path, quick: Cell, swinging: CampaignPlan
 ) -> None:
     bare = replace(swinging, excitation=designed(sines(quick, ramp=0.0)))
-    campaign = Campaign.create(tmp_path / "bare", quick, bare)
-    with pytest.raises(MotionRefusedError, match="begin and end at full speed; give them a ramp"):
-        campaign.run(simulated_link(quick), Stop(), Silent(), provenance={}, durable=False)
-    assert not list(campaign.folder.archives.iterdir())
+    wrong = "begin and end at full speed; give them a ramp"
+    with pytest.raises(MotionRefusedError, match=wrong):
+        plan_around(quick, bare.excitation)
+    with pytest.raises(MotionRefusedError, match=wrong):
+        Campaign.create(tmp_path / "bare", quick, bare)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"length": 1e300}, "lasts 1e\\+300 s; at most 600 s"),
+        ({"length": 1e6}, "lasts 1e\\+06 s; at most 600 s"),
+        ({"amplitude": np.full((6, 3), 1e308)}, "beyond all numbers"),
+        ({"frequency": np.full((6, 3), 1e300)}, "beyond all numbers"),
+        ({"ramp": 1e-200}, "beyond all numbers"),
+        ({"amplitude": np.ones((6, 99)), "frequency": np.ones((6, 99))}, "99 sines"),
+        (
+            {name: np.zeros(shape) for name, shape in
+             (("offset", 5), ("amplitude", (5, 1)), ("frequency", (5, 1)))},
+            "for 5 joints, the arm has 6",
+        ),
+    ],
+    ids=["endless", "long", "wide", "fast", "abrupt", "many sines", "five joints"],
+)  # fmt: skip
+def test_what_cannot_even_be_looked_at_is_refused_by_name(
+    tmp_path: Path, quick: Cell, swinging: CampaignPlan, changes: dict[str, Any], reason: str
+) -> None:
+    bad = designed(replace(sines(quick), **changes))
+    with pytest.raises(MotionRefusedError, match=reason):
+        plan_around(quick, bad)
+    with pytest.raises(MotionRefusedError, match=f"excitation 0 was not sent: .*{reason}"):
+        Campaign.create(tmp_path / "bad", quick, replace(swinging, excitation=bad))
+
+
+@pytest.mark.parametrize("ramp", [1e-9, 1e-6, 1e-4, 1e-3, 3e-3, 0.02, 0.1])
+@pytest.mark.parametrize("size", [1e-9, 1e-5, 0.01])
+def test_short_ramps_are_told_in_no_time(quick: Cell, ramp: float, size: float) -> None:
+    series = FourierSeries(
+        quick.home, np.full((6, 1), size), np.full((6, 1), np.pi), length=5.0, ramp=ramp
+    )
+    checks = MotionChecks.of(quick)
+    constraints = Constraints(quick.joint_limits, checker=checks.checker)
+    began = time.process_time()
+    checks.refusal(series)
+    constraints.violations(series, sampled(series))
+    assert time.process_time() - began < 2.0
 
 
 @pytest.mark.parametrize(
     ("factor", "pace", "broken"),
-    [(3.0, 1.0, "position of joint"), (1.0, 2.5, "of joint")],
+    [(3.0, 1.0, "position of J"), (1.0, 2.5, "of J")],
 )
 def test_sines_beyond_a_limit_are_refused(
     quick: Cell, factor: float, pace: float, broken: str

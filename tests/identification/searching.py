@@ -81,9 +81,12 @@ def bits(design: Design) -> dict[str, Any]:
             for array in (front.genes, front.log10_det, front.coupling_index, front.duration)
         ],
         "chosen": design.chosen,
+        "origin": design.origin,
+        "origin_criteria": design.origin_criteria,
         "history": design.history.tobytes(),
         "evaluated": design.evaluated,
         "infeasible": dict(design.infeasible),
         "complete": design.complete,
+        "exhausted": design.exhausted,
         "scale": design.scale,
     }

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pickle
+import time
 from itertools import combinations, pairwise
 
 import coal
@@ -15,14 +16,17 @@ from identification.excitation import (
     Box,
     CollisionChecker,
     CollisionModelError,
+    PostureError,
     Wall,
     Workspace,
     WorkspaceError,
 )
+from identification.excitation.collision import checker as checker_module
+from identification.excitation.collision.built_in import told
 from identification.excitation.collision.checker import joint_poses
 from identification.excitation.sampling import sampled
 from identification.kinematics import chain_from_urdf
-from planner import FourierSeries, JointLimits, plan
+from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
 
 NOWHERE = Workspace(floor=None, margin=0.0)
@@ -401,6 +405,123 @@ def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
     assert contact is not None
     assert (contact.first, contact.second, contact.sample) == ("link_0", "link_3", 0)
     assert contact.distance < 0.0
+
+
+def test_what_is_built_in_is_named_shape_by_shape():
+    wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
+    (pair,) = wrist.built_in
+    assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
+    assert pair.nearest <= pair.farthest < 0.0
+    assert told(wrist.built_in) is not None and "link_0_0 and link_2_0" in told(wrist.built_in)
+    assert checkers(0.05).built_in == ()
+    assert told(()) is None
+
+
+@pytest.mark.parametrize("limit", ['lower="-2" upper="2"', "", 'lower="-0.02" upper="0.02"'])
+def test_limits_missing_or_narrow_in_the_description_leave_nothing_out(limit):
+    # Two arms of 0.6 m beyond a turntable; the first swings to and from a box in its way.
+    rod = '<cylinder radius="0.05" length="0.5"/>'
+    parts = [link("base")]
+    for k in range(3):
+        parent, at = ("base", "0 0 0.42") if k == 0 else (f"l{k - 1}", "0.6 0 0")
+        parts += [
+            link(f"l{k}", rod, at="0.3 0 0"),
+            f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
+            f'<origin xyz="{at}"/><axis xyz="0 {int(k > 0)} {int(k == 0)}"/>'
+            f'<limit effort="1" velocity="1" {limit}/></joint>',
+        ]
+    urdf = robot(*parts)
+    limits = JointLimits([-3.0] * 3, [3.0] * 3, [2.0] * 3, [10.0] * 3, [100.0] * 3)
+    crate = Box((0.8, -0.2, 0.0), (0.95, 0.2, 0.33))
+    workspace = Workspace(floor=None, boxes=(crate,))
+    for in_use in (limits, None):
+        checker = CollisionChecker(urdf, workspace, limits=in_use)
+        assert ("l1", "box 0") in checker.pairs
+        contact = checker.deepest_contact(np.array([[0.0, 0.3, -0.6]]))
+        assert contact is not None and "box 0" in (contact.first, contact.second)
+
+
+@pytest.mark.parametrize(
+    "workspace",
+    [
+        Workspace(floor=0.6),
+        Workspace(floor=1e6),
+        Workspace(floor=None, boxes=(Box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0)),)),
+    ],
+    ids=["floor above the foot", "floor above all", "box around all"],
+)
+def test_obstacles_in_the_wrong_place_leave_no_moving_link_unchecked(arm, workspace):
+    checker = CollisionChecker(urdf_text(), workspace, limits=FAST)
+    with_obstacle = {first for first, second in checker.pairs if not second.startswith("link")}
+    assert with_obstacle >= {f"link_{k}" for k in range(2, 7)}
+    # The first link turns in it: no motion can mend that, so it is told and not checked.
+    assert {pair.first[:6] for pair in checker.built_in} == {"link_1"}
+    home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
+    contact = checker.deepest_contact(home)
+    assert contact is not None and contact.first == "link_2"
+    assert not np.any(checker.clear(postures(arm, 3, 200)))
+
+
+def test_a_first_link_that_swings_towards_the_floor_is_checked():
+    rod = '<cylinder radius="0.05" length="0.6"/>'
+    urdf = robot(link("base"), link("arm", rod), joint(1, "base", "arm", "1 0 0"))
+    for floor in (0.0, 0.4):  # in it in every posture: the ends of the rod now more, now less
+        checker = CollisionChecker(urdf, Workspace(floor=floor))
+        assert checker.pairs == (("arm", "floor"),)
+        assert checker.built_in == ()
+
+
+def test_limits_of_another_arm_are_refused():
+    with pytest.raises(ShapeError, match="limits"):
+        CollisionChecker(ball_chain(0.05, 0.05), NOWHERE, limits=FAST)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_postures_that_are_no_numbers_are_refused(value):
+    q = np.zeros((3, 6))
+    q[1, 4] = value
+    for look in (checkers(0.05).clear, checkers(0.05).deepest_contact):
+        with pytest.raises(PostureError, match=r"joint 4 .* posture 1"):
+            look(q)
+
+
+@pytest.mark.parametrize("ramp", [0.0, 1e-9, 1e-5, 1e-3, 0.1, 2.5])
+@pytest.mark.parametrize(("size", "pace"), [(1e-9, 1e5), (1e-3, 30.0), (0.2, 3.0), (3.0, 50.0)])
+def test_the_most_violent_sines_are_told_in_no_time(ramp, size, pace):
+    motion = FourierSeries(
+        offset=np.array([0.0, -1.2, 2.0, 0.0, 0.0, 0.0]),
+        amplitude=np.full((6, 2), size),
+        frequency=np.array([[pace, 1.3 * pace]] * 6),
+        length=5.0,
+        ramp=ramp,
+    )
+    began = time.process_time()
+    checkers(0.05).deepest_along(motion, sampled(motion))
+    assert time.process_time() - began < 3.0
+
+
+@pytest.mark.parametrize("jerk", [1e3, 1e6, 1e9, 1e12])
+def test_the_most_violent_pieces_are_told_in_no_time(jerk):
+    random = np.random.default_rng(3)
+    knots = np.linspace(0.0, 5.0, 501)
+    table = np.array(
+        [random.uniform(-1.0, 1.0, (500, 4)) * [1.0, 3.0, 9.0, jerk] for _ in range(6)]
+    )
+    motion = PiecewiseCubic(tuple(knots for _ in range(6)), tuple(table))
+    began = time.process_time()
+    checkers(0.05).deepest_along(motion, sampled(motion))
+    assert time.process_time() - began < 3.0
+
+
+def test_a_long_motion_is_looked_at_part_by_part_and_not_otherwise(monkeypatch):
+    motion = short_sines(7)
+    whole = [checkers(m).deepest_along(motion, sampled(motion)) for m in (0.0, 0.05, 0.3)]
+    monkeypatch.setattr(checker_module, "_PART", 50)
+    for margin, contact in zip((0.0, 0.05, 0.3), whole, strict=True):
+        again = checkers(margin).deepest_along(motion, sampled(motion))
+        assert (again is None) == (contact is None)
+        if contact is not None:
+            assert again.distance == pytest.approx(contact.distance, abs=0.006)
 
 
 def test_a_wider_margin_checks_no_fewer_pairs():

@@ -301,12 +301,6 @@ def test_every_kind_is_told_at_once_and_counts_by_its_worst(make_currents, swing
     assert [kind for kind, e in zip(KINDS, excess, strict=True) if e > 0] == list(KINDS[1:])
     for kind, worst in zip(KINDS, excess, strict=True):
         assert worst == max((v.excess for v in violations if v.kind == kind), default=0.0)
-    # the torque may come from elsewhere; it is not asked for again
-    currents = constraints.currents
-    nominal = currents.model.torque(currents.values, *motion[1:])
-    assert constraints.violations(swing, motion, nominal) == violations
-    with pytest.raises(ShapeError, match="nominal"):
-        constraints.violations(swing, motion, nominal[1:])
 
 
 def test_the_worst_excess_of_nothing_is_nothing():

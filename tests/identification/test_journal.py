@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import io
+import json
 import os
 import struct
 import subprocess
@@ -85,15 +87,25 @@ def test_wherever_writing_was_cut_off_only_that_generation_is_lost():
         assert kept(torn) == known + 1
 
 
-def test_a_record_with_a_wrong_bit_is_dropped_with_all_behind_it():
-    file, lengths = written(3)
+def test_a_record_with_a_wrong_bit_costs_its_own_generation_and_no_other():
+    file, lengths = written(4)
     for offset in range(lengths[1], lengths[2], 97):
         damaged = bytearray(file.getvalue())
         damaged[offset] ^= 0x10
-        assert kept(io.BytesIO(bytes(damaged))) == 1
+        again = io.BytesIO(bytes(damaged))
+        journal = opened(again)
+        assert [journal.recall(generation(seed)[0]) is not None for seed in range(4)] == [
+            True,
+            False,
+            True,
+            True,
+        ]
+        assert journal.damaged == lengths[2] - lengths[1]
+        journal.record(*generation(1))
+        assert kept(again) == 4
 
 
-def test_other_genes_than_those_recorded_are_not_recalled_and_take_their_place():
+def test_what_was_not_recorded_is_not_recalled():
     file, _ = written(3)
     journal = opened(file)
     first, _ = generation(0)
@@ -106,10 +118,65 @@ def test_other_genes_than_those_recorded_are_not_recalled_and_take_their_place()
     assert journal.recall(moved[:3]) is None
     journal.record(others, scores)
     again = opened(file)
-    assert again.recall(first) is not None
-    assert again.recall(others) is not None
-    assert again.recall(generation(2)[0]) is None
-    assert again.recalled == 8
+    for genes in (others, generation(2)[0], first):
+        assert again.recall(genes) is not None
+    assert again.recalled == 12
+    assert again.damaged == 0
+
+
+class FullDisk(io.BytesIO):
+    """A disk that takes a part of what is written, then no more, until there is room again."""
+
+    room = True
+
+    def write(self, content):
+        if not self.room:
+            super().write(bytes(content)[:50])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return super().write(bytes(content)[:1000])
+
+
+def test_a_full_disk_ends_no_search_and_what_waits_is_written_once_there_is_room():
+    file = FullDisk()
+    journal = opened(file)
+    journal.record(*generation(0))
+    file.room = False
+    for seed in (1, 2):
+        journal.record(*generation(seed))
+        assert journal.trouble is not None and journal.trouble.errno == errno.ENOSPC
+    assert kept(io.BytesIO(file.getvalue())) == 1
+    journal.close()
+    assert journal.trouble is not None
+    file.room = True
+    journal.record(*generation(3))
+    assert journal.trouble is None
+    assert kept(io.BytesIO(file.getvalue())) == 4
+    file.room = False
+    journal.record(*generation(4))
+    file.room = True
+    journal.close()
+    assert journal.trouble is None
+    assert kept(io.BytesIO(file.getvalue())) == 5
+
+
+@pytest.mark.parametrize("identity", [{"problem": 3}, {"settings": "b"}, {"problem": None}, []])
+def test_an_identity_without_sense_is_no_journal(identity):
+    content = json.dumps(identity).encode()
+    frame = struct.pack("<QI", len(content), zlib.crc32(content)) + content
+    with pytest.raises(JournalError, match="does not say which search"):
+        opened(io.BytesIO(b"hil search journal 1\n" + frame))
+
+
+def test_the_disk_is_waited_for_at_times_and_at_the_end(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(os, "fsync", synced.append)
+    with (tmp_path / "journal").open("x+b", buffering=0) as file:
+        journal = Journal(file, PROBLEM, SETTINGS)
+        for seed in range(20):
+            journal.record(*generation(seed))
+        assert len(synced) <= 1
+        journal.close()
+        assert len(synced) >= 1
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import os
+import signal
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from identification.excitation import DesignError, Population, Scores, midpoints, sampled
+from identification.excitation import DesignError, Population, Scores, midpoints
 from identification.excitation.searches.scores import ROW, unplanned
 from identification.excitation.violation import KINDS
 from planner import PiecewiseCubic, check_limits
@@ -42,7 +44,7 @@ def test_scores_are_those_of_the_regressor_of_the_planned_motion(population):
     scores = population.score(rows)
     for k, trajectory in enumerate(population.problem.genome.motions(rows)):
         assert isinstance(trajectory, PiecewiseCubic)
-        motion = sampled(trajectory, 0.008)
+        motion = midpoints(trajectory, 0.008)
         phi = model.regressor(motion.position, motion.velocity, motion.acceleration)
         stacked = phi.dense(model.n_parameters).reshape(-1, model.n_parameters)
         sign, log_det = np.linalg.slogdet(stacked.T @ stacked / motion.n_samples)
@@ -125,6 +127,18 @@ def test_a_crash_is_told_as_a_reason_too():
         (violation,) = deadly.violations(genes(1)[0])
     assert violation.kind == "planning"
     assert "signal 6" in str(violation)
+
+
+def test_a_process_ended_from_outside_changes_nothing(population):
+    rows = genes(2)
+    expected = population.score(rows[:1]), population.judged(rows[0], 0.01)[1]
+    for pid in (child.pid for child in population._children):
+        os.kill(pid, signal.SIGKILL)
+    assert same(population.score(rows[:1]), expected[0])
+    os.kill(population._children[0].pid, signal.SIGKILL)
+    assert population.judged(rows[0], 0.01)[1] == expected[1]
+    os.kill(population._children[0].pid, signal.SIGKILL)
+    assert population.violations(rows[0]) == ()
 
 
 def test_excess_is_told_kind_by_kind_and_agrees_with_the_violations(population):

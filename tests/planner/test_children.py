@@ -1,14 +1,22 @@
 from __future__ import annotations
 
 import operator
+import os
+import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planner import PlanningChild, map_in_children
-from planner.children import chunks_of
+from planner import PlannerCrashed, PlanningChild, chunks_of, map_in_children
+
+
+@pytest.fixture
+def importable(monkeypatch):
+    """A child finds the functions of these tests under the name that they have here."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
 
 
 @given(st.integers(0, 200), st.integers(1, 50))
@@ -32,3 +40,53 @@ def test_what_the_function_raises_ends_the_map_and_the_children_go_on():
         with pytest.raises(ZeroDivisionError):
             map_in_children([child], operator.truediv, chunks_of(3, 2), lambda _: (1, 0))
         assert map_in_children([child], list, chunks_of(3, 2), lambda chunk: (chunk,)) == [0, 1, 2]
+
+
+def killed_so_often(indices, folder, often):
+    """Negate, but for the item 5, end the process so many times as if from outside."""
+    for index in indices:
+        count = len(list(Path(folder).iterdir()))
+        if index == 5 and count < often:
+            (Path(folder) / str(count)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    return [-index for index in indices]
+
+
+@pytest.mark.parametrize("size", [1, 4])
+def test_an_item_whose_process_was_killed_from_outside_is_tried_again(size, tmp_path, importable):
+    """A chunk of one as much as one of several, in whose company it was killed before."""
+    with PlanningChild() as child:
+        results = map_in_children(
+            [child],
+            killed_so_often,
+            chunks_of(9, size),
+            lambda chunk: (list(chunk), str(tmp_path), 1 if size == 1 else 2),
+        )
+    assert results == [-index for index in range(9)]
+
+
+def test_an_item_that_ends_every_process_is_believed_at_last(tmp_path, importable):
+    with PlanningChild() as child:
+        results = map_in_children(
+            [child],
+            killed_so_often,
+            chunks_of(9, 1),
+            lambda chunk: (list(chunk), str(tmp_path), 99),
+        )
+    assert isinstance(results[5], PlannerCrashed)
+    assert results[4] == -4 and results[6] == -6
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_child_killed_while_it_starts_is_started_again():
+    with PlanningChild() as one, PlanningChild() as other:
+        os.kill(one.pid, signal.SIGKILL)
+        results = map_in_children([one, other], list, chunks_of(9, 3), lambda chunk: (chunk,))
+    assert results == list(range(9))
+
+
+def test_what_is_done_is_told_as_it_comes():
+    told = []
+    with PlanningChild() as child:
+        map_in_children([child], list, chunks_of(7, 3), lambda chunk: (chunk,), done=told.append)
+    assert told == [3, 3, 1]

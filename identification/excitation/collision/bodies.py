@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import coal
 import numpy as np
@@ -13,9 +14,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.excitation.collision.workspace import Workspace
-from identification.excitation.errors import CollisionModelError
+from identification.excitation.errors import CollisionModelError, MissingMeshError
 
 Array = NDArray[np.float64]
+
+_MISSING_MESH: Final = re.compile(r"Mesh (.+) could not be found")  # pinocchio's words
 
 
 class Hull(NamedTuple):
@@ -43,6 +46,7 @@ class Body:
 
     Attributes:
         name: of the link or obstacle.
+        shape_name: of this shape; the obstacle's own.
         joint: the joint that moves it, -1 for what stands still.
         shape: its geometry.
         pose: in the frame of that joint.
@@ -52,6 +56,7 @@ class Body:
     """
 
     name: str
+    shape_name: str
     joint: int
     shape: coal.CollisionGeometry
     pose: coal.Transform3s
@@ -66,13 +71,17 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     Meshes are replaced by their convex hulls.
 
     Raises:
-        CollisionModelError: a mesh is missing, or no moving link has a shape.
+        MissingMeshError: a mesh is not to be found.
+        CollisionModelError: a mesh cannot be read, or no moving link has a shape.
     """
     try:
         shapes = pin.buildGeomFromUrdfString(
             model, urdf, pin.GeometryType.COLLISION, None, list(mesh_folders)
         )
     except (ValueError, RuntimeError) as error:
+        missing = _MISSING_MESH.search(str(error))
+        if missing:
+            raise MissingMeshError(missing[1]) from error
         raise CollisionModelError(f"collision shapes cannot be loaded: {error}") from error
     bodies = []
     for item in shapes.geometryObjects:
@@ -84,6 +93,7 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
         bodies.append(
             Body(
                 model.frames[item.parentFrame].name,
+                item.name,
                 item.parentJoint - 1,
                 shape,
                 coal.Transform3s(rotation, translation),
@@ -110,7 +120,7 @@ def obstacles(workspace: Workspace) -> list[Body]:
         # To separations from it the box itself counts, not something round about it.
         hull = Hull(middle, np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 0.0, exact=False)
         pose = coal.Transform3s(np.eye(3), middle)
-        bodies.append(Body(f"box {i}", -1, shape, pose, hull, half_sides=half))
+        bodies.append(Body(f"box {i}", f"box {i}", -1, shape, pose, hull, half_sides=half))
     return bodies
 
 
@@ -120,7 +130,9 @@ def _plane(name: str, normal: Array, offset: float) -> Body:
     # coal fills the side opposite to the normal.
     shape = coal.Halfspace(normal, offset / length)
     hull = Hull(normal * (offset / length), normal, 0.0, 0.0, 0.0, exact=True)
-    return Body(name, -1, shape, coal.Transform3s(np.eye(3), np.zeros(3)), hull, normal=normal)
+    return Body(
+        name, name, -1, shape, coal.Transform3s(np.eye(3), np.zeros(3)), hull, normal=normal
+    )
 
 
 def _hull(shape: coal.CollisionGeometry, rotation: Array, translation: Array) -> Hull:

@@ -22,6 +22,16 @@ Array = NDArray[np.float64]
 
 # What stays open between two samples is divided by BLOCK, so many times at most.
 _DIVISIONS = 4
+# A motion of which more stays open is not looked at any closer; motions that an arm can follow
+# leave some dozens open.
+_MOST_GAPS = 1000
+# Distances that are computed at most before closer looking is given up: so many, or so many for
+# each sample of a long motion.
+_MOST_DISTANCES = 10_000
+_MOST_PER_SAMPLE = 5
+
+
+_Seen = dict[int, tuple[float, Array]]
 
 
 class _Stretch(NamedTuple):
@@ -66,6 +76,7 @@ def touch_between(
         path: where the bodies are there.
         near: what may touch.
     """
+    distances = max(_MOST_DISTANCES, _MOST_PER_SAMPLE * motion.n_samples)
     for division in range(_DIVISIONS + 1):
         gaps: list[_Stretch] = []
         for stretch in _open_stretches(scene, path, near):
@@ -73,11 +84,15 @@ def touch_between(
                 # looking closer by slabs costs less than distances
                 gaps += [stretch.gap(k) for k in range(stretch.start, stretch.stop)]
                 continue
-            found = _open_gaps(scene, path, stretch)
+            seen: _Seen = {}
+            found = _open_gaps(scene, path, stretch, seen)
             if isinstance(found, Touch):
                 return found, motion
             gaps += found
-        if not gaps or division == _DIVISIONS:
+            distances -= len(seen)
+            if distances < 0:
+                return _untold(scene, stretch), motion
+        if not gaps or division == _DIVISIONS or len(gaps) > _MOST_GAPS:
             break
         gaps.sort()
         pairs, left = (np.array([gap[column] for gap in gaps]) for column in (0, 1))
@@ -86,11 +101,12 @@ def touch_between(
         path = scene.path(motion.position)
         bulge = np.array([(gap.bulge, gap.own_bulge) for gap in gaps]).T / BLOCK**2
         near = rows_of(scene, path, pairs, np.arange(time.size).reshape(time.shape), bulge)
-    if not gaps:
-        return None
-    # So close to the margin that it cannot be told: not clear.
-    almost = float(np.nextafter(scene.margin, -1.0))
-    return Touch(gaps[0].pair, gaps[0].start, almost), motion
+    return (_untold(scene, gaps[0]), motion) if gaps else None
+
+
+def _untold(scene: Scene, stretch: _Stretch) -> Touch:
+    """Return what counts as a touch: so close to the margin that it cannot be told, or too long."""
+    return Touch(stretch.pair, stretch.start, float(np.nextafter(scene.margin, -1.0)))
 
 
 def _open_stretches(scene: Scene, path: Path, near: Near) -> list[_Stretch]:
@@ -106,7 +122,7 @@ def _open_stretches(scene: Scene, path: Path, near: Near) -> list[_Stretch]:
     way = gone[a, after] - gone[a, before] + gone[b, after] - gone[b, before]
     margin = scene.margin
     reach = (bound[0] + bound[1] - way) / 2.0 - bulge
-    open_ = np.flatnonzero((reach < margin) & (after > before))
+    open_ = np.flatnonzero(~(reach >= margin) & (after > before))
     normals = near.normal.reshape(3, *rows)
     least = np.full(len(open_), -np.inf)
     for side, (here, there) in ((0, (before, after)), (1, (after, before))):
@@ -114,7 +130,7 @@ def _open_stretches(scene: Scene, path: Path, near: Near) -> list[_Stretch]:
         seen = _slab(scene, path, pair[open_], here[open_], there[open_], normal)
         np.maximum(least, np.minimum(bound[side][open_], seen), out=least)
     stretches: list[_Stretch] = []
-    for k in open_[least - own_bulge[open_] < margin].tolist():
+    for k in open_[~(least - own_bulge[open_] >= margin)].tolist():
         ends = int(pair[k]), int(before[k]), int(after[k])
         stretch = _Stretch(*ends, float(bulge[k]), float(own_bulge[k]))
         joined = stretches[-1].joined(stretch) if stretches else None
@@ -138,22 +154,21 @@ def _slab(
     return scene.separation.along(path.bodies, pair, there, turned)
 
 
-def _open_gaps(scene: Scene, path: Path, stretch: _Stretch) -> list[_Stretch] | Touch:
+def _open_gaps(scene: Scene, path: Path, stretch: _Stretch, seen: _Seen) -> list[_Stretch] | Touch:
     """Return where one pair may touch between neighbouring samples, or a touch at one.
 
     Divides the stretch until the bodies cannot meet for the way they go, or for the slab
-    that lies between them at both ends.
+    that lies between them at both ends. Every distance it computes is left in `seen`.
     """
     a, b = scene.indices(stretch.pair)
     margin = scene.margin
-    seen: dict[int, tuple[float, Array]] = {}
     gaps, stack = [], [(stretch.start, stretch.stop)]
     while stack:
         left, right = stack.pop()
         for sample in (left, right):
             if sample not in seen:
                 seen[sample] = scene.distance(stretch.pair, path, sample), scene.normal(b)
-            if seen[sample][0] < margin:
+            if not seen[sample][0] >= margin:
                 return Touch(stretch.pair, sample, seen[sample][0])
         way = path.gone[a, right] - path.gone[a, left]
         way += path.gone[b, right] - path.gone[b, left]
@@ -168,6 +183,6 @@ def _open_gaps(scene: Scene, path: Path, stretch: _Stretch) -> list[_Stretch] | 
         pair = np.full(2, stretch.pair)
         own = scene.separation.along(path.bodies, pair, ends, normal)
         other = _slab(scene, path, pair, ends, ends[::-1], normal)
-        if np.max(np.minimum(own, other)) - stretch.own_bulge < margin:
+        if not np.max(np.minimum(own, other)) - stretch.own_bulge >= margin:
             gaps.append(stretch.gap(left))
     return gaps

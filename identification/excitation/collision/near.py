@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from identification.excitation.collision.scene import Path, Scene
 from identification.excitation.collision.separation import Indices
-from identification.excitation.joint_limits import RateBounds
+from identification.excitation.joint_limits import rate_bounds
 from identification.motion import Motion
+from planner import FourierSeries, PiecewiseCubic
 
 Array = NDArray[np.float64]
 
@@ -47,24 +48,25 @@ class Near(NamedTuple):
     bulge: Array
 
 
-def bulges_of(scene: Scene, motion: Motion, bounds: RateBounds) -> Array:
+def bulges_of(scene: Scene, trajectory: PiecewiseCubic | FourierSeries, motion: Motion) -> Array:
     """Bound how far pairs leave straight lines in rows of `BLOCK` samples, (2, p, rows) [m].
 
     As seen from the base and from the frame that carries both bodies.
 
     Args:
         scene: the bodies.
-        motion: samples.
-        bounds: of the rates over all time.
+        trajectory: the motion.
+        motion: samples of it.
     """
     starts = _starts(motion.n_samples)
     step = float(np.max(np.diff(motion.time), initial=0.0))
     ends = np.append(starts[1:], motion.n_samples - 1)
+    bounds = rate_bounds(trajectory, motion.time[starts], motion.time[ends])
 
     def largest(rate: Array, change: Array) -> Array:
         size = np.abs(rate.T)
         seen = np.maximum(np.maximum.reduceat(size, starts, axis=1), size[:, ends])
-        found: Array = seen + change[:, None] * (step / 2.0)
+        found: Array = seen + change * (step / 2.0)
         return found
 
     velocity = largest(motion.velocity, bounds.acceleration)
@@ -86,7 +88,7 @@ def what_is_near(scene: Scene, path: Path, bulges: Array) -> Near:
     bound = scene.separation.coarse(path.bodies, grid)
     way = np.diff(path.gone[:, grid])
     least = (bound[:, :-1] + bound[:, 1:] - way[first] - way[second]) / 2.0 - bulges[0]
-    pairs, blocks = np.nonzero(least < scene.margin)
+    pairs, blocks = np.nonzero(~(least >= scene.margin))
     bulge = np.broadcast_to(bulges, (2, *least.shape))[:, pairs, blocks]
     sample = np.minimum(starts[blocks][:, None] + np.arange(BLOCK + 1), last)
     return rows_of(scene, path, pairs, sample, bulge)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from identification.errors import ShapeError
 from identification.excitation.collision.bodies import link_bodies, obstacles
+from identification.excitation.collision.built_in import BuiltIn, always_close, random_postures
 from identification.excitation.collision.curvature import Curvature, carrier
 from identification.excitation.collision.poses import (
     Bodies,
@@ -24,15 +25,11 @@ from identification.excitation.collision.poses import (
 )
 from identification.excitation.collision.separation import Indices, Separation
 from identification.excitation.collision.workspace import Workspace
+from identification.excitation.errors import PostureError
 from identification.kinematics import Chain, chain_from_urdf
+from planner import JointLimits
 
 Array = NDArray[np.float64]
-
-# Shapes that are closer than the margin, and than this [m], in all of so many postures are built
-# that way; a wider margin must not check less.
-BUILT_IN = 0.05
-_N_POSTURES = 200
-_SEED = 20140901
 
 
 class Path(NamedTuple):
@@ -60,13 +57,26 @@ class Scene:
         separation: of the p pairs.
         carrier: (p,) the last joint that moves both bodies of a pair, -1 for the base.
         from_base, from_carrier: how far pairs leave straight lines, seen from there.
+        built_in: shapes that are no pair, because they are always too close.
+
+    Args:
+        urdf: of the arm.
+        workspace: obstacles and margin.
+        mesh_folders: where `package://` paths begin.
+        limits: in use; None for those of the description.
 
     Raises:
         CollisionModelError: the description has no collision shapes, or a mesh is missing.
         ModelError: the description is no open chain.
     """
 
-    def __init__(self, urdf: str, workspace: Workspace, mesh_folders: Sequence[str]) -> None:
+    def __init__(
+        self,
+        urdf: str,
+        workspace: Workspace,
+        mesh_folders: Sequence[str],
+        limits: JointLimits | None = None,
+    ) -> None:
         self.margin = workspace.margin
         self._chain = chain_from_urdf(urdf)
         model = pin.buildModelFromXML(urdf)
@@ -74,15 +84,17 @@ class Scene:
         self._bodies = [*links, *obstacles(workspace)]
         self._request = coal.DistanceRequest()
         self._result = coal.DistanceResult()
+        if limits is not None and limits.n_joints != self._chain.n_joints:
+            raise ShapeError("limits", (limits.n_joints,), f"({self._chain.n_joints},)")
+        self._n_links = len(links)
         pairs = [
             (a, b)
             for a, b in combinations(range(len(self._bodies)), 2)
-            if a < len(links) and self._joints_between(a, b) > (0 if b >= len(links) else 1)
+            if a < len(links) and self._joints_apart(a, b) > (0 if b >= len(links) else 1)
         ]
         self.separation = Separation(self._bodies, pairs)
-        built_in = self._built_in(_random_postures(model))
-        kept = zip(self.separation.first, self.separation.second, built_in, strict=True)
-        self.separation = Separation(self._bodies, [(a, b) for a, b, always in kept if not always])
+        self._tried = random_postures(model, limits)
+        self.built_in = self._leave_out(self._tried)
         first, second = self.separation.first, self.separation.second
         joints = [body.joint for body in self._bodies]
         self.carrier: Indices = np.array(
@@ -103,15 +115,19 @@ class Scene:
 
         Raises:
             ShapeError: postures of another arm.
+            PostureError: a position that is no finite number.
         """
         if q.ndim != 2 or q.shape[1] != self._chain.n_joints:
             raise ShapeError("q", q.shape, f"(m, {self._chain.n_joints})")
+        if not np.all(np.isfinite(q)):
+            sample, joint = np.argwhere(~np.isfinite(q))[0].tolist()
+            raise PostureError(sample, joint, float(q[sample, joint]))
         at = frames(self._chain, q)
         bodies = placed(self._bodies, at)
         return Path(q, at, bodies, travel(self._bodies, bodies, turning(self._chain, q)))
 
     def distance(self, pair: int, path: Path, sample: int) -> float:
-        """Return the signed distance of a pair at a sample [m]."""
+        """Return the signed distance of a pair at a sample [m], -inf if it cannot be told."""
         poses = []
         for index in (self.separation.first[pair], self.separation.second[pair]):
             body = self._bodies[index]
@@ -123,11 +139,12 @@ class Scene:
             poses.append(coal.Transform3s(rotation, translation) * body.pose)
         self._result.clear()
         first, second = (self._bodies[i] for i in self.indices(pair))
-        return float(
+        distance = float(
             coal.distance(
                 first.shape, poses[0], second.shape, poses[1], self._request, self._result
             )
         )
+        return -np.inf if np.isnan(distance) else distance
 
     def normal(self, second: int) -> Array:
         """Return the direction of the distance computed last, from second to first body."""
@@ -144,23 +161,42 @@ class Scene:
         a, b = self.indices(pair)
         return self._bodies[a].name, self._bodies[b].name
 
-    def _built_in(self, postures: Array) -> list[bool]:
-        """Return of each pair whether it is too close in all of these postures."""
-        path = self.path(postures)
-        near = min(self.margin, BUILT_IN)
-        samples = np.arange(len(postures))
-        built_in = []
+    def _leave_out(self, postures: Array) -> tuple[BuiltIn, ...]:
+        """Leave out the pairs that are built in, as these postures (k, n) show, and return them."""
+        tried = _Tried(self, self.path(postures))
+        kept: list[tuple[int, int]] = []
+        left_out: list[BuiltIn] = []
         for pair in range(len(self.separation.first)):
-            always = self._joints_between(*self.indices(pair)) <= 2
-            if always:
-                lower, _ = self.separation.bound(path.bodies, np.full(len(samples), pair), samples)
-                always = bool(np.all(lower < near)) and all(
-                    self.distance(pair, path, k) < near for k in samples.tolist()
-                )
-            built_in.append(always)
-        return built_in
+            a, b = self.indices(pair)
+            always = always_close(tried, pair, self.margin)
+            if always is None:
+                kept.append((a, b))
+            else:
+                names = self._bodies[a].shape_name, self._bodies[b].shape_name
+                left_out.append(BuiltIn(*names, *always))
+        self.separation = Separation(self._bodies, kept)
+        return tuple(left_out)
 
-    def _joints_between(self, a: int, b: int) -> int:
+    def spread(self, first: str, second: str) -> tuple[float, float]:
+        """Return the least and largest distance of two bodies in random postures [m].
+
+        Raises:
+            ValueError: they are no pair.
+        """
+        pairs = [k for k in range(len(self.separation.first)) if self.names(k) == (first, second)]
+        tried = _Tried(self, self.path(self._tried))
+        distances = np.min([tried.distances(pair) for pair in pairs], axis=0)
+        return float(distances.min()), float(distances.max())
+
+    def joints_between(self, pair: int) -> int:
+        """Count the joints between the bodies of a pair."""
+        return self._joints_apart(*self.indices(pair))
+
+    def with_obstacle(self, pair: int) -> bool:
+        """Whether the second body of a pair is an obstacle."""
+        return bool(self.separation.second[pair] >= self._n_links)
+
+    def _joints_apart(self, a: int, b: int) -> int:
         """Count the joints between two bodies."""
         trunks = [
             set(self._chain.ancestors(joint)) if joint >= 0 else set()
@@ -169,26 +205,25 @@ class Scene:
         return len(trunks[0] ^ trunks[1])
 
 
+class _Tried:
+    """Pairs of a scene in the postures of a path."""
+
+    def __init__(self, scene: Scene, path: Path) -> None:
+        self._scene, self._path = scene, path
+        self._samples = np.arange(len(path.q))
+        self.joints_between, self.with_obstacle = scene.joints_between, scene.with_obstacle
+
+    def lower_bounds(self, pair: int) -> Array:
+        pairs = np.full(len(self._samples), pair)
+        return self._scene.separation.bound(self._path.bodies, pairs, self._samples)[0]
+
+    def distances(self, pair: int) -> Array:
+        samples = self._samples.tolist()
+        return np.array([self._scene.distance(pair, self._path, k) for k in samples])
+
+
 def _length(chain: Chain) -> float:
     reach = np.zeros(1 + chain.n_joints)
     for joint, parent in enumerate(chain.parents):
         reach[joint + 1] = reach[parent + 1] + np.linalg.norm(chain.translation[joint])
     return float(reach.max()) or 1.0
-
-
-def _random_postures(model: pin.Model) -> Array:
-    """Return postures within the description's limits, half a turn where it has none (k, n)."""
-    if model.nq != model.nv:  # a continuous joint counts as two numbers in pinocchio
-        lower = np.full(model.nv, -np.pi)
-        upper = np.full(model.nv, np.pi)
-        for joint in range(1, model.njoints):
-            if model.joints[joint].nq == 1:
-                index, limit = model.joints[joint].idx_v, model.joints[joint].idx_q
-                lower[index] = model.lowerPositionLimit[limit]
-                upper[index] = model.upperPositionLimit[limit]
-    else:
-        lower, upper = model.lowerPositionLimit, model.upperPositionLimit
-    lower, upper = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
-    shares = np.random.default_rng(_SEED).random((_N_POSTURES, model.nv))
-    postures: Array = lower + shares * (upper - lower)
-    return postures

@@ -24,8 +24,9 @@ Array = NDArray[np.float64]
 
 # Random numbers that are no other part's, whatever the seeds.
 _STREAM: Final = 6
-# Excess of a motion that keeps every constraint but cannot be judged: it ranks behind all others.
-_UNEXCITING: Final = 1.0
+# Added to the excess of a motion that cannot be judged: it ranks behind all that can, however much
+# they exceed, and before those that cannot even be planned, whose excess is infinite.
+_UNEXCITING: Final = 1e6
 
 
 class Evolution:
@@ -71,7 +72,8 @@ class Evolution:
     def tell(self, scores: Scores, objectives: Array) -> None:
         """Take the scores of what was asked for, and its objectives (m, n_objectives)."""
         judged = scores.usable
-        unexciting = np.where(scores.feasible & ~judged, _UNEXCITING, 0.0)
+        exciting = np.isfinite(scores.log10_det) & np.isfinite(scores.coupling_index)
+        unexciting = np.where(exciting, 0.0, _UNEXCITING)
         excess = np.column_stack((scores.excess, unexciting))
         # Objectives decide among feasible motions only, and must be finite for their distances.
         finite = np.nan_to_num(np.where(judged[:, None], objectives, 0.0))

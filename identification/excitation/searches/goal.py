@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.criteria import fitness_of
+from identification.excitation.criteria import Criteria, fitness_of
 from identification.excitation.searches.front import Front
 from identification.excitation.searches.polish import dominating
 from identification.excitation.searches.scale import Scale
@@ -77,6 +77,15 @@ class Goal:
         k = self.choice(front)
         values = self.fitness(front.log10_det, front.coupling_index)
         return float(values[k]), float(front.log10_det[k]), float(front.coupling_index[k])
+
+    def is_worse(self, one: Criteria, other: Criteria) -> bool:
+        """Return whether a motion is worse than another, with "front" in either measure."""
+        log10_det = np.array((one.log10_det, other.log10_det))
+        coupling_index = np.array((one.coupling_index, other.coupling_index))
+        if self.single:
+            fitness = self.fitness(log10_det, coupling_index)
+            return not bool(fitness[0] >= fitness[1])
+        return not bool(log10_det[0] >= log10_det[1] and coupling_index[0] <= coupling_index[1])
 
     def polished_by(self, start: Scores) -> Callable[[Scores], Array]:
         """Return what a polish from a motion (scores, m = 1) makes larger."""

@@ -13,9 +13,13 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 import zlib
+from contextlib import suppress
 from dataclasses import asdict
+from hashlib import sha256
+from time import monotonic
 from typing import Any, BinaryIO, Final
 
 import numpy as np
@@ -30,85 +34,137 @@ from identification.excitation.searches.settings import SearchSettings
 Array = NDArray[np.float64]
 
 _FIRST_LINE: Final = b"hil search journal 1\n"
+_NAMELESS: Final = "this journal does not say which search it belongs to"
 _FRAME: Final = struct.Struct("<QI")
+# What the content of a generation's frame begins with, by which frames are found behind damage.
+_ARRAY: Final = b"\x93NUMPY"
+# s; what the operating system has is safe from a crash of ours, what is synced from one of its own.
+_SYNCED_EVERY: Final = 5.0
 
 
 class Journal:
     """Scores of a search in a file that only ever grows.
 
-    A last record that was cut off while it was written is dropped.
+    Scores are found by their genes, so a damaged record costs its own generation and no other,
+    and a last record that was cut off while it was written is dropped. Where the disk takes no
+    more, records wait in memory and are tried again with the next one: the search goes on.
 
     Args:
-        file: binary, readable, writable and seekable, empty or an earlier journal of this search;
-            it stays the caller's to close. One search at a time may use it.
+        file: binary, readable, writable and seekable, best without a buffer of its own; empty or
+            an earlier journal of this search. It stays the caller's to close. One search at a
+            time may use it.
         problem: of the search.
         settings: of the search.
+
+    Attributes:
+        recalled: how many motions were taken from the file so far.
+        damaged: how many bytes before the last whole record cannot be read.
+        trouble: why records wait in memory, None while none do.
 
     Raises:
         JournalError: the file holds something else.
         ForeignJournalError: it is the journal of another search, or of other software.
+        OSError: it cannot be read, or a new one not be begun.
     """
 
     def __init__(self, file: BinaryIO, problem: Problem, settings: SearchSettings) -> None:
         self._file = file
-        self.recalled = 0
+        self.recalled = self.damaged = 0
+        self.trouble: OSError | None = None
+        self._known: dict[bytes, Array] = {}
+        self._waiting = b""
+        self._synced = monotonic()
         ours = identity(problem, settings)
         head = _FIRST_LINE + _framed(json.dumps(ours, sort_keys=True).encode())
         file.seek(0)
-        there = file.read(len(head))
-        if len(there) < len(head) and head.startswith(there):  # empty, or cut off at once
+        there = file.read()
+        if head.startswith(there):  # empty, or cut off at once
             self._next = 0
             self._append(head)
             return
         if not there.startswith(_FIRST_LINE):
             raise JournalError("this file is not the journal of a search")
-        self._next = len(_FIRST_LINE)
-        _compare(_identity(self._read()), ours)
+        content = _content(there, len(_FIRST_LINE))
+        _compare(_identity(content), ours)
+        self._next = len(_FIRST_LINE) + _FRAME.size + len(content or b"")
+        self._read(there)
 
     def recall(self, genes: Array) -> Scores | None:
-        """Return the recorded scores of genes (m, n_genes) if these are what comes next.
-
-        None if other genes or none were recorded; `record` then writes over what follows.
-        """
-        before = self._next
-        recorded = _generation(self._read())
-        if recorded is None or not _same_bits(recorded[0], genes):
-            self._next = before
+        """Return the recorded scores of genes (m, n_genes), None where there are none."""
+        rows = self._known.get(_key(genes))
+        if rows is None:
             return None
         self.recalled += len(genes)
-        return Scores.of_rows(recorded[1])
+        return Scores.of_rows(rows)
 
     def record(self, genes: Array, scores: Scores) -> None:
-        """Append the scores of genes (m, n_genes)."""
+        """Append the scores of genes (m, n_genes), as soon as the disk takes them."""
         content = io.BytesIO()
         for array in (genes, scores.rows):
             np.save(content, np.asarray(array, dtype="<f8"), allow_pickle=False)
-        self._append(_framed(content.getvalue()))
+        self._waiting += _framed(content.getvalue())
+        try:
+            self._append(self._waiting)
+            self._waiting = b""
+            if monotonic() - self._synced >= _SYNCED_EVERY:
+                self._sync()
+            self.trouble = None
+        except OSError as error:
+            self.trouble = error
+
+    def close(self) -> None:
+        """Bring all that waits onto the disk, as far as it can be; the file stays open."""
+        try:
+            self._append(self._waiting)
+            self._waiting = b""
+            self._sync()
+            self.trouble = None
+        except OSError as error:
+            self.trouble = error
 
     def _append(self, content: bytes) -> None:
         """Put bytes where the next record belongs, and nothing behind them."""
         self._file.seek(self._next)
         self._file.truncate()
-        self._file.write(content)
+        left = memoryview(content)
+        while left:  # an unbuffered file may take a part
+            left = left[self._file.write(left) :]
         self._file.flush()
         self._next += len(content)
 
-    def _read(self) -> bytes | None:
-        """Return the next frame's content, None where there is no whole one."""
-        self._file.seek(self._next)
-        head = self._file.read(_FRAME.size)
-        if len(head) < _FRAME.size:
-            return None
-        length, checksum = _FRAME.unpack(head)
-        behind = self._file.seek(0, io.SEEK_END) - self._next - _FRAME.size
-        if length > behind:
-            return None
-        self._file.seek(self._next + _FRAME.size)
-        content = self._file.read(length)
-        if zlib.crc32(content) != checksum:
-            return None
-        self._next += _FRAME.size + length
-        return content
+    def _sync(self) -> None:
+        with suppress(io.UnsupportedOperation):  # a file in memory
+            os.fsync(self._file.fileno())
+        self._synced = monotonic()
+
+    def _read(self, there: bytes) -> None:
+        """Take in every whole record; the next one belongs behind the last of them."""
+        begin = self._next
+        while begin < len(there):
+            content = _content(there, begin)
+            if content is None:
+                # Only the next record's own beginning tells where it is.
+                array = there.find(_ARRAY, begin + _FRAME.size + 1)
+                begin = len(there) if array < 0 else array - _FRAME.size
+                continue
+            self.damaged += begin - self._next
+            begin = self._next = begin + _FRAME.size + len(content)
+            generation = _generation(content)
+            if generation is not None:
+                self._known[_key(generation[0])] = generation[1]
+
+
+def _content(there: bytes, begin: int) -> bytes | None:
+    """Return the content of the frame that begins here, None where there is no whole one."""
+    if begin + _FRAME.size > len(there):
+        return None
+    length, checksum = _FRAME.unpack_from(there, begin)
+    content = there[begin + _FRAME.size : begin + _FRAME.size + length]
+    return content if len(content) == length and zlib.crc32(content) == checksum else None
+
+
+def _key(genes: Array) -> bytes:
+    return sha256(repr(genes.shape).encode() + np.asarray(genes, dtype="<f8").tobytes()).digest()
 
 
 def identity(problem: Problem, settings: SearchSettings) -> dict[str, Any]:
@@ -126,9 +182,11 @@ def identity(problem: Problem, settings: SearchSettings) -> dict[str, Any]:
 
 
 def _compare(there: dict[str, Any], ours: dict[str, Any]) -> None:
-    """Raise ForeignJournalError at the first difference."""
-    for part in ("problem", "settings", "versions"):
-        theirs = there.get(part, {})
+    """Raise ForeignJournalError at the first difference, JournalError where there is no sense."""
+    parts = {part: there.get(part, {}) for part in ("problem", "settings", "versions")}
+    if not all(isinstance(theirs, dict) for theirs in parts.values()):
+        raise JournalError(_NAMELESS)
+    for part, theirs in parts.items():
         for name in sorted({*theirs, *ours[part]}):
             if theirs.get(name) != ours[part].get(name):
                 raise ForeignJournalError(part, name, theirs.get(name), ours[part].get(name))
@@ -140,7 +198,7 @@ def _identity(content: bytes | None) -> dict[str, Any]:
     except ValueError:
         found = None
     if not isinstance(found, dict):
-        raise JournalError("this journal does not say which search it belongs to")
+        raise JournalError(_NAMELESS)
     return found
 
 
@@ -156,10 +214,6 @@ def _generation(content: bytes | None) -> tuple[Array, Array] | None:
     if genes.ndim != 2 or rows.shape != (len(genes), ROW) or rows.dtype != np.float64:
         return None
     return genes, rows
-
-
-def _same_bits(recorded: Array, genes: Array) -> bool:
-    return recorded.shape == genes.shape and recorded.tobytes() == genes.tobytes()
 
 
 def _framed(content: bytes) -> bytes:

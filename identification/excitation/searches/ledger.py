@@ -50,6 +50,7 @@ class Ledger:
         population: scores what the journal does not know.
         journal: where scores are looked up and kept.
         entered: called after each lot of motions.
+        scored: called with a number of motions whenever so many more of a lot are scored.
 
     Attributes:
         front: of everything scored.
@@ -63,10 +64,11 @@ class Ledger:
         population: Population,
         journal: Journal | None,
         entered: Callable[[], None] | None = None,
+        scored: Callable[[int], None] | None = None,
     ) -> None:
         self._population = population
         self._journal = journal
-        self._entered = entered
+        self._entered, self._scored = entered, scored
         self.front = Front.empty(population.problem.genome.n_genes)
         self.evaluated = 0
         self.feasible = 0
@@ -78,7 +80,7 @@ class Ledger:
         """Return the scores of genes (m, n_genes)."""
         scores = None if self._journal is None else self._journal.recall(genes)
         if scores is None:
-            scores = self._population.score(genes)
+            scores = self._population.score(genes, self._scored)
             if self._journal is not None:
                 self._journal.record(genes, scores)
         self._enter(genes, scores)

@@ -21,6 +21,7 @@ from scipy.stats import rankdata
 
 from identification.errors import ShapeError
 from identification.excitation.errors import DesignError
+from identification.excitation.searches.population import CHUNK
 
 if TYPE_CHECKING:
     from identification.excitation.searches.scale import Scale
@@ -33,8 +34,6 @@ Fitness = Callable[["Scores"], Array]
 _STEP: Final = 0.03
 # Steps below this change no motion that anybody could tell from the one before.
 _SMALLEST_STEP: Final = 1e-7
-# Whole chunks of a population that is spread over processes.
-_CHUNK: Final = 8
 # Random numbers that are no other search's, whatever the seeds.
 _STREAM: Final = 3
 # How much the better of two gains counts where neither is a loss.
@@ -55,24 +54,20 @@ class PolishResult(NamedTuple):
     Attributes:
         genes: (n_genes,), those of the start, bit for bit, where nothing better was found.
         scores: of this one motion, m = 1.
-        evaluated: how many motions were scored, the start among them.
-        generations: how many generations of them.
     """
 
     genes: Array
     scores: Scores
-    evaluated: int
-    generations: int
 
 
 def polish(
     population: Scorer,
     genes: ArrayLike,
+    scores: Scores,
     fitness: Fitness,
     *,
     evaluations: int,
     seed: int,
-    progress: Callable[[int, float], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> PolishResult:
     """Return the best motion found near a start, never a worse one than the start.
@@ -83,36 +78,36 @@ def polish(
     Args:
         population: scores whole generations at once.
         genes: (n_genes,) of the start, within [0, 1].
+        scores: of the start, m = 1. It is not scored again: were that to fail for a reason that is
+            not its own, anything would be better than the start.
         fitness: (m,) of scores, the larger the better; -inf is the worst there is.
-        evaluations: how many motions may be scored, the start among them.
+        evaluations: how many motions may be scored.
         seed: of the random numbers.
-        progress: called with the motions scored and the best fitness after each generation.
         stop: asked before each generation; true ends the polish with the best so far.
 
     Raises:
-        ShapeError: the start is no vector of at least two genes.
+        ShapeError: the start is no vector of at least two genes, or its scores are not of one.
         DesignError: genes outside [0, 1], or no evaluation allowed.
     """
     start = _checked(genes)
     if evaluations < 1:
         raise DesignError("evaluations", evaluations, "at least 1")
-    best = _Best(start, population.score(start[None].copy()), fitness)
+    if len(scores.duration) != 1:
+        raise ShapeError("scores", np.shape(scores.duration), "(1,)")
+    best = _Best(start, scores, fitness)
     size = generation_size(len(start))
     strategy = _strategy(start, size, seed)
-    evaluated, generations = 1, 0
+    evaluated = 0
     while evaluated + size <= evaluations and not stop():
         asked = np.array(strategy.ask())
-        scores = population.score(asked.copy())
-        merits = _merits(scores, fitness)
+        found = population.score(asked.copy())
+        merits = _merits(found, fitness)
         strategy.tell(list(asked), _ranks(merits).tolist())
-        best.take(asked, scores, merits)
+        best.take(asked, found, merits)
         evaluated += size
-        generations += 1
-        if progress is not None:
-            progress(evaluated, best.fitness)
         if not _SMALLEST_STEP < float(np.max(strategy.stds)) < np.inf:
             break
-    return PolishResult(best.genes, best.scores, evaluated, generations)
+    return PolishResult(best.genes, best.scores)
 
 
 def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
@@ -155,7 +150,7 @@ def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
 
 def generation_size(n_genes: int) -> int:
     """Return how many motions make a generation: the usual 4 + 3 ln n, in whole chunks."""
-    return _CHUNK * int(np.ceil((4.0 + 3.0 * np.log(n_genes)) / _CHUNK))
+    return CHUNK * int(np.ceil((4.0 + 3.0 * np.log(n_genes)) / CHUNK))
 
 
 class _Merits(NamedTuple):
@@ -189,14 +184,14 @@ class _Best:
     def __init__(self, genes: Array, scores: Scores, fitness: Fitness) -> None:
         self.genes, self.scores = genes, scores
         merits = _merits(scores, fitness)
-        self._excess, self.fitness = float(merits.excess[0]), float(merits.fitness[0])
+        self._excess, self._fitness = float(merits.excess[0]), float(merits.fitness[0])
 
     def take(self, genes: Array, scores: Scores, merits: _Merits) -> None:
         """Take the best of a generation if it is better; the first of those that are alike."""
         index = int(np.lexsort((-merits.fitness, merits.excess))[0])
         excess, fitness = float(merits.excess[index]), float(merits.fitness[index])
-        if (excess, -fitness) < (self._excess, -self.fitness):
-            self._excess, self.fitness = excess, fitness
+        if (excess, -fitness) < (self._excess, -self._fitness):
+            self._excess, self._fitness = excess, fitness
             self.genes = genes[index].copy()
             self.scores = scores.take(index)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,34 +20,38 @@ from planner import (
     PlannerCrashed,
     PlanningChild,
     PlanningTimedOut,
+    chunks_of,
+    load,
     map_in_children,
+    pack,
 )
-from planner.children import chunks_of
-from planner.remote import load, pack
 
 Array = NDArray[np.float64]
 
-# Motions per call to a process. The same for any number of processes; few, so that the processes
-# end a generation of a hundred together.
-_CHUNK: Final = 8
+CHUNK: Final = 8
+"""Motions per call to a process, the same for any number of processes.
+
+Few, so that the processes end a generation of a hundred together.
+"""
 
 
 class Population:
     """Scores motions of one problem in child processes; keep one for all generations.
 
     Every motion is scored in a child, each with one thread for linear algebra, so scores are the
-    same to the last bit for any number of workers. Genes whose motion ends its process, or holds
-    it up alone for the whole timeout, are scored as having no motion.
+    same to the last bit for any number of workers. Genes whose motion ends its process, alone and
+    twice, or holds it up alone for the whole timeout, are scored as having no motion.
 
     Args:
         problem: what scores mean.
         workers: number of processes, at least 1.
         timeout: longest time [s] for 8 motions, then for each of them alone. Generous, so that
-            a busy machine changes no result.
+            a busy machine changes no result. A motion that hangs takes twice as long at most, and
+            nobody can stop the search meanwhile but by an interrupt.
 
     Raises:
         DesignError: no workers.
-        PlannerNotStarted: in `score`, a process could not even be started.
+        PlannerNotStarted: in `score`, a process could not even be started, several times.
     """
 
     def __init__(self, problem: Problem, workers: int = 1, timeout: float = 60.0) -> None:
@@ -67,13 +72,19 @@ class Population:
         for child in self._children:
             child.close()
 
-    def score(self, genes: Array) -> Scores:
-        """Return the scores of rows of genes (m, n_genes)."""
+    def score(self, genes: Array, scored: Callable[[int], None] | None = None) -> Scores:
+        """Return the scores of rows of genes (m, n_genes).
+
+        Args:
+            genes: what to score.
+            scored: called with a number of motions whenever so many more are scored.
+        """
         results = map_in_children(
             self._children,
             _score,
-            chunks_of(len(genes), _CHUNK),
+            chunks_of(len(genes), CHUNK),
             lambda chunk: (self._packed, genes[list(chunk)]),
+            done=scored,
         )
         rows = [unplanned() if isinstance(row, Exception) else row for row in results]
         return Scores.of_rows(np.array(rows))
@@ -81,9 +92,10 @@ class Population:
     def violations(self, genes: Array) -> tuple[Violation, ...]:
         """Return what the motion of genes (n_genes,) breaks, with place and amount."""
         try:
-            return self._children[0].call(_violations, self._packed, genes)
+            found: tuple[Violation, ...] = self._alone(_violations, genes)
         except (PlannerCrashed, PlanningTimedOut) as error:
             return (unplannable(error),)
+        return found
 
     def judged(
         self, genes: Array, period: float
@@ -93,21 +105,31 @@ class Population:
         Raises:
             PlannerError: there is no motion, or its planning ended the process.
         """
-        return self._children[0].call(_judged, self._packed, genes, period)
+        found: tuple[PiecewiseCubic | FourierSeries, Criteria] = self._alone(_judged, genes, period)
+        return found
+
+    def _alone(self, function: Callable[..., list[Any]], *arguments: object) -> Any:
+        """Return the one result of a function of the problem; an outside kill is made good."""
+        (result,) = map_in_children(
+            self._children[:1], function, [[0]], lambda _: (self._packed, *arguments)
+        )
+        if isinstance(result, PlannerCrashed | PlanningTimedOut):
+            raise result
+        return result
 
 
 def _score(packed: bytes, genes: Array) -> Array:
     return _problem(packed).score(genes).rows
 
 
-def _violations(packed: bytes, genes: Array) -> tuple[Violation, ...]:
-    return _problem(packed).violations(genes)
+def _violations(packed: bytes, genes: Array) -> list[tuple[Violation, ...]]:
+    return [_problem(packed).violations(genes)]
 
 
 def _judged(
     packed: bytes, genes: Array, period: float
-) -> tuple[PiecewiseCubic | FourierSeries, Criteria]:
-    return _problem(packed).judged(genes, period)
+) -> list[tuple[PiecewiseCubic | FourierSeries, Criteria]]:
+    return [_problem(packed).judged(genes, period)]
 
 
 @lru_cache(maxsize=1)

@@ -11,7 +11,7 @@ from identification.excitation.constraints import Constraints
 from identification.excitation.criteria import Criteria
 from identification.excitation.genome import Genome
 from identification.excitation.objective import Objective
-from identification.excitation.sampling import SAMPLE_PERIOD, sampled
+from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
 from identification.excitation.searches.scores import Scores, unplanned
 from identification.excitation.violation import Violation, excess_by_kind
 from planner import FourierSeries, PiecewiseCubic, PlannerError
@@ -27,7 +27,8 @@ class Problem:
         genome: what genes mean.
         objective: how good a motion is.
         constraints: what it must keep.
-        period: motions are sampled this often [s] while searching.
+        period: motions are sampled this often [s] while searching: in the middle of such steps
+            for the objective, at their ends for the constraints.
     """
 
     genome: Genome
@@ -73,13 +74,9 @@ class Problem:
     def _assessed(
         self, trajectory: PiecewiseCubic | FourierSeries
     ) -> tuple[float, float, tuple[Violation, ...]]:
-        currents = self.constraints.currents
-        motion = sampled(trajectory, self.period)
-        log10_det, coupling_index, torque = self.objective.measures(
-            motion, None if currents is None else currents.values
-        )
-        violations = self.constraints.violations(trajectory, motion, torque)
-        return log10_det, coupling_index, violations
+        # Constraints are looked at where the last check before a motion is sent looks.
+        measures = self.objective.measures(midpoints(trajectory, self.period))
+        return *measures, self.constraints.violations(trajectory, sampled(trajectory, self.period))
 
 
 def unplannable(error: PlannerError) -> Violation:

@@ -14,7 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
+from identification.excitation.excitation import Excitation
 from identification.excitation.searches.design import Design
 from identification.excitation.searches.evolution import Evolution
 from identification.excitation.searches.front import Front
@@ -26,6 +28,7 @@ from identification.excitation.searches.population import Population
 from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
 from identification.excitation.searches.scores import Scores
 from identification.excitation.searches.settings import SearchSettings
+from planner import FourierSeries, PiecewiseCubic
 
 Array = NDArray[np.float64]
 
@@ -44,6 +47,7 @@ def search(
     *,
     journal: Journal | None = None,
     progress: Callable[[Progress], None] | None = None,
+    scored: Callable[[int], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Design:
     """Return the best motion of a search.
@@ -53,14 +57,24 @@ def search(
         settings: how to search, and what for.
         journal: scores already known, and where new ones are kept.
         progress: called after each generation.
-        stop: asked before each generation; true ends the search with the best so far.
+        scored: called with a number of motions whenever so many more of a generation are scored
+            (those that the journal knows are not).
+        stop: asked before each generation; true ends the search with the best so far. The one
+            under way is finished first, which a motion that hangs delays by the population's
+            timeout.
 
     Raises:
         NoFeasibleMotionError: no motion tried keeps every constraint and excites every parameter.
         PlannerNotStarted: a process could not be started.
         KeyboardInterrupt: as it comes; the generation under way is lost, no other.
     """
-    return _Search(population, settings, journal, progress, stop).run()
+    return _Search(population, settings, journal, progress, scored, stop).run()
+
+
+def most_evaluations(settings: SearchSettings) -> int:
+    """Return how many motions a search is going to score at most, in all its phases."""
+    sampled = SAMPLE_COUNT if _needs_scale(settings) else 0
+    return sampled + settings.population * settings.generations + settings.polish
 
 
 class _Search:
@@ -72,16 +86,17 @@ class _Search:
         settings: SearchSettings,
         journal: Journal | None,
         progress: Callable[[Progress], None] | None,
+        scored: Callable[[int], None] | None,
         stop: Callable[[], bool],
     ) -> None:
         self._population, self._settings = population, settings
         self._genome = population.problem.genome
         self._progress, self._stop = progress, stop
-        self._stopped = False
+        self._stopped = self._exhausted = False
         self._phase: Phase = "sample"
         self._goal: Goal | None = None
         self._history: list[tuple[float, float, float]] = []
-        self._ledger = Ledger(population, journal, self._entered)
+        self._ledger = Ledger(population, journal, self._entered, scored)
 
     def run(self) -> Design:
         goal = self._goal = self._chosen_goal()
@@ -90,15 +105,35 @@ class _Search:
         if len(front) == 0:
             raise self._ledger.failure(stopped=self._stopped)
         winner = goal.choice(front)
-        genes = front.genes[winner]
+        start = front.genes[winner]
+        origin = trajectory, criteria = self._population.judged(start, RESCORE_PERIOD)
+        genes = start
         if self._settings.polish > 0 and not self._halted():
-            genes = self._polished(goal, winner)
-        return self._design(genes, front, goal.scale)
+            genes = self._polished(goal, front, winner)
+        if genes.tobytes() != start.tobytes():
+            trajectory, criteria = self._population.judged(genes, RESCORE_PERIOD)
+            if goal.is_worse(criteria, origin[1]):  # better only as the search samples
+                genes, (trajectory, criteria) = start, origin
+        return Design(
+            settings=self._settings,
+            genes=genes.copy(),
+            excitation=self._excitation(genes, trajectory, criteria),
+            front=front,
+            chosen=winner if genes is start else None,
+            origin=winner,
+            origin_criteria=origin[1],
+            history=np.array(self._history).reshape(-1, 3),
+            evaluated=self._ledger.evaluated,
+            infeasible=dict(self._ledger.infeasible),
+            complete=not self._stopped,
+            exhausted=self._exhausted,
+            scale=goal.scale,
+        )
 
     def _chosen_goal(self) -> Goal:
         """Return what decides, after a look at random motions where it needs a scale."""
         p = self._population.problem.objective.n_parameters
-        if not self._needs_scale:
+        if not _needs_scale(self._settings):
             return Goal(self._settings, p, None)
         drawn = self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT)
         scores = self._ledger.score(drawn)
@@ -118,47 +153,37 @@ class _Search:
         while len(self._history) < self._settings.generations and not self._halted():
             genes = evolution.ask()
             if genes is None:
+                self._exhausted = True
                 return
             scores = self._ledger.score(genes)
             evolution.tell(scores, goal.objectives(scores))
 
-    def _polished(self, goal: Goal, winner: int) -> Array:
+    def _polished(self, goal: Goal, front: Front, winner: int) -> Array:
         """Return the genes of the best motion near the winner, or its own."""
         self._phase = "polish"
-        front = self._ledger.front
+        start = _scores_on(front, winner)
         result = polish(
             self._ledger,
             front.genes[winner],
-            goal.polished_by(_scores_on(front, winner)),
+            start,
+            goal.polished_by(start),
             evaluations=self._settings.polish,
             seed=self._settings.seed,
             stop=self._halted,
         )
         return result.genes
 
-    def _design(self, genes: Array, front: Front, scale: Scale | None) -> Design:
-        trajectory, criteria = self._population.judged(genes, RESCORE_PERIOD)
-        ledger = self._ledger
-        same = np.flatnonzero(np.all(front.genes == genes, axis=1))
-        return Design(
-            settings=self._settings,
-            genes=genes.copy(),
-            excitation=self._genome.excitation(
-                genes,
-                trajectory,
-                criteria,
-                method=self._settings.method,
-                seed=self._settings.seed,
-                tried=ledger.evaluated,
-                rejected=ledger.infeasible,
-            ),
-            front=front,
-            chosen=int(same[0]) if len(same) else None,
-            history=np.array(self._history).reshape(-1, 3),
-            evaluated=ledger.evaluated,
-            infeasible=dict(ledger.infeasible),
-            complete=not self._stopped,
-            scale=scale,
+    def _excitation(
+        self, genes: Array, trajectory: PiecewiseCubic | FourierSeries, criteria: Criteria
+    ) -> Excitation:
+        return self._genome.excitation(
+            genes,
+            trajectory,
+            criteria,
+            method=self._settings.method,
+            seed=self._settings.seed,
+            tried=self._ledger.evaluated,
+            rejected=self._ledger.infeasible,
         )
 
     def _entered(self) -> None:
@@ -172,15 +197,13 @@ class _Search:
         if self._goal is not None and len(ledger.front) > 0:
             k = self._goal.choice(ledger.front)
             best = float(ledger.front.log10_det[k]), float(ledger.front.coupling_index[k])
-        sampled = SAMPLE_COUNT if self._needs_scale else 0
-        total = sampled + settings.population * settings.generations + settings.polish
         self._progress(
             Progress(
                 self._phase,
                 len(self._history),
                 settings.generations,
                 ledger.evaluated,
-                total,
+                most_evaluations(settings),
                 ledger.feasible,
                 *best,
             )
@@ -190,9 +213,9 @@ class _Search:
         self._stopped = self._stopped or self._stop()
         return self._stopped
 
-    @property
-    def _needs_scale(self) -> bool:
-        return self._settings.method in ("balanced", "front")
+
+def _needs_scale(settings: SearchSettings) -> bool:
+    return settings.method in ("balanced", "front")
 
 
 def _scores_on(front: Front, index: int) -> Scores:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.cell import Cell
+if TYPE_CHECKING:
+    from .cell import Cell
 
 Array = NDArray[np.float64]
 
@@ -47,6 +49,18 @@ class AngleFrame:
     def shown_rate(self, rate: Array) -> Array:
         """Rates to show (..., n) [deg/s, deg/s²] from those of URDF angles [rad]."""
         return np.asarray(np.degrees(rate * self.sign), dtype=np.float64)
+
+    def told(self, q: Array | Sequence[float]) -> str:
+        """One posture (n,) [rad] of URDF angles in words, as a person would set it."""
+        angles = ", ".join(
+            f"J{joint} {angle:z.1f}" for joint, angle in enumerate(self.shown(np.asarray(q)), 1)
+        )
+        return f"{angles} deg, {self.whose}"
+
+    @property
+    def whose(self) -> str:
+        """Whose angles are shown, in words."""
+        return "teach pendant angles" if self.name == "controller" else "angles of the URDF"
 
     def urdf(self, shown: Array) -> Array:
         """URDF angles (..., n) [rad] from angles shown [deg]."""

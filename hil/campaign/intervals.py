@@ -1,0 +1,177 @@
+"""The motions of a campaign in order, with the ways between them, checked before they are sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.motion_checks import MotionChecks
+from planner import FourierSeries, Move, PiecewiseCubic, PlanFile, in_child, plan_moves
+
+from .errors import MotionRefusedError
+from .plan import CampaignPlan
+
+Array = NDArray[np.float64]
+
+AT_REST_TOLERANCE = 1e-6
+"""rad; a move shorter than this is not worth an interval."""
+START_TOLERANCE = 1e-3
+"""rad by which a motion may begin elsewhere than where the arm is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Interval:
+    """One interval of motion: what kind it is, the trajectory to run, and the moves behind it.
+
+    Attributes:
+        kind: "standstill", "excitation", "validation" or "move".
+        index: which of its kind, from 0.
+        trajectory: the motion.
+        moves: those that it was planned from, where there are any.
+        from_arm: whether it is a way from or to where the arm happens to stand.
+    """
+
+    kind: str
+    index: int
+    trajectory: PiecewiseCubic | FourierSeries
+    moves: PlanFile | None = None
+    from_arm: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.index}"
+
+
+def wanted(cell: Cell, plan: CampaignPlan) -> list[Interval]:
+    """All motions of a plan, without the ways between them."""
+    settings = cell.campaign
+    excitation = plan.excitation.trajectory
+    return [
+        Interval("standstill", 0, hold(cell.home, settings.standstill_s)),
+        *(Interval("excitation", i, excitation, plan.moves) for i in range(settings.repetitions)),
+        *(
+            Interval("validation", i, motion.trajectory, motion.moves)
+            for i, motion in enumerate(plan.validation)
+        ),
+    ]
+
+
+def with_ways(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[Interval]:
+    """Put moves between: from `where` (n,) to home, from home to an excitation, and back.
+
+    An excitation may begin and end elsewhere than at home; whatever else does is not met.
+    """
+    home, at = cell.home, where
+    joined: list[Interval] = []
+    ways: dict[bytes, Interval] = {}
+
+    def go(target: Array) -> None:
+        nonlocal at
+        from_arm = at is where or target is where
+        if np.max(np.abs(target - at)) > AT_REST_TOLERANCE:
+            key = at.tobytes() + target.tobytes()
+            if key not in ways:
+                ways[key] = _way(cell, at, target)
+            index = sum(interval.kind == "move" for interval in joined)
+            joined.append(replace(ways[key], index=index, from_arm=from_arm))
+        at = target
+
+    for interval in intervals:
+        start, end = ends(interval) if interval.kind == "excitation" else (home, home)
+        go(start)
+        joined.append(interval)
+        at = end
+    go(home)
+    go(where)
+    return joined
+
+
+def require_sound(intervals: Sequence[Interval], checks: MotionChecks) -> None:
+    """Refuse motions that must not be sent; each is looked at once.
+
+    Raises:
+        MotionRefusedError: names the motion, what is wrong with it and what to do.
+    """
+    checked: set[int] = set()
+    for interval in intervals:
+        if id(interval.trajectory) not in checked:
+            _require(interval, checks.refusal(interval.trajectory))
+            checked.add(id(interval.trajectory))
+
+
+def require_joined(intervals: Sequence[Interval]) -> None:
+    """Refuse motions that do not begin where the one before ends.
+
+    Raises:
+        MotionRefusedError: names the motion and the joint.
+    """
+    for before, after in pairwise(intervals):
+        _require(after, _jump(before, after))
+
+
+def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None = None) -> None:
+    """Refuse a plan that can never run on a cell, wherever its arm stands.
+
+    Args:
+        cell: the cell.
+        plan: excitation and validation motions.
+        checks: those of the cell, where they are at hand.
+
+    Raises:
+        MotionRefusedError: names the motion, what is wrong with it and what to do.
+    """
+    checks = checks or MotionChecks.of(cell)
+    intervals = wanted(cell, plan)
+    require_sound(intervals, checks)  # before ways are planned to where they lead
+    joined = with_ways(cell, intervals, cell.home)
+    require_sound([interval for interval in joined if interval.kind == "move"], checks)
+    require_joined(joined)
+
+
+def ends(interval: Interval) -> tuple[Array, Array]:
+    """Where a motion begins and where it ends, (n,) [rad] each."""
+    start, end = interval.trajectory.sample(np.array([0.0, interval.trajectory.duration]))[0]
+    return start, end
+
+
+def hold(position: Array, duration: float) -> PiecewiseCubic:
+    """Rest at `position` (n,) [rad] for `duration` [s]."""
+    return PiecewiseCubic(
+        knots=tuple(np.array([0.0, duration]) for _ in position),
+        coefficients=tuple(np.array([[q, 0.0, 0.0, 0.0]]) for q in position),
+    )
+
+
+def _way(cell: Cell, start: Array, end: Array) -> Interval:
+    """The straight way between two postures; planned where a crash does not end us."""
+    move = Move(end, speed=cell.campaign.approach_speed)
+    motion = in_child(plan_moves, start, (move,), cell.joint_limits)
+    return Interval("move", 0, motion.trajectory, PlanFile.of(motion, cell.joint_names))
+
+
+def _require(interval: Interval, problem: str | None) -> None:
+    if problem is None:
+        return
+    remedy = "design another motion"
+    if interval.from_arm:
+        remedy = "jog the arm to where the straight way to the motion is free"
+    elif interval.kind == "standstill":
+        remedy = "correct home_deg or standstill_s in [campaign], or [workspace], of the cell file"
+    raise MotionRefusedError(str(interval), problem, remedy)
+
+
+def _jump(before: Interval, after: Interval) -> str | None:
+    """Why `after` cannot follow `before`, or None if it begins where that ends."""
+    (_, end), (start, _) = ends(before), ends(after)
+    distance = np.abs(start - end)
+    if np.max(distance) <= START_TOLERANCE:
+        return None
+    joint = int(np.argmax(distance))
+    return (
+        f"it begins with joint {joint + 1} at {start[joint]:.6g} rad, but {before} ends at "
+        f"{end[joint]:.6g} rad"
+    )

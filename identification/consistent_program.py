@@ -1,0 +1,348 @@
+"""The semidefinite program behind :mod:`identification.consistent`, its options and its errors."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.consistent_polish import Smooth, follow_path, polish
+from identification.errors import IdentificationError, ShapeError
+from identification.estimation import WORST_CONDITION
+from identification.factor import NormalEquations
+from identification.model import RobotModel
+from identification.pseudo_inertia import inertial_from_pseudo
+from identification.reference_bodies import ReferenceBodies, reference_bodies
+from identification.wrench import LINK_SYMBOLS
+
+Array = NDArray[np.float64]
+
+_N_LINK: Final = len(LINK_SYMBOLS)
+# Friction coefficients that can only take energy away.
+_DISSIPATIVE: Final = ("f0", "f1")
+# Smallest eigenvalue of a pseudo-inertia in axes in which the reference's is the unit matrix: far
+# more than the solver's error, so that the result can be relied on to be inside.
+_INSIDE: Final = 1e-6
+# Rows beyond which the prior's weight no longer falls behind the data's, when no machine fits:
+# a pseudo-inertia at the edge is singular to rounding then.
+_MOST_ROWS: Final = 100_000
+# A solution outside by more than this is no solution.
+_TOLERANCE: Final = 1e-4
+# Share of a bound on a mass within which the solver's answer is on it.
+_ON_BOUND: Final = 1e-6
+
+
+class InfeasibleError(IdentificationError):
+    """No physically consistent parameters meet the bounds that were asked for."""
+
+
+class SolverError(IdentificationError):
+    """The solver of the semidefinite program gave no usable answer.
+
+    Attributes:
+        status: what the solver called it.
+    """
+
+    def __init__(self, message: str, *, status: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """What a consistent estimate is asked for beyond consistency.
+
+    Attributes:
+        prior_weight: how many rows of data (each at its noise) the nominal parameters count for.
+        total_mass: of all moving links together [kg], if it is known.
+        largest_mass: upper bound per link [kg], shape (n,), infinite for none.
+        nominal: standard parameters to stay close to, shape (s,), those of the model without it.
+            Rotor inertias count; a URDF has none, so the model's are zero.
+    """
+
+    prior_weight: float = 1.0
+    total_mass: float | None = None
+    largest_mass: Array | None = None
+    nominal: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.prior_weight) and self.prior_weight > 0.0):
+            raise IdentificationError(
+                f"the prior weight is {self.prior_weight!r}; it must be finite and positive, for"
+                " the data alone leave standard parameters open"
+            )
+        if self.total_mass is not None and not (0.0 < self.total_mass < math.inf):
+            raise InfeasibleError(f"a total mass of {self.total_mass!r} kg is no mass")
+
+
+class SquareRoot(NamedTuple):
+    """``||R x - z||²`` is the weighted squared error above its minimum.
+
+    Attributes:
+        R: (r, p), one row per direction that the data determine.
+        z: (r,).
+    """
+
+    R: Array
+    z: Array
+
+    def excess(self, values: Array) -> float:
+        """Weighted squared error of parameters (p,) above the minimum."""
+        return float(np.sum((self.R @ values - self.z) ** 2))
+
+
+def square_root(equations: NormalEquations) -> SquareRoot:
+    """Take the square root of normal equations, without directions they do not determine."""
+    length = np.sqrt(np.diag(equations.A))
+    scale = np.where(length > 0.0, length, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
+    kept = eigenvalues > eigenvalues[-1] / WORST_CONDITION**2
+    basis, root = vectors[:, kept].T, np.sqrt(eigenvalues[kept])
+    return SquareRoot(R=root[:, None] * basis * scale, z=basis @ (equations.b / scale) / root)
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """The semidefinite program in variables u for which the reference is of size one.
+
+    Per link ten entries of the pseudo-inertia in axes in which the reference's is the unit
+    matrix; then rotors; then friction.
+
+    Attributes:
+        bodies: reference of each link.
+        to_standard: physical standard parameters from u (s, v).
+        to_friction: physical friction from u (k, v).
+        rows: R and z in u.
+        centre: what squares of the variables behind the links are counted from (v - 10 n,).
+        not_negative: indices into u.
+        masses: mass of each link from u (n, v).
+    """
+
+    bodies: ReferenceBodies
+    to_standard: Array
+    to_friction: Array
+    rows: SquareRoot
+    centre: Array
+    not_negative: NDArray[np.intp]
+    masses: Array
+
+    @classmethod
+    def of(cls, model: RobotModel, root: SquareRoot, options: Consistency) -> Program:
+        """Set up the program for weighted normal equations.
+
+        Raises:
+            ShapeError: nominal parameters or bounds do not fit the model.
+            InfeasibleError: the bounds on the masses contradict each other.
+        """
+        _check_bounds(model, options)
+        nominal = model.nominal if options.nominal is None else np.asarray(options.nominal)
+        bodies = reference_bodies(link_parameters(model, nominal), model.chain.translation)
+        n, b = model.n_joints, model.base.rank
+        inertial, others = _places(model)
+        s, k = len(model.standard_names), model.n_parameters - b
+        v = s + k
+        to_standard, to_friction = np.zeros((s, v)), np.zeros((k, v))
+        for link, (places, frame) in enumerate(zip(inertial, bodies.frames, strict=True)):
+            entries = np.einsum("ab,kbc,dc->kad", frame, _SYMMETRIC, frame)
+            span = slice(_N_LINK * link, _N_LINK * (link + 1))
+            to_standard[places, span] = inertial_from_pseudo(entries).T
+        rotors = np.arange(_N_LINK * n, s)
+        # A nominal rotor of zero says that nobody knows it: whatever moves the joint is allowed.
+        unknown = _whole_torque_units(root, model.base.grouping[:, others])
+        unit = np.where(nominal[others] > 0.0, nominal[others], unknown)
+        to_standard[others, rotors] = unit
+        rest = np.arange(s, v)
+        to_friction[np.arange(k), rest] = _whole_torque_units(root, np.eye(b + k, k, -b))
+        mapping = np.vstack([model.base.grouping @ to_standard, to_friction])
+        kinds = [name.split("_")[0] for name in model.parameter_names[b:]]
+        dissipative = np.array([kind in _DISSIPATIVE for kind in kinds], dtype=np.bool_)
+        return cls(
+            bodies=bodies,
+            to_standard=to_standard,
+            to_friction=to_friction,
+            rows=SquareRoot(root.R @ mapping, root.z),
+            centre=np.concatenate([nominal[others] / unit, np.zeros(k)]),
+            not_negative=np.concatenate([rotors, rest[dissipative]]),
+            masses=to_standard[inertial[:, -1]],
+        )
+
+    def reference(self, options: Consistency, largest: Array) -> Array:
+        """Return the u of the reference bodies, as heavy as the bounds ask for."""
+        u = np.zeros(self.rows.R.shape[1])
+        links = u[: _N_LINK * len(self.masses)].reshape(-1, _N_LINK)  # a view
+        links[:] = _UNIT_ENTRIES
+        mass = np.minimum(self.masses @ u, largest)
+        if options.total_mass is not None:
+            free = mass < largest
+            rest = options.total_mass - mass[~free].sum()
+            mass[free] *= rest / mass[free].sum()
+        links *= (mass / (self.masses @ u))[:, None]
+        return u
+
+    def physical(self, u: Array) -> tuple[Array, Array]:
+        """Return standard parameters (s,) and friction (k,).
+
+        A solver holds inequalities to its tolerance. What is left beyond them is taken back.
+        """
+        u = u.copy()
+        u[self.not_negative] = np.maximum(u[self.not_negative], 0.0)
+        links = u[: _N_LINK * len(self.masses)].reshape(-1, _N_LINK)  # a view
+        smallest = np.linalg.eigvalsh(np.tensordot(links, _SYMMETRIC, axes=1))[:, 0]
+        lift = np.where(smallest > -_TOLERANCE, np.maximum(_INSIDE - smallest, 0.0), 0.0)
+        links += lift[:, None] * _UNIT_ENTRIES
+        return self.to_standard @ u, self.to_friction @ u
+
+
+def _symmetric_basis() -> Array:
+    rows, columns = np.triu_indices(4)
+    basis = np.zeros((_N_LINK, 4, 4))
+    basis[np.arange(_N_LINK), rows, columns] = 1.0
+    basis[np.arange(_N_LINK), columns, rows] = 1.0
+    return basis
+
+
+# Unit entries of a symmetric 4x4 matrix, shape (10, 4, 4).
+_SYMMETRIC: Final = _symmetric_basis()
+# The entries of the unit matrix, shape (10,).
+_UNIT_ENTRIES: Final = np.eye(4)[np.triu_indices(4)]
+
+
+def solve_program(program: Program, options: Consistency, rows: int) -> tuple[Array, str]:
+    """Return the solution u to rounding, and how it was found: a status in words.
+
+    The prior counts for `prior_weight` rows at their noise. Where no machine fits the data to
+    their noise, the error of the best one is the noise, and the weight grows with it.
+
+    Args:
+        program: what to solve.
+        options: prior and bounds.
+        rows: number of rows in the weighted normal equations.
+
+    Raises:
+        SolverError: neither the solver nor Newton's method found an answer.
+    """
+
+    def weight(u: Array) -> float:
+        excess = program.rows.excess(u) / min(max(rows, 1), _MOST_ROWS)
+        return options.prior_weight * max(1.0, excess)
+
+    start, status = _solve_cone(program, options)
+    largest = np.full(len(program.masses), np.inf)
+    if options.largest_mass is not None:
+        largest = options.largest_mass
+    if start is not None:
+        at_bound = program.masses @ start >= largest * (1.0 - _ON_BOUND)
+        found = polish(_smooth(program, options, largest, at_bound), start)
+        if found.converged and weight(found.u) == options.prior_weight:
+            return found.u, "optimal"
+    at_bound = np.zeros(len(largest), dtype=np.bool_)
+    for _ in range(len(largest) + 1):
+        reference = program.reference(options, np.where(at_bound, largest, np.inf))
+        found = follow_path(_smooth(program, options, largest, at_bound), reference, weight)
+        beyond = program.masses @ found.u > largest * (1.0 + _ON_BOUND)
+        if found.converged and not np.any(beyond):
+            return found.u, "optimal (Newton: no machine fits these data to their noise)"
+        at_bound = at_bound | beyond
+    raise SolverError(
+        f"no solution was found, the conic solver stopped with: {status}; with a prior weight"
+        f" above {options.prior_weight:g} there may be one",
+        status=status,
+    )
+
+
+def _solve_cone(program: Program, options: Consistency) -> tuple[Array | None, str]:
+    """Return the conic solver's solution u, if it has one, and its word for it."""
+    import cvxpy  # a third of a second to import, and only this estimate needs it
+
+    cp: Any = cvxpy  # its names come from star imports, which a type checker does not follow
+    u = cp.Variable(program.rows.R.shape[1])
+    n = len(program.masses)
+    first = _N_LINK * n
+    prior: Any = cp.sum_squares(u[first:] - program.centre)
+    constraints: list[Any] = [u[program.not_negative] >= 0.0]
+    for link in range(n):
+        entries = _SYMMETRIC.reshape(_N_LINK, 16).T @ u[_N_LINK * link : _N_LINK * (link + 1)]
+        matrix = cp.reshape(entries, (4, 4), order="C")
+        prior = prior + cp.trace(matrix) - cp.log_det(matrix)
+        constraints.append(matrix >> _INSIDE * np.eye(4))
+    error = cp.sum_squares(program.rows.R @ u - program.rows.z)
+    if options.total_mass is not None:
+        constraints.append(program.masses.sum(axis=0) @ u / options.total_mass == 1.0)
+    if options.largest_mass is not None:
+        bounded = np.isfinite(options.largest_mass)
+        constraints.append(program.masses[bounded] @ u <= options.largest_mass[bounded])
+    problem = cp.Problem(cp.Minimize(error + options.prior_weight * prior), constraints)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # an inaccurate solution is told by its status
+        try:
+            problem.solve(solver=cp.CLARABEL)
+        except cp.error.SolverError as failure:
+            return None, f"failed ({failure})"
+    # "Infeasible" cannot be true: bounds that contradict each other were refused before.
+    usable = problem.status in ("optimal", "optimal_inaccurate") and u.value is not None
+    return (np.asarray(u.value, dtype=np.float64) if usable else None), str(problem.status)
+
+
+def _smooth(
+    program: Program, options: Consistency, largest: Array, at_bound: NDArray[np.bool_]
+) -> Smooth:
+    """Return the program for Newton's method, with some links (n,) as heavy as they may be."""
+    equal = list(program.masses[at_bound] / largest[at_bound, None])
+    if options.total_mass is not None:
+        equal.append(program.masses.sum(axis=0) / options.total_mass)
+    return Smooth(
+        R=program.rows.R,
+        z=program.rows.z,
+        weight=options.prior_weight,
+        entries=_SYMMETRIC,
+        centre=program.centre,
+        not_negative=program.not_negative,
+        equal=np.array(equal).reshape(-1, program.rows.R.shape[1]),
+    )
+
+
+def _places(model: RobotModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return where the ten of each link stand among the standard parameters, and the others."""
+    n = model.n_joints
+    width = len(model.standard_names) // n
+    everything = np.arange(len(model.standard_names)).reshape(n, width)
+    return everything[:, :_N_LINK], everything[:, _N_LINK:].reshape(-1)
+
+
+def link_parameters(model: RobotModel, standard: Array) -> Array:
+    """Return the ten parameters of each link (n, 10)."""
+    if standard.shape != (len(model.standard_names),):
+        raise ShapeError("standard", standard.shape, f"({len(model.standard_names)},)")
+    return np.asarray(standard[_places(model)[0]])
+
+
+def _whole_torque_units(root: SquareRoot, directions: Array) -> Array:
+    """Multiples of `directions` (p or b, k) that would make all the torque there is.
+
+    In such units the parameters are far below one, and a prior on their squares says little.
+    """
+    columns = np.linalg.norm(root.R[:, : len(directions)] @ directions, axis=0)
+    whole = float(np.linalg.norm(root.z))
+    usable = (columns > 0.0) & (whole > 0.0)
+    return np.where(usable, whole / np.where(usable, columns, 1.0), 1.0)
+
+
+def _check_bounds(model: RobotModel, options: Consistency) -> None:
+    """Raise `InfeasibleError` for bounds that no set of masses can meet."""
+    largest = options.largest_mass
+    if largest is None:
+        return
+    if largest.shape != (model.n_joints,):
+        raise ShapeError("largest_mass", largest.shape, f"({model.n_joints},)")
+    for joint, bound in zip(model.joint_names, largest, strict=True):
+        if not bound > 0.0:
+            raise InfeasibleError(f"the link of joint {joint!r} may weigh {bound} kg at most")
+    if options.total_mass is not None and float(largest.sum()) <= options.total_mass:
+        raise InfeasibleError(
+            f"links of at most {float(largest.sum()):g} kg together cannot weigh"
+            f" {options.total_mass:g} kg"
+        )

@@ -1,0 +1,195 @@
+"""Which rows of a recording count in a fit, and in words why the others do not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import ShapeError
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.preprocessing import END_PERIODS, LONGEST_END, REVERSAL_PERIODS
+from identification.recording import Recording
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+# Drives hold a limit to within their resolution.
+AT_LIMIT: Final = 0.995
+# A clipped top lasts; shorter ones are chance.
+SHORTEST_TOP: Final = 5  # samples
+# A smooth peak read with a resolution r has a flat top as well. One top's length further out a
+# parabola has fallen by at most 8 r, and by 12 r with the worst rounding.
+_FALL: Final = 16.0
+
+TORN: Final = "beside a gap or an end of the recording"
+SATURATED: Final = "torque or current saturated"
+STANDSTILL: Final = "standing still"
+REVERSAL: Final = "turning round"
+
+
+@dataclass(frozen=True, eq=False)
+class RowMask:
+    """Rows that count, and for those that do not every reason.
+
+    Attributes:
+        reasons: by reason in words, the rows it excludes (m, n); a row may have several.
+        shape: (m, n).
+    """
+
+    reasons: Mapping[str, Rows]
+    shape: tuple[int, int]
+
+    @property
+    def usable(self) -> Rows:
+        """Rows without any reason against them (m, n)."""
+        usable = np.ones(self.shape, dtype=np.bool_)
+        for rows in self.reasons.values():
+            usable &= ~rows
+        return usable
+
+    @property
+    def counts(self) -> dict[str, NDArray[np.intp]]:
+        """Rows excluded per joint (n,), by the first reason in the order of `reasons`."""
+        left = np.ones(self.shape, dtype=np.bool_)
+        counts = {}
+        for reason, rows in self.reasons.items():
+            counts[reason] = np.count_nonzero(rows & left, axis=0)
+            left &= ~rows
+        return counts
+
+    def describe(self, joint_names: Sequence[str]) -> list[str]:
+        """One line per joint: how many rows count, and why the others do not."""
+        total, counts, used = self.shape[0], self.counts, np.count_nonzero(self.usable, axis=0)
+        lines = []
+        for j, name in enumerate(joint_names):
+            lost = [f"{rows[j]} {reason}" for reason, rows in counts.items() if rows[j]]
+            line = f"{name}: {used[j]} of {total} rows count"
+            lines.append(f"{line}; {', '.join(lost)}" if lost else line)
+        return lines
+
+
+def mask_rows(
+    recording: Recording,
+    model: RobotModel,
+    motion: Motion,
+    bandwidth: Array,
+    *,
+    torque_limit: Array | None = None,
+    current_limit: Array | None = None,
+) -> RowMask:
+    """Reasons against each row of a recording.
+
+    Args:
+        recording: checked.
+        model: says below which speed a joint stands.
+        motion: smoothed, in the rows of the recording.
+        bandwidth: of that smoothing per joint (n,) [Hz].
+        torque_limit: largest torque a joint is given (n,) [N·m or N].
+        current_limit: largest current a motor is given (n,) [A].
+
+    Raises:
+        ShapeError: an array does not have the shape it should have.
+    """
+    shape = recording.position.shape
+    if motion.velocity.shape != shape:
+        raise ShapeError("motion", motion.velocity.shape, f"{shape}, as recorded")
+    bandwidth = np.asarray(bandwidth, dtype=np.float64)
+    if bandwidth.shape != shape[1:]:
+        raise ShapeError("bandwidth", bandwidth.shape, f"{shape[1:]}")
+    standing = ~model.moving(motion.velocity)
+    saturated = np.zeros(shape, dtype=np.bool_)
+    for values, limit in (
+        (recording.torque, torque_limit),
+        (recording.motor_current, current_limit),
+    ):
+        if values is not None:
+            saturated |= flat_topped(values, ~standing)
+            if limit is not None:
+                saturated |= at_limit(values, limit)
+    slowest = float(bandwidth[np.ptp(recording.position, axis=0) > 0.0].min(initial=np.inf))
+    torn = torn_rows(recording, min(LONGEST_END, END_PERIODS / slowest))
+    reasons = {
+        TORN: np.broadcast_to(torn[:, None], shape),
+        STANDSTILL: standing,
+        REVERSAL: near_reversal(motion, REVERSAL_PERIODS / bandwidth),
+        SATURATED: saturated,
+    }
+    return RowMask(MappingProxyType(reasons), (shape[0], shape[1]))
+
+
+def at_limit(values: Array, limit: Array) -> Rows:
+    """Rows (m, n) in which a channel is at its limit (n,), either way.
+
+    Raises:
+        ShapeError: not one limit per channel.
+    """
+    limit = np.asarray(limit, dtype=np.float64)
+    if limit.shape != values.shape[1:]:
+        raise ShapeError("limit", limit.shape, f"{values.shape[1:]}")
+    return np.asarray(np.abs(values) >= AT_LIMIT * np.abs(limit))
+
+
+def flat_topped(values: Array, moving: Rows | None = None) -> Rows:
+    """Rows (m, n) that look clipped: a channel stays at its own extreme to the last bit.
+
+    A run of `SHORTEST_TOP` equal values or more, at the largest or smallest value of the channel,
+    from which it departs faster than a smooth peak read with the channel's resolution would.
+
+    Args:
+        values: (m, n), of any unit.
+        moving: rows (m, n) that may be a clipped top; at standstill a channel without noise stays
+            the same for better reasons. All by default.
+    """
+    clipped = np.zeros(values.shape, dtype=np.bool_)
+    for j, channel in enumerate(values.T):
+        steps = np.abs(np.diff(channel))
+        if not steps.any():
+            continue
+        resolution = float(steps[steps > 0.0].min())
+        for extreme in (channel.max(), channel.min()):
+            for start, stop in _runs(channel == extreme):
+                if stop - start >= SHORTEST_TOP and _departs(channel, start, stop, resolution):
+                    clipped[start:stop, j] = True
+    return clipped if moving is None else clipped & moving
+
+
+def near_reversal(motion: Motion, reach: Array) -> Rows:
+    """Rows (m, n) nearer to a reversal of the joint than its reach (n,) [s]."""
+    near = np.zeros(motion.velocity.shape, dtype=np.bool_)
+    for joint, velocity in enumerate(motion.velocity.T):
+        before = min(LONGEST_END, float(reach[joint]))
+        last = np.flatnonzero(velocity[1:] * velocity[:-1] < 0.0)
+        starts = np.searchsorted(motion.time, motion.time[last] - before)
+        stops = np.searchsorted(motion.time, motion.time[last + 1] + before, side="right")
+        for start, stop in zip(starts, stops, strict=True):
+            near[start:stop, joint] = True
+    return near
+
+
+def torn_rows(recording: Recording, end: float) -> NDArray[np.bool_]:
+    """Rows (m,) within a time [s] of the ends of their stretch, or of a stretch without inside."""
+    torn = np.ones(recording.n_samples, dtype=np.bool_)
+    for segment in recording.segments():
+        inside = recording.time[segment]
+        torn[segment] = (inside < inside[0] + end) | (inside > inside[-1] - end)
+    return torn
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Start and stop of every run of True."""
+    edges = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _departs(channel: Array, start: int, stop: int, resolution: float) -> bool:
+    """Whether a channel leaves a flat top on some side faster than a parabola would."""
+    length, top = stop - start, channel[start]
+    outside = [channel[max(0, start - length) : start], channel[stop : stop + length]]
+    falls = [float(np.abs(side - top).max(initial=0.0)) for side in outside]
+    return max(falls) > _FALL * resolution

@@ -1,0 +1,174 @@
+"""What a motion breaks is told in degrees, in the angles of the cell's own limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.campaign import quick_design
+from hil.cell import AngleFrame, Cell, CellError
+from hil.cell.text import replaced_value
+from hil.design import preset, problem_of
+from hil.design.advice import NoExcitationError, no_excitation
+from hil.motion_checks import MotionChecks, collision_checker
+from hil.violation_text import always_so, violation_text
+from identification.excitation import CollisionChecker, NoFeasibleMotionError, Violation, Workspace
+from sim_fixtures.ns16 import CELL_PATH
+
+# Two links two joints apart that a turn about their common axis leaves where they are.
+WRIST = """<robot name="wrist"><link name="base"/>
+{links}
+<joint name="one" type="revolute"><parent link="base"/><child link="a"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="two" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.2 0 0"/>
+<axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="three" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0.3 0 0"/>
+<axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+LINK = """<link name="{name}"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>{shape}</link>"""
+BALL = '<collision><geometry><sphere radius="{radius}"/></geometry></collision>'
+BARE_CELL = """[cell]
+name = "wrist"
+urdf = "wrist.urdf"
+[limits]
+frame = "urdf"
+lower_deg = [-50, -50, -50]
+upper_deg = [50, 50, 50]
+velocity_deg = [50, 50, 50]
+acceleration_deg = [100, 100, 100]
+jerk_deg = [1000, 1000, 1000]
+[workspace]
+floor = "none"
+"""
+
+
+def wrist(*shapes: str) -> str:
+    """The arm with these shapes on its links."""
+    links = [LINK.format(name=name, shape=shape) for name, shape in zip("abc", shapes, strict=True)]
+    return WRIST.format(links="\n".join(links))
+
+
+@pytest.fixture
+def cell() -> Cell:
+    return Cell.load(CELL_PATH)
+
+
+def test_a_posture_is_told_as_the_teach_pendant_shows_it(cell: Cell) -> None:
+    told = AngleFrame.of(cell).told(cell.home)
+    assert told == "J1 0.0, J2 0.0, J3 -90.0, J4 0.0, J5 90.0, J6 0.0 deg, teach pendant angles"
+    plain = AngleFrame("urdf", np.ones(2), np.zeros(2))
+    assert plain.told((0.5, -1.0)) == "J1 28.6, J2 -57.3 deg, angles of the URDF"
+
+
+def test_a_joint_limit_is_told_in_the_angles_of_the_file(cell: Cell) -> None:
+    frame, limits = AngleFrame.of(cell), cell.joint_limits
+    # joint_sign of J3 is -1: the URDF's upper limit is the file's lower one, -170 deg.
+    beyond = limits.upper.copy()
+    beyond[2] += np.radians(5.0)
+    position = Violation(
+        "joint limit", "position of joint 2", beyond[2], limits.upper[2], 1.0, tuple(beyond)
+    )
+    text = violation_text(position, frame)
+    assert "position of J3: -175 deg, at least -170 deg is wanted, at 1.000 s" in text
+    assert "J3 -175.0" in text
+    fast = Violation("joint limit", "velocity of joint 1", 3.0, np.radians(155.0), 0.5)
+    assert "velocity of J2: 171.9 deg/s, at most 155 deg/s is wanted" in violation_text(fast, frame)
+    assert str(fast) == "joint limit of velocity of joint 1: 3, at most 2.705 is wanted, at 0.500 s"
+
+
+def test_a_blocked_home_is_told_in_these_angles(cell: Cell) -> None:
+    high = cell.text.replace("floor = 0.0", "floor = 1.0")
+    raised = Cell.from_texts(high, cell.urdf, cell.path)
+    with pytest.raises(NoExcitationError, match=r"J3 -90\.0, .* deg, teach pendant angles") as told:
+        problem_of(raised, preset("b"))
+    assert " rad" not in str(told.value)
+
+
+def test_a_search_that_found_nothing_is_told_in_these_angles(cell: Cell) -> None:
+    contact = Violation("collision", "link_2 and floor", 0.01, 0.05, 2.0, tuple(cell.home))
+    error = NoFeasibleMotionError({"collision": 3}, {"collision": contact}, closest=(contact,) * 2)
+    told = str(no_excitation(error, AngleFrame.of(cell), None, preset("b")))
+    assert told.count("J3 -90.0") >= 1
+    assert " rad" not in told
+
+
+def test_a_pair_that_no_posture_parts_asks_for_another_margin() -> None:
+    urdf = wrist(BALL.format(radius=0.05), "", BALL.format(radius=0.437))
+    checker = CollisionChecker(urdf, Workspace(floor=None, margin=0.005))
+    assert checker.spread("a", "c") == pytest.approx((0.013, 0.013), abs=1e-6)
+    contact = Violation("collision", "a and c", 0.013, 0.02, None, (0.0, 0.0, 0.0))
+    assert "0.013 to 0.013 m apart in any posture; [workspace] margin must be below" in str(
+        always_so(contact, checker)
+    )
+    deep = CollisionChecker(
+        wrist(BALL.format(radius=0.1), "", BALL.format(radius=0.437)),
+        Workspace(floor=None, margin=0.0),
+    )
+    assert deep.pairs == ()  # left out, and told as built in
+    assert always_so(contact, deep) is None
+
+
+def test_what_can_come_apart_gets_no_such_advice(cell: Cell) -> None:
+    checker = collision_checker(cell)
+    contact = Violation("collision", "link_5 and floor", -0.1, 0.05, None, tuple(cell.home))
+    assert always_so(contact, checker) is None
+
+
+def test_a_robot_without_shapes_gets_the_file_and_a_remedy() -> None:
+    cell = Cell.from_texts(BARE_CELL, wrist("", "", ""), Path("cell.toml"))
+    with pytest.raises(CellError, match=r"cell\.toml: cell\.urdf.*no moving link.*collision = fal"):
+        collision_checker(cell)
+
+
+def test_a_missing_mesh_gets_file_mesh_and_remedy(tmp_path: Path) -> None:
+    mesh = '<collision><geometry><mesh filename="package://arm/a.stl"/></geometry></collision>'
+    urdf = wrist(mesh, "", BALL.format(radius=0.02))
+    (tmp_path / "wrist.urdf").write_text(urdf, "utf-8")
+    path = tmp_path / "cell.toml"
+    path.write_text(BARE_CELL, "utf-8")
+    with pytest.raises(CellError) as caught:
+        collision_checker(Cell.load(path))
+    for part in (str(path), "package://arm/a.stl", "wrist.urdf", "mesh_folders", "ROS_PACKAGE"):
+        assert part in str(caught.value)
+    folder = tmp_path / "meshes" / "arm"
+    folder.mkdir(parents=True)
+    corners = ("0 0 0", "0.1 0 0", "0 0.1 0", "0 0 0.1")
+    faces = [
+        "facet normal 0 0 1\nouter loop\n"
+        + "".join(f"vertex {corners[k]}\n" for k in face)
+        + "endloop\nendfacet\n"
+        for face in ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+    ]
+    (folder / "a.stl").write_text("solid a\n" + "".join(faces) + "endsolid a\n", "utf-8")
+    text = replaced_value(BARE_CELL, "cell", "mesh_folders", '["meshes"]')
+    path.write_text(text, "utf-8")
+    found = Cell.load(path)
+    assert ("a", "c") in collision_checker(found).pairs
+    # A copy elsewhere finds them too, and a list over several lines is replaced whole.
+    path.write_text(text.replace('["meshes"]', '[\n  "meshes", # here\n]'), "utf-8")
+    (tmp_path / "copy").mkdir()
+    moved = Cell.load(path).with_urdf(tmp_path / "copy" / "cell.toml", "wrist.urdf")
+    assert moved.file.cell.mesh_folders == ["../meshes"]
+    assert collision_checker(moved).pairs == collision_checker(found).pairs
+
+
+def test_a_refusal_before_a_motion_is_sent_is_told_in_degrees(cell: Cell) -> None:
+    checks = MotionChecks.of(cell)
+    told = checks._told(Violation("joint limit", "velocity of joint 1", 3.0, 2.0, 0.5, (0.0,) * 6))
+    assert "J2" in told
+    assert "deg/s" in told
+
+
+def test_validation_motions_that_nothing_allows_are_told_in_these_angles(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contact = Violation("collision", "link_2 and floor", 0.01, 0.05, 2.0, tuple(cell.home))
+
+    def nothing(*_: object, **__: object) -> None:
+        raise NoFeasibleMotionError({"collision": 3}, {"collision": contact})
+
+    monkeypatch.setattr(quick_design, "random_validation_motions", nothing)
+    with pytest.raises(NoExcitationError, match=r"J3 -90\.0.*teach pendant angles"):
+        quick_design._validation_motions(cell, MotionChecks.of(cell))

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from identification.covariance import PhaseFactor, with_block_covariance
+from identification.errors import IdentificationError
+from identification.estimation import estimate, joint_weights
+from identification.friction import FrictionLaw
+from identification.least_squares import (
+    fit_least_squares,
+    ordinary_least_squares,
+    weighted_least_squares,
+)
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.preprocessing import Samples
+from identification.qr_factor import QRFactor
+from identification.robust import robust_estimate
+
+Array = NDArray[np.float64]
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
+P = MODEL.n_parameters
+NOISE = np.array([3.0, 0.2])
+
+
+def truth() -> Array:
+    standard = MODEL.nominal.copy()
+    standard[[10, 21]] = 0.4, 0.1  # rotors
+    return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
+
+
+def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
+    time = np.arange(0.0, duration, step)
+    rng = np.random.default_rng(12)
+    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
+    angle = w * time[:, None, None] + phase
+    return Motion(
+        time,
+        (a * np.sin(angle)).sum(axis=1),
+        (a * w * np.cos(angle)).sum(axis=1),
+        (-a * w**2 * np.sin(angle)).sum(axis=1),
+    )
+
+
+def recording(error: Array, motion: Motion) -> Samples:
+    return Samples(
+        motion=motion,
+        torque=MODEL.torque(truth(), *motion[1:]) + error,
+        usable=MODEL.moving(motion.velocity),
+        segments=(slice(0, len(motion.time)),),
+        origin=float(motion.time[0]),
+        position_bandwidth=np.full(2, np.inf),
+    )
+
+
+def gaussian(rng: np.random.Generator, motion: Motion) -> Array:
+    return NOISE * rng.standard_normal((len(motion.time), 2))
+
+
+def coloured(rng: np.random.Generator, length: int, step: float, correlation: float) -> Array:
+    r = np.exp(-step / correlation) if correlation else 0.0
+    start = rng.standard_normal((1, 2)) * r
+    white = np.sqrt(1.0 - r**2) * rng.standard_normal((length, 2))
+    return NOISE * lfilter([1.0], [1.0, -r], white, axis=0, zi=start)[0]
+
+
+def test_ordinary_least_squares_is_the_stacked_unweighted_solution() -> None:
+    motion = a_motion(4.0)
+    samples = recording(gaussian(np.random.default_rng(8), motion), motion)
+    rows = MODEL.regressor(*motion[1:]).dense(P)[samples.usable]
+    expected, *_ = np.linalg.lstsq(rows, samples.torque[samples.usable], rcond=None)
+    for factor in (samples.factor(MODEL), QRFactor.from_samples(MODEL, samples)):
+        result = ordinary_least_squares(MODEL, factor)
+        np.testing.assert_allclose(result.values, expected, rtol=1e-8)
+        assert result.method.startswith("ordinary least squares")
+
+
+def test_its_covariance_is_that_of_many_trials_though_joints_differ_in_noise() -> None:
+    motion = a_motion(4.0)
+    trials = []
+    for seed in range(200):
+        samples = recording(gaussian(np.random.default_rng(seed), motion), motion)
+        trials.append(ordinary_least_squares(MODEL, samples.factor(MODEL)))
+    scatter = np.std([trial.values for trial in trials], axis=0)
+    np.testing.assert_allclose(trials[0].std, scatter, rtol=0.2)
+    by_qr = ordinary_least_squares(MODEL, QRFactor.from_samples(MODEL, samples))
+    np.testing.assert_allclose(by_qr.covariance, trials[-1].covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_the_covariance_from_rows_is_that_from_gram_matrices_of_blocks() -> None:
+    motion, rng = a_motion(), np.random.default_rng(9)
+    runs = [recording(coloured(rng, len(motion.time), 5e-3, 0.05), motion) for _ in range(3)]
+    phase = PhaseFactor.from_samples(MODEL, runs[0])
+    for run in runs[1:]:
+        phase = phase + PhaseFactor.from_samples(MODEL, run)
+    for weighting in ("ordinary", "weighted"):
+        ordinary = weighting == "ordinary"
+        weights = np.ones(2) if ordinary else joint_weights(phase.total)
+        expected = with_block_covariance(estimate(MODEL, phase.total, weights), phase, weights)
+        found = fit_least_squares(MODEL, runs, weighting)  # type: ignore[arg-type]
+        np.testing.assert_allclose(found.values, expected.values, rtol=1e-9)
+        np.testing.assert_allclose(found.std, expected.std, rtol=1e-6)
+        assert found.interval_factor == expected.interval_factor
+        assert found.method.startswith(f"{weighting} least squares, cluster-robust covariance")
+
+
+def test_an_ill_conditioned_fit_is_done_by_qr_and_says_so() -> None:
+    time = np.arange(400) * 2e-3
+    ripple, w = 1e-5, 3.7
+    q = np.column_stack([0.9 * np.sin(2.1 * time), time + ripple * np.sin(w * time)])
+    qd = np.column_stack([1.89 * np.cos(2.1 * time), 1.0 + ripple * w * np.cos(w * time)])
+    qdd = np.column_stack([-3.969 * np.sin(2.1 * time), -ripple * w**2 * np.sin(w * time)])
+    samples = recording(np.zeros((400, 2)), Motion(time, q, qd, qdd))
+    result = fit_least_squares(MODEL, [samples])
+    assert "by QR" in result.method
+    assert result.condition > 1e6
+    np.testing.assert_allclose(result.values, truth(), rtol=1e-4)
+    robust = robust_estimate(MODEL, [samples])
+    assert "by QR" in robust.estimate.method
+
+
+def test_weighted_least_squares_takes_either_factor() -> None:
+    motion = a_motion(4.0)
+    samples = recording(gaussian(np.random.default_rng(10), motion), motion)
+    by_gram = weighted_least_squares(MODEL, samples.factor(MODEL))
+    by_qr = weighted_least_squares(MODEL, QRFactor.from_samples(MODEL, samples))
+    np.testing.assert_allclose(by_qr.values, by_gram.values, rtol=1e-9)
+    with pytest.raises(IdentificationError, match="not one usable sample"):
+        fit_least_squares(MODEL, [replace(samples, usable=np.zeros_like(samples.usable))])

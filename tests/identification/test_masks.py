@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from identification.errors import ShapeError
+from identification.friction import FrictionLaw
+from identification.masks import (
+    REVERSAL,
+    SATURATED,
+    STANDSTILL,
+    TORN,
+    at_limit,
+    flat_topped,
+    mask_rows,
+)
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.preprocessing import prepare
+from identification.recording import Recording
+
+Array = NDArray[np.float64]
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+TIME = np.arange(4000) * 1e-3
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return RobotModel.from_urdf(URDF, friction=FrictionLaw(standstill=0.05))
+
+
+def motion_and_recording(model: RobotModel, clip: float = np.inf) -> tuple[Motion, Recording]:
+    angle = np.array([2.0, 3.1]) * TIME[:, None] + 0.4
+    rate = np.array([2.0, 3.1])
+    motion = Motion(TIME, np.sin(angle), rate * np.cos(angle), -(rate**2) * np.sin(angle))
+    rng = np.random.default_rng(2)
+    torque = 20.0 * np.sin(angle * 1.7) + 0.2 * rng.standard_normal(angle.shape)
+    return motion, Recording(
+        time=TIME,
+        position=motion.position + 1e-6 * rng.standard_normal(angle.shape),
+        joint_names=model.joint_names,
+        torque=np.clip(torque, -clip, clip),
+    )
+
+
+def test_a_clipped_torque_is_found_where_it_was_clipped(model: RobotModel) -> None:
+    _, whole = motion_and_recording(model)
+    _, clipped = motion_and_recording(model, clip=15.0)
+    assert whole.torque is not None
+    assert clipped.torque is not None
+    true = np.abs(whole.torque) > 15.0
+    found = flat_topped(clipped.torque)
+    assert not np.any(found & ~true)
+    # Noise lets the torque out of the limit for a sample now and then; short runs are let pass.
+    assert np.count_nonzero(found) > 0.9 * np.count_nonzero(true)
+    assert not flat_topped(whole.torque).any()
+
+
+@given(
+    resolution=st.sampled_from([1.0, 0.1, 0.01]),
+    rate=st.floats(0.5, 20.0),
+    phase=st.floats(0.0, 6.0),
+)
+def test_a_smooth_peak_read_with_a_coarse_resolution_is_not_clipped(
+    resolution: float, rate: float, phase: float
+) -> None:
+    smooth = np.round(20.0 * np.sin(rate * TIME + phase) / resolution) * resolution
+    assert not flat_topped(smooth[:, None]).any()
+
+
+def test_a_channel_that_stays_the_same_at_rest_is_not_clipped() -> None:
+    channel = np.concatenate([np.full(500, 12.0), 12.0 * np.cos(TIME[:2000] * 4.0)])[:, None]
+    moving = np.arange(len(channel))[:, None] > 500
+    assert not flat_topped(channel, moving).any()
+    assert not flat_topped(np.full((100, 1), 3.0)).any()
+
+
+def test_at_a_limit_either_way(model: RobotModel) -> None:
+    values = np.array([[9.96, 1.0], [-10.0, 2.0], [9.9, -2.1]])
+    expected = [[True, False], [True, True], [False, True]]
+    np.testing.assert_array_equal(at_limit(values, np.array([10.0, 2.0])), expected)
+    with pytest.raises(ShapeError, match="limit"):
+        at_limit(values, np.array([1.0]))
+
+
+def test_every_row_left_out_has_a_reason_and_counts_add_up(model: RobotModel) -> None:
+    motion, recording = motion_and_recording(model, clip=15.0)
+    mask = mask_rows(recording, model, motion, np.full(2, 40.0))
+    reasons = np.any(list(mask.reasons.values()), axis=0)
+    np.testing.assert_array_equal(mask.usable, ~reasons)
+    lost = np.sum(list(mask.counts.values()), axis=0)
+    np.testing.assert_array_equal(lost + mask.usable.sum(axis=0), len(TIME))
+    for reason in (TORN, STANDSTILL, REVERSAL, SATURATED):
+        assert np.all(mask.counts[reason] > 0)
+
+
+def test_the_words_name_the_joint_the_number_and_the_reason(model: RobotModel) -> None:
+    motion, recording = motion_and_recording(model, clip=15.0)
+    mask = mask_rows(recording, model, motion, np.full(2, 40.0))
+    line = mask.describe(model.joint_names)[1]
+    assert line.startswith(f"elbow: {mask.usable[:, 1].sum()} of 4000 rows count; ")
+    assert f"{mask.counts[SATURATED][1]} torque or current saturated" in line
+
+
+def test_without_saturation_the_rows_are_those_the_spline_leaves(model: RobotModel) -> None:
+    _, recording = motion_and_recording(model)
+    samples = prepare(recording, model)
+    mask = mask_rows(recording, model, samples.motion, samples.position_bandwidth)
+    np.testing.assert_array_equal(mask.usable, samples.usable)
+
+
+def test_rows_beside_a_gap_and_short_stretches_are_torn(model: RobotModel) -> None:
+    motion, recording = motion_and_recording(model)
+    gap = np.zeros(len(TIME), dtype=np.bool_)
+    gap[[2000, 2040]] = True
+    torn = Recording(
+        time=TIME, position=recording.position, joint_names=model.joint_names, gap_before=gap
+    )
+    rows = mask_rows(torn, model, motion, np.full(2, 40.0)).reasons[TORN][:, 0]
+    assert rows[1950:2090].all()
+    assert not rows[100:1940].any()
+    assert not rows[2100:3900].any()
+
+
+def test_limits_of_torque_and_current_count(model: RobotModel) -> None:
+    motion, recording = motion_and_recording(model)
+    mask = mask_rows(
+        recording, model, motion, np.full(2, 40.0), torque_limit=np.array([18.0, 100.0])
+    )
+    assert recording.torque is not None
+    np.testing.assert_array_equal(
+        mask.reasons[SATURATED][:, 0], np.abs(recording.torque[:, 0]) >= 0.995 * 18.0
+    )
+    assert not mask.reasons[SATURATED][:, 1].any()
+
+
+def test_arrays_that_do_not_fit_are_refused(model: RobotModel) -> None:
+    motion, recording = motion_and_recording(model)
+    with pytest.raises(ShapeError, match="bandwidth"):
+        mask_rows(recording, model, motion, np.full(3, 40.0))
+    with pytest.raises(ShapeError, match="motion"):
+        mask_rows(recording.between(0, 100), model, motion, np.full(2, 40.0))

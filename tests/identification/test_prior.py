@@ -1,0 +1,368 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from identification.errors import IdentificationError, ShapeError
+from identification.estimation import estimate
+from identification.factor import Factor
+from identification.friction import FrictionLaw
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.nominal_prior import nominal_prior
+from identification.preprocessing import Samples
+from identification.prior import LEARNED, GaussianPrior, fit_with_prior, with_prior
+from identification.qr_factor import QRFactor
+from sim_fixtures.ns16 import urdf_text
+
+Array = NDArray[np.float64]
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
+P = MODEL.n_parameters
+NOISE = np.array([3.0, 0.2])
+ROTORS = {"I1m": (0.3, 0.2), "I2m": (0.1, 0.05)}
+FRICTION = {"f0_1": (4.0, 2.0), "f0_2": (2.0, 1.0), "f1_1": (1.5, 1.0), "f1_2": (0.8, 0.5)}
+KNOWN = ROTORS | FRICTION
+
+
+def truth() -> Array:
+    standard = MODEL.nominal.copy()
+    standard[[10, 21]] = 0.4, 0.1  # rotors
+    return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
+
+
+def a_motion(duration: float = 6.0, *, held_elbow: bool = False) -> Motion:
+    time = np.arange(0.0, duration, 5e-3)
+    a, w = np.array([0.9, 0.0 if held_elbow else 1.2]), np.array([2.1, 3.7])
+    angle = w * time[:, None] + np.array([0.3, 1.1])
+    return Motion(
+        time,
+        a * np.sin(angle) + np.array([0.0, 0.4]),
+        a * w * np.cos(angle),
+        -a * w**2 * np.sin(angle),
+    )
+
+
+def recording(values: Array, error: Array | float, motion: Motion) -> Samples:
+    return Samples(
+        motion=motion,
+        torque=MODEL.torque(values, *motion[1:]) + error,
+        usable=MODEL.moving(motion.velocity),
+        segments=(slice(0, len(motion.time)),),
+        origin=float(motion.time[0]),
+        position_bandwidth=np.full(2, np.inf),
+    )
+
+
+@cache
+def noisy(held_elbow: bool = False) -> Samples:
+    motion = a_motion(held_elbow=held_elbow)
+    random = np.random.default_rng(0)
+    return recording(truth(), NOISE * random.standard_normal((len(motion.time), 2)), motion)
+
+
+def some_covariance(seed: int, size: float = 1.0) -> Array:
+    root = np.random.default_rng(seed).standard_normal((P, P))
+    return size * (root @ root.T + 0.1 * np.eye(P))
+
+
+# The prior itself ---------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 999), size=st.floats(1e-6, 1e6))
+def test_a_covariance_is_what_its_root_undoes(seed: int, size: float) -> None:
+    covariance = some_covariance(seed, size)
+    prior = GaussianPrior.from_covariance(np.zeros(P), covariance)
+    np.testing.assert_allclose(prior.root @ covariance @ prior.root.T, np.eye(P), atol=1e-8)
+    np.testing.assert_allclose(prior.std, np.sqrt(np.diag(covariance)), rtol=1e-6)
+
+
+def test_an_infinite_variance_is_a_flat_parameter() -> None:
+    covariance = some_covariance(1)
+    covariance[2, :] = covariance[:, 2] = 0.0
+    covariance[2, 2] = np.inf
+    prior = GaussianPrior.from_covariance(np.zeros(P), covariance)
+    assert np.isinf(prior.std[2])
+    known = np.arange(P) != 2
+    np.testing.assert_allclose(prior.std[known], np.sqrt(np.diag(covariance)[known]), rtol=1e-9)
+
+
+@given(seed=st.integers(0, 999), flat=st.integers(0, 3))
+def test_an_infinite_deviation_is_the_limit_of_a_large_one(seed: int, flat: int) -> None:
+    random = np.random.default_rng(seed)
+    combinations = np.hstack([np.eye(4), random.standard_normal((4, 3))])
+    std = random.uniform(0.5, 2.0, 7)
+    std[random.permutation(7)[:flat]] = np.inf
+    prior = GaussianPrior.of_combinations(combinations, np.zeros(7), std)
+    # Woodbury's identity in the limit of infinite variances.
+    known, endless = combinations[:, np.isfinite(std)], combinations[:, np.isinf(std)]
+    finite = np.linalg.inv((known * std[np.isfinite(std)] ** 2) @ known.T)
+    seen = finite @ endless
+    expected = finite - seen @ np.linalg.inv(endless.T @ seen) @ seen.T
+    size = np.abs(finite).max()
+    np.testing.assert_allclose(prior.root.T @ prior.root / size, expected / size, atol=1e-9)
+    assert len(prior.root) == 4 - flat
+
+
+@pytest.mark.parametrize("std", [[1.0, 0.0], [1.0, -1.0], [1.0, np.nan]])
+def test_a_deviation_that_is_none_is_refused(std: list[float]) -> None:
+    with pytest.raises(IdentificationError, match="positive deviations"):
+        GaussianPrior.independent(np.zeros(2), np.array(std))
+
+
+def test_what_is_no_covariance_is_refused() -> None:
+    for covariance in (np.array([[1.0, 2.0], [2.0, 1.0]]), np.zeros((2, 2))):
+        with pytest.raises(IdentificationError, match="positive"):
+            GaussianPrior.from_covariance(np.zeros(2), covariance)
+    with pytest.raises(ShapeError, match="covariance"):
+        GaussianPrior.from_covariance(np.zeros(2), np.eye(3))
+    with pytest.raises(ShapeError, match="std"):
+        GaussianPrior.independent(np.zeros(2), np.ones(3))
+    with pytest.raises(ShapeError, match="prior mean"):
+        with_prior(MODEL, noisy().factor(MODEL), GaussianPrior.independent([0.0], np.ones(1)))
+
+
+# The posterior ------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 999), size=st.floats(1e-3, 1e3))
+def test_it_is_the_textbook_posterior(seed: int, size: float) -> None:
+    mean = np.random.default_rng(seed).standard_normal(P)
+    covariance, weights = some_covariance(seed, size), 1.0 / NOISE**2
+    factor = noisy().factor(MODEL)
+    equations, precision = factor.weighted(weights), np.linalg.inv(covariance)
+    posterior = np.linalg.inv(equations.A + precision)
+    expected = posterior @ (equations.b + precision @ mean)
+    prior = GaussianPrior.from_covariance(mean, covariance)
+    for kind in (factor, QRFactor.from_samples(MODEL, noisy())):
+        found = with_prior(MODEL, kind, prior, weights)
+        np.testing.assert_allclose(found.estimate.values, expected, rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(found.estimate.std, np.sqrt(np.diag(posterior)), rtol=1e-6)
+        assert found.estimate.undetermined == ()
+        assert (found.ratio < 1.0).all()
+
+
+@pytest.mark.parametrize("kind", ["gram", "qr"])
+def test_an_infinite_prior_is_weighted_least_squares(kind: str) -> None:
+    factor = noisy().factor(MODEL) if kind == "gram" else QRFactor.from_samples(MODEL, noisy())
+    expected = estimate(MODEL, noisy().factor(MODEL))
+    for std in (1e7, np.inf):
+        prior = GaussianPrior.independent(np.full(P, 3.0), np.full(P, std))
+        found = with_prior(MODEL, factor, prior)
+        np.testing.assert_allclose(found.estimate.values, expected.values, rtol=1e-8)
+        np.testing.assert_allclose(found.estimate.std, expected.std, rtol=1e-8)
+        np.testing.assert_allclose(found.estimate.noise_std, expected.noise_std, rtol=1e-8)
+        assert found.learned.all()
+
+
+@pytest.mark.parametrize("kind", ["gram", "qr"])
+def test_without_data_it_is_the_prior(kind: str) -> None:
+    nothing = Factor.zero(MODEL) if kind == "gram" else QRFactor.zero(MODEL)
+    prior = nominal_prior(MODEL, known=KNOWN)
+    found = with_prior(MODEL, nothing, prior)
+    np.testing.assert_allclose(found.estimate.values, prior.mean)
+    np.testing.assert_allclose(found.estimate.std, prior.std, rtol=1e-9)
+    np.testing.assert_allclose(found.ratio, 1.0, rtol=1e-9)
+    assert not found.learned.any()
+    assert found.estimate.undetermined == ()
+
+
+def test_what_the_data_do_not_determine_keeps_the_prior_and_what_they_do_does_not() -> None:
+    prior = nominal_prior(MODEL, known=KNOWN)
+    found = with_prior(MODEL, noisy(held_elbow=True).factor(MODEL), prior)
+    at = {name: index for index, name in enumerate(found.estimate.names)}
+    for name in ("f0_2", "f1_2"):  # the elbow stands still
+        assert found.ratio[at[name]] == pytest.approx(1.0, rel=1e-9)
+        assert found.estimate.values[at[name]] == pytest.approx(FRICTION[name][0], rel=1e-9)
+        assert not found.learned[at[name]]
+    assert found.ratio[at["f0_1"]] < 0.2
+    assert found.learned[at["f0_1"]]
+    assert found.estimate.undetermined == ()
+    assert np.isfinite(found.estimate.std).all()
+    # No parameter is known worse than before.
+    assert (found.ratio <= 1.0 + 1e-9).all()
+
+
+def test_what_neither_says_stays_at_the_prior_mean_and_is_named() -> None:
+    prior = nominal_prior(MODEL, known=ROTORS)
+    found = with_prior(MODEL, noisy(held_elbow=True).factor(MODEL), prior)
+    assert set(found.estimate.undetermined) == {"f0_2", "f1_2"}
+    assert np.isinf(found.estimate.std[-3])
+    unknown = np.array([name in found.estimate.undetermined for name in found.estimate.names])
+    np.testing.assert_array_equal(found.ratio[unknown], 1.0)
+    np.testing.assert_array_equal(found.estimate.values[unknown], 0.0)
+
+
+@given(seed=st.integers(0, 999))
+@settings(max_examples=20)
+def test_data_in_two_steps_are_data_at_once(seed: int) -> None:
+    # Yesterday's posterior is today's prior: the law that makes it one.
+    samples, weights = noisy(), 1.0 / NOISE**2
+    half = len(samples.torque) // 2
+    parts = [
+        replace(
+            samples,
+            motion=Motion(*(array[s] for array in samples.motion)),
+            torque=samples.torque[s],
+            usable=samples.usable[s],
+        ).factor(MODEL)
+        for s in (slice(0, half), slice(half, None))
+    ]
+    prior = GaussianPrior.from_covariance(truth(), some_covariance(seed))
+    once = with_prior(MODEL, parts[0] + parts[1], prior, weights).estimate
+    first = with_prior(MODEL, parts[0], prior, weights).estimate
+    between = GaussianPrior.from_covariance(first.values, first.covariance)
+    second = with_prior(MODEL, parts[1], between, weights).estimate
+    np.testing.assert_allclose(second.values, once.values, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(second.std, once.std, rtol=1e-5)
+
+
+def test_the_ratio_does_not_depend_on_units() -> None:
+    factor, std = noisy().factor(MODEL), np.linspace(0.1, 2.0, P)
+    scale = np.append(np.logspace(-4, 4, P), 1.0)
+    scaled = replace(factor, gram=factor.gram * np.outer(scale, scale))
+    one = with_prior(MODEL, factor, GaussianPrior.independent(np.zeros(P), std))
+    other = with_prior(MODEL, scaled, GaussianPrior.independent(np.zeros(P), std / scale[:-1]))
+    np.testing.assert_allclose(other.ratio, one.ratio, rtol=1e-6)
+
+
+def test_too_few_rows_to_know_the_noise_need_weights() -> None:
+    samples = noisy()
+    few = replace(
+        samples, usable=samples.usable & (np.arange(len(samples.torque)) % 200 == 7)[:, None]
+    )
+    prior = nominal_prior(MODEL, known=KNOWN)
+    with pytest.raises(IdentificationError, match="too few"):
+        with_prior(MODEL, few.factor(MODEL), prior)
+    found = with_prior(MODEL, few.factor(MODEL), prior, 1.0 / NOISE**2)
+    assert np.isfinite(found.estimate.values).all()
+
+
+def coloured(rng: np.random.Generator, length: int, correlation: float) -> Array:
+    r = np.exp(-5e-3 / correlation) if correlation else 0.0
+    start = rng.standard_normal((1, 2)) * r
+    white = np.sqrt(1.0 - r**2) * rng.standard_normal((length, 2))
+    return NOISE * lfilter([1.0], [1.0, -r], white, axis=0, zi=start)[0]
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.05])
+def test_if_prior_and_noise_are_as_stated_95_percent_intervals_hold_90_to_99_percent(
+    correlation: float,
+) -> None:
+    prior = nominal_prior(MODEL, known=KNOWN)
+    spread = np.linalg.inv(prior.root)  # as many directions as parameters: nothing is flat
+    motion = a_motion()
+    inside, surprise, naive = [], [], []
+    for seed in range(80):
+        rng = np.random.default_rng(seed)
+        values = prior.mean + spread @ rng.standard_normal(P)
+        samples = recording(values, coloured(rng, len(motion.time), correlation), motion)
+        result = fit_with_prior(MODEL, [samples], prior)
+        found, white = result.estimate, with_prior(MODEL, samples.factor(MODEL), prior).estimate
+        inside.append(np.abs(found.values - values) < found.interval_factor * found.std)
+        naive.append(np.abs(white.values - values) < 1.96 * white.std)
+        surprise.append(result.surprise[np.isfinite(result.surprise)])
+    assert 0.90 <= np.mean(inside) <= 0.99
+    # What the data changed is as much as the prior allowed.
+    assert 0.85 < np.std(np.concatenate(surprise)) < 1.15
+    if correlation:
+        assert np.mean(naive) < 0.85
+        assert result.design_effect > 3.0
+    else:
+        assert result.design_effect < 2.0
+
+
+def test_a_prior_that_is_wrong_is_seen_to_be() -> None:
+    wrong = KNOWN | {"f0_1": (20.0, 1.0)}
+    result = fit_with_prior(MODEL, [noisy()], nominal_prior(MODEL, known=wrong))
+    at = result.estimate.names.index("f0_1")
+    assert result.learned[at]
+    assert result.surprise[at] < -4.0
+    others = np.delete(result.surprise, at)
+    assert np.nanmax(np.abs(others)) < 4.0
+
+
+def test_the_method_says_where_the_prior_comes_from() -> None:
+    result = fit_with_prior(MODEL, [noisy()], nominal_prior(MODEL, known=ROTORS))
+    assert "Gaussian prior (nominal parameters to 10 %, 2 given)" in result.estimate.method
+    empty = replace(noisy(), usable=np.zeros_like(noisy().usable))
+    with pytest.raises(IdentificationError, match="not one usable sample"):
+        fit_with_prior(MODEL, [empty], nominal_prior(MODEL))
+
+
+# The prior from a URDF ----------------------------------------------------------------------
+
+
+def test_the_nominal_prior_is_that_of_many_arms_built_with_its_spread() -> None:
+    prior = nominal_prior(MODEL, 0.1, known=KNOWN)
+    nominal = MODEL.nominal.reshape(2, 11)
+    rng = np.random.default_rng(3)
+    drawn = np.repeat(nominal[None], 20_000, axis=0)
+    drawn[:, :, 10] = [0.3, 0.1] + np.array([0.2, 0.05]) * rng.standard_normal((20_000, 2))
+    for link in range(2):
+        for part in (slice(0, 6), slice(6, 9), slice(9, 10)):
+            size = 0.1 * np.abs(nominal[link, part]).max()
+            count = part.stop - part.start
+            drawn[:, link, part] += size * rng.standard_normal((20_000, count))
+    base = drawn.reshape(20_000, -1) @ MODEL.base.grouping.T
+    rank = MODEL.base.rank
+    np.testing.assert_allclose(
+        prior.mean[:rank],
+        MODEL.base.grouping
+        @ np.where(np.arange(22) == 10, 0.3, np.where(np.arange(22) == 21, 0.1, MODEL.nominal)),
+    )
+    covariance = np.linalg.inv(prior.root.T @ prior.root)[:rank, :rank]
+    scale = np.outer(prior.std[:rank], prior.std[:rank])
+    assert np.abs((np.cov(base.T) - covariance) / scale).max() < 0.04
+    np.testing.assert_allclose(prior.std[rank:], [2.0, 1.0, 1.0, 0.5])
+
+
+def test_of_rotors_and_friction_a_urdf_says_nothing() -> None:
+    model = RobotModel.from_urdf(urdf_text())
+    std = dict(zip(model.parameter_names, nominal_prior(model).std, strict=True))
+    flat = {name for name, value in std.items() if np.isinf(value)}
+    # A flat rotor makes flat the group it is part of, and no other.
+    groups = {
+        name
+        for name, row in zip(model.base.names, model.base.grouping, strict=True)
+        if any(row[model.standard_names.index(f"I{j}m")] != 0.0 for j in range(1, 7))
+    }
+    assert flat == groups | set(model.parameter_names[model.base.rank :])
+    assert {"I3m", "I4m", "f0_1", "f2_6"} <= flat
+    assert all(value > 0.0 for value in std.values())
+
+
+def test_a_zero_in_the_cad_is_no_certainty() -> None:
+    model = RobotModel.from_urdf(urdf_text())
+    prior = nominal_prior(model)
+    zeros = np.flatnonzero(prior.mean[: model.base.rank] == 0.0)
+    assert np.all(prior.std[zeros] > 0.0)
+
+
+def test_a_urdf_without_inertia_a_name_unknown_or_no_share_are_errors() -> None:
+    bare = replace(MODEL, chain=replace(MODEL.chain, inertial=np.zeros((2, 10))))
+    with pytest.raises(IdentificationError, match="no inertia"):
+        nominal_prior(bare)
+    with pytest.raises(IdentificationError, match="I9m"):
+        nominal_prior(MODEL, known={"I9m": (1.0, 1.0)})
+    with pytest.raises(IdentificationError, match="not positive"):
+        nominal_prior(MODEL, 0.0)
+
+
+def test_links_without_moments_or_mass_borrow_a_scale() -> None:
+    inertial = MODEL.chain.inertial.copy()
+    inertial[0, 6:9], inertial[1] = 0.0, 0.0
+    model = replace(MODEL, chain=replace(MODEL.chain, inertial=inertial))
+    prior = nominal_prior(model, known=KNOWN)
+    assert np.isfinite(prior.std).all()
+    assert np.all(prior.std > 0.0)
+    assert LEARNED == 0.5

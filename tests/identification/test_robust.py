@@ -1,0 +1,343 @@
+from __future__ import annotations
+
+import importlib.metadata
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+
+from hil.importers import Robot, import_rosbag2
+from hil.recordings import open_recording
+from identification.errors import IdentificationError
+from identification.estimation import estimate
+from identification.friction import FrictionLaw
+from identification.losses import Huber, LeastSquares, Loss, Tukey
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.preprocessing import Samples, prepare
+from identification.robust import robust_estimate, robust_weights
+from identification.validation import prediction_error
+
+Array = NDArray[np.float64]
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
+P = MODEL.n_parameters
+NOISE = np.array([3.0, 0.2])
+LOSSES = [Huber(), Tukey()]
+
+
+def truth() -> Array:
+    standard = MODEL.nominal.copy()
+    standard[[10, 21]] = 0.4, 0.1  # rotors
+    return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
+
+
+def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
+    time = np.arange(0.0, duration, step)
+    rng = np.random.default_rng(12)
+    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
+    angle = w * time[:, None, None] + phase
+    return Motion(
+        time,
+        (a * np.sin(angle)).sum(axis=1),
+        (a * w * np.cos(angle)).sum(axis=1),
+        (-a * w**2 * np.sin(angle)).sum(axis=1),
+    )
+
+
+def recording(error: Array, motion: Motion) -> Samples:
+    return Samples(
+        motion=motion,
+        torque=MODEL.torque(truth(), *motion[1:]) + error,
+        usable=MODEL.moving(motion.velocity),
+        segments=(slice(0, len(motion.time)),),
+        origin=float(motion.time[0]),
+        position_bandwidth=np.full(2, np.inf),
+    )
+
+
+def gaussian(rng: np.random.Generator, motion: Motion) -> Array:
+    return NOISE * rng.standard_normal((len(motion.time), 2))
+
+
+def coloured(rng: np.random.Generator, length: int, step: float, correlation: float) -> Array:
+    r = np.exp(-step / correlation) if correlation else 0.0
+    start = rng.standard_normal((1, 2)) * r
+    white = np.sqrt(1.0 - r**2) * rng.standard_normal((length, 2))
+    return NOISE * lfilter([1.0], [1.0, -r], white, axis=0, zi=start)[0]
+
+
+def spoiled(rng: np.random.Generator, error: Array, share: float, size: float) -> Array:
+    """Errors of `size` standard deviations, all of one sign, in a share of the rows."""
+    bad = rng.random(error.shape) < share
+    return np.where(bad, size * NOISE * rng.uniform(0.5, 1.5, error.shape), error)
+
+
+def distance(values: Array, samples: Samples) -> float:
+    """Distance from the truth in standard deviations of a fit to good rows, rms."""
+    information = samples.factor(MODEL).weighted(1.0 / NOISE**2).A
+    off = values - truth()
+    return float(np.sqrt(off @ information @ off / P))
+
+
+# Losses -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loss", [LeastSquares(), *LOSSES, Huber(0.7), Tukey(3.0)])
+@given(x=st.floats(-1e6, 1e6))
+def test_weights_lie_between_zero_and_one_and_fall_with_the_residual(loss: Loss, x: float) -> None:
+    one, further = loss.weight(np.array([x])), loss.weight(np.array([1.1 * x]))
+    assert 0.0 <= further[0] <= one[0] <= 1.0
+    assert loss.weight(np.array([-x])) == one
+    assert loss.weight(np.zeros(1)) == 1.0
+
+
+@pytest.mark.parametrize("loss", [LeastSquares(), *LOSSES])
+def test_the_slope_is_the_derivative_of_weight_times_residual(loss: Loss) -> None:
+    x = np.linspace(-7.0, 7.0, 1401)
+    x = x[np.abs(np.abs(x) - 1.345) > 0.01]  # Huber's has a corner there
+    h = 1e-6
+    numeric = ((x + h) * loss.weight(x + h) - (x - h) * loss.weight(x - h)) / (2.0 * h)
+    np.testing.assert_allclose(loss.slope(x), numeric, atol=1e-4)
+
+
+def test_an_infinite_residual_of_tukeys_counts_nothing() -> None:
+    assert Tukey().weight(np.array([np.inf])) == 0.0
+
+
+@pytest.mark.parametrize("tuning", [0.0, -1.0, np.nan, np.inf])
+def test_a_constant_that_makes_no_loss_is_refused(tuning: float) -> None:
+    for kind in (Huber, Tukey):
+        with pytest.raises(IdentificationError, match="positive"):
+            kind(tuning)
+
+
+# The robust fit -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
+@given(seed=st.integers(0, 2**16))
+@settings(max_examples=8)
+def test_on_gaussian_noise_it_is_within_sampling_error_of_weighted_least_squares(
+    loss: Loss, seed: int
+) -> None:
+    motion = a_motion(5.0)
+    samples = recording(gaussian(np.random.default_rng(seed), motion), motion)
+    robust = robust_estimate(MODEL, [samples], loss)
+    plain = estimate(MODEL, samples.factor(MODEL))
+    # 95 % efficiency: the two differ by sqrt(1/0.95 - 1) = 0.23 standard deviations.
+    assert np.sqrt(np.mean(((robust.estimate.values - plain.values) / plain.std) ** 2)) < 0.6
+    np.testing.assert_allclose(robust.estimate.noise_std, NOISE, rtol=0.12)
+    assert robust.converged
+    assert robust.outlying.max() < 0.002
+    assert 0.85 < robust.mean_weight.min() <= robust.mean_weight.max() <= 1.0
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
+@given(seed=st.integers(0, 2**16), size=st.floats(20.0, 300.0))
+@settings(max_examples=8)
+def test_with_5_percent_of_gross_errors_it_is_far_better_than_least_squares(
+    loss: Loss, seed: int, size: float
+) -> None:
+    motion, rng = a_motion(5.0), np.random.default_rng(seed)
+    samples = recording(spoiled(rng, gaussian(rng, motion), 0.05, size), motion)
+    robust = robust_estimate(MODEL, [samples], loss)
+    plain = estimate(MODEL, samples.factor(MODEL))
+    error = distance(robust.estimate.values, samples)
+    assert robust.converged
+    assert error < distance(plain.values, samples) / 2.0
+    assert error < 2.5
+    np.testing.assert_allclose(robust.outlying, 0.05, atol=0.025)
+
+
+def test_beyond_some_size_it_does_not_matter_how_large_a_gross_error_is() -> None:
+    motion = a_motion(5.0)
+    errors = []
+    for size in (100.0, 1e6):
+        rng = np.random.default_rng(1)
+        samples = recording(spoiled(rng, gaussian(rng, motion), 0.05, size), motion)
+        errors.append([robust_estimate(MODEL, [samples], loss).estimate.values for loss in LOSSES])
+    np.testing.assert_allclose(errors[1], errors[0], rtol=1e-4)
+
+
+def test_tukeys_loss_leaves_no_trace_of_gross_errors_of_one_sign() -> None:
+    motion, rng = a_motion(), np.random.default_rng(2)
+    clean = gaussian(rng, motion)
+    bad = recording(spoiled(rng, clean, 0.10, 40.0), motion)
+    plain, huber, tukey = (
+        distance(values, bad)
+        for values in (
+            estimate(MODEL, bad.factor(MODEL)).values,
+            robust_estimate(MODEL, [bad], Huber()).estimate.values,
+            robust_estimate(MODEL, [bad], Tukey()).estimate.values,
+        )
+    )
+    assert tukey < huber < plain
+    assert tukey < 1.5
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
+def test_it_is_the_minimum_of_the_loss_with_the_scales_it_found(loss: Loss) -> None:
+    motion, rng = a_motion(2.0), np.random.default_rng(3)
+    samples = recording(spoiled(rng, gaussian(rng, motion), 0.05, 15.0), motion)
+    result = robust_estimate(MODEL, [samples], loss)
+    rows = MODEL.regressor(*motion[1:]).dense(P)
+    scale, usable = result.estimate.noise_std, samples.usable
+
+    def cost(values: Array) -> tuple[float, Array]:
+        x = (samples.torque - rows @ values) / scale
+        if isinstance(loss, Huber):
+            k = loss.tuning
+            rho = np.where(np.abs(x) <= k, 0.5 * x**2, k * np.abs(x) - 0.5 * k**2)
+        else:
+            assert isinstance(loss, Tukey)
+            inside = np.minimum((x / loss.tuning) ** 2, 1.0)
+            rho = loss.tuning**2 / 6.0 * (1.0 - (1.0 - inside) ** 3)
+        psi = np.where(usable, loss.weight(x) * x / scale, 0.0)
+        return float(rho[usable].sum()), -np.einsum("mj,mjp->p", psi, rows)
+
+    start = result.estimate.values
+    best, gradient = cost(start)
+    deviations = result.estimate.std
+    assert np.abs(gradient * deviations).max() < 1e-3
+    away = start + 0.5 * deviations * rng.standard_normal(P)
+    found = minimize(cost, away, jac=True, method="L-BFGS-B", options={"maxiter": 3000})
+    assert best <= found.fun + 1e-6 * abs(best)
+    middle = [np.median(np.abs((samples.torque - rows @ start)[usable[:, j], j])) for j in (0, 1)]
+    np.testing.assert_allclose(scale, np.array(middle) / 0.67449, rtol=0.02)
+
+
+@given(pieces=st.integers(2, 40), seed=st.integers(0, 999))
+@settings(max_examples=5)
+def test_one_recording_or_many_pieces_give_the_same_to_nine_digits(pieces: int, seed: int) -> None:
+    motion, rng = a_motion(3.0), np.random.default_rng(seed)
+    whole = recording(spoiled(rng, gaussian(rng, motion), 0.05, 30.0), motion)
+    edges = np.unique(np.linspace(0, len(motion.time), pieces + 1).astype(int))
+    parts = [
+        replace(
+            whole,
+            motion=Motion(*(array[a:b] for array in motion)),
+            torque=whole.torque[a:b],
+            usable=whole.usable[a:b],
+        )
+        for a, b in pairwise(edges)
+    ]
+    for loss in LOSSES:
+        one = robust_estimate(MODEL, [whole], loss).estimate
+        many = robust_estimate(MODEL, parts, loss).estimate
+        np.testing.assert_allclose(many.values, one.values, rtol=1e-9)
+        np.testing.assert_allclose(many.std, one.std, rtol=1e-6)
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
+@pytest.mark.parametrize("correlation", [0.0, 0.05])
+def test_95_percent_intervals_cover_90_to_99_percent_with_gross_errors_and_coloured_noise(
+    loss: Loss, correlation: float
+) -> None:
+    motion = a_motion()
+    inside = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        error = coloured(rng, len(motion.time), 5e-3, correlation)
+        bad = rng.random(error.shape) < 0.03
+        error = np.where(bad, 30.0 * NOISE * rng.standard_normal(error.shape), error)
+        result = robust_estimate(MODEL, [recording(error, motion)], loss).estimate
+        inside.append(np.abs(result.values - truth()) < result.interval_factor * result.std)
+    assert 0.90 <= np.mean(inside) <= 0.99
+
+
+def test_what_was_doubted_can_be_seen_row_by_row() -> None:
+    motion, rng = a_motion(4.0), np.random.default_rng(5)
+    samples = recording(gaussian(rng, motion), motion)
+    samples.torque[300:310, 0] += 200.0
+    samples.usable[305, 0] = False
+    samples.torque[305, 0] = np.nan
+    result = robust_estimate(MODEL, [samples], Tukey())
+    weights = robust_weights(MODEL, result, samples, Tukey())
+    hit = samples.usable[300:310, 0]
+    assert hit.any()
+    assert weights[300:310, 0].max() == 0.0
+    assert np.median(weights[samples.usable]) > 0.8
+    assert not weights[~samples.usable].any()
+
+
+def test_exact_data_come_back_and_do_not_divide_by_zero() -> None:
+    motion = a_motion(3.0)
+    samples = recording(np.zeros((len(motion.time), 2)), motion)
+    samples.torque[::40] += 500.0
+    result = robust_estimate(MODEL, [samples], Tukey())
+    np.testing.assert_allclose(result.estimate.values, truth(), rtol=1e-6)
+
+
+def test_a_joint_that_never_moves_has_no_scale_and_is_named() -> None:
+    motion = a_motion(4.0)
+    samples = recording(gaussian(np.random.default_rng(6), motion), motion)
+    samples.usable[:, 1] = False
+    result = robust_estimate(MODEL, [samples])
+    assert np.isnan(result.estimate.noise_std[1])
+    assert np.isnan(result.mean_weight[1])
+    assert {"f0_2", "f1_2"} <= set(result.estimate.undetermined)
+    assert np.isinf(result.estimate.std[result.estimate.names.index("f0_2")])
+    assert "f0_1" not in result.estimate.undetermined
+
+
+def test_what_does_not_converge_says_so() -> None:
+    motion, rng = a_motion(3.0), np.random.default_rng(7)
+    samples = recording(spoiled(rng, gaussian(rng, motion), 0.05, 30.0), motion)
+    result = robust_estimate(MODEL, [samples], most_iterations=1)
+    assert not result.converged
+    assert "NOT converged" in result.estimate.method
+    assert "Huber" in result.estimate.method
+
+
+def test_where_a_model_leaves_much_out_the_outlying_rows_say_so() -> None:
+    motion, rng = a_motion(5.0), np.random.default_rng(11)
+    error = gaussian(rng, motion)
+    # The elbow's friction in one direction of some poses is not in the model.
+    error[:, 1] += 3.0 * (motion.position[:, 1] > 0.3) * (motion.velocity[:, 1] > 0.0)
+    result = robust_estimate(MODEL, [recording(error, motion)], Tukey())
+    assert result.doubtful.tolist() == [False, True]
+
+
+def test_no_rows_and_recordings_that_can_be_read_once_only_are_errors() -> None:
+    motion = a_motion(1.0)
+    samples = recording(np.zeros((len(motion.time), 2)), motion)
+    empty = replace(samples, usable=np.zeros_like(samples.usable))
+    with pytest.raises(IdentificationError, match="not one usable sample"):
+        robust_estimate(MODEL, [empty])
+    with pytest.raises(IdentificationError, match="twice"):
+        robust_estimate(MODEL, (s for s in [samples]))  # type: ignore[arg-type]
+
+
+def test_on_a_real_arm_5_percent_of_gross_errors_hardly_cost_anything(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    folder = shared_data / "ur10_unisa"
+    files = importlib.metadata.files("example-robot-data") or ()
+    urdf = next(Path(str(f.locate())) for f in files if f.name == "ur10_robot.urdf")
+    bag = folder / "ur10_exciting_trajectory.db3"
+    import_rosbag2(bag, tmp_path / "ur10.mcap", robot=Robot.from_urdf(urdf))
+    recorded = open_recording(tmp_path / "ur10.mcap")
+    model = RobotModel.from_urdf(urdf.read_text(), friction=FrictionLaw(offset=True))
+    cut = round(0.7 * recorded.n_samples)
+    first = prepare(recorded.between(0, cut), model)
+    last = prepare(recorded.between(cut, recorded.n_samples), model)
+    rng, rms = np.random.default_rng(0), np.sqrt(np.mean(first.torque**2, axis=0))
+    gross = 3.0 * rms * rng.uniform(0.5, 1.5, first.torque.shape)
+    bad = replace(first, torque=first.torque + gross * (rng.random(gross.shape) < 0.05))
+
+    def error(values: Array) -> float:
+        (one,) = prediction_error(model, values, [last], all_rows=True)
+        return one.overall
+
+    untouched = error(estimate(model, first.factor(model)).values)
+    assert error(estimate(model, bad.factor(model)).values) > 2.0 * untouched
+    assert error(robust_estimate(model, [bad], Huber()).estimate.values) < untouched + 0.005
