@@ -154,7 +154,7 @@ def test_a_refusal_comes_with_its_flight_recorder(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
     campaign = campaign_of(tmp_path / "refused", on_loopback(cell), plan)
-    fault = ("--fault", "saturate@350x5000:axis=2")
+    fault = ("--fault", "following-error@350x200:axis=2:slip")
     with (
         loopback_link(campaign.cell, options=(*PATIENT, *fault)) as link,
         pytest.raises(MotionFailedError) as failed,
