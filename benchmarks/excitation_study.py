@@ -54,6 +54,7 @@ GOAL: Final = 104.0
 """log10 det that a motion is to have at least, and ..."""
 CEILING: Final = 80.0
 """... I_c that it is to have at most."""
+_PAPER_WIDTH: Final = 150  # characters, in a file or a pipe
 FINE: Final = 1e-3
 QUICK: Final = {"search": {"population": 24, "generations": 6}}
 
@@ -356,13 +357,18 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def _wide(console: Console) -> Console:
+    """Return a console on which the tables are legible where there is no terminal to fit into."""
+    return console if console.is_terminal else Console(width=_PAPER_WIDTH)
+
+
 def main() -> None:
     """Run the searches, and print and write what they came to."""
     arguments = _arguments()
     chosen = [case for case in cases() if not arguments.only or case.name in arguments.only]
     if not chosen:
         raise SystemExit(f"--only knows {', '.join(repr(case.name) for case in cases())}")
-    console, cell = Console(), Cell.load(CELL_PATH)
+    console, cell = _wide(Console()), Cell.load(CELL_PATH)
     rows: list[Row] = []
     for case in chosen:
         for seed in range(1, arguments.seeds + 1):
