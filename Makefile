@@ -38,6 +38,7 @@ bench: $(STAMP)  ## every benchmark that needs no data beside the project
 	$(BIN)/python -m benchmarks.planner
 	$(BIN)/python -m benchmarks.design
 	$(BIN)/python -m benchmarks.live_motion
+	$(BIN)/python -m benchmarks.archive --sizes
 	$(BIN)/python -m benchmarks.turnaround --busy
 
 clean:  ## remove .venv, runs and caches

@@ -1,17 +1,24 @@
 """Torque error of identified models on real recordings, read by the package's own importers.
 
 Run with ``python -m benchmarks.real_data --data DIR [--json]``, where DIR is a folder that is
-named like a file of ``benchmarks/recordings`` (``ur10_unisa``, ``tx40``). Each friction law is
-fitted
+named like a file of ``benchmarks/recordings`` (``ur10_unisa``, ``tx40``). Errors are
+||tau - tau_hat|| / ||tau|| over all joints and over all rows of the part in question, standing
+still and first and last rows included:
 
-- to the whole recording: in-sample error;
-- to its first 70 %: held-out error, of predicting the last 30 %. A temporal split of one motion,
-  not a prediction of other motions.
+- *in sample*: the whole recording fitted and predicted;
+- *held out*: the first 70 % fitted, the last 30 % predicted; *held out first*: the last 70 %
+  fitted, the first 30 % predicted. Temporal splits of one motion, not predictions of other motions.
 
-Errors are ||tau - tau_hat|| / ||tau|| over all joints and over all rows of the part in question,
-standing still and first and last rows included. `torque_bandwidth` is that of the low-pass the
-torque has come through before it was logged, found on the fitted part alone; "plain" does without.
-The headline figures are those of the full friction law, bandwidth included.
+Three tables. *Models*: friction linear or with the third term and, where the drive train couples
+axes, with inertia and friction of the coupled motors or without (the same angles and torques in
+both). *Estimators*: on the largest of these models. *Essential*: that model after backward
+elimination; "chosen on it" means on the very part that is predicted, as the tool's own table shows
+it, "chosen inside" on the last two sevenths of the part that is fitted, which is then fitted whole:
+only that is a prediction.
+
+`torque_bandwidth` is that of the low-pass the torque has come through before it was logged, found
+on the fitted part alone; "plain" does without. The headline figures are those of weighted least
+squares on the largest model, bandwidth included.
 """
 
 # ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
@@ -28,26 +35,236 @@ import importlib.metadata
 import json
 import tempfile
 import tomllib
-from dataclasses import replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
-from hil.importers import ColumnMap, Robot, import_csv, import_rosbag2
+import numpy as np
+
+from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
 from hil.recordings import open_recording
-from identification.estimation import estimate
+from identification.consistent import consistent_estimate
+from identification.coupling import Coupling
+from identification.essential import eliminate
+from identification.estimation import Estimate, joint_weights, solve
+from identification.factor import NormalEquations
 from identification.friction import FrictionLaw
+from identification.least_squares import fit_least_squares
+from identification.losses import Huber, Tukey
 from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, prepare
+from identification.nominal_prior import nominal_prior
+from identification.phase_factor import PhaseFactor
+from identification.preprocessing import Preprocessing, Samples, prepare
+from identification.prior import fit_with_prior
 from identification.recording import Recording
+from identification.robust import robust_estimate
 from identification.torque_channel import find_torque_bandwidth
 from identification.validation import prediction_error
+from planner.arrays import Array
 
-CONFIGURATIONS = Path(__file__).parent / "recordings"
-FITTED_SHARE = 0.7
-LAWS = {
+CONFIGURATIONS: Final = Path(__file__).parent / "recordings"
+FITTED_SHARE: Final = 0.7
+LAWS: Final = {
     "linear_friction": FrictionLaw(third=None, offset=True),
     "quadratic_friction": FrictionLaw(third="quadratic", offset=True),
 }
+_CHOSEN_SHARE: Final = 5.0 / 7.0
+"""Of the fitted part: what is fitted while parameters are chosen on the rest of it."""
+
+
+class Split(NamedTuple):
+    """What is fitted, and what is predicted."""
+
+    fitted: Recording
+    predicted: Recording
+
+
+def splits_of(recording: Recording) -> dict[str, Split]:
+    """The three ways to divide a recording."""
+    m = recording.n_samples
+    cut = round(FITTED_SHARE * m)
+    return {
+        "in_sample": Split(recording, recording),
+        "held_out": Split(recording.between(0, cut), recording.between(cut, m)),
+        "held_out_first": Split(recording.between(m - cut, m), recording.between(0, m - cut)),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One recording, and how its torque is treated.
+
+    Attributes:
+        recording: all of it.
+        urdf: text of the robot description.
+        motor_from_joint: motor angles per joint angle (n, n) where axes are coupled, else None.
+        options: what is done to the torque; its bandwidth is looked for where it is not smoothed.
+    """
+
+    recording: Recording
+    urdf: str
+    motor_from_joint: Array | None
+    options: Preprocessing
+
+    def models(self) -> dict[str, RobotModel]:
+        """The models that are compared, the largest last."""
+        couplings: dict[str, Coupling | None] = {"": None}
+        if self.motor_from_joint is not None:
+            couplings = {
+                ", without coupling": None,
+                ", with coupling": Coupling(self.motor_from_joint),
+            }
+        return {
+            f"{law}{words}": RobotModel.from_urdf(self.urdf, friction=friction, coupling=coupling)
+            for words, coupling in couplings.items()
+            for law, friction in LAWS.items()
+        }
+
+    def prepared(self, model: RobotModel, split: Split) -> tuple[Samples, Samples, Preprocessing]:
+        """Fitted and predicted samples, and how they were treated."""
+        options = self.options
+        if not options.smooth_torque:
+            found = find_torque_bandwidth(split.fitted, model)
+            options = replace(options, torque_bandwidth=found)
+        fitted, predicted = (prepare(part, model, options=options) for part in split)
+        return fitted, predicted, options
+
+
+Estimator = Callable[[RobotModel, Samples], Array]
+
+
+def _consistent(model: RobotModel, samples: Samples) -> Array:
+    free = fit_least_squares(model, [samples])
+    return consistent_estimate(model, samples.factor(model), free).estimate.values
+
+
+def _values(fit: Callable[[RobotModel, Sequence[Samples]], Estimate]) -> Estimator:
+    return lambda model, samples: fit(model, [samples]).values
+
+
+ESTIMATORS: Final[dict[str, Estimator]] = {
+    "ols": _values(lambda model, runs: fit_least_squares(model, runs, "ordinary")),
+    "wls": _values(fit_least_squares),
+    "huber": _values(lambda model, runs: robust_estimate(model, runs, Huber()).estimate),
+    "tukey": _values(lambda model, runs: robust_estimate(model, runs, Tukey()).estimate),
+    "prior": _values(
+        lambda model, runs: fit_with_prior(model, runs, nominal_prior(model)).estimate
+    ),
+    "consistent": _consistent,
+}
+
+
+def error(model: RobotModel, values: Array, predicted: Samples) -> float:
+    """Relative torque error over all joints and all rows."""
+    (found,) = prediction_error(model, values, [predicted], all_rows=True)
+    return round(found.overall, 5)
+
+
+def model_table(case: Case, splits: dict[str, Split]) -> dict[str, Any]:
+    """Weighted least squares with every model, by split."""
+    table: dict[str, Any] = {}
+    for name, model in case.models().items():
+        row: dict[str, Any] = {"parameters": model.n_parameters}
+        for kind, split in splits.items():
+            fitted, predicted, options = case.prepared(model, split)
+            row[kind] = error(model, ESTIMATORS["wls"](model, fitted), predicted)
+            if kind == "in_sample":
+                (found,) = prediction_error(
+                    model, ESTIMATORS["ols"](model, fitted), [predicted], all_rows=True
+                )
+                row["in_sample_ols"] = round(found.overall, 5)
+                row["in_sample_ols_by_joint"] = [round(e, 4) for e in found.relative.tolist()]
+            if not options.smooth_torque:
+                row[f"plain_{kind}"] = _plain(model, split)
+                row[f"{kind}_torque_bandwidth"] = options.torque_bandwidth
+        table[name] = row
+    return table
+
+
+def estimator_table(
+    case: Case, model: RobotModel, splits: dict[str, Split]
+) -> dict[str, dict[str, float]]:
+    """Every estimator on one model, by split."""
+    table: dict[str, dict[str, float]] = {name: {} for name in ESTIMATORS}
+    for kind, split in splits.items():
+        fitted, predicted, _ = case.prepared(model, split)
+        for name, estimator in ESTIMATORS.items():
+            table[name][kind] = error(model, estimator(model, fitted), predicted)
+    return table
+
+
+def essential_table(
+    case: Case, model: RobotModel, splits: dict[str, Split]
+) -> dict[str, dict[str, float | int]]:
+    """Essential parameters, chosen on what is predicted and chosen without having seen it."""
+    table: dict[str, dict[str, float | int]] = {}
+    for kind in ("held_out", "held_out_first"):
+        fitted, predicted, options = case.prepared(model, splits[kind])
+        whole = PhaseFactor.from_samples(model, fitted)
+        flattered = eliminate(model, whole, PhaseFactor.from_samples(model, predicted))
+        part = splits[kind].fitted
+        cut = round(_CHOSEN_SHARE * part.n_samples)
+        inner = [
+            PhaseFactor.from_samples(model, prepare(one, model, options=options))
+            for one in (part.between(0, cut), part.between(cut, part.n_samples))
+        ]
+        kept = eliminate(model, *inner).estimate.names
+        table[kind] = {
+            "parameters": model.n_parameters,
+            "all": error(model, ESTIMATORS["wls"](model, fitted), predicted),
+            "chosen_on_it": error(model, flattered.values, predicted),
+            "chosen_on_it_parameters": len(flattered.estimate.names),
+            "chosen_inside": error(model, _refitted(model, whole, kept), predicted),
+            "chosen_inside_parameters": len(kept),
+        }
+    return table
+
+
+def load_case(folder: Path) -> Case:
+    """The recording of a folder, imported as its configuration says."""
+    file = CONFIGURATIONS / f"{folder.name}.toml"
+    if not file.is_file():
+        known = ", ".join(sorted(path.stem for path in CONFIGURATIONS.glob("*.toml")))
+        raise SystemExit(f"nothing is known about {folder.name}; known are {known}")
+    configuration = tomllib.loads(file.read_text(encoding="utf-8"))
+    bandwidth = configuration.get("smooth_bandwidth")
+    urdf = _urdf(configuration, folder)
+    recording, matrix = _recording(configuration, folder, urdf)
+    return Case(
+        recording,
+        urdf.read_text(encoding="utf-8"),
+        matrix,
+        Preprocessing(smooth_torque=bandwidth is not None, torque_bandwidth=bandwidth),
+    )
+
+
+def main() -> None:
+    """Measure, and print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--data", type=Path, required=True, help="folder with the recording")
+    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
+    arguments = parser.parse_args()
+    folder = arguments.data.resolve()
+    case = load_case(folder)
+    splits = splits_of(case.recording)
+    models = model_table(case, splits)
+    largest, model = list(case.models().items())[-1]
+    estimators = estimator_table(case, model, splits)
+    essential = essential_table(case, model, splits)
+    if not arguments.json:
+        _show(f"{folder.name}: models, weighted least squares", models)
+        _show(f"{folder.name}: estimators, {largest}", estimators)
+        _show(f"{folder.name}: essential parameters, {largest}", essential)
+    result = {
+        "data": folder.name,
+        "held_out_relative_error": models[largest]["held_out"],
+        "in_sample_relative_error": models[largest]["in_sample"],
+        "models": models,
+        "estimators": estimators,
+        "essential": essential,
+    }
+    print(json.dumps(result))
 
 
 def _urdf(configuration: dict[str, Any], folder: Path) -> Path:
@@ -61,80 +278,67 @@ def _urdf(configuration: dict[str, Any], folder: Path) -> Path:
     raise SystemExit(f"{configuration['urdf']} is not in the package {package}; is it installed?")
 
 
-def _recording(configuration: dict[str, Any], folder: Path, urdf: Path) -> Recording:
-    """Import into an archive and read that, as `hil import` and `hil identify` do."""
+def _recording(
+    configuration: dict[str, Any], folder: Path, urdf: Path
+) -> tuple[Recording, Array | None]:
+    """Import into an archive and read that, as `hil import` and `hil identify` do.
+
+    Returns:
+        The recording, and the motors' angles per joint angle where axes are coupled.
+    """
     robot = Robot.from_urdf(urdf)
     with tempfile.TemporaryDirectory() as scratch:
         archive = Path(scratch) / "imported.mcap"
         if "bag" in configuration:
             import_rosbag2(folder / configuration["bag"], archive, robot=robot)
-        else:
-            columns = ColumnMap.model_validate(configuration["map"])
-            import_csv(folder / configuration["log"], archive, robot=robot, columns=columns)
-        return open_recording(archive)
+            return open_recording(archive), None
+        columns = ColumnMap.model_validate(configuration["map"])
+        import_log(folder / configuration["log"], archive, robot=robot, columns=columns)
+        drive = columns.drive
+        if not drive.coupling or drive.gear_ratio is None:
+            return open_recording(archive), None
+        matrix = np.diag(np.array(drive.gear_ratio))
+        for motor, joint, ratio in drive.coupling:
+            matrix[motor - 1, joint - 1] = ratio
+        return open_recording(archive), matrix
 
 
-def _error(
-    model: RobotModel, fitted: Recording, predicted: Recording, options: Preprocessing
-) -> float:
-    """Relative torque error over all joints and rows of one part, after a fit to another."""
-    samples = prepare(fitted, model, options=options)
-    values = estimate(model, samples.factor(model)).values
-    target = prepare(predicted, model, options=options)
-    (error,) = prediction_error(model, values, [target], all_rows=True)
-    return error.overall
+def _plain(model: RobotModel, split: Split) -> float:
+    """Error if the torque is believed to have come through no low-pass."""
+    fitted, predicted = (prepare(part, model) for part in split)
+    return error(model, ESTIMATORS["wls"](model, fitted), predicted)
 
 
-def _figures(model: RobotModel, recording: Recording, options: Preprocessing) -> dict[str, Any]:
-    """Held-out and in-sample errors with and without the low-pass before the log."""
-    cut = round(FITTED_SHARE * recording.n_samples)
-    first = recording.between(0, cut)
-    last = recording.between(cut, recording.n_samples)
-    found = None if options.smooth_torque else find_torque_bandwidth(first, model)
-    best = options if found is None else replace(options, torque_bandwidth=found)
-    return {
-        "held_out_relative_error": round(_error(model, first, last, best), 5),
-        "in_sample_relative_error": round(_error(model, recording, recording, best), 5),
-        "torque_bandwidth": None if found is None else round(found, 3),
-        "plain_held_out_relative_error": round(_error(model, first, last, options), 5),
-        "plain_in_sample_relative_error": round(_error(model, recording, recording, options), 5),
-    }
+def _refitted(model: RobotModel, whole: PhaseFactor, kept: Collection[str]) -> Array:
+    """Weighted least squares of some parameters (p,), zero for the others."""
+    total = whole.total
+    equations = total.weighted(joint_weights(total))
+    index = np.flatnonzero([name in kept for name in model.parameter_names])
+    values = np.zeros(model.n_parameters)
+    values[index] = solve(
+        NormalEquations(
+            equations.A[np.ix_(index, index)], equations.b[index], equations.yy, equations.n
+        )
+    ).values
+    return values
 
 
-def main() -> None:
-    """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--data", type=Path, required=True, help="folder with the recording")
-    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
-    arguments = parser.parse_args()
-    folder = arguments.data.resolve()
-    file = CONFIGURATIONS / f"{folder.name}.toml"
-    if not file.is_file():
-        known = ", ".join(sorted(path.stem for path in CONFIGURATIONS.glob("*.toml")))
-        raise SystemExit(f"nothing is known about {folder.name}; known are {known}")
-    configuration = tomllib.loads(file.read_text(encoding="utf-8"))
-    bandwidth = configuration.get("smooth_bandwidth")
-    options = Preprocessing(smooth_torque=bandwidth is not None, torque_bandwidth=bandwidth)
-    urdf = _urdf(configuration, folder)
-    recording = _recording(configuration, folder, urdf)
+def _show(heading: str, table: dict[str, Any]) -> None:
+    print(f"\n### {heading}\n")
+    columns = list(dict.fromkeys(key for row in table.values() for key in row))
+    print("| | " + " | ".join(column.replace("_", " ") for column in columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
+    for name, row in table.items():
+        cells = [_cell(row.get(column, "")) for column in columns]
+        print(f"| {name.replace('_', ' ')} | " + " | ".join(cells) + " |")
 
-    figures: dict[str, Any] = {}
-    for name, law in LAWS.items():
-        model = RobotModel.from_urdf(urdf.read_text(encoding="utf-8"), friction=law)
-        figures[name] = _figures(model, recording, options)
-        if not arguments.json:
-            print(f"{folder.name}, {name.replace('_', ' ')}:")
-            for key, value in figures[name].items():
-                shown = f"{value:.2%}" if key.endswith("error") else value
-                print(f"  {key.replace('_', ' '):34} {shown}")
-    headline = figures["quadratic_friction"]
-    result = {
-        "data": folder.name,
-        "held_out_relative_error": headline["held_out_relative_error"],
-        "in_sample_relative_error": headline["in_sample_relative_error"],
-        **figures,
-    }
-    print(json.dumps(result))
+
+def _cell(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(_cell(one) for one in value)
+    if isinstance(value, float):
+        return f"{value:.2%}" if value < 1.0 else f"{value:.3g}"
+    return str(value)
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ REPETITIONS = 25
 URDF = Path(__file__).resolve().parents[1] / "sim_fixtures" / "ns16" / "ns16.urdf"
 
 
-def _motion(n_joints: int) -> Motion:
+def sine_motion(n_joints: int) -> Motion:
     """Return a smooth motion of 16 s at 1 kHz: three sines per joint."""
     random = np.random.default_rng(1)
     t = np.arange(SAMPLES, dtype=np.float64) * 1e-3
@@ -103,7 +103,7 @@ def main() -> None:
     urdf = URDF.read_text(encoding="utf-8")
     model = RobotModel.from_urdf(urdf)
     reference = pin.buildModelFromXML(urdf)
-    motion = _motion(model.n_joints)
+    motion = sine_motion(model.n_joints)
     torque = model.torque(
         np.ones(model.n_parameters), motion.position, motion.velocity, motion.acceleration
     )

@@ -171,6 +171,11 @@ class Session:
         return self._machine.interval
 
     @property
+    def cycle(self) -> int:
+        """Cycles of the controller since its init packet, up to the packet answered last."""
+        return self._machine.cycle
+
+    @property
     def init(self) -> InitPacket | None:
         """The controller's init packet, None before it."""
         return None if self._answers is None else self._answers.init

@@ -9,6 +9,7 @@ HilError                   exit status 1
 ├── ControllerFault        4: the controller, the link or the guard ended a motion
 │   └── MotionFailedError       and what was recorded of it is archived
 ├── OperatorStopError         130: a person stopped the work
+├── OutputError            1: what was found cannot be written: disk full, no permission
 └── InputError             2: something the user gave cannot be used: file, field, problem, remedy
     ├── ArchiveError       an archive that cannot be read or written
     │   ├── NotAnArchiveError       not ours: other format, empty, torn at its head
@@ -85,6 +86,22 @@ class ArchiveWriteError(ArchiveError):
 
 class SourceError(InputError):
     """A foreign recording that cannot be imported."""
+
+
+class OutputError(HilError):
+    """A folder that does not take what was found; nothing in it was changed.
+
+    Attributes:
+        path: the folder.
+        problem: what is wrong with it.
+    """
+
+    def __init__(self, path: Path, problem: str) -> None:
+        self.path = path
+        self.problem = problem
+        super().__init__(
+            f"{path}: {problem}; nothing there was changed: make room, or name another folder"
+        )
 
 
 class UnsafeError(HilError):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from hil.errors import InputError
+from hil.errors import InputError, OutputError
 
 
 def make_folder(path: Path) -> None:
@@ -29,16 +32,82 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """Replace `path` by `content`: a crash leaves the old or the new file, never half of one."""
     temporary = path.with_suffix(path.suffix + ".tmp")
     try:
-        with temporary.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
+        _write_through(temporary, content)
         temporary.replace(path)
     except OSError:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise
     _sync_folder(path.parent)
+
+
+def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
+    """Replace several files of a folder, or none of them.
+
+    All are written beside the old ones first. These are kept until the last is in its place, and
+    put back if one of them cannot get there.
+
+    Args:
+        folder: it exists.
+        contents: by file name; None takes a file away.
+
+    Raises:
+        OutputError: one could not be written; the folder is as it was.
+    """
+    try:
+        in_the_way = next((name for name in contents if (folder / name).is_dir()), None)
+        if in_the_way is not None:
+            raise IsADirectoryError(errno.EISDIR, f"{in_the_way} is a folder")
+        with TemporaryDirectory(prefix=".hil-", dir=folder, ignore_cleanup_errors=True) as stage:
+            _replace_all(folder, contents, Path(stage))
+    except OSError as error:
+        raise OutputError(folder, f"cannot be written to ({error.strerror})") from error
+    _sync_folder(folder)
+
+
+def _replace_all(folder: Path, contents: Mapping[str, str | bytes | None], stage: Path) -> None:
+    """Replace files by way of a folder beside them; should one fail, put the others back."""
+    new, old = stage / "new", stage / "old"
+    new.mkdir()
+    old.mkdir()
+    for name, content in contents.items():
+        if content is not None:
+            _write_through(new / name, content)
+    touched: list[str] = []
+    try:
+        for name, content in contents.items():
+            touched.append(name)
+            _keep(folder / name, old / name)
+            if content is not None:
+                (new / name).replace(folder / name)
+            else:
+                (folder / name).unlink(missing_ok=True)
+    except BaseException:
+        for name in touched:
+            with suppress(OSError):
+                if os.path.lexists(old / name):
+                    (old / name).replace(folder / name)
+                elif not (new / name).exists():
+                    (folder / name).unlink(missing_ok=True)
+        raise
+
+
+def _keep(path: Path, copy: Path) -> None:
+    """Have a file under a second name, where there is one; its own may be lost."""
+    if not os.path.lexists(path):
+        return
+    try:
+        os.link(path, copy, follow_symlinks=False)
+    except OSError:  # a file system without links, or somebody else's file
+        path.replace(copy)
+
+
+def _write_through(path: Path, content: str | bytes) -> None:
+    """Write a file and have it on the disk."""
+    with path.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _sync_folder(path: Path) -> None:

@@ -35,7 +35,8 @@ class MotionChecks:
     Attributes:
         limits: joint limits.
         checker: floor, walls and the arm itself.
-        currents: motor currents by the nominal model, with its uncertainty.
+        currents: motor currents by the nominal model, with its uncertainty, and joint torques
+            where the cell limits them.
         frame: of the angles in which refusals are worded.
     """
 
@@ -123,7 +124,7 @@ def collision_checker(cell: Cell) -> CollisionChecker:
 
 
 def current_model(cell: Cell) -> CurrentModel:
-    """Motor currents of a cell's arm by its nominal model."""
+    """Motor currents and joint torques of a cell's arm by its nominal model, and their limits."""
     drives = cell.drive_train
     return CurrentModel(
         model=cell.model,
@@ -132,6 +133,7 @@ def current_model(cell: Cell) -> CurrentModel:
         torque_constant=drives.torque_constant,
         current_limit=drives.current_limit,
         uncertainty=cell.nominal.uncertainty,
+        torque_limit=cell.torque_limit,
     )
 
 

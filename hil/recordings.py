@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
+from dataclasses import replace
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,32 +18,59 @@ from identification.recording import Recording
 
 Array = NDArray[np.float64]
 
-_FIELDS = (
-    "cycle",
-    "gap",
-    "position",
-    "torque",
-    "target_current",
-    "motor_current",
-    "commanded_position",
-    "target_position",
-)
+_ALWAYS = ("cycle", "gap", "position")
+_CHANNELS = {
+    "torque": ("torque",),
+    "motor_current": ("target_current", "motor_current"),
+    "commanded_position": ("commanded_position", "target_position"),
+}
+"""Columns of an archive that a recording takes, by what they become there."""
 
 
-def open_recording(path: str | PathLike[str]) -> Recording:
+def open_recording(
+    path: str | PathLike[str],
+    *,
+    channels: Collection[str] | None = None,
+    start: float | None = None,
+    stop: float | None = None,
+) -> Recording:
     """Read an archive as a recording.
 
     Works on archives of this package and on imported ones. An archive that was cut off gives what
     is whole of it; the recording's provenance then has an entry ``missing`` that says what is not.
     The recording is as it was taken: `Recording.checked` decides whether it can be identified from.
 
+    Only what is wanted is decoded, chunk by chunk, and of a range of times only the chunks it lies
+    in are read where the index of the file is whole.
+
     Args:
         path: the archive.
+        channels: of ``torque``, ``motor_current`` and ``commanded_position`` those that are wanted
+            beside the position; None for all that were recorded.
+        start: first instant wanted [s], on the archive's clock; the recording's own time begins at
+            zero all the same.
+        stop: end of the time wanted [s]; what happened then is left out.
 
     Raises:
-        ArchiveError: the file is no archive, cannot be read, or holds no sample.
+        ArchiveError: the file is no archive, cannot be read, or holds no sample (of that time).
+        ValueError: a channel that recordings do not have.
     """
-    return recording_of(open_archive(path, fields=_FIELDS))
+    wanted = _CHANNELS.keys() if channels is None else set(channels)
+    unknown = sorted(wanted - _CHANNELS.keys())
+    if unknown:
+        raise ValueError(f"recordings have no {unknown[0]!r}; they have {', '.join(_CHANNELS)}")
+    fields = [*_ALWAYS, *(column for name in wanted for column in _CHANNELS[name])]
+    archive = open_archive(path, fields=fields, start=start, stop=stop)
+    if start is None and stop is None:
+        return recording_of(archive)
+    part = f"{'its beginning' if start is None else f'{start:g} s'} to "
+    part += "its end" if stop is None else f"{stop:g} s"
+    if not archive.n_samples and archive.complete:
+        raise ArchiveError(
+            Path(path), f"holds no sample from {part}", remedy="name a time within the recording"
+        )
+    recording = recording_of(archive)
+    return replace(recording, provenance={**recording.provenance, "part": part})
 
 
 def recording_of(archive: Archive) -> Recording:

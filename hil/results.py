@@ -7,15 +7,18 @@ Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hil.errors import InputError
+from hil.extras_results import ConsistencyResult, EssentialResult, ExportResult
 from hil.files import write_atomically
+from hil.judgement import JudgementResult
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 class _Frozen(BaseModel):
@@ -62,6 +65,15 @@ class ParameterResult(_Frozen):
     """Standard deviation over the repetitions (of one repetition, not of their mean)."""
     truth: float | None
     """Planted value; only a simulated cell has one."""
+    undetermined: bool = False
+    """Whether the motion says nothing about it, alone or as part of a combination."""
+    prior_std: float | None = None
+    """What was believed before the data, from CAD; infinite where nothing was."""
+    prior_ratio: float | None = None
+    """Standard deviation with prior and data over that of the prior alone: 0 where all that is
+    known comes from the data, 1 where all comes from the prior."""
+    learned: bool | None = None
+    """Whether at least three quarters of what is known of it come from the data."""
 
 
 class ValidationResult(_Frozen):
@@ -77,6 +89,43 @@ class ValidationResult(_Frozen):
     """||e|| / ||tau|| over all joints, rows in which the joint moves."""
     all_rows_relative_error: float
     """The same over every row, standstill and the first and last rows included."""
+
+
+class FittedResult(_Frozen):
+    """Torque error on the motion that was fitted, all recordings; lists are per joint."""
+
+    relative_error: list[float]
+    """||e|| / ||tau||, rows in which the joint moves; torque as recorded."""
+    overall_relative_error: float
+    all_rows_relative_error: float
+    """The same over every row, standstill and the first and last rows included."""
+    smoothed_relative_error: list[float] | None = None
+    """Every row, of the torque as it was fitted, where that was smoothed; null where not."""
+    smoothed_overall_relative_error: float | None = None
+
+    @property
+    def words(self) -> str:
+        """The figures over all joints, in a sentence without its full stop."""
+        smoothed = self.smoothed_overall_relative_error
+        text = (
+            "on the fitted motion (in-sample) the torque error is"
+            f" {self.overall_relative_error:.2%} over all joints,"
+            f" {self.all_rows_relative_error:.2%} with every row, standstill included"
+        )
+        if smoothed is not None:
+            text += f"; of the torque smoothed as it was fitted {smoothed:.2%}, every row"
+        return text
+
+
+class DelaysResult(_Frozen):
+    """Delay of the torque behind the position; lists are per joint, s."""
+
+    found: list[float | None]
+    """Null where the recordings do not determine it."""
+    interval: list[float | None]
+    """Half a 95 % interval of it."""
+    applied: list[float]
+    """What the fit took it to be."""
 
 
 class CoverageResult(_Frozen):
@@ -98,11 +147,45 @@ class VerdictResult(_Frozen):
     """What is not as it should be, but too small or too uncertain to say no."""
 
 
+class EstimatorResult(_Frozen):
+    """How the parameters were estimated."""
+
+    name: str
+    """As `hil identify --estimator` has it."""
+    words: str
+    prior: str | None
+    """What the prior of `ParameterResult.prior_std` is, in words; or why there is none."""
+    condition: float
+    """Of the weighted regressor with columns of unit length."""
+    grouping: str
+    """Why there are as many base parameters, in words."""
+
+
+class EndogeneityResult(_Frozen):
+    """Durbin-Wu-Hausman test: was least squares biased by noise in the regressor?"""
+
+    sentence: str
+    biased: bool
+    statistic: float
+    p_value: float
+    degrees_of_freedom: tuple[int, int]
+    noise: list[float]
+    """What the instruments do not explain of the regressor, as a share of each joint's torque."""
+    shifted: list[str]
+    """Parameters in which least squares and instrumental variables differ by more than chance."""
+    shift: list[float]
+    """Least squares less instrumental variables, per parameter."""
+
+
 class UncertaintyResult(_Frozen):
-    """Standard deviation of each parameter by four routes."""
+    """Standard deviation of each parameter by several routes."""
 
     reported: Literal[
-        "least_squares", "independent_repetitions", "phase_clustered", "scatter_of_mean"
+        "least_squares",
+        "independent_repetitions",
+        "phase_clustered",
+        "scatter_of_mean",
+        "posterior",
     ]
     """The route that `ParameterResult.std` was taken from."""
     method: str
@@ -113,6 +196,7 @@ class UncertaintyResult(_Frozen):
     independent_repetitions: list[float] | None
     phase_clustered: list[float] | None
     scatter_of_mean: list[float] | None
+    posterior: list[float] | None = None
 
 
 class Results(_Frozen):
@@ -128,6 +212,12 @@ class Results(_Frozen):
     period: float
     software: dict[str, str]
     excitation: ExcitationResult
+    estimator: EstimatorResult
+    endogeneity: EndogeneityResult | None
+    endogeneity_untested: str | None
+    """Why there was no such test."""
+    notes: list[str]
+    """What was found and done when the recordings were prepared."""
     parameters: list[ParameterResult]
     n_base: int
     uncertainty: UncertaintyResult
@@ -139,12 +229,29 @@ class Results(_Frozen):
     correlation: list[list[float]]
     """Normalised Ψ of eq. 5 (signed), friction included, from the executed motion."""
     validation: list[ValidationResult]
+    """Empty where nothing was held out."""
+    fitted: FittedResult | None = None
+    """In-sample errors, to stand beside those on unseen motion."""
+    delays: DelaysResult | None = None
+    """Null where they could not be looked for."""
     coverage: CoverageResult | None
     verdict: VerdictResult
+    essential: EssentialResult | None = None
+    """Which parameters the motion needs."""
+    consistency: ConsistencyResult | None = None
+    """The nearest parameters that a machine can have."""
+    exports: ExportResult | None = None
+    """Files for other tools beside this one."""
+    judgement: JudgementResult | None = None
+    """Every check behind the verdict, and the figures it rests on."""
+
+    def to_json(self) -> str:
+        """As indented JSON, the text of `results.json`."""
+        return self.model_dump_json(indent=1) + "\n"
 
     def save(self, path: Path) -> None:
         """Write `path` as indented JSON."""
-        write_atomically(path, self.model_dump_json(indent=1) + "\n")
+        write_atomically(path, self.to_json())
 
     @classmethod
     def load(cls, path: Path) -> Results:
@@ -154,13 +261,27 @@ class Results(_Frozen):
             InputError: the file is not of this schema.
         """
         try:
-            results = cls.model_validate_json(path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            found = json.loads(text)
         except (OSError, ValueError) as error:
             raise InputError(
-                path, f"is not a result of this version ({error})", remedy="identify again"
+                path, f"cannot be read as a result ({error})", remedy="name a results.json"
             ) from error
-        if results.schema_version != SCHEMA_VERSION:
+        version = found.get("schema_version") if isinstance(found, dict) else None
+        if version != SCHEMA_VERSION:
             raise InputError(
-                path, f"is of version {results.schema_version}", remedy="identify again"
+                path,
+                f"is of version {version!r}; this program reads version {SCHEMA_VERSION}",
+                field="schema_version",
+                remedy="identify again from the archives, which hold all that is needed",
             )
-        return results
+        try:
+            return cls.model_validate_json(text)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise InputError(
+                path,
+                f"{first['msg'].lower()}; found {str(first['input'])[:80]!r}",
+                field=".".join(str(part) for part in first["loc"]),
+                remedy="identify again from the archives",
+            ) from error

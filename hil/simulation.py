@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,16 +158,38 @@ def simulated_drive(cell: Cell) -> SimulatedDrive:
 
 
 def planted_truth(cell: Cell) -> PlantTruth:
-    """Rotor inertias and friction planted in the plant."""
+    """Rotor inertias and friction planted in the plant.
+
+    Raises:
+        CellError: joints with a third friction term differ in its law.
+    """
     settings = cell.simulation
-    third = cell.file.robot.friction.third
     return PlantTruth(
         rotor_inertia=np.array(settings.rotor_inertia),
         coulomb=np.array(settings.coulomb),
         viscous=np.array(settings.viscous),
         third=np.array(settings.third),
-        third_law="cubic" if third == "cubic" else "quadratic",
+        third_law=_third_law(cell),
     )
+
+
+def _third_law(cell: Cell) -> Literal["quadratic", "cubic"]:
+    """The third friction law of the joints that are planted with one."""
+    table = cell.file.robot.friction
+    own = {name: joint.third or table.third for name, joint in table.joints.items()}
+    planted = [
+        name for name, third in zip(cell.joint_names, cell.simulation.third, strict=True) if third
+    ]
+    laws = {own.get(name, table.third) for name in planted} - {"none"}
+    if len(laws) > 1:
+        raise CellError(
+            cell.path,
+            "robot.friction.joints",
+            None,
+            f"quadratic and cubic terms among {', '.join(planted)}; a simulated arm has one law",
+            "give all joints of the simulated arm the same third term",
+        )
+    return "cubic" if laws == {"cubic"} else "quadratic"
 
 
 def unmodelled_effects(cell: Cell) -> UnmodelledEffects:

@@ -29,10 +29,10 @@ def violation_text(violation: Violation, frame: AngleFrame) -> str:
     if limit is None:
         return violation.sentence(joints)
     quantity, joint, where = limit[1], int(limit[2]), limit[3]
-    zero = frame.offset[joint] if quantity == "position" else 0.0
+    # Of a rate it is the size, which is the same in any frame.
+    sign, zero = (frame.sign[joint], frame.offset[joint]) if quantity == "position" else (1.0, 0.0)
     value, bound = (
-        float(np.degrees(frame.sign[joint] * number + zero))
-        for number in (violation.value, violation.bound)
+        float(np.degrees(sign * number + zero)) for number in (violation.value, violation.bound)
     )
     shown = replace(
         violation, subject=f"{quantity} of J{joint + 1}{where}", value=value, bound=bound

@@ -55,9 +55,10 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
     else:
         chunks = _filtered(model, samples)
     for part, blocks in chunks:
-        for joint, block in enumerate(blocks):
-            # Assigned, not multiplied: a row left out may hold NaN.
-            np.copyto(block, 0.0, where=~samples.usable[part, joint])
+        for block, lost in zip(blocks, ~samples.usable[part].T, strict=True):
+            if lost.any():
+                # Assigned, not multiplied: a row left out may hold NaN.
+                block[:, np.flatnonzero(lost)] = 0.0
         yield Rows(part, blocks)
 
 

@@ -16,6 +16,11 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-5
 
 _ROUNDING = 1e-13
+# A gap as wide leaves room for a threshold; a kept share below the second hangs on the geometry's
+# last digits; dropped shares below the third are rounding alone.
+_CLEAR = 100.0
+_WEAK = 1e-3
+_EXACT = 1e-9
 # Factors below this (a lever of a nanometre) are in the grouping, but not in the words for it.
 _UNSPEAKABLE = 1e-9
 
@@ -32,6 +37,7 @@ class BaseParameters:
         smallest_kept: how much of a kept column the columns kept before it leave unexplained,
             as a share of the longest column of its unit; the smallest over all kept.
         largest_dropped: the same, the largest over all dropped: zero but for rounding.
+        shares: the same of each standard parameter, shape (s,).
     """
 
     names: tuple[str, ...]
@@ -40,6 +46,7 @@ class BaseParameters:
     standard_names: tuple[str, ...]
     smallest_kept: float
     largest_dropped: float
+    shares: Array
 
     @property
     def rank(self) -> int:
@@ -56,6 +63,42 @@ class BaseParameters:
         """Standard parameters that no torque depends on."""
         absent = ~np.any(np.abs(self.grouping) > _UNSPEAKABLE, axis=0)
         return tuple(n for n, gone in zip(self.standard_names, absent, strict=True) if gone)
+
+    def explanation(self) -> str:
+        """Return the rank decision in words: how many are kept, how clearly, what would change it.
+
+        Shares are of the longest column of the same unit, after what the columns kept before it
+        explain; a parameter is dropped below :data:`TOLERANCE`.
+        """
+        dropped = len(self.standard_names) - self.rank - len(self.unobservable)
+        text = (
+            f"{self.rank} of {len(self.standard_names)} standard parameters are kept,"
+            f" {dropped} are grouped into them, {len(self.unobservable)} act on no torque."
+        )
+        if dropped + len(self.unobservable) == 0:
+            return f"{text} Nothing had to be decided."
+        weakest = self.names[int(np.argmin(self.shares[self.kept]))]
+        text += (
+            f" The weakest kept one, {weakest}, leaves {self.smallest_kept:.1e} of its column"
+            f" unexplained, the strongest dropped one {self.largest_dropped:.1e}; the threshold is"
+            f" {TOLERANCE:g}."
+        )
+        if self.gap < _CLEAR or self.smallest_kept < _WEAK:
+            return (
+                f"{text} That is close: small lengths or angles of the robot description, meant as"
+                f" zero or not, decide whether {weakest} is a parameter of its own. Check them; a"
+                " parameter that is kept but hardly acts is named where data do not determine it."
+            )
+        if self.largest_dropped < _EXACT:
+            return (
+                f"{text} A gap of {np.log10(self.gap):.0f} orders of magnitude: the decision is"
+                " clear, any threshold in between gives the same groups."
+            )
+        return (
+            f"{text} What is dropped is not quite zero, from figures of the robot description that"
+            " are rounded (1.5708 for pi/2): with exact ones the gap would be wider, the groups"
+            " the same."
+        )
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
         """Return each group in words: ``I1yy + I1m + 0.09 m2 + ...``."""
@@ -107,6 +150,7 @@ def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) ->
         standard_names=tuple(names),
         smallest_kept=float(shares[kept].min(initial=1.0)),
         largest_dropped=largest_dropped,
+        shares=shares,
     )
 
 

@@ -21,10 +21,8 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.signal import butter, periodogram, sosfiltfilt
 
 from identification.errors import ShapeError
-from identification.masks import RowMask, mask_rows
-from identification.model import RobotModel
 from identification.motion import Motion
-from identification.preprocessing import RIGID_BANDWIDTH, Samples, difference_variance
+from identification.noise import difference_variance
 from identification.recording import Recording, RecordingError
 from identification.resampling import resample, time_base
 
@@ -47,7 +45,7 @@ def choose_cutoff(
     noise_variance: Array | None = None,
     *,
     order: int = ORDER,
-    widest: float = RIGID_BANDWIDTH,
+    widest: float = np.inf,
 ) -> Array:
     """Cut-off per joint (n,) [Hz] with the least estimated error of the acceleration.
 
@@ -122,51 +120,6 @@ def butterworth_motion(
         q[segment], qd[segment] = spline(at), spline(at, 1)
         qdd[segment] = spline(at, 2)
     return Motion(recording.time, q, qd, qdd)
-
-
-def prepare_butterworth(
-    recording: Recording,
-    model: RobotModel,
-    *,
-    noise_variance: Array | None = None,
-    cutoff: Array | None = None,
-    order: int = ORDER,
-    delay: float = 0.0,
-    origin: float | None = None,
-) -> tuple[Samples, RowMask]:
-    """Samples of a recording for a model, and why rows do not count.
-
-    As :func:`identification.preprocessing.prepare`, with the Butterworth filter in the place of
-    the spline; the torque is left as measured.
-
-    Args:
-        recording: with torque; joints in the model's order.
-        model: says below which speed a joint stands.
-        noise_variance: of the positions (n,), see :func:`choose_cutoff`.
-        cutoff: per joint (n,) [Hz]; None: chosen.
-        order: of the filter, one way.
-        delay: time by which the recorded torque lags the recorded position [s].
-        origin: time at which the planned motion begins [s]; by default where the command does.
-
-    Raises:
-        RecordingError: the recording does not pass its checks, or has no torque.
-    """
-    recording.checked(model.joint_names)
-    if recording.torque is None:
-        raise RecordingError("torque", "the recording has no joint torque to fit")
-    if cutoff is None:
-        cutoff = choose_cutoff(recording, noise_variance, order=order)
-    motion = butterworth_motion(recording, cutoff, order=order, delay=delay)
-    mask = mask_rows(recording, model, motion, cutoff)
-    samples = Samples(
-        motion=motion,
-        torque=recording.torque,
-        usable=mask.usable,
-        segments=tuple(recording.segments()),
-        origin=recording.motion_start if origin is None else origin,
-        position_bandwidth=np.asarray(cutoff, dtype=np.float64),
-    )
-    return samples, mask
 
 
 def _bare(one: Recording) -> Recording:

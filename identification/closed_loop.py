@@ -16,6 +16,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
+from identification.friction import SYMBOLS
 from identification.instrument_motion import Instruments
 from identification.kinematics import FROM_PINOCCHIO, Chain
 from identification.model import RobotModel
@@ -75,12 +76,12 @@ def simulated_motion(
         model.n_joints,
     ):
         raise ShapeError("servo gains", np.shape(servo.position), f"({model.n_joints},)")
-    arm = _arm(model, values)
+    arm, coupled = _arm(model, values)
     friction = _Friction.of(model, values)
     ahead = np.zeros(command.position.shape)
     if servo.feedforward:
-        ahead = model.torque(values, *command[1:])
-    q, qd = _run(arm, friction, servo, command, ahead)
+        ahead = model.torque(values, *command[1:]) + model.load_torque(*command[1:])
+    q, qd = _run(arm, coupled, friction, servo, command, ahead)
     qdd = np.gradient(qd, command.time, axis=0)
     return Instruments(
         Motion(command.time, q, qd, qdd),
@@ -91,9 +92,17 @@ def simulated_motion(
 
 
 def _run(
-    arm: pin.Model, friction: _Friction, servo: JointServo, command: Motion, ahead: Array
+    arm: pin.Model,
+    coupled: Array,
+    friction: _Friction,
+    servo: JointServo,
+    command: Motion,
+    ahead: Array,
 ) -> tuple[Array, Array]:
-    """Positions and velocities (m, n) at the instants of the command."""
+    """Positions and velocities (m, n) at the instants of the command.
+
+    `coupled` (n, n) is what the rotors add to the mass matrix off its diagonal.
+    """
     data = arm.createData()
     positions, velocities = np.empty_like(command.position), np.empty_like(command.position)
     q, qd = command.position[0].copy(), command.velocity[0].copy()
@@ -110,9 +119,8 @@ def _run(
             torque += servo.position * (wanted - q - h * qd) + servo.velocity * (speed - qd)
             mass = pin.crba(arm, data, q)
             torque -= pin.nonLinearEffects(arm, data, q, qd)
-            stiff = servo.velocity + friction.slope(qd) + h * servo.position
-            matrix = np.triu(mass) + np.triu(mass, 1).T
-            matrix[np.diag_indices_from(matrix)] += h * stiff
+            matrix = np.triu(mass) + np.triu(mass, 1).T + coupled + h * friction.slope(qd)
+            matrix[np.diag_indices_from(matrix)] += h * (servo.velocity + h * servo.position)
             try:
                 factor = np.linalg.cholesky(matrix)
             except np.linalg.LinAlgError:
@@ -132,53 +140,74 @@ def _between(rows: Array, k: int, share: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Friction:
-    """Friction of all joints, sign made linear below standstill speed so that it can stick."""
+    """Friction of joints and coupled motors, sign made linear below standstill so that it sticks.
 
-    coulomb: Array
-    viscous: Array
-    third: Array
-    offset: Array
-    exponent: int
-    standstill: float
+    Attributes:
+        speeds: speed of each of the a joints and motors per joint speed (a, n).
+        coefficients: by symbol (a,), zero where there is no such term.
+        cubic: whether the third term is (a,).
+        stribeck, standstill: speeds (a,).
+    """
+
+    speeds: Array
+    coefficients: dict[str, Array]
+    cubic: NDArray[np.bool_]
+    stribeck: Array
+    standstill: Array
 
     @classmethod
     def of(cls, model: RobotModel, values: Array) -> _Friction:
-        n, law = model.n_joints, model.friction
-        place = {name: k for k, name in enumerate(model.parameter_names)}
-
-        def coefficients(symbol: str) -> Array:
-            names = [f"{symbol}_{joint}" for joint in range(1, n + 1)]
-            return np.array([values[place[name]] if name in place else 0.0 for name in names])
-
+        """Take the friction out of parameters (p,)."""
+        friction = model.friction
+        speeds = np.concatenate([np.eye(model.n_joints), friction.motor_speeds()])
+        laws = friction.laws + tuple(friction.laws[motor] for motor in friction.motors)
+        places = {motor: model.n_joints + k for k, motor in enumerate(friction.motors)}
+        coefficients = {symbol: np.zeros(len(speeds)) for symbol in SYMBOLS}
+        for term, value in zip(friction.terms, values[model.base.rank :], strict=True):
+            place = places[term.owner] if term.motor else term.owner
+            coefficients[term.symbol][place] = value
         return cls(
-            coulomb=coefficients("f0"),
-            viscous=coefficients("f1"),
-            third=coefficients("f2"),
-            offset=coefficients("fo"),
-            exponent=3 if law.third == "cubic" else 2,
-            standstill=max(law.standstill, _NARROWEST_STANDSTILL),
+            speeds=speeds,
+            coefficients=coefficients,
+            cubic=np.array([law.third == "cubic" for law in laws]),
+            stribeck=np.array([law.stribeck or 1.0 for law in laws]),
+            standstill=np.maximum([law.standstill for law in laws], _NARROWEST_STANDSTILL),
         )
 
     def torque(self, qd: Array) -> Array:
-        size = np.abs(qd) ** (self.exponent - 1)
-        sign = np.clip(qd / self.standstill, -1.0, 1.0)
-        return np.asarray(
-            self.coulomb * sign + (self.viscous + self.third * size) * qd + self.offset
-        )
+        """Torque (n,) at joint speeds (n,)."""
+        v, c = self.speeds @ qd, self.coefficients
+        size = np.abs(v)
+        dry = c["f0"] + c["fs"] * np.exp(-((v / self.stribeck) ** 2))
+        third = c["f2"] * np.where(self.cubic, size**2, size)
+        torque = dry * np.clip(v / self.standstill, -1.0, 1.0) + (c["f1"] + third) * v
+        return np.asarray(self.speeds.T @ (torque + c["fd"] * size + c["fo"]))
 
     def slope(self, qd: Array) -> Array:
-        """Derivative with speed, never negative."""
-        size = self.exponent * np.abs(qd) ** (self.exponent - 1)
-        sticking = np.abs(qd) < self.standstill
-        slope = self.viscous + self.third * size + sticking * self.coulomb / self.standstill
-        return np.asarray(np.maximum(slope, 0.0))
+        """Derivative with joint speeds (n, n), of each joint or motor never negative.
+
+        Without the fall of the Stribeck term, which only the step after the next would feel.
+        """
+        v, c = self.speeds @ qd, self.coefficients
+        size = np.abs(v)
+        third = c["f2"] * np.where(self.cubic, 3.0 * size**2, 2.0 * size)
+        sticking = (size < self.standstill) * (c["f0"] + c["fs"]) / self.standstill
+        slope = np.maximum(c["f1"] + c["fd"] * np.sign(v) + third + sticking, 0.0)
+        return np.asarray((self.speeds.T * slope) @ self.speeds)
 
 
-def _arm(model: RobotModel, values: Array) -> pin.Model:
-    """Pinocchio model with these base parameters: any bodies with the same torques will do."""
+def _arm(model: RobotModel, values: Array) -> tuple[pin.Model, Array]:
+    """Pinocchio model with these base parameters: any bodies with the same torques will do.
+
+    Beside it what the rotors add to the mass matrix off its diagonal (n, n), for which pinocchio
+    has no place.
+    """
     standard, rotors = standard_parameters(model, values)
     arm = _skeleton(model.chain)
     arm.gravity.linear = model.gravity
+    if model.payload is not None:
+        carrier, carried = model.payload.carried_by(model.chain)
+        standard[carrier] += carried
     for joint, link in enumerate(standard):
         if not link[_MASS] > 0.0:
             raise IdentificationError(
@@ -188,8 +217,8 @@ def _arm(model: RobotModel, values: Array) -> pin.Model:
         pinocchio_order = np.empty(len(FROM_PINOCCHIO))
         pinocchio_order[list(FROM_PINOCCHIO)] = link
         arm.inertias[joint + 1] = pin.Inertia.FromDynamicParameters(pinocchio_order)
-    arm.armature = rotors
-    return arm
+    arm.armature = np.diag(rotors).copy()
+    return arm, rotors - np.diag(np.diag(rotors))
 
 
 def standard_parameters(model: RobotModel, values: Array) -> tuple[Array, Array]:
@@ -199,19 +228,16 @@ def standard_parameters(model: RobotModel, values: Array) -> tuple[Array, Array]
     links.
 
     Returns:
-        Of the links (n, 10), about the joint frames, and of the rotors (n,).
+        Of the links (n, 10), about the joint frames, and the rotors' inertia matrix (n, n).
     """
-    nominal = model.nominal.reshape(model.n_joints, -1).copy()
-    nominal[:, _MASS] = np.where(nominal[:, _MASS] > 0.0, nominal[:, _MASS], 1.0)
+    nominal, masses = model.nominal, model.layout.links[:, _MASS]
+    nominal[masses] = np.where(nominal[masses] > 0.0, nominal[masses], 1.0)
     freedom = np.ones_like(nominal)
-    freedom[:, _MASS] = 1.0 / _RELUCTANCE
-    grouping, scale = model.base.grouping, freedom.ravel()
-    missing = values[: model.base.rank] - grouping @ nominal.ravel()
-    step = scale * np.linalg.lstsq(grouping * scale, missing, rcond=None)[0]
-    standard = (nominal.ravel() + step).reshape(model.n_joints, -1)
-    links = standard[:, : _MASS + 1]
-    rotors = standard[:, _MASS + 1] if model.rotor_inertia else np.zeros(model.n_joints)
-    return links, rotors
+    freedom[masses] = 1.0 / _RELUCTANCE
+    grouping = model.base.grouping
+    missing = values[: model.base.rank] - grouping @ nominal
+    standard = nominal + freedom * np.linalg.lstsq(grouping * freedom, missing, rcond=None)[0]
+    return standard[model.layout.links], model.layout.rotor_matrix(standard)
 
 
 def _skeleton(chain: Chain) -> pin.Model:

@@ -15,7 +15,9 @@ standard parameters open; there the nominal decides, elsewhere it weighs as much
 rows of data: next to nothing. D is infinite at the edge of what is possible, so the result is
 strictly inside.
 
-Signs of the third friction term and of the offset are left open.
+Where motors turn with several joints, the rotors' inertia matrix, coupling inertias beside the
+diagonal, is kept positive definite in place of I_im >= 0. What friction needs to take energy says
+:mod:`identification.dissipation`: signs of the third friction term and of the offset are left open.
 """
 
 from __future__ import annotations

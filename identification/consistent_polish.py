@@ -24,62 +24,91 @@ _ON_BOUND: Final = 1e-6
 _CONVERGED: Final = 1e-13
 # How far above the minimum, as a share of the prior's weight and of the objective.
 _SMALL: Final = 1e-6
+# Ratio of Cholesky pivots at which a matrix counts as singular: its inverse would be rounding.
+_SINGULAR: Final = 1e-7
 _ROUNDING: Final = 1e-12
 _ENOUGH: Final = 1e-2  # share of the decrease that a linear model promises
 _WEIGHT_STEP: Final = 10.0
 _SAME_WEIGHT: Final = 1e-9
 
 
+class Cone(NamedTuple):
+    """Variables that are entries of symmetric matrices, which have to be positive definite.
+
+    Attributes:
+        places: indices of the d variables of each of b matrices (b, d).
+        entries: symmetric matrices E_k, S_i = sum_k u_k E_k over the variables of matrix i
+            (d, k, k).
+        pull: factor of tr S in the objective.
+        barrier: factor of -log det S.
+    """
+
+    places: NDArray[np.intp]
+    entries: Array
+    pull: float = 1.0
+    barrier: float = 1.0
+
+    def matrices(self, u: Array) -> Array:
+        """Return the S_i (b, k, k)."""
+        return np.asarray(np.tensordot(u[self.places], self.entries, axes=1))
+
+    def value(self, u: Array) -> float:
+        """Return ``sum_i pull tr S_i - barrier log det S_i``, infinite outside."""
+        matrices = self.matrices(u)
+        try:
+            diagonal = np.einsum("ijj->ij", np.linalg.cholesky(matrices))
+        except np.linalg.LinAlgError:
+            return np.inf
+        if np.any(diagonal.min(axis=1) <= _SINGULAR * diagonal.max(axis=1)):
+            return np.inf
+        trace = np.trace(matrices, axis1=1, axis2=2).sum()
+        return float(self.pull * trace - 2.0 * self.barrier * np.log(diagonal).sum())
+
+    def add_derivatives(self, u: Array, weight: float, gradient: Array, hessian: Array) -> None:
+        """Add those of ``weight * value`` to gradient (v,) and Hessian (v, v)."""
+        pull = self.pull * np.einsum("kaa->k", self.entries)
+        for places, inverse in zip(self.places, np.linalg.inv(self.matrices(u)), strict=True):
+            turned = np.einsum("ab,kbc->kac", inverse, self.entries)
+            gradient[places] += weight * (pull - self.barrier * np.einsum("kaa->k", turned))
+            curvature = np.einsum("kab,lba->kl", turned, turned)
+            hessian[np.ix_(places, places)] += weight * self.barrier * curvature
+
+
 class Smooth(NamedTuple):
-    """``||R u - z||² + w (sum_i tr S_i - log det S_i + ||u_rest - centre||²)``.
+    """``||R u - z||² + w (sum over the cones of their values + ||u_rest - centre||²)``.
 
     Attributes:
         R: (r, v).
         z: (r,).
         weight: w.
-        entries: symmetric matrices E_k, S_i = sum_k u_k E_k over the ten u of link i (10, 4, 4).
-        centre: of the variables behind the links (v - 10 n,).
-        not_negative: indices of variables behind the links.
+        cones: matrices that stay positive definite.
+        centre: of the last variables, those behind the links.
+        not_negative: indices of variables behind the links, in no cone.
         equal: rows of equations on variables of the links, ``equal u = 1`` (e, v).
     """
 
     R: Array
     z: Array
     weight: float
-    entries: Array
+    cones: tuple[Cone, ...]
     centre: Array
     not_negative: NDArray[np.intp]
     equal: Array
 
-    def matrices(self, u: Array) -> Array:
-        """Return the S_i (n, 4, 4)."""
-        links = u[: len(u) - len(self.centre)].reshape(-1, len(self.entries))
-        return np.asarray(np.tensordot(links, self.entries, axes=1))
-
     def value(self, u: Array) -> float:
         """Return the objective, infinite outside."""
-        matrices = self.matrices(u)
-        try:
-            diagonal = np.einsum("ijj->ij", np.linalg.cholesky(matrices))
-        except np.linalg.LinAlgError:
-            return np.inf
-        prior = np.trace(matrices, axis1=1, axis2=2) - 2.0 * np.log(diagonal).sum(axis=1)
+        prior = sum(cone.value(u) for cone in self.cones)
         rest = u[len(u) - len(self.centre) :] - self.centre
         error = self.R @ u - self.z
-        return float(error @ error + self.weight * (prior.sum() + rest @ rest))
+        return float(error @ error + self.weight * (prior + rest @ rest))
 
     def derivatives(self, u: Array) -> tuple[Array, Array]:
         """Return gradient (v,) and Hessian (v, v)."""
         gradient = 2.0 * self.R.T @ (self.R @ u - self.z)
         hessian = 2.0 * self.R.T @ self.R
-        inverse = np.linalg.inv(self.matrices(u))
-        width = len(self.entries)
-        for link, s in enumerate(inverse):
-            span = slice(width * link, width * (link + 1))
-            turned = np.einsum("ab,kbc->kac", s, self.entries)
-            gradient[span] += self.weight * np.einsum("kaa->k", self.entries - turned)
-            hessian[span, span] += self.weight * np.einsum("kab,lba->kl", turned, turned)
-        first = width * len(inverse)
+        for cone in self.cones:
+            cone.add_derivatives(u, self.weight, gradient, hessian)
+        first = len(u) - len(self.centre)
         gradient[first:] += 2.0 * self.weight * (u[first:] - self.centre)
         rest = np.arange(first, len(u))
         hessian[rest, rest] += 2.0 * self.weight

@@ -10,7 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.consistent_polish import Smooth, follow_path, polish
+from identification.consistent_polish import Cone, Smooth, follow_path, polish
+from identification.dissipation import dissipation
 from identification.errors import IdentificationError, ShapeError
 from identification.estimation import WORST_CONDITION
 from identification.factor import NormalEquations
@@ -22,8 +23,10 @@ from identification.wrench import LINK_SYMBOLS
 Array = NDArray[np.float64]
 
 _N_LINK: Final = len(LINK_SYMBOLS)
-# Friction coefficients that can only take energy away.
-_DISSIPATIVE: Final = ("f0", "f1")
+# Factor of -log det of the rotors' coupled inertia matrix, in units in which all the torque there
+# is makes a one: keeps it positive definite, and moves a rotor that is larger than its standard
+# deviation by less than half a per cent of that.
+_ROTOR_BARRIER: Final = 1e-2
 # Smallest eigenvalue of a pseudo-inertia in axes in which the reference's is the unit matrix: far
 # more than the solver's error, so that the result can be relied on to be inside.
 _INSIDE: Final = 1e-6
@@ -102,7 +105,8 @@ def square_root(equations: NormalEquations) -> SquareRoot:
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
     kept = eigenvalues > eigenvalues[-1] / WORST_CONDITION**2
     basis, root = vectors[:, kept].T, np.sqrt(eigenvalues[kept])
-    return SquareRoot(R=root[:, None] * basis * scale, z=basis @ (equations.b / scale) / root)
+    # Times the length itself: a column without data stays exactly zero, without rounding.
+    return SquareRoot(R=root[:, None] * basis * length, z=basis @ (equations.b / scale) / root)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +114,14 @@ class Program:
     """The semidefinite program in variables u for which the reference is of size one.
 
     Per link ten entries of the pseudo-inertia in axes in which the reference's is the unit
-    matrix; then rotors; then friction.
+    matrix; then rotors and coupling inertias; then friction.
 
     Attributes:
         bodies: reference of each link.
         to_standard: physical standard parameters from u (s, v).
         to_friction: physical friction from u (k, v).
         rows: R and z in u.
+        cones: pseudo-inertias, and the rotors' inertia matrix where joints are coupled.
         centre: what squares of the variables behind the links are counted from (v - 10 n,).
         not_negative: indices into u.
         masses: mass of each link from u (n, v).
@@ -126,6 +131,7 @@ class Program:
     to_standard: Array
     to_friction: Array
     rows: SquareRoot
+    cones: tuple[Cone, ...]
     centre: Array
     not_negative: NDArray[np.intp]
     masses: Array
@@ -142,32 +148,36 @@ class Program:
         nominal = model.nominal if options.nominal is None else np.asarray(options.nominal)
         bodies = reference_bodies(link_parameters(model, nominal), model.chain.translation)
         n, b = model.n_joints, model.base.rank
-        inertial, others = _places(model)
-        s, k = len(model.standard_names), model.n_parameters - b
+        layout, taken = model.layout, dissipation(model.friction)
+        others = np.concatenate([layout.rotors, layout.couplings])
+        s, k = layout.size, model.n_parameters - b
         v = s + k
         to_standard, to_friction = np.zeros((s, v)), np.zeros((k, v))
-        for link, (places, frame) in enumerate(zip(inertial, bodies.frames, strict=True)):
+        for link, (places, frame) in enumerate(zip(layout.links, bodies.frames, strict=True)):
             entries = np.einsum("ab,kbc,dc->kad", frame, _SYMMETRIC, frame)
             span = slice(_N_LINK * link, _N_LINK * (link + 1))
             to_standard[places, span] = inertial_from_pseudo(entries).T
         rotors = np.arange(_N_LINK * n, s)
-        # A nominal rotor of zero says that nobody knows it: whatever moves the joint is allowed.
-        unknown = _whole_torque_units(root, model.base.grouping[:, others])
-        unit = np.where(nominal[others] > 0.0, nominal[others], unknown)
+        unit = _rotor_units(model, root, nominal)
         to_standard[others, rotors] = unit
         rest = np.arange(s, v)
-        to_friction[np.arange(k), rest] = _whole_torque_units(root, np.eye(b + k, k, -b))
+        directions = np.vstack([np.zeros((b, k)), taken.combine])
+        to_friction[:, rest] = taken.combine * _whole_torque_units(root, directions)
         mapping = np.vstack([model.base.grouping @ to_standard, to_friction])
-        kinds = [name.split("_")[0] for name in model.parameter_names[b:]]
-        dissipative = np.array([kind in _DISSIPATIVE for kind in kinds], dtype=np.bool_)
+        coupled = _coupled_rotors(model, _N_LINK * n)
+        alone = rotors[: len(layout.rotors)]
+        if coupled is not None:
+            alone = np.setdiff1d(alone, coupled.places)
+        links = np.arange(_N_LINK * n).reshape(n, _N_LINK)
         return cls(
             bodies=bodies,
             to_standard=to_standard,
             to_friction=to_friction,
             rows=SquareRoot(root.R @ mapping, root.z),
+            cones=(Cone(links, _SYMMETRIC),) + (() if coupled is None else (coupled,)),
             centre=np.concatenate([nominal[others] / unit, np.zeros(k)]),
-            not_negative=np.concatenate([rotors, rest[dissipative]]),
-            masses=to_standard[inertial[:, -1]],
+            not_negative=np.concatenate([alone, rest[taken.not_negative]]),
+            masses=to_standard[layout.links[:, -1]],
         )
 
     def reference(self, options: Consistency, largest: Array) -> Array:
@@ -181,6 +191,8 @@ class Program:
             rest = options.total_mass - mass[~free].sum()
             mass[free] *= rest / mass[free].sum()
         links *= (mass / (self.masses @ u))[:, None]
+        for cone in self.cones[1:]:
+            u[cone.places] = np.einsum("kaa->k", cone.entries)  # the unit matrix
         return u
 
     def physical(self, u: Array) -> tuple[Array, Array]:
@@ -194,6 +206,10 @@ class Program:
         smallest = np.linalg.eigvalsh(np.tensordot(links, _SYMMETRIC, axes=1))[:, 0]
         lift = np.where(smallest > -_TOLERANCE, np.maximum(_INSIDE - smallest, 0.0), 0.0)
         links += lift[:, None] * _UNIT_ENTRIES
+        for cone in self.cones[1:]:
+            below = -np.linalg.eigvalsh(cone.matrices(u))[:, :1]
+            lift = np.where(below < _TOLERANCE, np.maximum(below, 0.0), 0.0)
+            u[cone.places] += lift * np.einsum("kaa->k", cone.entries)
         return self.to_standard @ u, self.to_friction @ u
 
 
@@ -269,6 +285,10 @@ def _solve_cone(program: Program, options: Consistency) -> tuple[Array | None, s
         matrix = cp.reshape(entries, (4, 4), order="C")
         prior = prior + cp.trace(matrix) - cp.log_det(matrix)
         constraints.append(matrix >> _INSIDE * np.eye(4))
+    for cone in program.cones[1:]:
+        size = cone.entries.shape[1]
+        entries = cone.entries.reshape(-1, size * size).T @ u[cone.places[0]]
+        prior = prior - cone.barrier * cp.log_det(cp.reshape(entries, (size, size), order="C"))
     error = cp.sum_squares(program.rows.R @ u - program.rows.z)
     if options.total_mass is not None:
         constraints.append(program.masses.sum(axis=0) @ u / options.total_mass == 1.0)
@@ -298,26 +318,50 @@ def _smooth(
         R=program.rows.R,
         z=program.rows.z,
         weight=options.prior_weight,
-        entries=_SYMMETRIC,
+        cones=program.cones,
         centre=program.centre,
         not_negative=program.not_negative,
         equal=np.array(equal).reshape(-1, program.rows.R.shape[1]),
     )
 
 
-def _places(model: RobotModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return where the ten of each link stand among the standard parameters, and the others."""
-    n = model.n_joints
-    width = len(model.standard_names) // n
-    everything = np.arange(len(model.standard_names)).reshape(n, width)
-    return everything[:, :_N_LINK], everything[:, _N_LINK:].reshape(-1)
-
-
 def link_parameters(model: RobotModel, standard: Array) -> Array:
-    """Return the ten parameters of each link (n, 10)."""
-    if standard.shape != (len(model.standard_names),):
-        raise ShapeError("standard", standard.shape, f"({len(model.standard_names)},)")
-    return np.asarray(standard[_places(model)[0]])
+    """Return the ten parameters of each link (n, 10).
+
+    Raises:
+        ShapeError: the standard parameters are not (s,).
+    """
+    return np.asarray(model.layout.checked(standard)[model.layout.links])
+
+
+def _rotor_units(model: RobotModel, root: SquareRoot, nominal: Array) -> Array:
+    """Return the unit of each rotor and coupling inertia, in which it is small.
+
+    A nominal rotor of zero says that nobody knows it: whatever moves the joint is allowed. A
+    coupling's unit is the mean of its joints', so that the matrix of the rotors is only scaled.
+    """
+    layout = model.layout
+    unknown = _whole_torque_units(root, model.base.grouping[:, layout.rotors])
+    known = nominal[layout.rotors]
+    own = np.where(known > 0.0, known, unknown)
+    between = [np.sqrt(own[i] * own[j]) for i, j in layout.pairs]
+    return np.concatenate([own, between])
+
+
+def _coupled_rotors(model: RobotModel, first: int) -> Cone | None:
+    """Return the inertia matrix of the rotors of coupled joints; variables from `first` on."""
+    layout = model.layout
+    if not layout.pairs:
+        return None
+    joints = sorted({joint for pair in layout.pairs for joint in pair})
+    n, c, size = layout.n_joints, len(layout.pairs), len(joints)
+    places = np.concatenate([first + np.array(joints), first + n + np.arange(c)])
+    entries = np.zeros((size + c, size, size))
+    entries[np.arange(size), np.arange(size), np.arange(size)] = 1.0
+    for k, pair in enumerate(layout.pairs):
+        i, j = (joints.index(joint) for joint in pair)
+        entries[size + k, i, j] = entries[size + k, j, i] = 1.0
+    return Cone(places[None], entries, pull=0.0, barrier=_ROTOR_BARRIER)
 
 
 def _whole_torque_units(root: SquareRoot, directions: Array) -> Array:

@@ -28,11 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from identification.covariance import PhaseFactor, block_length, with_block_covariance
+from identification.covariance import block_length, with_block_covariance
 from identification.errors import IdentificationError
 from identification.estimation import Estimate, Solution, joint_weights, residual_variance, solve
 from identification.factor import Factor, NormalEquations
 from identification.model import RobotModel
+from identification.phase_factor import PhaseFactor
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -70,6 +71,7 @@ class EliminationStep:
             removed; infinite for one that the data do not determine.
         left: number of parameters left.
         spread: largest over smallest relative standard deviation of those left.
+        largest_relative_std: of those left, classical; infinite with one that is not determined.
         condition: of the weighted regressor with columns of unit length.
         in_sample: relative torque error ||e|| / ||tau|| over all joints on the fitted motion.
         held_out: the same on the motion that was held out.
@@ -82,6 +84,7 @@ class EliminationStep:
     relative_std: float
     left: int
     spread: float
+    largest_relative_std: float
     condition: float
     in_sample: float
     held_out: float
@@ -289,6 +292,7 @@ class _Path:
                 relative_std=relative_std,
                 left=len(subset.left),
                 spread=float(subset.relative.max() / max(subset.relative.min(), _TINY)),
+                largest_relative_std=float(subset.relative.max()),
                 condition=subset.solution.condition,
                 in_sample=_relative_errors(self._total, subset.values)[0],
                 held_out=subset.held_out,
@@ -354,17 +358,15 @@ def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], ru
     elif chosen.spread < rule.spread:
         text += f", less than {rule.spread:g}"
     return (
-        f"{text}. Held-out error: {full.held_out:.2%} with all parameters,"
-        f" {chosen.held_out:.2%} with these"
+        f"{text}. Error on the motion they were chosen on: {full.held_out:.2%} with all"
+        f" parameters, {chosen.held_out:.2%} with these"
     )
 
 
 def _estimate(model: RobotModel, training: PhaseFactor, weights: Array, left: Indices) -> Estimate:
     """Estimate of some of the parameters, as a model of its own."""
     names = tuple(model.parameter_names[k] for k in left)
-    columns = np.append(left, model.n_parameters)
-    gram = training.gram[:, :, columns[:, None], columns]
-    part = PhaseFactor(gram, training.samples, names)
+    part = training.restricted(left)
     total = part.total
     solution = solve(total.weighted(weights))
     result = Estimate(

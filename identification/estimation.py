@@ -74,19 +74,24 @@ class Estimate:
 
 
 class Solution(NamedTuple):
-    """Solution of normal equations.
+    """Solution of a least-squares problem, of normal equations ``A x = b`` or of rows.
 
     Attributes:
         values: (p,), of least (scaled) norm where the data leave a choice.
-        inverse: inverse of A on what is determined, zero elsewhere (p, p).
+        root: S (p, k) with S S' the inverse of A on the k directions the data determine.
         condition: of the regressor with columns of unit length, infinite without some column.
         determined: (p,).
     """
 
     values: Array
-    inverse: Array
+    root: Array
     condition: float
     determined: NDArray[np.bool_]
+
+    @property
+    def inverse(self) -> Array:
+        """Inverse of A on what is determined, zero elsewhere (p, p)."""
+        return np.asarray(self.root @ self.root.T)
 
 
 def solve(equations: NormalEquations) -> Solution:
@@ -104,11 +109,11 @@ def solve(equations: NormalEquations) -> Solution:
     lost = vectors[:, ~kept]
     determined = present & (np.abs(lost).max(axis=1, initial=0.0) < _PARTICIPATION)
     basis = vectors[:, kept]
-    inverse = (basis / eigenvalues[kept]) @ basis.T / np.outer(scale, scale)
+    root = basis / np.sqrt(eigenvalues[kept]) / scale[:, None]
     smallest = eigenvalues[0] if present.all() else 0.0
     return Solution(
-        values=inverse @ equations.b,
-        inverse=inverse,
+        values=root @ (root.T @ equations.b),
+        root=root,
         condition=float(np.sqrt(largest / smallest)) if smallest > 0.0 else np.inf,
         determined=np.asarray(determined),
     )
@@ -154,15 +159,12 @@ def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) ->
         IdentificationError: the factor holds no rows.
     """
     if not factor.samples.any():
-        raise IdentificationError(
-            "there is not one usable sample: no joint moves faster than the standstill speed of"
-            f" {model.friction.standstill} away from the ends and gaps of the recording"
-        )
+        raise IdentificationError(nothing_usable(model))
     if weights is None:
         weights = joint_weights(factor)
     solution = solve(factor.weighted(weights))
     variance = residual_variance(factor, solution.values, solution.inverse, weights)
-    covariance = solution.inverse.copy()
+    covariance = solution.inverse
     mark_undetermined(covariance, solution.determined)
     return Estimate(
         names=model.parameter_names,
@@ -178,6 +180,15 @@ def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) ->
             for name, known in zip(model.parameter_names, solution.determined, strict=True)
             if not known
         ),
+    )
+
+
+def nothing_usable(model: RobotModel) -> str:
+    """What to say where no row can be fitted."""
+    slowest = float(np.min(model.friction.standstill))
+    return (
+        "there is not one usable sample: no joint moves faster than the standstill speed of"
+        f" {slowest:g} away from the ends and gaps of the recording"
     )
 
 

@@ -9,16 +9,35 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.directions import gain_if_turned
+from identification.carried_load import CarriedLoad, find_load
+from identification.delay import DelayEstimate
+from identification.directions import MOST_RECORDINGS
 from identification.errors import IdentificationError
 from identification.estimation import Estimate, total
+from identification.excitation.criteria import (
+    coupling_index,
+    coupling_index_max,
+    information,
+)
 from identification.factor import Factor
+from identification.gravity_direction import GravityDirection, find_gravity
+from identification.inertia_ratio import InertiaRatio
 from identification.model import RobotModel
+from identification.nominal_scale import NominalScale
 from identification.plausibility import Implausible, implausibilities
+from identification.position_jumps import PositionJump
 from identification.preprocessing import Samples
 from identification.repeatability import Repeatability, repeatability
 from identification.repetitions import RepeatedEstimate
-from identification.validation import PredictionError, over_all, prediction_error, slow_error
+from identification.residual_checks import ResidualChecks, check_residuals
+from identification.standard_gram import StandardGram, gravity_loads
+from identification.turned_axes import Turned, compare_turned
+from identification.validation import (
+    PredictionError,
+    over_all,
+    prediction_error,
+    slow_error,
+)
 
 Array = NDArray[np.float64]
 
@@ -31,6 +50,46 @@ _PLAUSIBLE: Final = Implausible((), ())
 
 
 @dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What is known of the cell beside its model; None throughout where nothing is.
+
+    Attributes:
+        torque_limit: largest torque of each joint (n,) [N·m or N], NaN where unknown.
+        saturated: share of each joint's samples at the limit of torque or current (n,).
+        motor_from_joint: motor angle per joint angle (n, n).
+        controller: error of the controller's own dynamic model on the unseen motion.
+        delays: of the torque behind the position, as the recordings have them.
+        nominal_scale: measured torque over that of the nominal inertias, axis by axis.
+        jumps: steps of the measured positions that no arm makes.
+        controller_inertia: the controller's own diagonal inertia over the model's.
+        assumed_delay: what the fit took that delay to be, of all axes or of each (n,) [s].
+    """
+
+    torque_limit: Array | None = None
+    saturated: Array | None = None
+    motor_from_joint: Array | None = None
+    controller: PredictionError | None = None
+    delays: DelayEstimate | None = None
+    assumed_delay: float | Array = 0.0
+    nominal_scale: NominalScale | None = None
+    jumps: tuple[PositionJump, ...] = ()
+    controller_inertia: InertiaRatio | None = None
+
+
+@dataclass(frozen=True)
+class CouplingIndex:
+    """How far the estimates of the parameters move together (paper, eq. 5).
+
+    Attributes:
+        index: I_c of the fitted rows, infinite where they leave a parameter undetermined.
+        largest: I_c,max of as many parameters.
+    """
+
+    index: float
+    largest: float
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """What a verdict is given on.
 
@@ -40,6 +99,8 @@ class Evidence:
         training: its error on the motion it was fitted to.
         held_out_slow: as `held_out`, with the error low-passed and apart from a change of
             friction; None where there are no repetitions to tell noise from error.
+        held_out_apart: the same apart from all change of friction, not only from what warm gears
+            excuse; None likewise.
         friction_change: share by which friction was higher on an unseen motion than estimated,
             of all motions the one with the largest change, per joint (n,); None likewise.
         slow: what repeats and what does not of the low-passed residual; None likewise.
@@ -48,23 +109,45 @@ class Evidence:
             [N·m or N]; None likewise.
         disagreement: of the repetitions' own estimates with the pooled one, the worst of them,
             as a share of each axis's torque (n,); None without repetitions.
-        gain_if_turned: see :func:`identification.directions.gain_if_turned` (n,), None if it was
-            not tried.
+        turned: whether an axis seems to count the other way round, None if it was not tried.
+        gravity: the direction of gravity that fits best, None if it was not looked for.
+        load: a body that the arm seems to carry on unseen motion only, None likewise.
+        loaded: joints that gravity can load (n,), None if that was not looked at.
         nominal: error of the nominal (CAD) model on the same unseen motion, None without one.
         implausible: what is physically impossible about the estimate.
+        residuals: what is left over, looked at from all sides; None if it was not.
+        coupling: of the parameters' estimates; None if it was not computed.
+        surroundings: limits, saturation and the controller's own model.
+        prismatic: indices of the joints that slide.
+        tested_on: what the unseen motion was, in words.
+        in_sample: whether nothing was held out, so that all errors are those of the fit.
     """
 
     estimate: Estimate
     held_out: PredictionError
     training: PredictionError
     held_out_slow: PredictionError | None = None
+    held_out_apart: PredictionError | None = None
     friction_change: Array | None = None
     slow: Repeatability | None = None
     estimation_noise: Array | None = None
     disagreement: Array | None = None
-    gain_if_turned: Array | None = None
+    turned: Turned | None = None
+    gravity: GravityDirection | None = None
+    load: CarriedLoad | None = None
+    loaded: NDArray[np.bool_] | None = None
     nominal: PredictionError | None = None
     implausible: Implausible = _PLAUSIBLE
+    residuals: ResidualChecks | None = None
+    coupling: CouplingIndex | None = None
+    surroundings: Surroundings = Surroundings()
+    prismatic: tuple[int, ...] = ()
+    tested_on: str = "unseen motion"
+    in_sample: bool = False
+
+    def revolute(self, joint: int) -> bool:
+        """Whether a joint turns; its torque is in N·m then, else in N."""
+        return joint not in self.prismatic
 
     @property
     def systematic(self) -> Array | None:
@@ -73,14 +156,41 @@ class Evidence:
         Explained are the torque noise and, up to two standard deviations, what it has done to
         the parameters. NaN for a joint that was not tested.
         """
-        if self.held_out_slow is None or self.slow is None or self.estimation_noise is None:
+        return self._beyond_noise(self.held_out_slow)
+
+    def spoilt_by_friction(self, limit: float) -> NDArray[np.bool_]:
+        """Joints (n,) whose systematic error is beyond a limit, and only by change of friction."""
+        share = self.systematic
+        if share is None:
+            return np.zeros(len(self.held_out.rows), dtype=np.bool_)
+        return np.asarray((np.nan_to_num(share) > limit) & ~self.beyond_friction(limit))
+
+    def beyond_friction(self, limit: float) -> NDArray[np.bool_]:
+        """Joints (n,) whose systematic error is beyond a limit whatever friction did."""
+        share = self._beyond_noise(self.held_out_apart)
+        if share is None:
+            share = self.systematic
+        if share is None:
+            return np.zeros(len(self.held_out.rows), dtype=np.bool_)
+        return np.asarray(np.nan_to_num(share) > limit)
+
+    def _beyond_noise(self, slow_error: PredictionError | None) -> Array | None:
+        if slow_error is None or self.slow is None or self.estimation_noise is None:
             return None
         explained = self.slow.noise**2 + (2.0 * self.estimation_noise) ** 2
-        excess = np.maximum(self.held_out_slow.rms**2 - explained, 0.0)
+        excess = np.maximum(slow_error.rms**2 - explained, 0.0)
         tested = self.held_out.rows > 0
         return np.where(
-            tested, np.sqrt(excess) / np.where(tested, self.held_out.torque_rms, 1), np.nan
+            tested,
+            np.sqrt(excess) / np.where(tested, self.held_out.torque_rms, 1),
+            np.nan,
         )
+
+    @property
+    def share_of_limit(self) -> Array | None:
+        """RMS error on unseen motion over the joint's torque limit (n,); None without limits."""
+        limit = self.surroundings.torque_limit
+        return None if limit is None else np.asarray(self.held_out.rms / limit)
 
 
 def gather(
@@ -91,10 +201,12 @@ def gather(
     *,
     same_motion: bool = True,
     nominal: Array | None = None,
+    surroundings: Surroundings = Surroundings(),
+    in_sample: bool = False,
     slow: float = SLOW,
     sigmas: float = SIGMAS,
 ) -> Evidence:
-    """Collect the evidence for a verdict; every recording is read two or three times.
+    """Collect the evidence for a verdict; every recording is read a few times.
 
     Args:
         model: the robot.
@@ -104,6 +216,8 @@ def gather(
             told from noise.
         held_out: motions that were not used for fitting.
         nominal: parameters (p,) of the nominal model.
+        surroundings: what is known of the cell beside its model.
+        in_sample: whether the held-out motions are those of the training after all.
         slow: bandwidth in which systematic errors are looked for [Hz].
         sigmas: standard deviations that make a wrong sign certain.
 
@@ -118,17 +232,22 @@ def gather(
     position = np.concatenate([run.motion.position for run in held_out])
     unseen = total([run.factor(model) for run in held_out])
     error = over_all(prediction_error(model, values, held_out))
+    grams = [StandardGram.of(model, some[:MOST_RECORDINGS]) for some in (training, held_out)]
     slow_errors = [slow_error(model, values, run, slow) for run in held_out if repeated]
     return Evidence(
         estimate=result.pooled,
         held_out=error,
         training=over_all(prediction_error(model, values, training)),
         held_out_slow=over_all(one.error for one in slow_errors) if repeated else None,
+        held_out_apart=over_all(one.apart for one in slow_errors) if repeated else None,
         friction_change=_largest([one.friction_change for one in slow_errors]),
         slow=repeatability(model, values, training, slow) if repeated else None,
         estimation_noise=_estimation_noise(result, unseen) if repeated else None,
         disagreement=_disagreement(result) if repeated else None,
-        gain_if_turned=gain_if_turned(model, training, held_out, slow),
+        turned=compare_turned(model, training, held_out, slow),
+        gravity=find_gravity(model, *grams),
+        load=find_load(model, *grams),
+        loaded=gravity_loads(model, position[:: max(1, len(position) // _POSTURES)]),
         nominal=None if nominal is None else over_all(prediction_error(model, nominal, held_out)),
         implausible=implausibilities(
             model,
@@ -139,7 +258,24 @@ def gather(
             speed=np.abs(velocity).max(axis=0),
             sigmas=sigmas,
         ),
+        residuals=check_residuals(
+            model,
+            values,
+            training,
+            () if in_sample else held_out,
+            same_motion=same_motion,
+            motor_from_joint=surroundings.motor_from_joint,
+        ),
+        coupling=_coupling(result.factor),
+        surroundings=surroundings,
+        in_sample=in_sample,
+        prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
     )
+
+
+def _coupling(factor: Factor) -> CouplingIndex:
+    gram = information(factor)
+    return CouplingIndex(float(coupling_index(gram)), coupling_index_max(len(gram)))
 
 
 def _largest(changes: list[Array]) -> Array | None:

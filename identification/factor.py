@@ -93,7 +93,7 @@ class Factor:
             for joint, block in enumerate(rows):
                 if mask is not None:
                     # Assigned, not multiplied: a row left out may hold NaN.
-                    np.copyto(block, 0.0, where=~mask[part, joint])
+                    block[:, np.flatnonzero(~mask[part, joint])] = 0.0
                 sums[joint] += block @ block.T
         factor = cls.zero(model)
         for joint, (total, used) in enumerate(zip(sums, columns, strict=True)):

@@ -1,11 +1,12 @@
 r"""Joint friction, linear in its coefficients.
 
-.. math:: \tau_f = f_0\,\mathrm{sgn}(\dot q) + f_1 \dot q
-                   + f_2\,\mathrm{sgn}(\dot q)\,\dot q^2 + f_o
+.. math:: \tau_f = f_0\,\mathrm{sgn}(v) + f_1 v + f_d |v| + f_2\,\mathrm{sgn}(v)\,v^2
+                   + f_s\,\mathrm{sgn}(v)\,e^{-(v/v_s)^2} + f_o
 
-The source equation of the paper (after eq. 1: three coefficients per joint) could not be read.
-The quadratic third term is what the same authors' later software uses; the cubic one, ``qd**3``,
-is the other form found in the field, so the term can be chosen or left out.
+with the joint's speed v. The source equation of the paper (after eq. 1: three coefficients per
+joint) could not be read. The quadratic third term is what the same authors' later software uses;
+the cubic one, ``v**3``, is the other form found in the field, so the term can be chosen or left
+out.
 """
 
 from __future__ import annotations
@@ -21,23 +22,37 @@ from identification.errors import ModelError
 
 Array = NDArray[np.float64]
 ThirdTerm = Literal["quadratic", "cubic"]
+Zone = Literal["exclude", "linear"]
+
+SYMBOLS = ("f0", "f1", "fd", "f2", "fs", "fo")
+"""All coefficients that a joint can have, in the order of the parameters."""
+
+OFFSET = "fo"
+"""The one coefficient that may be no friction at all, but the zero error of a sensor."""
 
 _THIRD_EXPONENT = {"quadratic": 2, "cubic": 3}
-_ROTARY_UNITS = {"f0": "N·m", "f1": "N·m·s/rad", "fo": "N·m"}
-_LINEAR_UNITS = {"f0": "N", "f1": "N·s/m", "fo": "N"}
+_DRY, _VISCOUS = ("f0", "fs", "fo"), ("f1", "fd")
 
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Which friction terms every joint has.
+    """Which friction terms a joint has.
 
     Attributes:
-        coulomb: ``f0 sgn(qd)``.
-        viscous: ``f1 qd``.
-        third: ``f2 sgn(qd) qd**2`` ("quadratic"), ``f2 qd**3`` ("cubic") or none.
+        coulomb: ``f0 sgn(v)``.
+        viscous: ``f1 v``.
+        third: ``f2 sgn(v) v**2`` ("quadratic"), ``f2 v**3`` ("cubic") or none.
         offset: constant ``fo``, also the zero error of a torque or current measurement.
         standstill: speed [rad/s, m/s] below which a joint counts as standing. Stiction can take
-            any value there, so such rows are left out of a fit (see :meth:`moving`).
+            any value there; see `zone`.
+        stribeck: fixed speed v_s [rad/s, m/s] of a term ``fs sgn(v) exp(-(v / v_s)**2)``, by which
+            friction is larger at low speed; none without it.
+        asymmetric: friction differs by direction. The viscous coefficient is f1 + fd forwards and
+            f1 - fd backwards, with a term ``fd |v|``. Coulomb friction is f0 + fo forwards and
+            f0 - fo backwards: its asymmetry is the constant column of the offset, which is there
+            then too, and the two cannot be told apart.
+        zone: what becomes of rows slower than standstill. "exclude": they are not fitted, see
+            :meth:`moving`. "linear": they are, with sgn(v) replaced by v / standstill.
     """
 
     coulomb: bool = True
@@ -45,6 +60,9 @@ class FrictionLaw:
     third: ThirdTerm | None = "quadratic"
     offset: bool = False
     standstill: float = 0.01
+    stribeck: float | None = None
+    asymmetric: bool = False
+    zone: Zone = "exclude"
 
     def __post_init__(self) -> None:
         if self.third is not None and self.third not in _THIRD_EXPONENT:
@@ -56,50 +74,78 @@ class FrictionLaw:
                 f"friction standstill speed is {self.standstill!r}; "
                 "it must be a finite number, zero or more"
             )
+        if self.stribeck is not None and not (math.isfinite(self.stribeck) and self.stribeck > 0.0):
+            raise ModelError(
+                f"friction's Stribeck speed is {self.stribeck!r}; it must be finite and positive"
+            )
+        if self.zone not in ("exclude", "linear"):
+            raise ModelError(f'friction zone = {self.zone!r}: "exclude" or "linear" are known')
+        if self.zone == "linear" and self.standstill == 0.0:
+            raise ModelError(
+                "a linear friction zone needs a standstill speed above zero to be as wide as"
+            )
 
     @property
     def symbols(self) -> tuple[str, ...]:
-        """Coefficients per joint, in order: a subset of ``f0, f1, f2, fo``."""
+        """Coefficients, in order: a subset of :data:`SYMBOLS`."""
         present = {
             "f0": self.coulomb,
             "f1": self.viscous,
+            "fd": self.asymmetric and self.viscous,
             "f2": self.third is not None,
-            "fo": self.offset,
+            "fs": self.stribeck is not None,
+            "fo": self.offset or (self.asymmetric and self.coulomb),
         }
         return tuple(symbol for symbol, wanted in present.items() if wanted)
 
     def names(self, n_joints: int) -> tuple[str, ...]:
-        """Return the parameter names, term by term: ``f0_1 .. f0_n, f1_1 .. f1_n, ...``."""
+        """Return the names if all joints have this law: ``f0_1 .. f0_n, f1_1 .. f1_n, ...``."""
         return tuple(f"{s}_{j}" for s in self.symbols for j in range(1, n_joints + 1))
 
     def unit(self, symbol: str, *, revolute: bool) -> str:
         """Return the unit of one coefficient of a revolute or a prismatic joint."""
-        if symbol != "f2":
-            return (_ROTARY_UNITS if revolute else _LINEAR_UNITS)[symbol]
+        if symbol in _DRY:
+            return "N·m" if revolute else "N"
+        if symbol in _VISCOUS:
+            return "N·m·s/rad" if revolute else "N·s/m"
         power = "²" if self.third == "quadratic" else "³"
         return f"N·m·s{power}/rad{power}" if revolute else f"N·s{power}/m{power}"
 
-    def columns(self, velocity: Array, out: Array) -> None:
-        """Write one row of `out` (k, ...) per coefficient for speeds `velocity` (...).
+    def sign(self, velocity: Array, out: Array | None = None) -> Array:
+        """Return the direction of motion: sgn(v), in a linear zone v / standstill.
 
-        The sign function has no dead zone: sgn(0) = 0, everything else is ±1.
+        Otherwise it has no dead zone: sgn(0) = 0, everything else is ±1.
         """
-        row = 0
-        if self.coulomb:
-            np.sign(velocity, out=out[row])
-            row += 1
-        if self.viscous:
-            out[row] = velocity
-            row += 1
-        if self.third is not None:
-            np.abs(velocity, out=out[row])
-            if self.third == "cubic":
-                out[row] *= out[row]
-            out[row] *= velocity
-            row += 1
-        if self.offset:
-            out[row] = 1.0
+        if self.zone == "exclude":
+            return np.asarray(np.sign(velocity, out=out))
+        scaled = np.divide(velocity, self.standstill, out=out)
+        return np.asarray(np.clip(scaled, -1.0, 1.0, out=out))
+
+    def columns(self, velocity: Array, out: Array) -> None:
+        """Write one row of `out` (k, ...) per coefficient for speeds `velocity` (...)."""
+        for row, symbol in enumerate(self.symbols):
+            target = out[row]
+            if symbol == "f0":
+                self.sign(velocity, out=target)
+            elif symbol == "f1":
+                target[...] = velocity
+            elif symbol == "fd":
+                np.abs(velocity, out=target)
+            elif symbol == "f2":
+                np.abs(velocity, out=target)
+                if self.third == "cubic":
+                    target *= target
+                target *= velocity
+            elif symbol == "fs":
+                assert self.stribeck is not None
+                ratio = velocity / self.stribeck
+                np.exp(-ratio * ratio, out=target)
+                target *= self.sign(velocity)
+            else:
+                target[...] = 1.0
 
     def moving(self, velocity: Array) -> NDArray[np.bool_]:
-        """Return where a joint is faster than standstill, same shape as `velocity`."""
+        """Return where this law can be fitted: faster than standstill, or in a linear zone."""
+        if self.zone == "linear":
+            return np.ones(np.shape(velocity), dtype=np.bool_)
         return np.asarray(np.abs(velocity) > self.standstill)

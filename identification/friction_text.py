@@ -2,38 +2,62 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
 from identification.friction import FrictionLaw
 from identification.model import RobotModel
 
 Array = NDArray[np.float64]
 
 
-class _Term(NamedTuple):
+class _Kind(NamedTuple):
+    """A kind of term; the third term of different joints may be of two kinds."""
+
+    symbol: str
     name: str  # of the tuple of coefficients in the source
     formula: str  # for people; v is the joint's speed
-    code: str  # v: speed, sign: of the speed, linear at standstill
+    code: str  # v: speed, sign: of the speed
     words: str
 
 
-_TERMS: Final = {
-    "f0": _Term("COULOMB", "f0 sgn(v)", "COULOMB[joint] * sign", "Coulomb (dry) friction f0"),
-    "f1": _Term("VISCOUS", "f1 v", "VISCOUS[joint] * v", "viscous friction f1"),
-    "fo": _Term("OFFSET", "fo", "OFFSET[joint]", "a constant offset fo"),
-}
-_THIRD: Final = {
-    "quadratic": _Term(
-        "THIRD", "f2 sgn(v) v²", "THIRD[joint] * v * abs(v)", "a term f2 with the speed squared"
+_KINDS: Final = (
+    _Kind("f0", "COULOMB", "f0 sgn(v)", "COULOMB[joint] * sign", "Coulomb (dry) friction f0"),
+    _Kind("f1", "VISCOUS", "f1 v", "VISCOUS[joint] * v", "viscous friction f1"),
+    _Kind(
+        "fd",
+        "DIFFERENCE",
+        "fd |v|",
+        "DIFFERENCE[joint] * abs(v)",
+        "half the difference fd of viscous friction forwards and backwards",
     ),
-    "cubic": _Term(
-        "THIRD", "f2 v³", "THIRD[joint] * v**3", "a term f2 with the third power of the speed"
+    _Kind(
+        "f2",
+        "THIRD",
+        "f2 sgn(v) v²",
+        "THIRD[joint] * v * abs(v)",
+        "a term f2 with the speed squared",
     ),
-}
+    _Kind(
+        "f2",
+        "CUBIC",
+        "f2 v³",
+        "CUBIC[joint] * v**3",
+        "a term f2 with the third power of the speed",
+    ),
+    _Kind(
+        "fs",
+        "STRIBECK",
+        "fs sgn(v) exp(-(v/vs)²)",
+        "STRIBECK[joint] * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
+        "what friction is larger by at low speed, fs (Stribeck)",
+    ),
+    _Kind("fo", "OFFSET", "fo", "OFFSET[joint]", "a constant offset fo"),
+)
 
 
 def friction_in_words(model: RobotModel, coefficients: Array) -> str:
@@ -41,93 +65,198 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
 
     Raises:
         ShapeError: `coefficients` is not (k,), as in the last `model.parameter_names`.
-        IdentificationError: the law has a term that has no words.
     """
-    table = _table(model, coefficients)
-    if not table:
+    friction = model.friction
+    table, motors = friction.table(coefficients), friction.motor_table(coefficients)
+    if not friction.terms:
         return "The joints have no friction.\n"
-    terms = [_term(model.friction, symbol) for symbol in table]
-    lines = [
-        f"Torque that friction takes at the speed v of a joint: {_formula(terms)}",
-        "with " + _joined([term.words for term in terms]) + ".",
-        "sgn(v) is 1 forwards, -1 backwards. Slower than "
-        f"{model.friction.standstill:g} rad/s (m/s) nothing was fitted: there sticking friction",
-        "can take any value up to the Coulomb friction, to either side.",
-        "",
-    ]
-    for joint, name in enumerate(model.joint_names):
+    kinds = _kinds(friction.laws)
+    lines = []
+    if kinds:
+        lines += [
+            f"Torque that friction takes at the speed v of a joint: {_formula(kinds)}",
+            "with " + _joined([kind.words for kind in kinds]) + ".",
+            *_standstill_lines(model),
+            "",
+        ]
+    for joint, (name, law) in enumerate(zip(model.joint_names, friction.laws, strict=True)):
         revolute = bool(model.chain.revolute[joint])
-        values = (
-            f"{symbol} = {row[joint]:.5g} {model.friction.unit(symbol, revolute=revolute)}"
-            for symbol, row in table.items()
+        values = [
+            f"{symbol} = {table[symbol][joint]:.5g} {law.unit(symbol, revolute=revolute)}"
+            for symbol in law.symbols
+        ]
+        if law.third is not None and {"THIRD", "CUBIC"} <= {kind.name for kind in kinds}:
+            values.append(f"f2 with {'v³' if law.third == 'cubic' else 'sgn(v) v²'}")
+        if law.stribeck is not None:
+            values.append(f"vs = {law.stribeck:g} {'rad/s' if revolute else 'm/s'}")
+        lines.append(f"{_line(name)}: " + (", ".join(values) or "no friction"))
+    if any(law.asymmetric and law.coulomb for law in friction.laws):
+        lines.append(
+            "Coulomb friction is f0 + fo forwards and f0 - fo backwards: its asymmetry cannot be"
+            " told from the zero error of a sensor."
         )
-        lines.append(f"{name}: " + ", ".join(values))
+    lines += _motor_lines(model, motors)
     return "\n".join(lines) + "\n"
 
 
 def friction_source(model: RobotModel, coefficients: Array) -> str:
-    """Return Python source of ``friction(joint, v)`` with coefficients (k,); it imports nothing.
+    """Return Python source of ``friction(joint, v)`` and ``torques(speeds)``; no other package.
 
-    It is the model's law, but for speeds below standstill, at which nothing was fitted: there
-    the sign is made linear, so that a simulation does not jump at zero speed.
+    `friction` is the joint's own law as :meth:`RobotModel.torque` has it, `torques` that of all
+    joints, with what motors that turn with several of them take. Both take a speed below which
+    the sign is made linear, for simulations that must not jump at zero speed.
 
     Raises:
         ShapeError: `coefficients` is not (k,), as in the last `model.parameter_names`.
-        IdentificationError: the law has a term that has no words.
     """
-    table = _table(model, coefficients)
-    terms = [_term(model.friction, symbol) for symbol in table]
-    lines = [
-        '"""Identified friction of a robot\'s joints. Source: hil."""',
-        "",
-        f"JOINTS = {_tuple([repr(name) for name in model.joint_names])}",
-        f"STANDSTILL = {model.friction.standstill!r}  # rad/s or m/s: slower was not fitted",
+    friction, n = model.friction, model.n_joints
+    table = friction.table(coefficients)
+    motors = friction.motor_table(coefficients)
+    kinds = _kinds(friction.laws)
+    lines = ['"""Identified friction of a robot\'s joints. Source: hil."""', ""]
+    lines += [
+        f"JOINTS = {_tuple(repr(name) for name in model.joint_names)}",
+        f"LINEAR = {_tuple(repr(_linear(law)) for law in friction.laws)}"
+        "  # rad/s or m/s: slower, the sign was fitted as linear",
     ]
-    for (symbol, row), term in zip(table.items(), terms, strict=True):
-        units = {model.friction.unit(symbol, revolute=bool(r)) for r in model.chain.revolute}
-        values = _tuple([repr(float(value)) for value in row])
-        lines.append(f"{term.name} = {values}  # {' or '.join(sorted(units))}")
+    for kind in kinds:
+        has = [_has(law, kind) for law in friction.laws]
+        values = np.where(has, table[kind.symbol], 0.0)
+        units = {
+            law.unit(kind.symbol, revolute=bool(turns))
+            for law, turns, own in zip(friction.laws, model.chain.revolute, has, strict=True)
+            if own
+        }
+        lines.append(f"{kind.name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
+        if kind.symbol == "fs":
+            speeds = np.array([law.stribeck or 1.0 for law in friction.laws])
+            lines.append(f"STRIBECK_SPEED = {_numbers(speeds)}  # rad/s or m/s")
+            lines.append(f"E = {math.e!r}")
+    lines.append(_motor_table(model, motors))
     lines += [
         "",
         "",
-        "def friction(joint, v):",
-        f'    """Return {_formula(terms) or "0"} of a joint (0, 1, ...) at speed v, N·m or N."""',
+        "def direction(v, linear):",
+        '    """Return the sign of a speed; slower than `linear`, v / linear."""',
+        "    if abs(v) < linear:",
+        "        return v / linear",
+        "    return 1.0 if v > 0 else -1.0 if v < 0 else 0.0",
+        "",
+        "",
+        "def friction(joint, v, smooth=0.0):",
+        f'    """Return {_formula(kinds) or "0"} of a joint (0, 1, ...) at speed v, N·m or N.',
+        "",
+        "    Slower than `smooth` (rad/s or m/s) the sign is linear: no jump at zero speed.",
+        '    """',
     ]
-    if "f0" in table:
-        lines += [
-            "    if abs(v) < STANDSTILL:",
-            "        sign = v / STANDSTILL",
-            "    else:",
-            "        sign = (v > 0) - (v < 0)",
-        ]
-    lines.append("    return " + (" + ".join(term.code for term in terms) or "0.0"))
+    if any("sign" in kind.code for kind in kinds):
+        lines.append("    sign = direction(v, max(LINEAR[joint], smooth))")
+    lines.append("    return " + (" + ".join(kind.code for kind in kinds) or "0.0"))
+    lines += [
+        "",
+        "",
+        "def torques(speeds, smooth=0.0):",
+        f'    """Return friction of all {n} joints at their speeds, coupled motors included."""',
+        "    result = [friction(joint, v, smooth) for joint, v in enumerate(speeds)]",
+        "    for share, coulomb, viscous, linear in MOTORS:",
+        "        v = sum(s * speed for s, speed in zip(share, speeds))",
+        "        taken = coulomb * direction(v, max(linear, smooth)) + viscous * v",
+        "        result = [total + s * taken for total, s in zip(result, share)]",
+        "    return result",
+    ]
     return "\n".join(lines) + "\n"
 
 
-def _table(model: RobotModel, coefficients: Array) -> dict[str, Array]:
-    """Return coefficients by symbol, each (n,)."""
-    symbols, n = model.friction.symbols, model.n_joints
-    if np.shape(coefficients) != (len(symbols) * n,):
-        raise ShapeError("coefficients", np.shape(coefficients), f"({len(symbols) * n},)")
-    rows = np.asarray(coefficients, dtype=np.float64).reshape(len(symbols), n)
-    return dict(zip(symbols, rows, strict=True))
+def _standstill_lines(model: RobotModel) -> list[str]:
+    """Say what holds below standstill, for joints left out there and for those made linear."""
+    lines = ["sgn(v) is 1 forwards, -1 backwards."]
+    for zone, words in (
+        (
+            "exclude",
+            "nothing was fitted: there sticking friction can take any value up to the Coulomb"
+            " friction, to either side.",
+        ),
+        ("linear", "sgn(v) is v / standstill, as fitted."),
+    ):
+        named = {
+            name: law.standstill
+            for name, law in zip(model.joint_names, model.friction.laws, strict=True)
+            if law.zone == zone and law.symbols
+        }
+        for speed in sorted(set(named.values())):
+            alike = [_line(name) for name, own in named.items() if own == speed]
+            whose = "" if len(alike) == model.n_joints else f" {_joined(alike)}:"
+            lines.append(f"Slower than {speed:g} rad/s (m/s){whose} {words}")
+    return lines
 
 
-def _term(law: FrictionLaw, symbol: str) -> _Term:
-    if symbol == "f2" and law.third is not None:
-        return _THIRD[law.third]
-    if symbol not in _TERMS:
-        raise IdentificationError(f"the friction term {symbol!r} has no words yet")
-    return _TERMS[symbol]
+def _motor_lines(model: RobotModel, motors: dict[int, dict[str, float]]) -> list[str]:
+    lines = []
+    for (motor, values), share in zip(motors.items(), model.friction.motor_speeds(), strict=True):
+        turning = " + ".join(
+            ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({_line(model.joint_names[j])})"
+            for j in np.flatnonzero(share)
+        )
+        law, revolute = model.friction.laws[motor], bool(model.chain.revolute[motor])
+        numbers = ", ".join(
+            f"{symbol} = {value:.5g} {law.unit(symbol, revolute=revolute)}"
+            for symbol, value in values.items()
+        )
+        lines.append(
+            f"motor {motor + 1}, at v = {turning}: {numbers}; each of these joints feels that"
+            " torque times its factor"
+        )
+    return lines
 
 
-def _formula(terms: list[_Term]) -> str:
-    return " + ".join(term.formula for term in terms)
+def _motor_table(model: RobotModel, motors: dict[int, dict[str, float]]) -> str:
+    """Return the line of source with coupled motors: shares of speed, coefficients, linear zone."""
+    rows = [
+        f"({_numbers(share)}, {_number(values.get('f0', 0.0))}, {_number(values.get('f1', 0.0))},"
+        f" {_linear(model.friction.laws[motor])!r})"
+        for (motor, values), share in zip(
+            motors.items(), model.friction.motor_speeds(), strict=True
+        )
+    ]
+    return f"MOTORS = {_tuple(rows)}  # speed per joint speed, Coulomb, viscous, linear"
+
+
+def _linear(law: FrictionLaw) -> float:
+    """Return the speed below which the fitted sign is linear; 0 where it is not."""
+    return float(law.standstill) if law.zone == "linear" else 0.0
+
+
+def _kinds(laws: tuple[FrictionLaw, ...]) -> list[_Kind]:
+    return [kind for kind in _KINDS if any(_has(law, kind) for law in laws)]
+
+
+def _has(law: FrictionLaw, kind: _Kind) -> bool:
+    if kind.symbol != "f2":
+        return kind.symbol in law.symbols
+    return law.third == ("cubic" if kind.name == "CUBIC" else "quadratic")
+
+
+def _formula(kinds: list[_Kind]) -> str:
+    return " + ".join(kind.formula for kind in kinds)
+
+
+def _line(name: str) -> str:
+    """Return a name without line ends and control characters."""
+    return "".join(c if c.isprintable() else " " for c in name)
 
 
 def _joined(parts: list[str]) -> str:
     return ", ".join(parts[:-1]) + " and " + parts[-1] if len(parts) > 1 else parts[0]
 
 
-def _tuple(items: list[str]) -> str:
-    return "(" + ", ".join(items) + ("," if len(items) == 1 else "") + ")"
+def _number(value: float) -> str:
+    return repr(float(value)) if math.isfinite(value) else f'float("{float(value)}")'
+
+
+def _numbers(values: Array) -> str:
+    return _tuple(_number(value) for value in values)
+
+
+def _tuple(items: Iterable[str]) -> str:
+    listed = list(items)
+    return "(" + ", ".join(listed) + ("," if len(listed) == 1 else "") + ")"

@@ -17,55 +17,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.covariance import FINE_BLOCK
 from identification.errors import IdentificationError, ShapeError
 from identification.model import RobotModel
+from identification.payload import Load, Payload
+from identification.phase_factor import FINE_BLOCK
 from identification.preprocessing import Samples
-from identification.regressor import RegressorPlan
-from identification.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 
 _MOST_BLOCKS: Final = 400
-
-
-@dataclass(frozen=True)
-class Payload:
-    """A body of known mass at the last link.
-
-    Attributes:
-        mass: [kg].
-        centre: its centre of mass in the frame of the last joint (3,) [m].
-        inertia: tensor about the centre of mass, in the axes of that frame: xx, xy, xz, yy, yz,
-            zz [kg m²]; a point without it.
-    """
-
-    mass: float
-    centre: tuple[float, float, float]
-    inertia: tuple[float, float, float, float, float, float] = (0.0,) * 6
-
-    @property
-    def parameters(self) -> Array:
-        """Inertial parameters about the joint frame's origin (10,), as `LINK_SYMBOLS`."""
-        x, y, z = self.centre
-        m = self.mass
-        steiner = m * np.array(
-            [y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y]
-        )
-        return np.concatenate([np.array(self.inertia) + steiner, [m * x, m * y, m * z, m]])
-
-
-def payload_torque(model: RobotModel, payload: Payload, q: Array, qd: Array, qdd: Array) -> Array:
-    """Joint torques (m, n) [N·m or N] that moving the payload alone takes."""
-    n = model.n_joints
-    links: list[list[int]] = [[] for _ in range(n - 1)] + [list(range(len(LINK_SYMBOLS)))]
-    plan = RegressorPlan(model.chain, model.gravity, links, [False] * n, None)
-    values = payload.parameters
-    torque = np.zeros(q.shape)
-    for part, rows in plan.chunks(q, qd, qdd):
-        for joint, block in enumerate(rows):
-            torque[part, joint] = values[plan.columns[joint]] @ block
-    return torque
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +120,7 @@ class GainFactor:
 def _load(model: RobotModel, payload: Payload | None, samples: Samples) -> Array:
     if payload is None:
         return np.zeros_like(samples.motion.position)
-    return payload_torque(model, payload, *samples.motion[1:])
+    return Load(model.chain, model.gravity, payload).torque(*samples.motion[1:])
 
 
 def _block_edges(time: Array) -> NDArray[np.intp]:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.stats import t as student
 
-from identification.covariance import block_length, leverage_corrected
+from identification.covariance import block_length, spread
 from identification.errors import IdentificationError
 from identification.estimation import Solution, mark_undetermined, solve
 from identification.factor import NormalEquations
@@ -321,10 +321,8 @@ def _clustered(information: Array, scores: Array, solution: Solution) -> tuple[A
     edges = np.arange(0, len(scores), block_length(scores))
     information = np.add.reduceat(information, edges, axis=0)
     scores = np.add.reduceat(scores, edges, axis=0)
-    inverse = solution.inverse
-    corrected = leverage_corrected(information, scores, inverse)
-    covariance = inverse @ (corrected.T @ corrected) @ inverse
-    return np.asarray(covariance), float(student.ppf(0.975, max(1, len(scores) - 1)))
+    moved = spread(information, scores, solution.root)
+    return np.asarray(moved.T @ moved), float(student.ppf(0.975, max(1, len(scores) - 1)))
 
 
 def _loaded(gram: Array, p: int) -> bool:

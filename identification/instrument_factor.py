@@ -11,16 +11,16 @@ columns that act on a joint: a third of all of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.covariance import FINE_BLOCK, PhaseFactor
+from identification.augmented_rows import augmented_rows
 from identification.errors import IdentificationError, ShapeError
 from identification.model import RobotModel
 from identification.motion import Motion
+from identification.phase_factor import PhaseFactor, add_grams, counted, equal_runs, fine_blocks
 from identification.preprocessing import Samples
 
 Array = NDArray[np.float64]
@@ -71,21 +71,18 @@ class InstrumentFactor:
         rows = samples.usable & model.moving(instrument.velocity)
         if usable is not None:
             rows &= usable
-        index = np.floor((samples.motion.time - samples.origin) / FINE_BLOCK + 1e-9)
-        index = np.maximum(index.astype(np.int64), 0)
-        edges = np.searchsorted(index, np.arange(int(index[-1]) + 2))
-        measured, columns = samples.regressor(model)
-        planned = model.regressor(*instrument[1:]).blocks
-        gram = []
-        counts = np.zeros((len(edges) - 1, model.n_joints), dtype=np.intp)
-        for joint, block in enumerate(measured):
-            clean = samples.as_measured(joint, planned[joint])
-            table = np.column_stack([clean, block, samples.torque[:, joint]])
-            table[~rows[:, joint]] = 0.0
-            parts = [table[start:stop] for start, stop in pairwise(edges)]
-            gram.append(np.array([part.T @ part for part in parts]))
-            counts[:, joint] = [np.count_nonzero(rows[a:b, joint]) for a, b in pairwise(edges)]
-        return cls(tuple(gram), columns, counts, model.parameter_names)
+        index = fine_blocks(samples)
+        count = int(index[-1]) + 1 if len(index) else 0
+        columns = model.plan.columns
+        gram = tuple(np.zeros((count, 2 * len(c) + 1, 2 * len(c) + 1)) for c in columns)
+        measured = augmented_rows(model, replace(samples, usable=rows))
+        # Of the same rows, and through the same torque channel.
+        planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
+        for (part, blocks), (_, clean) in zip(measured, planned, strict=True):
+            runs = equal_runs(index[part])
+            for total, noisy, quiet in zip(gram, blocks, clean, strict=True):
+                add_grams(total, np.concatenate([quiet[:-1], noisy]), runs)
+        return cls(gram, columns, counted(index, rows), model.parameter_names)
 
     @property
     def n_parameters(self) -> int:
@@ -121,21 +118,30 @@ class InstrumentFactor:
     def weighted(self, weights: Array) -> Array:
         """Gram matrices of the blocks (B, 2 p + 1, 2 p + 1) with one weight per joint (n,)."""
         width = 2 * self.n_parameters + 1
-        total = np.zeros((len(self.samples), width, width))
+        total = np.zeros((len(self.samples), width * width))
         for joint, (weight, gram) in enumerate(zip(weights, self.gram, strict=True)):
             place = self.places(joint)
-            total[:, place[:, None], place] += weight * gram
+            flat = (place[:, None] * width + place).ravel()
+            total[:, flat] += weight * gram.reshape(len(gram), -1)
+        return total.reshape(-1, width, width)
+
+    def total(self, weights: Array) -> Array:
+        """Gram matrix of all blocks (2 p + 1, 2 p + 1) with one weight per joint (n,)."""
+        width = 2 * self.n_parameters + 1
+        total = np.zeros((width, width))
+        for joint, (weight, gram) in enumerate(zip(weights, self.gram, strict=True)):
+            place = self.places(joint)
+            total[place[:, None], place] += weight * gram.sum(axis=0)
         return total
 
     @property
     def measured(self) -> PhaseFactor:
         """The part without instruments, [W | y]: what least squares on the same rows sees."""
-        p = self.n_parameters
-        gram = np.zeros((len(self.samples), self.n_joints, p + 1, p + 1))
-        for joint, (own, used) in enumerate(zip(self.gram, self.columns, strict=True)):
-            place = np.append(used, p)
-            gram[:, joint, place[:, None], place] = own[:, len(used) :, len(used) :]
-        return PhaseFactor(gram, self.samples, self.parameter_names)
+        gram = tuple(
+            own[:, len(used) :, len(used) :]
+            for own, used in zip(self.gram, self.columns, strict=True)
+        )
+        return PhaseFactor(gram, self.columns, self.samples, self.parameter_names)
 
 
 def _longer(blocks: NDArray, count: int) -> NDArray:  # type: ignore[type-arg]

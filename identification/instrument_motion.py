@@ -25,6 +25,11 @@ _LAG_STEP: Final = 0.01  # s
 _ROWS: Final = 4000  # enough for a lag, however long the recording
 # A command is followed as closely as a spline of this bandwidth can: it has no noise.
 _COMMAND_TOLERANCE: Final = 1e-20  # rad² or m²
+# Of a joint's own range: clocks of repetitions start within a cycle of each other.
+_SAME_PLAN: Final = 0.01
+_STANDING: Final = 1e-4  # rad or m
+_OVERLAP: Final = 0.9
+_COMPARED: Final = 400  # instants
 
 
 class Instruments(NamedTuple):
@@ -45,7 +50,11 @@ class Instruments(NamedTuple):
 
 
 def planned_motion(
-    samples: Samples, commanded: Array, *, bandwidth: float = RIGID_BANDWIDTH
+    samples: Samples,
+    commanded: Array,
+    *,
+    bandwidth: float = RIGID_BANDWIDTH,
+    lag: Array | None = None,
 ) -> Instruments:
     """Commanded motion, shifted by the lag of each axis.
 
@@ -54,6 +63,7 @@ def planned_motion(
         commanded: commanded positions in the rows of the samples (m, n) [rad or m], NaN where
             nothing was commanded.
         bandwidth: of the derivatives [Hz]; the same as that of the measured motion's.
+        lag: of each axis where it is known from the same motion (n,) [s]; else it is sought.
 
     Raises:
         ShapeError: the commanded positions do not have the shape of the samples.
@@ -73,8 +83,9 @@ def planned_motion(
         splines.append((rows, spline))
     if not splines:
         raise IdentificationError("nothing was commanded: there are no instruments to be had")
-    longest_rows, longest = max(splines, key=lambda pair: len(pair[0]))
-    lag = tracking_lag(time[longest_rows], measured[longest_rows], longest)
+    if lag is None:
+        longest_rows, longest = max(splines, key=lambda pair: len(pair[0]))
+        lag = tracking_lag(time[longest_rows], measured[longest_rows], longest)
     if np.isnan(lag).all():
         raise IdentificationError("no joint is commanded to move: there are no instruments")
     shape = (3, *measured.shape)
@@ -88,6 +99,34 @@ def planned_motion(
     return Instruments(
         Motion(time, *derivatives), usable, lag, "the commanded motion, later by each axis's lag"
     )
+
+
+def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
+    """Whether two recordings were commanded the same motion.
+
+    Args:
+        first: time since the motion's origin (m,) [s] and commanded positions (m, n), NaN where
+            nothing was commanded.
+        second: likewise; compared where both are known.
+    """
+    (time, one), (other_time, other) = first, second
+    if one.shape[1] != other.shape[1]:
+        return False
+    rows, others = np.isfinite(one).all(axis=1), np.isfinite(other).all(axis=1)
+    if not rows.any() or not others.any():
+        return False
+    time, one, other_time, other = time[rows], one[rows], other_time[others], other[others]
+    start, stop = max(time[0], other_time[0]), min(time[-1], other_time[-1])
+    longer = max(time[-1] - time[0], other_time[-1] - other_time[0])
+    if stop - start < _OVERLAP * longer:
+        return False
+    at = np.linspace(start, stop, _COMPARED)
+    # Not the largest: across a gap the two are not known.
+    apart = [
+        np.quantile(np.abs(np.interp(at, time, a) - np.interp(at, other_time, b)), _OVERLAP)
+        for a, b in zip(one.T, other.T, strict=True)
+    ]
+    return bool(np.all(np.array(apart) <= _SAME_PLAN * np.maximum(np.ptp(one, axis=0), _STANDING)))
 
 
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:

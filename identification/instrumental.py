@@ -26,12 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from identification.covariance import (
-    FINE_BLOCK,
-    block_length,
-    leverage_corrected,
-    with_block_covariance,
-)
+from identification.covariance import block_length, spread, with_block_covariance
 from identification.errors import IdentificationError
 from identification.estimation import (
     WORST_CONDITION,
@@ -44,6 +39,7 @@ from identification.estimation import (
 from identification.factor import Factor
 from identification.instrument_factor import InstrumentFactor
 from identification.model import RobotModel
+from identification.phase_factor import FINE_BLOCK, merged
 
 Array = NDArray[np.float64]
 
@@ -77,15 +73,22 @@ class CrossSolution(NamedTuple):
 
     Attributes:
         values: (p,), of least (scaled) norm where the instruments leave a choice.
-        inverse: of Z^T W on what is determined, zero elsewhere (p, p).
+        right: R (p, k), and
+        left: L (p, k): R L^T is the inverse of Z^T W on the k directions determined.
         condition: square root of the scaled condition of Z^T W, comparable to that of W.
         determined: (p,).
     """
 
     values: Array
-    inverse: Array
+    right: Array
+    left: Array
     condition: float
     determined: NDArray[np.bool_]
+
+    @property
+    def inverse(self) -> Array:
+        """Inverse of Z^T W on what is determined, zero elsewhere (p, p)."""
+        return np.asarray(self.right @ self.left.T)
 
 
 def solve_cross(total: Array) -> CrossSolution:
@@ -97,10 +100,12 @@ def solve_cross(total: Array) -> CrossSolution:
     u, singular, vt = np.linalg.svd(total[:p, p : 2 * p] / np.outer(left, right))
     kept = singular > singular[0] / WORST_CONDITION**2
     lost = np.abs(vt[~kept]).max(axis=0, initial=0.0)
-    inverse = (vt[kept].T / singular[kept]) @ u[:, kept].T / np.outer(right, left)
+    root = np.sqrt(singular[kept])
+    own_right, own_left = vt[kept].T / root / right[:, None], u[:, kept] / root / left[:, None]
     return CrossSolution(
-        values=inverse @ total[:p, -1],
-        inverse=inverse,
+        values=own_right @ (own_left.T @ total[:p, -1]),
+        right=own_right,
+        left=own_left,
         condition=float(np.sqrt(singular[0] / singular[-1])) if singular[-1] > 0.0 else np.inf,
         determined=np.asarray(lost < _PARTICIPATION),
     )
@@ -169,7 +174,7 @@ def _inverse(matrix: Array) -> Array:
 def _weights(factor: InstrumentFactor, rows: Factor) -> Array:
     """Inverse residual variance per joint (n,) of an instrumental fit, zero without rows."""
     first = joint_weights(rows)
-    solution = solve_cross(factor.weighted(first).sum(axis=0))
+    solution = solve_cross(factor.total(first))
     inverse = _inverse(rows.weighted(first).A)
     variance = residual_variance(rows, solution.values, inverse, first)
     return np.where(np.isnan(variance), 0.0, 1.0 / variance)
@@ -185,10 +190,9 @@ def _with_covariance(
     p = rows.n_parameters
     cross, moments = blocks[:, :p, p : 2 * p], blocks[:, :p, -1]
     length = block_length(moments - cross @ solution.values)
-    starts = np.arange(0, len(blocks), length)
-    cross = np.add.reduceat(cross, starts, axis=0)
-    scores = np.add.reduceat(moments, starts, axis=0) - cross @ solution.values
-    moved = leverage_corrected(cross, scores, solution.inverse) @ solution.inverse.T
+    cross = merged(cross, length)
+    scores = merged(moments, length) - cross @ solution.values
+    moved = spread(cross, scores, solution.right, solution.left)
     covariance = moved.T @ moved
     mark_undetermined(covariance, solution.determined)
     least = _inverse(rows.weighted(weights).A)
@@ -200,7 +204,7 @@ def _with_covariance(
         covariance=covariance,
         noise_std=np.sqrt(variance),
         samples=rows.samples,
-        method=f"instrumental variables, cluster-robust covariance over {len(starts)} blocks of"
+        method=f"instrumental variables, cluster-robust covariance over {len(scores)} blocks of"
         f" {length * FINE_BLOCK:g} s",
         condition=solution.condition,
         undetermined=tuple(
@@ -208,5 +212,5 @@ def _with_covariance(
             for name, known in zip(model.parameter_names, solution.determined, strict=True)
             if not known
         ),
-        interval_factor=float(student.ppf(0.975, max(1, len(starts) - 1))),
+        interval_factor=float(student.ppf(0.975, max(1, len(scores) - 1))),
     )

@@ -6,18 +6,32 @@ with the link. Joints are numbered depth first, so a parent comes before its chi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import ModelError
+from identification.urdf_faults import closed_chain, urdf_fault
 
 Array = NDArray[np.float64]
 
 # Where our ten parameters stand in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, ...
 FROM_PINOCCHIO = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)
+
+_LINK = "link "
+
+
+class LinkFrame(NamedTuple):
+    """Where the frame of a link of the description stands."""
+
+    joint: int
+    rotation: Array
+    translation: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +48,9 @@ class Chain:
         inertial: the ten parameters per link (:data:`identification.wrench.LINK_SYMBOLS`) about
             the joint frame's origin in its axes, as the description gives them (the nominal, CAD
             values), shape (n, 10).
+        frames: by name the links of the description, what is fixed to the base included: the
+            joint that moves each (-1: none), and its axes (3, 3) and origin (3,) [m] in that
+            joint's frame.
     """
 
     joint_names: tuple[str, ...]
@@ -43,6 +60,7 @@ class Chain:
     axis: Array
     revolute: NDArray[np.bool_]
     inertial: Array
+    frames: dict[str, LinkFrame] = field(default_factory=dict, repr=False)
 
     @property
     def n_joints(self) -> int:
@@ -57,17 +75,19 @@ class Chain:
         return tuple(reversed(path))
 
 
-def chain_from_urdf(urdf: str) -> Chain:
+def chain_from_urdf(urdf: str, locked: Mapping[str, float] | None = None) -> Chain:
     """Read a chain from URDF text; fixed joints are merged into the link they sit on.
 
+    Args:
+        urdf: the text of the file.
+        locked: joints held at a position [rad or m], by name; they become fixed joints.
+
     Raises:
-        ModelError: the text is no URDF, has no moving joint, or has a joint that is neither
-            revolute (or continuous) nor prismatic; the message names the joint.
+        ModelError: the text is no URDF, has no moving joint, has a joint that is neither
+            revolute (or continuous) nor prismatic, or no joint of a name in `locked`; the
+            message names the joint.
     """
-    try:
-        model = pin.buildModelFromXML(urdf)
-    except (ValueError, RuntimeError) as error:
-        raise ModelError(f"the robot description is not a readable URDF: {error}") from error
+    model = pinocchio_model(urdf, locked)
     if model.njoints < 2:
         raise ModelError("the robot description has no revolute or prismatic joint")
     indices = range(1, model.njoints)
@@ -82,7 +102,70 @@ def chain_from_urdf(urdf: str) -> Chain:
         inertial=np.array(
             [model.inertias[i].toDynamicParameters()[list(FROM_PINOCCHIO)] for i in indices]
         ),
+        frames={
+            frame.name: LinkFrame(
+                int(frame.parentJoint) - 1,
+                frame.placement.rotation.copy(),
+                frame.placement.translation.copy(),
+            )
+            for frame in model.frames
+            if frame.type == pin.FrameType.BODY
+        },
     )
+
+
+def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin.Model:
+    """Return pinocchio's model of URDF text, without the joints that are locked.
+
+    Raises:
+        ModelError: the text is no URDF of an open chain, or has no joint of a name in `locked`.
+    """
+    try:
+        model = pin.buildModelFromXML(urdf)
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(
+            f"the robot description is not a readable URDF: {urdf_fault(urdf) or error}"
+        ) from error
+    if (closed := closed_chain(urdf)) is not None:
+        raise ModelError(f"the robot description is no open chain: {closed}")
+    if not locked:
+        return model
+    posture = locked_posture(model, locked)
+    # Joints and links may share names, which the reduction takes for one and the same.
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY:
+            frame.name = _LINK + frame.name
+    reduced = pin.buildReducedModel(model, [model.getJointId(name) for name in locked], posture)
+    for frame in reduced.frames:
+        frame.name = frame.name.removeprefix(_LINK)
+    return reduced
+
+
+def locked_posture(model: pin.Model, locked: Mapping[str, float]) -> Array:
+    """Return the configuration with joints held at positions [rad or m], others at zero.
+
+    Raises:
+        ModelError: no joint has such a name, or a position is no number.
+    """
+    posture = pin.neutral(model)
+    names = list(model.names)[1:]
+    for name, position in locked.items():
+        if name not in names:
+            known = ", ".join(names) or "none"
+            raise ModelError(f"there is no moving joint {name!r} to lock; there are {known}")
+        if not math.isfinite(position):
+            raise ModelError(f"joint {name!r} is locked at {position!r}, no number", joint=name)
+        joint = model.joints[model.getJointId(name)]
+        if joint.nv == 1:
+            step = np.zeros(model.nv)
+            step[joint.idx_v] = position
+            posture = pin.integrate(model, posture, step)
+        elif position != 0.0:
+            raise ModelError(
+                f"joint {name!r} has {joint.nv} degrees of freedom; it can be locked at 0 only",
+                joint=name,
+            )
+    return np.asarray(posture)
 
 
 def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:

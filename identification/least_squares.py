@@ -15,16 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.clustered import clustered_covariance
+from identification.covariance import with_block_covariance
 from identification.errors import IdentificationError
 from identification.estimation import (
     Estimate,
+    Solution,
     estimate,
     joint_weights,
     mark_undetermined,
+    nothing_usable,
     residual_variance,
 )
 from identification.factor import Factor
 from identification.model import RobotModel
+from identification.phase_factor import PhaseFactor, total_phase
 from identification.preprocessing import Samples
 from identification.qr_factor import (
     QRFactor,
@@ -34,7 +38,6 @@ from identification.qr_factor import (
     reduced,
     solve_weighted,
 )
-from identification.row_solution import RowSolution
 
 Array = NDArray[np.float64]
 Weighting = Literal["ordinary", "weighted"]
@@ -78,25 +81,38 @@ def weighted_least_squares(
 
 
 def fit_least_squares(
-    model: RobotModel, recordings: Sequence[Samples], weighting: Weighting = "weighted"
+    model: RobotModel,
+    recordings: Sequence[Samples],
+    weighting: Weighting = "weighted",
+    *,
+    phase: PhaseFactor | None = None,
 ) -> Estimate:
     """Fit recordings, by QR where the condition demands it, with cluster-robust covariance.
+
+    Args:
+        model: the robot.
+        recordings: can be gone through twice: a sequence, not a generator.
+        weighting: whether joints count alike or by their own noise (eq. 4).
+        phase: of the recordings, if it is known: they are then read for QR only.
 
     Raises:
         IdentificationError: no recordings, or not one usable row.
     """
-    factor = reduced(model, recordings)
+    phase = total_phase(model, recordings) if phase is None else phase
+    factor = reduced(model, recordings, phase.total)
     if not factor.samples.any():
-        raise IdentificationError("there is not one usable sample to estimate from")
+        raise IdentificationError(nothing_usable(model))
     weights = np.ones(model.n_joints) if weighting == "ordinary" else weights_of(factor)
+    if isinstance(factor, Factor):
+        plain = estimate(model, factor, weights)
+        return with_block_covariance(plain, phase, weights, f"{weighting} least squares")
     solution = solve_weighted(factor, weights)
     clustered = clustered_covariance(model, recordings, solution, weights)
-    how = " by QR" if isinstance(factor, QRFactor) else ""
     return replace(
-        weighted_least_squares(model, factor, weights),
+        qr_estimate(model, factor, weights),
         covariance=clustered.covariance,
         interval_factor=clustered.interval_factor,
-        method=f"{weighting} least squares{how}, {clustered.words}",
+        method=f"{weighting} least squares by QR, {clustered.words}",
     )
 
 
@@ -107,14 +123,14 @@ def weights_of(factor: Factor | QRFactor) -> Array:
     return joint_weights(factor)
 
 
-def variance_of(factor: Factor | QRFactor, solution: RowSolution, weights: Array) -> Array:
+def variance_of(factor: Factor | QRFactor, solution: Solution, weights: Array) -> Array:
     """Variance of the torque residual per joint (n,), NaN for a joint without rows."""
     if isinstance(factor, QRFactor):
         return qr_residual_variance(factor, solution, weights)
     return residual_variance(factor, solution.values, solution.inverse, weights)
 
 
-def _middle(factor: Factor | QRFactor, solution: RowSolution, variance: Array) -> Array:
+def _middle(factor: Factor | QRFactor, solution: Solution, variance: Array) -> Array:
     """Sum of variance times S' G_j S (k, k), S being the solution's root."""
     if isinstance(factor, QRFactor):
         rows = np.sqrt(variance)[:, None, None] * (factor.triangle[:, :, :-1] @ solution.root)

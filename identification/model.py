@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.base_parameters import TOLERANCE, BaseParameters, select_base, share_left
+from identification.coupling import Coupling
 from identification.errors import ModelError, ShapeError
-from identification.friction import FrictionLaw
+from identification.friction import OFFSET, FrictionLaw
+from identification.joint_friction import JointFriction
 from identification.kinematics import Chain, chain_from_urdf
+from identification.payload import Load, Payload
 from identification.regressor import Regressor, RegressorPlan, joint_arrays
-from identification.wrench import LINK_SYMBOLS
+from identification.standard_layout import StandardLayout
 
 Array = NDArray[np.float64]
 
@@ -22,6 +27,8 @@ STANDARD_GRAVITY = (0.0, 0.0, -9.81)
 # States that excite every parameter of any arm; more than a few hundred change nothing.
 _N_STATES = 300
 _SEED = 20140901
+_NO_LAWS: Final[Mapping[str, FrictionLaw]] = MappingProxyType({})
+_NOT_LOCKED: Final[Mapping[str, float]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,29 +37,35 @@ class RobotModel:
 
     Build it with :meth:`from_urdf`. Joints are numbered from 1 in parameter names; inertial
     parameters are about the joint frame's origin, in its axes, ``mc`` is mass times centre of
-    mass, ``I`` the inertia tensor, ``I3m`` the rotor of joint 3 seen from the link side.
+    mass, ``I`` the inertia tensor, ``I3m`` the rotor of joint 3 seen from the link side, ``I45``
+    the coupling inertia of joints 4 and 5. A payload is known: its torque is no part of W pi.
 
     Attributes:
         chain: geometry and nominal inertia as read from the URDF.
         gravity: acceleration of gravity in base axes [m/s²], shape (3,).
-        rotor_inertia: whether every joint has a rotor inertia (column: its acceleration).
-        friction: friction law of every joint.
-        standard_names: the s standard parameters, link by link.
+        layout: where the s standard parameters stand.
+        friction: of every joint, and of coupled motors.
         base: the b base parameters and their grouping.
         parameter_names: the p parameters: base, then friction (all f0, all f1, ...).
         units: unit of each parameter, shape (p,).
         plan: how the regressor is made.
+        locked: position [rad or m] of joints of the description that are held.
+        coupling: motors that turn with several joints; None where each joint has its own.
+        payload: what the arm carries; None for nothing.
     """
 
     chain: Chain
     gravity: Array
-    rotor_inertia: bool
-    friction: FrictionLaw
-    standard_names: tuple[str, ...]
+    layout: StandardLayout
+    friction: JointFriction
     base: BaseParameters
     parameter_names: tuple[str, ...]
     units: tuple[str, ...]
     plan: RegressorPlan = field(repr=False)
+    locked: Mapping[str, float] = field(default_factory=dict)
+    coupling: Coupling | None = None
+    payload: Payload | None = None
+    _load: Load | None = field(default=None, repr=False)
 
     @classmethod
     def from_urdf(
@@ -62,6 +75,10 @@ class RobotModel:
         gravity: Sequence[float] = STANDARD_GRAVITY,
         rotor_inertia: bool = True,
         friction: FrictionLaw = FrictionLaw(),  # noqa: B008 - frozen
+        joint_friction: Mapping[str, FrictionLaw] = _NO_LAWS,
+        locked: Mapping[str, float] = _NOT_LOCKED,
+        coupling: Coupling | None = None,
+        payload: Payload | None = None,
     ) -> RobotModel:
         """Build the model from URDF text.
 
@@ -70,32 +87,60 @@ class RobotModel:
             gravity: in base axes [m/s²].
             rotor_inertia: give every joint a rotor inertia.
             friction: friction law of every joint.
+            joint_friction: other laws for some joints, by name.
+            locked: joints held at a position [rad or m], by name: no joints of the model.
+            coupling: motors that turn with several joints, joints in the model's order.
+            payload: a body of known mass that the arm carries.
 
         Raises:
             ModelError: the text is no open chain of revolute and prismatic joints, gravity is
-                not a finite vector, or a friction offset cannot be told from a weight.
+                not a finite vector, a name is of no joint, the coupling is of another number of
+                joints, or a friction offset cannot be told from a weight.
         """
-        chain = chain_from_urdf(urdf)
+        chain = chain_from_urdf(urdf, locked)
         down = np.array(gravity, dtype=np.float64)
         if down.shape != (3,) or not np.all(np.isfinite(down)):
             raise ModelError(f"gravity is {gravity!r}; it must be three finite numbers [m/s²]")
-        names = _standard_names(chain.n_joints, rotor_inertia)
-        base = _base_parameters(chain, down, rotor_inertia, friction, names)
-        friction_units = (
-            friction.unit(s, revolute=bool(r)) for s in friction.symbols for r in chain.revolute
-        )
+        laws = _laws(chain, friction, joint_friction)
+        if coupling is not None and coupling.n_joints != chain.n_joints:
+            raise ModelError(
+                f"the coupling is of {coupling.n_joints} joints, the robot has {chain.n_joints}"
+            )
+        revolute = tuple(bool(turns) for turns in chain.revolute)
+        pairs = coupling.pairs if coupling is not None and coupling.inertia else ()
+        layout = StandardLayout(revolute, rotor_inertia, pairs if rotor_inertia else ())
+        all_friction = JointFriction(laws, revolute, coupling)
+        base = _base_parameters(chain, down, layout, all_friction)
         return cls(
             chain=chain,
             gravity=down,
-            rotor_inertia=rotor_inertia,
-            friction=friction,
-            standard_names=names,
+            layout=layout,
+            friction=all_friction,
             base=base,
-            parameter_names=base.names + friction.names(chain.n_joints),
-            units=tuple(_unit(chain, int(k), rotor_inertia) for k in base.kept)
-            + tuple(friction_units),
-            plan=_plan(chain, down, base.kept, rotor_inertia, friction),
+            parameter_names=base.names + all_friction.names,
+            units=tuple(layout.units[k] for k in base.kept) + all_friction.units,
+            plan=_plan(chain, down, layout, base.kept, all_friction),
+            locked=dict(locked),
+            coupling=coupling,
+            payload=payload,
+            _load=None if payload is None else Load(chain, down, payload),
         )
+
+    @property
+    def standard_names(self) -> tuple[str, ...]:
+        """Names of the s standard parameters: link by link, then coupling inertias."""
+        return self.layout.names
+
+    @property
+    def rotor_inertia(self) -> bool:
+        """Whether every joint has a rotor inertia (column: its acceleration)."""
+        return self.layout.rotor_inertia
+
+    @property
+    def friction_columns(self) -> NDArray[np.bool_]:
+        """Which of the p parameters are friction (p,): all coefficients but offsets."""
+        inertial = np.zeros(self.base.rank, dtype=np.bool_)
+        return np.concatenate([inertial, self.friction.dissipating])
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -114,11 +159,10 @@ class RobotModel:
 
     @property
     def nominal(self) -> Array:
-        """Standard parameters as the URDF gives them, rotors zero, shape (s,)."""
-        width = _width(self.rotor_inertia)
-        values = np.zeros((self.n_joints, width))
-        values[:, : len(LINK_SYMBOLS)] = self.chain.inertial
-        return values.reshape(-1)
+        """Standard parameters as the URDF gives them, rotors and couplings zero, shape (s,)."""
+        values = np.zeros(self.layout.size)
+        values[self.layout.links] = self.chain.inertial
+        return values
 
     def regressor(self, q: Array, qd: Array, qdd: Array) -> Regressor:
         """Return W for m samples of motion, each array (m, n).
@@ -131,6 +175,8 @@ class RobotModel:
 
     def torque(self, values: Array, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the joint torques [N·m, N] for parameter values (p,), shape (m, n).
+
+        Without that of a payload: see :meth:`load_torque`.
 
         Raises:
             ShapeError: an array does not have the shape it should have.
@@ -146,85 +192,79 @@ class RobotModel:
                 torque[part, joint] = weights[joint] @ block
         return torque
 
+    def load_torque(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """Return the torque [N·m, N] that moving the known payload takes (m, n), zero without one.
+
+        Raises:
+            ShapeError: an array does not have the shape it should have.
+        """
+        if self._load is None:
+            (q,) = joint_arrays(self.n_joints, q=q)
+            return np.zeros(q.shape)
+        return self._load.torque(q, qd, qdd)
+
     def moving(self, qd: Array) -> NDArray[np.bool_]:
-        """Return where each joint is faster than the friction law's standstill, shape (m, n)."""
+        """Return where each joint's friction law can be fitted, shape (m, n).
+
+        Faster than its standstill, or anywhere in a linear zone.
+        """
         (qd,) = joint_arrays(self.n_joints, qd=qd)
         return self.friction.moving(qd)
 
 
-def _width(rotor_inertia: bool) -> int:
-    return len(LINK_SYMBOLS) + rotor_inertia
-
-
-def _standard_names(n_joints: int, rotor_inertia: bool) -> tuple[str, ...]:
-    symbols = LINK_SYMBOLS + (("Im",) if rotor_inertia else ())
-    return tuple(_name(symbol, joint) for joint in range(1, n_joints + 1) for symbol in symbols)
-
-
-def _name(symbol: str, joint: int) -> str:
-    """Put the joint number where the field writes it: I3xy, mc2y, m4, I5m."""
-    letters = "mc" if symbol.startswith("mc") else symbol[0]
-    return f"{letters}{joint}{symbol[len(letters) :]}"
-
-
-def _unit(chain: Chain, standard: int, rotor_inertia: bool) -> str:
-    joint, symbol = divmod(standard, _width(rotor_inertia))
-    if symbol == len(LINK_SYMBOLS):
-        return "kg m²" if chain.revolute[joint] else "kg"
-    name = LINK_SYMBOLS[symbol]
-    return {"I": "kg m²", "mc": "kg m", "m": "kg"}[name.rstrip("xyz")]
+def _laws(
+    chain: Chain, law: FrictionLaw, others: Mapping[str, FrictionLaw]
+) -> tuple[FrictionLaw, ...]:
+    """Return the friction law of each joint."""
+    for name in others:
+        if name not in chain.joint_names:
+            raise ModelError(
+                f"there is no joint {name!r} to have a friction law of its own; there are"
+                f" {', '.join(chain.joint_names)}"
+            )
+    return tuple(others.get(name, law) for name in chain.joint_names)
 
 
 def _plan(
     chain: Chain,
     gravity: Array,
+    layout: StandardLayout,
     kept: NDArray[np.intp],
-    rotor_inertia: bool,
-    friction: FrictionLaw | None,
+    friction: JointFriction | None,
 ) -> RegressorPlan:
-    links: list[list[int]] = [[] for _ in range(chain.n_joints)]
-    rotors = [False] * chain.n_joints
-    for standard in kept:
-        joint, symbol = divmod(int(standard), _width(rotor_inertia))
-        if symbol < len(LINK_SYMBOLS):
-            links[joint].append(symbol)
-        else:
-            rotors[joint] = True
-    return RegressorPlan(chain, gravity, links, rotors, friction)
+    links, rotors, couplings = layout.split(kept.tolist())
+    pairs = [layout.pairs[k] for k in couplings]
+    return RegressorPlan(chain, gravity, links, rotors, friction, pairs)
 
 
 def _base_parameters(
-    chain: Chain,
-    gravity: Array,
-    rotor_inertia: bool,
-    friction: FrictionLaw,
-    names: tuple[str, ...],
+    chain: Chain, gravity: Array, layout: StandardLayout, friction: JointFriction
 ) -> BaseParameters:
-    everything = np.arange(len(names), dtype=np.intp)
+    everything = np.arange(layout.size, dtype=np.intp)
     random = np.random.default_rng(_SEED)
     shape = (_N_STATES, chain.n_joints)
     q = random.uniform(-np.pi, np.pi, shape)
     qd = random.uniform(-3.0, 3.0, shape)
     qdd = random.uniform(-10.0, 10.0, shape)
-    plan = _plan(chain, gravity, everything, rotor_inertia, None)
-    rows = plan.evaluate(q, qd, qdd).dense(len(names)).reshape(-1, len(names))
-    units = [_unit(chain, standard, rotor_inertia) for standard in range(len(names))]
-    base = select_base(rows, names, units)
-    if friction.offset:
-        _refuse_weight_as_offset(chain, rows[:, base.kept])
+    plan = _plan(chain, gravity, layout, everything, None)
+    rows = plan.evaluate(q, qd, qdd).dense(layout.size).reshape(-1, layout.size)
+    base = select_base(rows, layout.names, layout.units)
+    _refuse_weight_as_offset(chain, friction, rows[:, base.kept])
     return base
 
 
-def _refuse_weight_as_offset(chain: Chain, columns: Array) -> None:
+def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Array) -> None:
     """Refuse an offset whose column, constant on one joint, the inertial columns contain."""
     n = chain.n_joints
+    if OFFSET not in friction.symbols:
+        return
     offsets = np.tile(np.eye(n), (len(columns) // n, 1))
     for joint, share in enumerate(share_left(offsets, columns)):
-        if share <= TOLERANCE:
+        if share <= TOLERANCE and OFFSET in friction.laws[joint].symbols:
             name = chain.joint_names[joint]
             raise ModelError(
                 f"joint {name!r} slides along gravity and has a rotor inertia: the offset of its "
                 "friction and the weight it carries cannot be told apart; leave out the offset "
-                "or the rotor inertias",
+                "(asymmetric friction has one) or the rotor inertias",
                 joint=name,
             )

@@ -63,17 +63,18 @@ def nominal_prior(
 
 
 def _nominal_std(model: RobotModel, share: float) -> Array:
-    """Standard deviations of the standard parameters (s,), infinite for rotors."""
-    per_link = len(model.standard_names) // model.n_joints
-    values = np.abs(model.nominal).reshape(model.n_joints, per_link)
+    """Standard deviations of the standard parameters (s,), infinite for what turns on motors."""
+    values = np.abs(model.nominal[model.layout.links])
     inertia, mass = values[:, _INERTIA].max(axis=1), values[:, _MASS].copy()
     if not (inertia.any() and mass.any()):
         raise IdentificationError("the URDF gives no inertia to make a prior from")
     inertia[inertia == 0.0], mass[mass == 0.0] = inertia.max(), mass.max()
     moment = values[:, _MOMENT].max(axis=1)
     moment = np.where(moment > 0.0, moment, np.sqrt(mass * inertia))
-    std = np.full(values.shape, np.inf)
-    std[:, _INERTIA] = share * inertia[:, None]
-    std[:, _MOMENT] = share * moment[:, None]
-    std[:, _MASS] = share * mass
-    return std.reshape(-1)
+    links = np.empty(values.shape)
+    links[:, _INERTIA] = share * inertia[:, None]
+    links[:, _MOMENT] = share * moment[:, None]
+    links[:, _MASS] = share * mass
+    std = np.full(model.layout.size, np.inf)
+    std[model.layout.links] = links
+    return std

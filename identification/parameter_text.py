@@ -7,10 +7,12 @@ no such numbers; a parameter that the data do not determine has an infinite stan
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -21,6 +23,7 @@ from identification.errors import IdentificationError
 from identification.estimation import Estimate
 from identification.friction_text import friction_in_words
 from identification.model import RobotModel
+from identification.urdf_write import not_in_urdf
 from identification.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
@@ -29,10 +32,9 @@ SCHEMA: Final = "hil-parameters-1"
 CONVENTION: Final = (
     "Link parameters are about the origin of the link's joint frame (URDF), in its axes: I is the"
     " inertia tensor (off-diagonals are minus the products of inertia), mc mass times centre of"
-    " mass, m the mass; Im is the rotor inertia seen from the link side. Joints count from 1,"
-    " depth first."
+    " mass, m the mass; Im is the rotor inertia seen from the link side; I45 is the inertia that"
+    " coupled motors add between joints 4 and 5. Joints count from 1, in the order of `joints`."
 )
-_N_LINK: Final = len(LINK_SYMBOLS)
 
 
 def parameters_dict(
@@ -40,6 +42,7 @@ def parameters_dict(
     estimate: Estimate,
     *,
     consistent: ConsistentEstimate | None = None,
+    essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Return everything about an estimate, of plain values that `json` can write.
@@ -48,6 +51,7 @@ def parameters_dict(
         model: the robot.
         estimate: of the model's parameters, with its covariance.
         consistent: adds the full standard parameters, rotor inertias included.
+        essential: names of the essential parameters, where they were looked for.
         provenance: what the parameters come from: recordings, versions, digests.
 
     Raises:
@@ -59,6 +63,8 @@ def parameters_dict(
         "schema": SCHEMA,
         "provenance": dict(provenance or {}),
         "joints": list(model.joint_names),
+        "locked_joints": {name: float(position) for name, position in model.locked.items()},
+        "payload": _payload(model),
         "gravity": [float(x) for x in model.gravity],
         "convention": CONVENTION,
         "method": estimate.method,
@@ -75,6 +81,8 @@ def parameters_dict(
                 "unit": unit,
                 "value": _plain(value),
                 "std": _plain(std),
+                "determined": name not in estimate.undetermined,
+                "essential": None if essential is None else name in essential,
             }
             for name, expression, unit, value, std in _rows(model, estimate)
         ],
@@ -88,10 +96,13 @@ def parameters_json(
     estimate: Estimate,
     *,
     consistent: ConsistentEstimate | None = None,
+    essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> str:
     """Return :func:`parameters_dict` as JSON text."""
-    content = parameters_dict(model, estimate, consistent=consistent, provenance=provenance)
+    content = parameters_dict(
+        model, estimate, consistent=consistent, essential=essential, provenance=provenance
+    )
     return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -126,24 +137,37 @@ def standard_csv(
     *,
     provenance: Mapping[str, str] | None = None,
 ) -> str:
-    """Return a table of the full standard parameters, one row per joint, consistent by link."""
+    """Return a table of the full standard parameters, one row per joint, consistent by link.
+
+    A name that a spreadsheet would compute has an apostrophe in front.
+    """
     out = io.StringIO()
     _write_remarks(out, {**(provenance or {}), "convention": CONVENTION})
     table = csv.writer(out, lineterminator="\n")
-    symbols = (*LINK_SYMBOLS, *(("Im",) if model.rotor_inertia else ()))
-    table.writerow(["joint", *symbols, "margin", "reference"])
-    rows = consistent.standard.reshape(model.n_joints, -1)
-    for joint, link, margin, words in zip(
-        model.joint_names, rows, consistent.margin, consistent.reference, strict=True
-    ):
-        table.writerow([joint, *(repr(float(x)) for x in link), repr(float(margin)), words])
+    inertial, rotors, couplings = _parts(model, consistent)
+    # In front of the table: behind it a comment would be a row of its own to some readers.
+    units = dict(zip(model.layout.names, model.layout.units, strict=True))
+    _write_remarks(out, {name: f"{value!r} {units[name]}" for name, value in couplings.items()})
+    table.writerow(["joint", *LINK_SYMBOLS, *(["Im"] if rotors else []), "margin", "reference"])
+    for joint, name in enumerate(model.joint_names):
+        numbers = [*inertial[joint], *rotors[joint : joint + 1], float(consistent.margin[joint])]
+        table.writerow(
+            [_harmless(name), *map(repr, numbers), _harmless(consistent.reference[joint])]
+        )
     return out.getvalue()
 
 
 def _write_remarks(out: io.StringIO, remarks: Mapping[str, str]) -> None:
     """Write one line that begins with # per remark, line ends within it removed."""
     for key, value in remarks.items():
-        out.write(f"# {' '.join(f'{key}: {value}'.split())}\n")
+        line = " ".join(f"{key}: {value}".split())
+        out.write("# " + re.sub(r"(?<=[,;])[=+@-]", r"'\g<0>", line) + "\n")
+
+
+def _harmless(text: str) -> str:
+    """Return text on one line that no spreadsheet takes for a formula, which can call programs."""
+    line = "".join(c if c.isprintable() else " " for c in text)
+    return f"'{line}" if line.lstrip().startswith(("=", "+", "-", "@")) else line
 
 
 def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, float, float]]:
@@ -164,29 +188,52 @@ def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, fl
 
 def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, Any]:
     """Return the consistent standard parameters and friction, joint by joint."""
-    rows = consistent.standard.reshape(model.n_joints, -1)
-    symbols = model.friction.symbols
-    friction = consistent.friction.reshape(len(symbols), model.n_joints)
-    links = []
-    for joint, name in enumerate(model.joint_names):
-        links.append(
+    inertial, rotors, couplings = _parts(model, consistent)
+    terms = list(zip(model.friction.terms, consistent.friction.tolist(), strict=True))
+    return {
+        "method": consistent.estimate.method,
+        "links": [
             {
                 "joint": name,
-                **{s: float(x) for s, x in zip(LINK_SYMBOLS, rows[joint], strict=False)},
-                "rotor_inertia": float(rows[joint, _N_LINK]) if model.rotor_inertia else None,
-                "friction": {s: float(friction[k, joint]) for k, s in enumerate(symbols)},
+                **dict(zip(LINK_SYMBOLS, inertial[joint], strict=True)),
+                "rotor_inertia": rotors[joint] if rotors else None,
+                "friction": {
+                    term.symbol: value
+                    for term, value in terms
+                    if term.owner == joint and not term.motor
+                },
                 "margin": float(consistent.margin[joint]),
                 "reference": consistent.reference[joint],
             }
-        )
-    return {
-        "links": links,
+            for joint, name in enumerate(model.joint_names)
+        ],
+        "coupling_inertia": couplings,
+        "rotor_matrix": _plain(model.layout.rotor_matrix(consistent.standard)),
+        "motor_friction": {term.name: value for term, value in terms if term.motor},
+        "not_in_urdf": list(not_in_urdf(model)),
         "status": consistent.status,
         "relative_error": consistent.relative_error,
         "unconstrained_relative_error": consistent.unconstrained_relative_error,
         "covariance": "that of the unconstrained parameters: inequalities have none of their own;"
         " what the data do not determine is the nominal's",
     }
+
+
+def _payload(model: RobotModel) -> dict[str, Any] | None:
+    """Return the known payload, whose torque is in none of the parameters."""
+    if model.payload is None:
+        return None
+    own = dataclasses.asdict(model.payload)
+    return {**own, "centre": list(own["centre"]), "inertia": list(own["inertia"])}
+
+
+def _parts(
+    model: RobotModel, consistent: ConsistentEstimate
+) -> tuple[list[list[float]], list[float], dict[str, float]]:
+    """Return the ten parameters of each link, the rotors, and inertias between joints by name."""
+    layout, standard = model.layout, consistent.standard
+    couplings = {layout.names[k]: float(standard[k]) for k in layout.couplings}
+    return standard[layout.links].tolist(), standard[layout.rotors].tolist(), couplings
 
 
 def _plain(values: float | Array) -> Any:

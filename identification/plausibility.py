@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from identification.estimation import Estimate
 from identification.factor import Factor
+from identification.friction import OFFSET
 from identification.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -105,17 +106,18 @@ def _friction(
     that is over, and less than half is a viscous coefficient with the wrong sign.
     """
     found = []
-    symbols = model.friction.symbols
-    at_speed = np.zeros((len(symbols), model.n_joints))
-    model.friction.columns(speed, at_speed)
-    for joint, name in enumerate(model.joint_names):
+    first = model.base.rank
+    for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
+        column = np.zeros((len(law.symbols), 1))
+        law.columns(speed[joint : joint + 1], column)
+        at_speed = dict(zip(law.symbols, column[:, 0], strict=True))
         top, coulomb = np.zeros((2, len(estimate.values)))
-        for symbol, column in zip(symbols, at_speed[:, joint], strict=True):
-            index = estimate.names.index(f"{symbol}_{joint + 1}")
-            if symbol != "fo":
-                top[index] = column
-            if symbol == "f0":
-                coulomb[index] = 1.0
+        for k, term in enumerate(model.friction.terms, start=first):
+            if term.motor or term.owner != joint or term.symbol == OFFSET:
+                continue
+            top[k] = at_speed[term.symbol]
+            if term.symbol == "f0":
+                coulomb[k] = 1.0
         torque = _torque_rms(motion, np.where(top != 0.0, estimate.values, 0.0))
         if _is_negative(estimate, coulomb, sigmas):
             words = (
@@ -130,6 +132,26 @@ def _friction(
                 f" {coulomb @ estimate.values:.3g}"
             )
             found.append(_Offence(words, torque))
+    return found + _motor_friction(model, estimate, motion, sigmas)
+
+
+def _motor_friction(
+    model: RobotModel, estimate: Estimate, motion: Factor, sigmas: float
+) -> list[_Offence]:
+    """Coulomb or viscous friction below zero of a motor that several joints turn."""
+    found = []
+    for k, term in enumerate(model.friction.terms, start=model.base.rank):
+        if not term.motor:
+            continue
+        direction = np.zeros(len(estimate.values))
+        direction[k] = 1.0
+        if _is_negative(estimate, direction, sigmas):
+            words = (
+                f"friction {term.name} of motor {term.owner + 1} is negative:"
+                f" {estimate.values[k]:.3g} ± {estimate.std[k]:.2g} {term.unit}; a coupling ratio"
+                " or a direction may have the wrong sign"
+            )
+            found.append(_Offence(words, _torque_rms(motion, direction * estimate.values)))
     return found
 
 

@@ -18,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.clustered import clustered_covariance
+from identification.covariance import block_covariance
 from identification.errors import IdentificationError, ShapeError
-from identification.estimation import Estimate, mark_undetermined
+from identification.estimation import Estimate, mark_undetermined, nothing_usable
 from identification.factor import Factor
 from identification.least_squares import variance_of, weights_of
 from identification.model import RobotModel
+from identification.phase_factor import PhaseFactor, total_phase
 from identification.preprocessing import Samples
 from identification.qr_factor import QRFactor, reduced, solve_weighted
 from identification.row_solution import rows_of, solve_rows, undetermined_names
@@ -128,12 +130,14 @@ class PosteriorEstimate:
         estimate: its covariance is the posterior's.
         prior_mean: (p,).
         prior_std: (p,), infinite where nothing was believed.
+        words: where the prior comes from.
         design_effect: by how much coloured residuals make the variance larger than white ones.
     """
 
     estimate: Estimate
     prior_mean: Array
     prior_std: Array
+    words: str
     design_effect: float
 
     @property
@@ -214,11 +218,15 @@ def with_prior(
         condition=solve_rows(rows, target).condition if len(rows) else np.inf,
         undetermined=undetermined_names(model.parameter_names, posterior.determined),
     )
-    return PosteriorEstimate(estimate, prior.mean, prior.std, design_effect)
+    return PosteriorEstimate(estimate, prior.mean, prior.std, prior.words, design_effect)
 
 
 def fit_with_prior(
-    model: RobotModel, recordings: Sequence[Samples], prior: GaussianPrior
+    model: RobotModel,
+    recordings: Sequence[Samples],
+    prior: GaussianPrior,
+    *,
+    phase: PhaseFactor | None = None,
 ) -> PosteriorEstimate:
     """Fit recordings with a prior, the data weighing as much as their coloured residuals allow.
 
@@ -227,14 +235,26 @@ def fit_with_prior(
     all directions of the parameter space, of the cluster-robust variance to that of white
     residuals (Rao and Scott 1981; Pauli, Racugno and Ventura 2011).
 
+    Args:
+        model: the robot.
+        recordings: can be gone through twice: a sequence, not a generator.
+        prior: on the model's p parameters.
+        phase: of the recordings, if it is known: they are then read for QR only.
+
     Raises:
         IdentificationError: no recordings, or not one usable row.
     """
-    factor = reduced(model, recordings)
-    weights = _weights(factor)
+    phase = total_phase(model, recordings) if phase is None else phase
+    factor = reduced(model, recordings, phase.total)
     if not factor.samples.any():
-        raise IdentificationError("there is not one usable sample to estimate from")
-    clustered = clustered_covariance(model, recordings, solve_weighted(factor, weights), weights)
+        raise IdentificationError(nothing_usable(model))
+    weights = _weights(factor)
+    solution = solve_weighted(factor, weights)
+    clustered = (
+        block_covariance(phase, weights, solution.values)
+        if isinstance(factor, Factor)
+        else clustered_covariance(model, recordings, solution, weights)
+    )
     effect = max(1.0, clustered.design_effect)
     result = with_prior(model, factor, prior, weights, design_effect=effect)
     return replace(

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from identification.augmented_rows import augmented_rows
 from identification.errors import IdentificationError, ShapeError
-from identification.estimation import Estimate, mark_undetermined, solve, total
+from identification.estimation import Estimate, Solution, mark_undetermined, solve, total
 from identification.factor import Factor
 from identification.model import RobotModel
 from identification.preprocessing import Samples
-from identification.row_solution import RowSolution, rows_of, solve_rows, undetermined_names
+from identification.row_solution import rows_of, solve_rows, undetermined_names
 
 Array = NDArray[np.float64]
 
@@ -162,13 +162,13 @@ class QRFactor:
             n=int(self.samples.sum()),
         )
 
-    def solve(self, weights: Array) -> RowSolution:
+    def solve(self, weights: Array) -> Solution:
         """Solve the weighted least-squares problem, weights (n,)."""
         rows = self.weighted(weights)
         return solve_rows(rows.R, rows.z)
 
 
-def qr_residual_variance(factor: QRFactor, solution: RowSolution, weights: Array) -> Array:
+def qr_residual_variance(factor: QRFactor, solution: Solution, weights: Array) -> Array:
     """Variance of the torque residual per joint (n,), NaN for a joint without rows.
 
     Degrees of freedom as in :func:`identification.estimation.residual_variance`.
@@ -225,7 +225,9 @@ def qr_estimate(model: RobotModel, factor: QRFactor, weights: Array | None = Non
     )
 
 
-def reduced(model: RobotModel, recordings: Iterable[Samples]) -> Factor | QRFactor:
+def reduced(
+    model: RobotModel, recordings: Iterable[Samples], gram: Factor | None = None
+) -> Factor | QRFactor:
     """Reduce recordings to Gram matrices, or to triangles where the condition demands it.
 
     The Gram matrices come first, being five times as fast; the samples are read a second time
@@ -234,23 +236,25 @@ def reduced(model: RobotModel, recordings: Iterable[Samples]) -> Factor | QRFact
     Args:
         model: the robot.
         recordings: can be gone through twice: a sequence, not a generator.
+        gram: their factor, if it is known.
 
     Raises:
         IdentificationError: no recordings, or they can be gone through only once.
     """
     if iter(recordings) is recordings:
         raise IdentificationError("recordings may have to be read twice: a sequence is needed")
-    factors = [samples.factor(model) for samples in recordings]
-    if not factors:
-        raise IdentificationError("there are no recordings to estimate from")
-    gram = total(factors)
+    if gram is None:
+        factors = [samples.factor(model) for samples in recordings]
+        if not factors:
+            raise IdentificationError("there are no recordings to estimate from")
+        gram = total(factors)
     if solve(gram.weighted(np.ones(model.n_joints))).condition <= QR_CONDITION:
         return gram
     triangles = (QRFactor.from_samples(model, samples) for samples in recordings)
     return sum(triangles, QRFactor.zero(model))
 
 
-def solve_weighted(factor: Factor | QRFactor, weights: Array) -> RowSolution:
+def solve_weighted(factor: Factor | QRFactor, weights: Array) -> Solution:
     """Solve the weighted least-squares problem of either kind of factor, weights (n,)."""
     if isinstance(factor, QRFactor):
         return factor.solve(weights)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from identification.errors import ShapeError
 from identification.friction import FrictionLaw
+from identification.joint_friction import JointFriction
 from identification.kinematics import Chain
 from identification.link_motion import LinkMotion
 from identification.wrench import (
@@ -69,11 +70,13 @@ class RegressorPlan:
         gravity: acceleration of gravity in base axes [m/s²], shape (3,).
         links: per joint the kept :data:`identification.wrench.LINK_SYMBOLS` (0..9), rising.
         rotors: joints whose rotor inertia has a column of its own.
-        friction: friction law of every joint, None for none.
+        friction: of joints and coupled motors, None for none.
+        couplings: pairs of joints whose coupling inertia has a column.
 
     Attributes:
         columns: per joint j the parameter index of each column in its row, shape (c_j,).
-            Parameters are numbered link by link (inertial, then rotor), then friction.
+            Parameters are numbered link by link (inertial, then rotor), then coupling inertias,
+            then friction.
     """
 
     def __init__(
@@ -82,17 +85,19 @@ class RegressorPlan:
         gravity: Array,
         links: Sequence[Sequence[int]],
         rotors: Sequence[bool],
-        friction: FrictionLaw | None,
+        friction: JointFriction | None,
+        couplings: Sequence[tuple[int, int]] = (),
     ) -> None:
         self.chain = chain
         self.gravity = gravity
         self.links = tuple(tuple(kept) for kept in links)
         self.rotors = tuple(rotors)
         self.friction = friction
-        # Order in the working array: columns of the links, then of the joint alone: friction,
-        # rotor, response.
+        self.couplings = tuple(couplings)
+        # Order in the working array: columns of the links, then of the joint's drive: friction,
+        # motor friction, rotor, coupling inertias, response.
         self.first_own = sum(len(kept) for kept in links)
-        self.rotor_row = self.first_own + (len(friction.symbols) if friction else 0)
+        self.own = tuple(_OwnRows.of(self, joint) for joint in range(chain.n_joints))
         self.rows: tuple[Rows, ...]
         self.columns: tuple[NDArray[np.intp], ...]
         self.rows, self.columns = _lay_out(self)
@@ -153,7 +158,36 @@ class RegressorPlan:
 
     def response_row(self, joint: int) -> int:
         """Return the row behind all columns of a joint."""
-        return self.rotor_row + self.rotors[joint]
+        return self.own[joint].response
+
+
+class _OwnRows(NamedTuple):
+    """Rows of one joint, in the working array, that belong to its drive."""
+
+    friction: slice  # its own law, term by term
+    motors: dict[tuple[int, str], int]  # by coupled motor and symbol
+    rotor: int | None
+    couplings: dict[int, int]  # by the joint that it is coupled to
+    response: int
+
+    @classmethod
+    def of(cls, plan: RegressorPlan, joint: int) -> _OwnRows:
+        """Lay out the rows of a joint, one behind the other."""
+        row = plan.first_own
+        motors: dict[tuple[int, str], int] = {}
+        if plan.friction is not None:
+            row += len(plan.friction.laws[joint].symbols)
+            speeds = plan.friction.motor_speeds()[:, joint]
+            felt = {m for m, s in zip(plan.friction.motors, speeds, strict=True) if s != 0.0}
+            acting = [t for t in plan.friction.terms if t.motor and t.owner in felt]
+            motors = {(term.owner, term.symbol): row + k for k, term in enumerate(acting)}
+        friction = slice(plan.first_own, row)
+        row += len(motors)
+        rotor = row if plan.rotors[joint] else None
+        row += plan.rotors[joint]
+        others = [sum(pair) - joint for pair in plan.couplings if joint in pair]
+        couplings = {other: row + k for k, other in enumerate(others)}
+        return cls(friction, motors, rotor, couplings, row + len(others))
 
 
 class _Workspace:
@@ -167,12 +201,13 @@ class _Workspace:
 
     def __init__(self, plan: RegressorPlan, size: int) -> None:
         n = plan.chain.n_joints
-        self.rows = np.zeros((n, plan.rotor_row + 2, size))
+        self.rows = np.zeros((n, max(own.response for own in plan.own) + 1, size))
         self.size = size
         self._plan = plan
         self._motion = LinkMotion(plan.chain, plan.gravity, size)
         self._primitives = np.empty((n, N_PRIMITIVES, size))
-        self._friction = self.rows[:, plan.first_own : plan.rotor_row].transpose(1, 0, 2)
+        self._friction = self._friction_parts()
+        self._drives = self._drive_parts()
         self._contractions: list[_Contraction] = []
         first = 0
         for link, kept in enumerate(plan.links):
@@ -206,6 +241,45 @@ class _Workspace:
             )
         )
 
+    def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array]]:
+        """Return laws, the speeds that they read, and the rows that they write."""
+        plan, velocity = self._plan, self._motion.velocity
+        if plan.friction is None:
+            return []
+        if (one := plan.friction.one_law) is not None:
+            rows = self.rows[:, plan.own[0].friction]
+            return [(one, velocity, rows.transpose(1, 0, 2))]
+        return [
+            (law, velocity[j], self.rows[j, plan.own[j].friction])
+            for j, law in enumerate(plan.friction.laws)
+        ]
+
+    def _drive_parts(self) -> list[tuple[Array, Array]]:
+        """Return accelerations and the rows of rotors and coupling inertias that they go to."""
+        acceleration = self._motion.acceleration
+        places = {own.rotor for own in self._plan.own}
+        parts = []
+        if len(places) == 1 and None not in places:  # one step for all joints
+            parts.append((acceleration, self.rows[:, next(iter(places))]))
+        else:
+            for joint, own in enumerate(self._plan.own):
+                if own.rotor is not None:
+                    parts.append((acceleration[joint], self.rows[joint, own.rotor]))
+        for joint, own in enumerate(self._plan.own):
+            for other, row in own.couplings.items():
+                parts.append((acceleration[other], self.rows[joint, row]))
+        return parts
+
+    def _write_motor_friction(self, friction: JointFriction) -> None:
+        """Friction f(c qd) of a motor acts on the joints as c' f(c qd)."""
+        for motor, share in zip(friction.motors, friction.motor_speeds(), strict=True):
+            speed = share @ self._motion.velocity
+            column = {"f0": friction.laws[motor].sign(speed), "f1": speed}
+            for joint in np.flatnonzero(share):
+                for (index, symbol), row in self._plan.own[joint].motors.items():
+                    if index == motor:
+                        np.multiply(share[joint], column[symbol], out=self.rows[joint, row])
+
     def update(self, q: Array, qd: Array, qdd: Array) -> None:
         """Make all columns for k <= size samples (k, n); those behind mean nothing."""
         motion, plan = self._motion, self._plan
@@ -217,10 +291,12 @@ class _Workspace:
                 np.einsum("jrt,crt->jct", c.twists, c.wrenches, out=c.target)
             else:
                 c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
-        if plan.friction is not None:
-            plan.friction.columns(motion.velocity, self._friction)
-        if any(plan.rotors):
-            self.rows[:, plan.rotor_row] = motion.acceleration
+        for law, velocity, target in self._friction:
+            law.columns(velocity, target)
+        for source, target in self._drives:
+            np.copyto(target, source)
+        if plan.friction is not None and plan.friction.motors:
+            self._write_motor_friction(plan.friction)
 
 
 class _Contraction(NamedTuple):
@@ -269,13 +345,20 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
                     rows[joint].append(place)
                     columns[joint].append(offsets[link] + position)
             place += 1
-    for joint in range(n):
-        for term in range(plan.rotor_row - plan.first_own):
-            rows[joint].append(plan.first_own + term)
-            columns[joint].append(offsets[-1] + term * n + joint)
-        if plan.rotors[joint]:
-            rows[joint].append(plan.rotor_row)
+    first_friction = offsets[-1] + len(plan.couplings)
+    terms = plan.friction.terms if plan.friction is not None else ()
+    places = {(t.motor, t.owner, t.symbol): first_friction + k for k, t in enumerate(terms)}
+    for joint, own in enumerate(plan.own):
+        if plan.friction is not None:
+            symbols = plan.friction.laws[joint].symbols
+            columns[joint] += [places[False, joint, symbol] for symbol in symbols]
+            columns[joint] += [places[True, motor, symbol] for motor, symbol in own.motors]
+        if own.rotor is not None:
             columns[joint].append(offsets[joint] + len(plan.links[joint]))
+        for other in own.couplings:
+            pair = (min(joint, other), max(joint, other))
+            columns[joint].append(offsets[-1] + plan.couplings.index(pair))
+        rows[joint] += range(plan.first_own, own.response)
     return (
         tuple(_as_slice(r) for r in rows),
         tuple(np.array(c, dtype=np.intp) for c in columns),

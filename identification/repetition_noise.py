@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.preprocessing import difference_variance
+from identification.noise import difference_variance
 from identification.recording import Recording
 
 Array = NDArray[np.float64]

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.covariance import PhaseFactor, with_block_covariance
 from identification.errors import IdentificationError
-from identification.estimation import Estimate, estimate, joint_weights
+from identification.estimation import Estimate, estimate
 from identification.factor import Factor
+from identification.least_squares import fit_least_squares
 from identification.model import RobotModel
+from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Samples
 
 Array = NDArray[np.float64]
+
+Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
+"""An estimator: some recordings and their factor to an estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +27,12 @@ class RepeatedEstimate:
     """Estimates over R repetitions of one motion.
 
     Attributes:
-        pooled: from the sum of all factors. This is the result. Its covariance is clustered by
+        pooled: from all samples at once. This is the result. Its covariance is clustered by
             time of the motion, so that an error of the model that repeats is not averaged away.
-        repetitions: from each alone (eq. 4), with the covariance of its own blocks.
-        factor: sum of all factors.
-        classical_std: of the pooled estimate if residuals were white (p,).
+        repetitions: from each alone, with the covariance of its own blocks.
+        phase: sum of all factors, by time of the motion.
+        factor: the same without regard to time.
+        classical_std: of weighted least squares on all samples if residuals were white (p,).
         independent_std: of the pooled estimate if repetitions were independent: root mean square
             of the repetitions' own standard deviations over sqrt(R) (p,).
         scatter_std: standard deviation over the repetitions over sqrt(R) (p,): what noise alone
@@ -36,10 +41,38 @@ class RepeatedEstimate:
 
     pooled: Estimate
     repetitions: tuple[Estimate, ...]
+    phase: PhaseFactor
     factor: Factor
     classical_std: Array
     independent_std: Array
     scatter_std: Array
+
+    @classmethod
+    def of(
+        cls,
+        model: RobotModel,
+        pooled: Estimate,
+        repetitions: Sequence[Estimate],
+        phase: PhaseFactor,
+    ) -> RepeatedEstimate:
+        """Put an estimate from all beside those from each."""
+        values = np.array([one.values for one in repetitions])
+        root = np.sqrt(len(repetitions))
+        variances = [np.diag(one.covariance) for one in repetitions]
+        factor = phase.total
+        return cls(
+            pooled=pooled,
+            repetitions=tuple(repetitions),
+            phase=phase,
+            factor=factor,
+            classical_std=estimate(model, factor).std,
+            independent_std=np.sqrt(np.mean(variances, axis=0)) / root,
+            scatter_std=(
+                values.std(axis=0, ddof=1) / root
+                if len(values) > 1
+                else np.full(values.shape[1], np.nan)
+            ),
+        )
 
     @property
     def mean(self) -> Array:
@@ -52,36 +85,36 @@ class RepeatedEstimate:
         return np.asarray(self.scatter_std * np.sqrt(len(self.repetitions)))
 
 
-def estimate_repetitions(model: RobotModel, recordings: Iterable[Samples]) -> RepeatedEstimate:
-    """Estimate from each repetition and from all; samples are read once, one at a time.
+def estimate_repetitions(
+    model: RobotModel,
+    recordings: Sequence[Samples],
+    fit: Fit | None = None,
+    *,
+    each: Fit | None = None,
+) -> RepeatedEstimate:
+    """Estimate from each repetition and from all.
+
+    Args:
+        model: the robot.
+        recordings: the repetitions.
+        fit: the estimator; by default weighted least squares (eq. 4), which reads the samples
+            once unless their condition demands QR.
+        each: that of single repetitions, by default the same.
 
     Raises:
         IdentificationError: no repetitions, or one without a usable row.
     """
-    phase: PhaseFactor | None = None
-    repetitions = []
+    if not recordings:
+        raise IdentificationError("there are no repetitions to estimate from")
+
+    def weighted(some: Sequence[Samples], factor: PhaseFactor) -> Estimate:
+        return fit_least_squares(model, some, phase=factor)
+
+    fit = weighted if fit is None else fit
+    each = fit if each is None else each
+    phase, repetitions = PhaseFactor.zero(model), []
     for samples in recordings:
         own = PhaseFactor.from_samples(model, samples)
-        weights = joint_weights(own.total)
-        repetitions.append(with_block_covariance(estimate(model, own.total, weights), own, weights))
-        phase = own if phase is None else phase + own
-    if phase is None:
-        raise IdentificationError("there are no repetitions to estimate from")
-    factor = phase.total
-    weights = joint_weights(factor)
-    classical = estimate(model, factor, weights)
-    values = np.array([one.values for one in repetitions])
-    root = np.sqrt(len(repetitions))
-    variances = [np.diag(one.covariance) for one in repetitions]
-    return RepeatedEstimate(
-        pooled=with_block_covariance(classical, phase, weights),
-        repetitions=tuple(repetitions),
-        factor=factor,
-        classical_std=classical.std,
-        independent_std=np.sqrt(np.mean(variances, axis=0)) / root,
-        scatter_std=(
-            values.std(axis=0, ddof=1) / root
-            if len(values) > 1
-            else np.full(values.shape[1], np.nan)
-        ),
-    )
+        repetitions.append(each([samples], own))
+        phase = phase + own
+    return RepeatedEstimate.of(model, fit(recordings, phase), repetitions, phase)

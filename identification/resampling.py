@@ -18,11 +18,14 @@ from scipy.interpolate import PchipInterpolator, make_interp_spline
 from identification.recording import GAP_STEPS, Recording, RecordingError
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
 # A filter that takes samples for uniform misplaces them by their jitter. One percent of a step
 # moves a sine of a tenth of the sampling rate by less than one percent of its amplitude.
 UNIFORM: Final = 0.01
-_DROPPED: Final = 1.5  # steps
+# Where a sample may be missing; whether one is, the phase of the clock around it says.
+_DROPPED: Final = 1.35  # steps
+_PHASE_STAMPS: Final = 7
 _CUBIC: Final = 4  # samples
 
 
@@ -38,8 +41,8 @@ class TimeBase:
         largest_deviation: of one of them, in such steps.
         repeated: samples with the time stamp of the one before.
         backward: samples with an earlier time stamp than the one before.
-        dropped: samples that are missing where the clock steps by more than 1.5 and at most
-            `GAP_STEPS` usual ones.
+        dropped: samples that are missing where the clock steps by at most
+            `GAP_STEPS` usual steps.
         gaps: longer steps, and gaps that were reported.
     """
 
@@ -99,26 +102,63 @@ def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeB
     forward = steps[steps > 0.0]
     if forward.size == 0:
         raise RecordingError("clock", f"the clock of all {len(time)} samples stands still")
-    step = float(np.median(forward))
     reported = np.zeros(len(steps), dtype=np.bool_) if gap_before is None else gap_before[1:]
-    gap = reported | (steps > GAP_STEPS * step)
-    missing = np.rint(steps / step) - 1.0
-    drop = ~gap & (steps > _DROPPED * step)
-    usual = steps[~gap & ~drop & (steps > 0.0)]
-    # The mean knows more digits than the median, which is one of the rounded steps.
-    step = float(usual.mean()) if usual.size else step
-    usual = usual / step
+    median = float(np.median(forward))
+    gap = reported | (steps > GAP_STEPS * median)
+    within = ~gap & (steps > 0.0)
+    step = _usual_step(time, steps[within], median)
+    suspects = np.flatnonzero(within & (steps > _DROPPED * step))
+    missing = _missing(time, gap, suspects, step)
+    if within.any() and within[~gap].all():  # nothing repeats: every sample stands for its time
+        step = float(steps[within].sum() / (np.count_nonzero(within) + missing.sum()))
+    relative = steps[within & (missing == 0.0)] / step
     return TimeBase(
         samples=len(time),
         duration=float(time[-1] - time[0]),
         step=step,
-        jitter=float(usual.std()) if usual.size else 0.0,
-        largest_deviation=float(np.abs(usual - 1.0).max(initial=0.0)),
+        jitter=float(relative.std()) if relative.size else 0.0,
+        largest_deviation=float(np.abs(relative - 1.0).max(initial=0.0)),
         repeated=int(np.count_nonzero(steps == 0.0)),
         backward=int(np.count_nonzero(steps < 0.0)),
-        dropped=int(np.maximum(missing[drop], 1.0).sum()),
+        dropped=int(missing.sum()),
         gaps=int(np.count_nonzero(gap)),
     )
+
+
+def _usual_step(time: Array, steps: Array, median: float) -> float:
+    """Step of the clock [s], to more digits than stamps that were rounded to a few.
+
+    The median over a few steps is known better than that of one step, and the mean of the steps
+    around it better still: as many are left out above it as below.
+    """
+    lag = min(_PHASE_STAMPS, len(time) - 1)
+    usual = float(np.median(time[lag:] - time[:-lag])) / lag
+    if not 0.5 * median < usual < 2.0 * median:
+        return median
+    near = steps[np.abs(steps - usual) <= 0.5 * usual]
+    return float(near.mean()) if near.size else usual
+
+
+def _missing(time: Array, gap: Rows, suspects: NDArray[np.intp], step: float) -> Array:
+    """Samples missing at suspiciously long steps, by the clock's phase before and after them.
+
+    A stamp that came late makes one step long and the next one short, and nothing is missing; the
+    median phase of a few stamps on either side does not move with one of them. Steps too close
+    together for that are judged as one, and what is missing is counted at the longest.
+    """
+    counts = np.zeros(len(time) - 1)
+    edges = np.flatnonzero(gap)
+    for group in np.split(suspects, np.flatnonzero(np.diff(suspects) > _PHASE_STAMPS) + 1):
+        if not group.size:
+            continue
+        stop, start = group[0] + 1, group[-1] + 1
+        first = max(0, stop - _PHASE_STAMPS, *(edges[edges < group[0]] + 1)[-1:])
+        last = min(len(time), start + _PHASE_STAMPS, *(edges[edges > group[-1]] + 1)[:1])
+        before = np.median(time[first:stop] - step * np.arange(first, stop))
+        behind = np.median(time[start:last] - step * np.arange(start, last))
+        lost = max(0.0, float(np.rint((behind - before) / step)))
+        counts[group[np.argmax(time[group + 1] - time[group])]] = lost
+    return counts
 
 
 def without_repeats(recording: Recording) -> Recording:

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from identification.augmented_rows import augmented_rows, gram_factor
 from identification.clustered import clustered_covariance
 from identification.errors import IdentificationError
-from identification.estimation import Estimate
+from identification.estimation import Estimate, Solution, nothing_usable
 from identification.factor import Factor
 from identification.losses import Huber, LeastSquares, Loss, Tukey
 from identification.model import RobotModel
 from identification.preprocessing import Samples
 from identification.qr_factor import QRFactor, reduced, solve_weighted
-from identification.row_solution import RowSolution, undetermined_names
+from identification.row_solution import undetermined_names
 
 Array = NDArray[np.float64]
 
@@ -90,7 +90,7 @@ class _State:
     """
 
     factor: Factor | QRFactor
-    solution: RowSolution
+    solution: Solution
     scale: Array
     residuals: list[Array]
     passes: int
@@ -103,6 +103,7 @@ def robust_estimate(
     recordings: Sequence[Samples],
     loss: Loss = Huber(),  # noqa: B008 - frozen
     *,
+    gram: Factor | None = None,
     most_iterations: int = MOST_ITERATIONS,
     tolerance: float = TOLERANCE,
 ) -> RobustEstimate:
@@ -116,15 +117,16 @@ def robust_estimate(
         model: the robot.
         recordings: can be gone through many times: a sequence, not a generator.
         loss: what a residual costs.
+        gram: factor of the recordings, if it is known: saves a pass over the samples.
         most_iterations: for each loss. What has not converged by then is returned and says so.
         tolerance: change in standard deviations that ends the iteration.
 
     Raises:
         IdentificationError: no recordings, or not one usable row.
     """
-    factor = reduced(model, recordings)
+    factor = reduced(model, recordings, gram)
     if not factor.samples.any():
-        raise IdentificationError("there is not one usable sample to estimate from")
+        raise IdentificationError(nothing_usable(model))
     solution = solve_weighted(factor, np.ones(model.n_joints))
     residuals = [np.full(samples.torque.shape, np.nan) for samples in recordings]
     state = _State(factor, solution, np.full(model.n_joints, np.inf), residuals, 1)
@@ -203,7 +205,7 @@ def _weighted_rows(
             yield blocks
 
 
-def _scales(recordings: Sequence[Samples], residuals: list[Array], solution: RowSolution) -> Array:
+def _scales(recordings: Sequence[Samples], residuals: list[Array], solution: Solution) -> Array:
     """Standard deviation per joint (n,) from the median of |residual|, NaN without rows.
 
     Corrected, all joints alike, for the degrees of freedom that the parameters take.

@@ -6,12 +6,12 @@ Forming R'R squares the condition number; a singular value decomposition of R it
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.estimation import WORST_CONDITION
+from identification.estimation import WORST_CONDITION, Solution
 from identification.factor import NormalEquations
 
 Array = NDArray[np.float64]
@@ -22,33 +22,12 @@ WORST_ROW_CONDITION: Final = 1e10
 _PARTICIPATION: Final = 1e-3
 
 
-class RowSolution(NamedTuple):
-    """Least-squares solution of rows.
-
-    Attributes:
-        values: (p,), of least (scaled) norm where the rows leave a choice.
-        root: S (p, k) with S S' the inverse of R'R on the k directions the rows determine.
-        condition: of the rows with columns of unit length, infinite without some column.
-        determined: (p,).
-    """
-
-    values: Array
-    root: Array
-    condition: float
-    determined: NDArray[np.bool_]
-
-    @property
-    def inverse(self) -> Array:
-        """Inverse of R'R on what is determined, zero elsewhere (p, p)."""
-        return np.asarray(self.root @ self.root.T)
-
-
 def undetermined_names(names: tuple[str, ...], determined: NDArray[np.bool_]) -> tuple[str, ...]:
     """Names (p,) of what is not determined (p,)."""
     return tuple(name for name, known in zip(names, determined, strict=True) if not known)
 
 
-def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> RowSolution:
+def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
     """Solve ``rows @ x = target`` by least squares, naming what the rows do not determine.
 
     Columns are scaled to unit length first, so that the condition does not depend on units.
@@ -71,7 +50,7 @@ def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -
     determined = present & (np.abs(lost).max(axis=0, initial=0.0) < _PARTICIPATION)
     root = right[kept].T / padded[kept] / scale[:, None]
     smallest = padded.min(initial=np.inf) if present.all() else 0.0
-    return RowSolution(
+    return Solution(
         values=root @ (left[:, : len(singular)].T @ target)[kept[: len(singular)]],
         root=root,
         condition=float(padded[0] / smallest) if smallest > 0.0 else np.inf,

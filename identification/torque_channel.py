@@ -11,7 +11,8 @@ from scipy.optimize import minimize_scalar
 
 from identification.estimation import estimate
 from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, difference_variance, prepare
+from identification.noise import difference_variance
+from identification.preprocessing import Preprocessing, prepare
 from identification.recording import Recording
 
 Array = NDArray[np.float64]

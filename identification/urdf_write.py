@@ -4,9 +4,12 @@
   frame it had (its ``rpy`` stays).
 - What is fixed to a moving link cannot be told from it. Its inertia is contained in the moving
   link's, so its own ``<inertial>`` is taken out, with a comment in its place.
+- A locked joint, and what it carries, stays as it was; the moving link gets what is left of the
+  identified inertia. Where that is no possible body, the locked links are treated as fixed ones.
 - The base and what is fixed to it keep theirs: no torque depends on it.
 - ``<dynamics>`` gets viscous friction as ``damping`` and Coulomb friction as ``friction``.
-- A URDF has no place for rotor inertias, a third friction term or an offset: see
+- A payload is known and no part of the arm: it is not written.
+- What a URDF has no place for, such as rotor inertias, :func:`not_in_urdf` names; see
   :func:`identification.parameter_text.parameters_json`.
 
 The text is read back and its inverse dynamics, by pinocchio, compared with the regressor's before
@@ -15,20 +18,22 @@ it is returned.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Collection, Iterator
 from typing import Final
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
-from identification.kinematics import chain_from_urdf
+from identification.errors import IdentificationError
+from identification.kinematics import chain_from_urdf, pinocchio_model
+from identification.locked_bodies import locked_bodies, without_locked
 from identification.model import RobotModel
 from identification.pseudo_inertia import Body, body, margin
 from identification.regressor import RegressorPlan
 from identification.wrench import LINK_SYMBOLS
-from identification.xml_source import Edit, Element, XmlSource
+from identification.xml_source import Edit, Element, XmlSource, comment_text
 
 Array = NDArray[np.float64]
 
@@ -72,7 +77,7 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
         model: the robot.
         standard: all standard parameters (s,), as in `model.standard_names`.
         friction: coefficients (k,) as in the last `model.parameter_names`; none leaves
-            ``<dynamics>`` as it is.
+            ``<dynamics>`` as it is, NaN leaves that figure.
 
     Raises:
         NotConsistentError: a link, a rotor or friction is not physically possible.
@@ -80,13 +85,15 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
         ModelError: the text is no URDF.
         ShapeError: an array does not have the shape it should have.
     """
-    inertial = _links(model, standard)
+    standard = model.layout.checked(standard)
+    inertial = standard[model.layout.links]
     coefficients = _friction(model, friction)
     _refuse_impossible(model, standard, inertial, coefficients)
+    bodies, kept = without_locked(inertial, locked_bodies(urdf, model))
     source = XmlSource(urdf)
-    tree = _Tree(source.root, model)
+    tree = _Tree(source.root, model, kept)
     edits: list[Edit] = []
-    for joint, parameters in zip(model.joint_names, inertial, strict=True):
+    for joint, parameters in zip(model.joint_names, bodies, strict=True):
         link = tree.link_of(joint)
         edits += _inertia_edits(source, link, body(parameters))
         for merged in tree.fixed_to(link):
@@ -97,19 +104,39 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
     return text
 
 
-class _Tree:
-    """Links and joints of a description by name."""
+def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
+    """Return in words which of the model's parameters a URDF has no place for."""
+    symbols = model.friction.symbols
+    absent = {
+        "rotor inertias": model.rotor_inertia,
+        "coupling inertias": bool(model.layout.pairs),
+        "the third friction term": "f2" in symbols,
+        "the Stribeck term": "fs" in symbols,
+        "what differs between directions in viscous friction": "fd" in symbols,
+        "the friction offset": "fo" in symbols,
+        "friction of coupled motors": bool(model.friction.motors),
+        "the payload": model.payload is not None,
+    }
+    return tuple(words for words, there in absent.items() if there)
 
-    def __init__(self, root: Element, model: RobotModel) -> None:
+
+class _Tree:
+    """Links and joints of a description by name; locked joints not in `kept` count as fixed."""
+
+    def __init__(self, root: Element, model: RobotModel, kept: Collection[str]) -> None:
         self.links = {e.attributes.get("name", ""): e for e in root.children if e.name == "link"}
         # Not every <joint> is one: a transmission has elements of that name, deeper down.
         self.joints = {e.attributes.get("name", ""): e for e in root.children if e.name == "joint"}
+        self._rigid: list[Element] = []
         missing = [name for name in model.joint_names if name not in self.joints]
         if missing:
             raise WriteBackError(f"the description has no joint {missing[0]!r}")
         for name, joint in self.joints.items():
-            fixed = joint.attributes.get("type") == "fixed"
-            if not fixed and name not in model.joint_names:
+            if joint.attributes.get("type") == "fixed":
+                self._rigid.append(joint)
+            elif name in model.locked:
+                self._rigid += [] if name in kept else [joint]
+            elif name not in model.joint_names:
                 raise WriteBackError(
                     f"joint {name!r} moves in the description but not in the model: the inertia"
                     " of what it carries is not known by itself"
@@ -121,8 +148,8 @@ class _Tree:
 
     def fixed_to(self, link: Element) -> Iterator[Element]:
         """Yield the links that fixed joints carry on from a link, all the way."""
-        for joint in self.joints.values():
-            if joint.attributes.get("type") == "fixed" and self._end(joint, "parent") is link:
+        for joint in self._rigid:
+            if self._end(joint, "parent") is link:
                 carried = self._end(joint, "child")
                 yield carried
                 yield from self.fixed_to(carried)
@@ -165,7 +192,7 @@ def _merged_edits(merged: Element, link: Element) -> Iterator[Edit]:
     """Take out the inertia of a link whose mass is counted with the one it is fixed to."""
     element = merged.child("inertial")
     if element is not None:
-        name = link.attributes["name"].replace("--", "- -")
+        name = comment_text(link.attributes["name"])
         yield Edit(element.start, element.end, f"<!-- inertia is contained in {name} -->")
 
 
@@ -176,7 +203,7 @@ def _friction_edits(
     values = {
         attribute: _number(coefficients[symbol])
         for symbol, attribute in _DYNAMICS.items()
-        if symbol in coefficients
+        if math.isfinite(coefficients.get(symbol, math.nan))
     }
     if not values:
         return
@@ -219,27 +246,14 @@ def _rotation(rpy: str) -> Array:
     return np.asarray(pin.rpy.rpyToMatrix(np.array([float(angle) for angle in rpy.split()])))
 
 
-def _links(model: RobotModel, standard: Array) -> Array:
-    """Return the ten inertial parameters of each link (n, 10)."""
-    standard = np.asarray(standard, dtype=np.float64)
-    expected = (len(model.standard_names),)
-    if standard.shape != expected:
-        raise ShapeError("standard", standard.shape, str(expected))
-    return np.asarray(standard.reshape(model.n_joints, -1)[:, :_N_LINK])
-
-
 def _friction(model: RobotModel, friction: Array | None) -> dict[str, dict[str, float]]:
     """Return friction coefficients by joint and symbol, nothing without friction."""
     if friction is None:
         return {}
-    n = model.n_joints
-    symbols = model.friction.symbols
-    if np.shape(friction) != (n * len(symbols),):
-        raise ShapeError("friction", np.shape(friction), f"({n * len(symbols)},)")
-    table = np.asarray(friction, dtype=np.float64).reshape(len(symbols), n)
+    table = model.friction.table(friction)
     return {
-        joint: {symbol: float(table[row, j]) for row, symbol in enumerate(symbols)}
-        for j, joint in enumerate(model.joint_names)
+        joint: {symbol: float(table[symbol][j]) for symbol in law.symbols}
+        for j, (joint, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True))
     }
 
 
@@ -250,11 +264,12 @@ def _refuse_impossible(
     coefficients: dict[str, dict[str, float]],
 ) -> None:
     """Raise `NotConsistentError` for what no machine can have."""
-    for joint, values in zip(
-        model.joint_names, np.asarray(standard).reshape(model.n_joints, -1), strict=True
-    ):
-        if not np.all(np.isfinite(values)):
-            raise NotConsistentError(f"a parameter of joint {joint!r} is no number", joint=joint)
+    for name, value in zip(model.standard_names, standard, strict=True):
+        if not math.isfinite(value):
+            joint = _joint_of(model, name)
+            raise NotConsistentError(
+                f"parameter {name} of joint {joint!r} is no number", joint=joint
+            )
     for joint, smallest in zip(model.joint_names, margin(inertial), strict=True):
         if not smallest > 0.0:
             raise NotConsistentError(
@@ -262,13 +277,19 @@ def _refuse_impossible(
                 f" eigenvalue {smallest:.3g}; write the physically consistent estimate",
                 joint=joint,
             )
-    rotors = np.asarray(standard).reshape(model.n_joints, -1)[:, _N_LINK:]
-    for joint, rotor in zip(model.joint_names, rotors, strict=True):
-        if not np.all(rotor >= 0.0):
+    rotors = model.layout.rotor_matrix(standard)
+    for joint, rotor in zip(model.joint_names, np.diag(rotors), strict=True):
+        if not rotor >= 0.0:
             raise NotConsistentError(f"the rotor of joint {joint!r} is negative", joint=joint)
+    smallest, directions = np.linalg.eigh(rotors)
+    if smallest[0] < -_ROUNDING * np.abs(rotors).max(initial=0.0):
+        joint = model.joint_names[int(np.argmax(np.abs(directions[:, 0])))]
+        raise NotConsistentError(
+            f"the coupling inertias of joint {joint!r} are too large for its rotors", joint=joint
+        )
     for joint, terms in coefficients.items():
         for symbol, attribute in _DYNAMICS.items():
-            if not terms.get(symbol, 0.0) >= 0.0:
+            if terms.get(symbol, 0.0) < 0.0:
                 raise NotConsistentError(
                     f"{attribute} of joint {joint!r} is {terms[symbol]:.3g}; friction takes"
                     " energy, it is never negative",
@@ -280,7 +301,7 @@ def _compare(
     text: str, model: RobotModel, inertial: Array, coefficients: dict[str, dict[str, float]]
 ) -> None:
     """Raise `WriteBackError` unless the text is read back as the robot that was meant."""
-    chain = chain_from_urdf(text)
+    chain = chain_from_urdf(text, model.locked)
     if chain.joint_names != model.joint_names:
         raise WriteBackError("the description is of another robot: its joints are not the model's")
     n = model.n_joints
@@ -290,7 +311,7 @@ def _compare(
     )
     columns = plan.evaluate(q, qd, qdd).dense(_N_LINK * n)
     expected = columns @ inertial.reshape(-1)
-    error = np.abs(_inverse_dynamics(text, model.gravity, q, qd, qdd) - expected).max(axis=0)
+    error = np.abs(_inverse_dynamics(text, model, q, qd, qdd) - expected).max(axis=0)
     # Links of very different mass share the rounding of the largest.
     allowed = _ROUNDING * max(float(np.abs(expected).max()), 1.0)
     wrong = np.flatnonzero(~(error <= allowed))
@@ -308,25 +329,36 @@ def _compare(
                 " rounding takes it beyond",
                 joint=joint,
             )
-    joints = {e.attributes.get("name"): e for e in XmlSource(text).root.children}
+    elements = XmlSource(text).root.children
+    joints = {e.attributes.get("name"): e for e in elements if e.name == "joint"}
     for joint, values in coefficients.items():
         dynamics = joints[joint].child("dynamics")
         for symbol, attribute in _DYNAMICS.items():
-            if symbol in values and (
-                dynamics is None or float(dynamics.attributes[attribute]) != values[symbol]
+            wanted = values.get(symbol, math.nan)
+            if math.isfinite(wanted) and (
+                dynamics is None or float(dynamics.attributes[attribute]) != wanted
             ):
                 raise WriteBackError(f"{attribute} of joint {joint!r} was not written")
 
 
-def _inverse_dynamics(text: str, gravity: Array, q: Array, qd: Array, qdd: Array) -> Array:
+def _joint_of(model: RobotModel, standard: str) -> str:
+    """Return the joint that a standard parameter is numbered after."""
+    place = model.standard_names.index(standard)
+    layout = model.layout
+    if place >= layout.n_joints * layout.width:
+        return model.joint_names[layout.pairs[place - layout.n_joints * layout.width][0]]
+    return model.joint_names[place // layout.width]
+
+
+def _inverse_dynamics(text: str, model: RobotModel, q: Array, qd: Array, qdd: Array) -> Array:
     """Return the torques (m, n) that pinocchio finds for a description."""
-    model = pin.buildModelFromXML(text)
-    model.gravity.linear = np.asarray(gravity)
-    data = model.createData()
-    still = pin.neutral(model)  # joints that turn on and on have two coordinates
+    arm = pinocchio_model(text, model.locked)
+    arm.gravity.linear = model.gravity
+    data = arm.createData()
+    still = pin.neutral(arm)  # joints that turn on and on have two coordinates
     return np.array(
         [
-            pin.rnea(model, data, pin.integrate(model, still, a), b, c)
+            pin.rnea(arm, data, pin.integrate(arm, still, a), b, c)
             for a, b, c in zip(q, qd, qdd, strict=True)
         ]
     )

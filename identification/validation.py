@@ -31,6 +31,7 @@ class PredictionError:
         absolute: sum of |e|.
         signed: sum of e.
         squared: sum of e².
+        torque_sum: sum of measured torque.
         torque_squared: sum of measured torque².
     """
 
@@ -38,6 +39,7 @@ class PredictionError:
     absolute: Array
     signed: Array
     squared: Array
+    torque_sum: Array
     torque_squared: Array
 
     @classmethod
@@ -54,6 +56,7 @@ class PredictionError:
             absolute=np.abs(error).sum(axis=0),
             signed=error.sum(axis=0),
             squared=(error**2).sum(axis=0),
+            torque_sum=np.where(counts, measured, 0.0).sum(axis=0),
             torque_squared=(np.where(counts, measured, 0.0) ** 2).sum(axis=0),
         )
 
@@ -64,6 +67,7 @@ class PredictionError:
             self.absolute + other.absolute,
             self.signed + other.signed,
             self.squared + other.squared,
+            self.torque_sum + other.torque_sum,
             self.torque_squared + other.torque_squared,
         )
 
@@ -89,15 +93,29 @@ class PredictionError:
 
     @property
     def relative(self) -> Array:
-        """||e|| / ||tau|| of each joint (n,); NaN where a joint has no row: not tested."""
-        tiny = np.finfo(np.float64).tiny
-        share = np.sqrt(self.squared / np.maximum(self.torque_squared, tiny))
-        return np.where(self.rows > 0, share, np.nan)
+        """||e|| / ||tau|| of each joint (n,); NaN for a joint without a row or without torque."""
+        known = (self.rows > 0) & (self.torque_squared > 0.0)
+        return np.where(
+            known, np.sqrt(self.squared / np.where(known, self.torque_squared, 1.0)), np.nan
+        )
+
+    @property
+    def explained(self) -> Array:
+        """Share of each joint's torque variance that the prediction explains (n,), R².
+
+        One less the squared error over that of the best constant, the mean torque of these very
+        rows: zero or less is no better than a constant. NaN for a joint without rows or whose
+        torque does not vary.
+        """
+        varies = self.torque_squared - self.torque_sum**2 / np.maximum(self.rows, 1)
+        known = (self.rows > 0) & (varies > 1e-12 * self.torque_squared)
+        return np.where(known, 1.0 - self.squared / np.where(known, varies, 1.0), np.nan)
 
     @property
     def overall(self) -> float:
-        """||e|| / ||tau|| over all joints stacked: the relative torque error."""
-        return float(np.sqrt(self.squared.sum() / max(self.torque_squared.sum(), 1e-300)))
+        """||e|| / ||tau|| over all joints stacked; NaN without a row or without torque."""
+        torque = float(self.torque_squared.sum())
+        return float(np.sqrt(self.squared.sum() / torque)) if torque > 0.0 else float("nan")
 
 
 def residual(
@@ -134,11 +152,13 @@ class SlowError(NamedTuple):
     Attributes:
         error: what is left.
         friction_change: share by which each joint's friction torque would have to be larger than
-            predicted (n,), within `FRICTION_CHANGE`.
+            predicted (n,), of any size.
+        apart: what would be left if all of that change were taken off.
     """
 
     error: PredictionError
     friction_change: Array
+    apart: PredictionError
 
 
 def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: float) -> SlowError:
@@ -146,7 +166,8 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
 
     Friction follows the temperature of the gears: between training and validation it may differ
     by some per cent without anything being wrong with the model. Each joint's whole friction
-    torque may therefore be scaled, by one number, before the error is taken.
+    torque may therefore be scaled, by one number within `FRICTION_CHANGE`, before the error is
+    taken.
 
     Args:
         model: the robot.
@@ -155,15 +176,18 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
         bandwidth: of the low-pass [Hz].
     """
     error = residual(model, values, samples, bandwidth)
-    is_friction = [name.startswith(("f0_", "f1_", "f2_")) for name in model.parameter_names]
-    friction = samples.predicted_torque(model, np.where(is_friction, values, 0.0))
+    friction = samples.predicted_torque(model, np.where(model.friction_columns, values, 0.0))
     friction = _usable_part(samples, friction, bandwidth)
     usable = samples.usable
     power = (friction**2 * usable).sum(axis=0)
     change = (friction * error * usable).sum(axis=0) / np.where(power > 0.0, power, 1.0)
-    change = np.clip(change, -FRICTION_CHANGE, FRICTION_CHANGE)
-    left = error - change * friction
-    return SlowError(PredictionError.between(samples.torque, samples.torque - left, usable), change)
+
+    def less(share: Array) -> PredictionError:
+        left = error - share * friction
+        return PredictionError.between(samples.torque, samples.torque - left, usable)
+
+    forgiven = np.clip(change, -FRICTION_CHANGE, FRICTION_CHANGE)
+    return SlowError(less(forgiven), change, less(change))
 
 
 def prediction_error(

@@ -16,6 +16,11 @@ from xml.sax.saxutils import escape
 from identification.errors import ModelError
 
 
+def comment_text(text: str) -> str:
+    """Return text that may stand inside a comment, which two dashes in a row would end."""
+    return re.sub("-(?=-)", "- ", text)
+
+
 @dataclass(eq=False)
 class Element:
     """One element and where it stands in the UTF-8 text.

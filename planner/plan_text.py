@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from typing import Any
 
-from planner.degrees import degrees_text, radians_of
+from planner.decimals import radians_in, without_decimals
+from planner.degrees import degrees_text
 from planner.errors import InvalidPlanFile
 from planner.plain import DAMAGED, table
+from planner.toml_value import toml_value
 
 _HEAD = """\
 # A motion of joint moves. Names that end in _deg hold degrees, degrees/s, degrees/s^2,
@@ -80,7 +81,7 @@ def _fields(name_of_table: str, fields: Mapping[str, Any]) -> str:
     return "".join(
         f"{name}{_SUFFIX} = {_in_degrees(value)}\n"
         if name in angles
-        else f"{name} = {json.dumps(value)}\n"  # JSON of numbers, texts and lists is TOML
+        else f"{name} = {toml_value(value)}\n"
         for name, value in fields.items()
     )
 
@@ -93,11 +94,11 @@ def _in_degrees(value: Any) -> str:
 
 def _motion(data: Mapping[str, Any]) -> str:
     def lines(rows: Sequence[Any], indent: str) -> str:
-        return "".join(f"{indent}{json.dumps(row)},\n" for row in rows)
+        return "".join(f"{indent}{toml_value(row)},\n" for row in rows)
 
     joints = "".join(f"  [\n{lines(rows, '    ')}  ],\n" for rows in data["coefficients"])
     return (
-        f"type = {json.dumps(data['type'])}\n"
+        f"type = {toml_value(data['type'])}\n"
         f"knots = [\n{lines(data['knots'], '  ')}]\n"
         f"coefficients = [\n{joints}]\n"
     )
@@ -111,25 +112,10 @@ def _in_si(name_of_table: str, fields: Mapping[str, Any]) -> dict[str, Any]:
         if plain != name and plain in angles:
             if plain in fields:
                 raise InvalidPlanFile(f"both {plain!r} and {name!r} are given")
-            data[plain] = _radians(name, value)
+            try:
+                data[plain] = radians_in(name, value)
+            except ValueError as error:
+                raise InvalidPlanFile(str(error)) from error
         else:
-            data[name] = _plain(value)
+            data[name] = without_decimals(value)
     return data
-
-
-def _radians(name: str, value: Any) -> Any:
-    if isinstance(value, list):
-        return [_radians(name, entry) for entry in value]
-    if isinstance(value, bool) or not isinstance(value, Decimal | int):
-        raise InvalidPlanFile(f"{name}: {value!r} is not a number of degrees")
-    return radians_of(value)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Decimal):
-        return float(value)
-    if isinstance(value, list):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, Mapping):
-        return {name: _plain(entry) for name, entry in value.items()}
-    return value

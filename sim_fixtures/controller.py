@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from math import isfinite
+from operator import gt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -300,6 +301,8 @@ class SimulatedController:
         """Switch the drive off where an axis does not follow."""
         thresholds = self._drive.following_error
         errors = self._servo.following_error()
+        if not any(map(gt, map(abs, errors), thresholds)):
+            return
         for axis, (error, threshold) in enumerate(zip(errors, thresholds, strict=True), start=1):
             if abs(error) > threshold:
                 self._program.trip(
@@ -333,7 +336,7 @@ class SimulatedController:
         open_mode = self.settings.open_mode
         return answer, [
             fields if is_open and modes[slot] == open_mode else None
-            for is_open, slot, fields in zip(program.open_axes, layout.own, answered, strict=True)
+            for is_open, slot, fields in zip(program.open_axes, layout.slots, answered, strict=True)
         ]
 
     def _cyclic_packet(self, phase: Phase) -> bytes:
@@ -348,8 +351,6 @@ class SimulatedController:
         slip = self._arm.mishaps.slip
         if slip is not None:
             measured = (slip + measured).tolist()
-        d = np.array((*demanded, measured, servo.measured_delta, servo.current)).T
-        layout.axes["d"][layout.own] = d
-        extra = np.array((servo.model_current, servo.inertia, zero)).T
-        layout.axes["extra"][layout.own] = extra
+        d = (*demanded, measured, servo.measured_delta, servo.current)
+        layout.fill(np.array((*d, servo.model_current, servo.inertia, zero)))
         return layout.packet(self._number, program.powered)

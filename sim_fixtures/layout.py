@@ -37,6 +37,7 @@ class Layout:
     Attributes:
         axes: (n_slots,) the axis blocks of the next packet.
         own: slot of each axis of this arm.
+        slots: the same as numbers.
         n_slots: axis blocks in a packet.
     """
 
@@ -60,6 +61,7 @@ class Layout:
         slots = settings.slots if settings.slots is not None else tuple(range(n_axes))
         if len(slots) != n_axes or len(set(slots)) != n_axes or not set(slots) <= set(range(n)):
             raise SettingError("slots", slots, f"{n_axes} different slots of 0..{n - 1}")
+        self.slots = tuple(slots)
         self.own = np.array(slots, np.intp)
         self._foreign = np.array([s for s in range(n) if s not in slots], np.intp)
         self._settings = settings
@@ -67,6 +69,9 @@ class Layout:
         others = [arm for arm in range(N_ARMS) if arm != settings.arm - 1]
         self._foreign_arm = [others[i // AXES_PER_ARM] for i in range(settings.foreign_axes)]
         self.axes: NDArray[np.void] = np.zeros(n, AXIS_DTYPE)
+        # D1..D5, extra1..3 of all slots, (8, n_slots)
+        self._values = self.axes.view(np.float32).reshape(n, -1)[:, 1:].T
+        self._modes: tuple[int | bool | None, ...] = ()
         # the axes of other arms stand somewhere, each in another place
         places = np.arange(1.0, 1.0 + settings.foreign_axes) / 4.0
         self.axes["d"][self._foreign, 0] = self.axes["d"][self._foreign, 2] = places
@@ -79,8 +84,16 @@ class Layout:
         targets: list[float] = self.axes["d"][self._foreign, 0].tolist()
         return targets
 
+    def fill(self, values: NDArray[np.float64]) -> None:
+        """Set D1..D5, extra1..3 of this arm's axes, (8, n_axes)."""
+        self._values[:, self.own] = values
+
     def set_modes(self, common: int | None, open_axes: Sequence[bool]) -> None:
         """Set all modes to `common`, or each axis to the open mode or to closed."""
+        wanted = (common, *open_axes)
+        if wanted == self._modes:
+            return
+        self._modes = wanted
         if common is not None:
             self.axes["mode"] = common
             return

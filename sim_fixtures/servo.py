@@ -155,7 +155,8 @@ class Servo:
     def _close_loops(self, gains: Sequence[float]) -> list[float]:
         """Return the target currents [A]; `gains` in A per motor rev/s."""
         settings, rate = self._settings, 1.0 / self._period
-        resolution, integral = self._resolution, self._integral
+        resolution, integral, deadband = self._resolution, self._integral, self._deadband
+        position_gain, growth = settings.position_gain, settings.integral_rate * self._period
         currents = []
         rows = zip(
             self.target,
@@ -174,19 +175,25 @@ class Servo:
             target, delta, before, fed, extra, measured, moved, gain, model, limit = row
             error = target - measured
             # the encoder's difference is the speed half a cycle ago, as the mean of the targets'
-            lag = rate * (0.5 * (delta + before) + fed - moved) + settings.position_gain * error
+            lag = rate * (0.5 * (delta + before) + fed - moved) + position_gain * error
             total = integral[i]
-            if delta != 0.0 or fed != 0.0 or abs(error) > self._deadband:
-                total += settings.integral_rate * self._period * lag
+            if delta != 0.0 or fed != 0.0 or abs(error) > deadband:
+                total += growth * lag
             wanted = model + extra + gain * (lag + total)
-            current = max(-limit, min(limit, wanted))
+            current = _within(limit, wanted)
             if current == wanted or lag * wanted < 0.0:  # no winding up against the limit
                 integral[i] = total
             if resolution > 0.0:
-                current = round(current / resolution) * resolution
-                current = max(-limit, min(limit, current))
+                current = _within(limit, round(current / resolution) * resolution)
             currents.append(current)
         return currents
+
+
+def _within(limit: float, value: float) -> float:
+    """Return `value` cut to +-`limit`; comparisons cost half of what `min` and `max` do."""
+    if value < limit:
+        return value if value > -limit else -limit
+    return limit
 
 
 class CurrentLoop:

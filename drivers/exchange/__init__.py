@@ -20,7 +20,12 @@ from drivers.exchange.notices import (
 from drivers.exchange.process import ExchangeProcess, ExchangeStatus
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.exchange.settings import ExchangeSettings
-from drivers.exchange.shared_ring import RingReader, SharedCycleRing
+from drivers.exchange.shared_ring import (
+    PacketReader,
+    RingReader,
+    SharedCycleRing,
+    SharedPacketRing,
+)
 
 __all__ = [
     "ArchiveState",
@@ -40,10 +45,12 @@ __all__ = [
     "HoldRefused",
     "Leaving",
     "OverrideRefused",
+    "PacketReader",
     "RealTimeReport",
     "RealTimeSettings",
     "ResumeRefused",
     "RingReader",
     "SharedCycleRing",
+    "SharedPacketRing",
     "exchange",
 ]

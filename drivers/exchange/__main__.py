@@ -21,11 +21,12 @@ from drivers.exchange.notices import ExchangeEnded, ExchangeFailed, ExchangeStar
 from drivers.exchange.rehearsal import rehearse
 from drivers.exchange.serving import Serving, portable
 from drivers.exchange.settings import ExchangeSettings
-from drivers.exchange.shared_ring import SharedCycleRing
+from drivers.exchange.shared_ring import SharedCycleRing, SharedPacketRing
 from drivers.guard import Guard
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
+from drivers.transports.tapped import tapped
 
 LINK_FAILED: Final = 1
 NOT_STARTED: Final = 2
@@ -33,8 +34,11 @@ CRASHED: Final = 70
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the exchange over descriptors: channel, settings, ring, events, control block."""
-    channel_fd, settings_fd, ring_fd, event_fd, control_fd = map(int, arguments)
+    """Run the exchange over descriptors: channel, settings, ring, events, control block, packets.
+
+    The last one is there only if raw packets are to be kept.
+    """
+    channel_fd, settings_fd, ring_fd, event_fd, control_fd, *packets_fd = map(int, arguments)
     # Whoever started this may be interrupted or hung up on while an arm moves.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -51,6 +55,8 @@ def main(arguments: Sequence[str]) -> int:
         session = Session(settings.drive_train, guard, ring, **settings.session)
         max_late = settings.late_allowed
         transport = settings.transport.open()
+        for fd in packets_fd:
+            transport = tapped(transport, SharedPacketRing(fd), lambda: session.cycle)
         control = ControlBlock(control_fd)
         serving = Serving(
             session,

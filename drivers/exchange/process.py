@@ -22,7 +22,7 @@ from drivers.exchange.inbox import LONGEST_MESSAGE, hand_over
 from drivers.exchange.notices import ExchangeEvent
 from drivers.exchange.realtime import RealTimeReport
 from drivers.exchange.settings import ExchangeSettings
-from drivers.exchange.shared_ring import SharedCycleRing
+from drivers.exchange.shared_ring import SharedCycleRing, SharedPacketRing
 from drivers.motion_source import MotionSource
 from drivers.states import State
 
@@ -76,6 +76,7 @@ class ExchangeProcess:
         realtime: what the system granted it.
         notes: options of the link that the system refused, in words.
         ring_fd: memory of the cycle records, for a `RingReader`.
+        packets_fd: memory of the raw packets, for a `PacketReader`; -1 if they are not kept.
         event_fd: memory of the events, for an `EventReader`.
         control_fd: memory of the control block, for a `ControlBlock`.
     """
@@ -83,6 +84,7 @@ class ExchangeProcess:
     def __init__(self, settings: ExchangeSettings) -> None:
         n_joints = settings.drive_train.n_joints
         self.ring_fd = SharedCycleRing.create(n_joints, settings.ring_capacity).fd
+        self.packets_fd = SharedPacketRing.create(settings.packets).fd if settings.packets else -1
         self.event_fd = event_log.create()
         self.control_fd = control.create()
         self._log_fd = memory.create("hil-exchange-log", 0)
@@ -93,7 +95,9 @@ class ExchangeProcess:
         settings_fd = memory.create("hil-settings", 0)
         try:
             os.pwrite(settings_fd, pickle.dumps(settings, protocol=5), 0)
-            fds = (theirs.fileno(), settings_fd, self.ring_fd, self.event_fd, self.control_fd)
+            fds = [theirs.fileno(), settings_fd, self.ring_fd, self.event_fd, self.control_fd]
+            if settings.packets:
+                fds.append(self.packets_fd)
             self._process = _spawn(fds, self._log_fd)
         except OSError as error:
             self.close()
@@ -245,7 +249,7 @@ class ExchangeProcess:
     def close(self) -> None:
         """Give up this end, and the memory; a process that still runs stops the arm and ends."""
         self._channel.close()
-        for name in ("ring_fd", "event_fd", "control_fd", "_log_fd"):
+        for name in ("ring_fd", "packets_fd", "event_fd", "control_fd", "_log_fd"):
             fd, closed = getattr(self, name), -1
             if fd != closed:
                 os.close(fd)

@@ -25,6 +25,7 @@ class ExchangeSettings:
         session: further keyword arguments of `Session`.
         realtime: what to ask the system for.
         ring_capacity: cycle records kept for whoever archives them.
+        packets: raw packets kept for whoever archives them; 0: none, and the link is as it is.
         preload: modules imported before the link opens, so that programs made of their classes
             are read quickly.
         needs_archive: whether a motion is accepted and goes on only while the archive process
@@ -40,6 +41,7 @@ class ExchangeSettings:
     session: Mapping[str, Any] = field(default_factory=dict)
     realtime: RealTimeSettings = field(default_factory=RealTimeSettings)
     ring_capacity: int = 20_000
+    packets: int = 0
     preload: tuple[str, ...] = ()
     needs_archive: bool = True
     max_late: int | None = None

@@ -1,4 +1,4 @@
-"""The ring of cycle records in shared memory: one process writes, others read.
+"""Rings of cycle records and of raw packets in shared memory: one process writes, others read.
 
 The writer fills a row and then raises the count of rows written; it never waits and never looks
 back. A reader copies rows and then reads the count again, to find out which of them were
@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.exchange import memory
+from drivers.packet_records import CAPACITY, PACKET_DTYPE, PacketRows
 from drivers.record import CycleRecords, cycle_dtype
 
 _MAGIC: Final = 0x31474E4952434948
+_PACKETS_MAGIC: Final = 0x31474E4952504948
 _HEADER_BYTES: Final = 256
 # Indices of 8-byte words, those of different writers on different cache lines.
 _TAG, _JOINTS, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
@@ -81,30 +83,55 @@ class SharedCycleRing(CycleRecords):
         return self._lost
 
 
-class RingReader:
-    """Reads a shared ring from the oldest record still there; one reader acknowledges.
-
-    Args:
-        fd: descriptor of the memory.
-        n_joints: of the records.
-        acknowledge: whether the writer is told how far this reader got, so that it counts what
-            it overwrites; one reader at a time may.
+class SharedPacketRing(PacketRows):
+    """Raw packets that other processes can read, the writer's end.
 
     Attributes:
-        overflow: records that were overwritten before this reader had them.
-        capacity: of the ring.
-
-    Raises:
-        ValueError: it is not a ring of `n_joints` joints.
+        fd: descriptor of the memory.
     """
 
-    def __init__(self, fd: int, n_joints: int, *, acknowledge: bool = True) -> None:
+    def __init__(self, fd: int) -> None:
+        whole = memoryview(memory.attach(fd)).cast("B")
+        words = whole[:_HEADER_BYTES].cast("q")
+        capacity = _checked(words, PACKET_DTYPE.itemsize, _PACKETS_MAGIC, "raw packets")
+        rows = whole[_HEADER_BYTES:][: capacity * PACKET_DTYPE.itemsize]
+        super().__init__(rows)
+        self.fd = fd
+        self._words = words
+        self.written = words[_WRITTEN]
+
+    @classmethod
+    def create(cls, capacity: int = CAPACITY) -> SharedPacketRing:
+        """Ask for memory for `capacity` packets."""
+        if capacity < 2:
+            raise ValueError(f"a shared ring of {capacity} packets; at least 2 are needed")
+        fd = memory.create("hil-packets", _HEADER_BYTES + capacity * PACKET_DTYPE.itemsize)
+        words = memoryview(memory.attach(fd)).cast("B")[:_HEADER_BYTES].cast("q")
+        words[_JOINTS], words[_CAPACITY] = PACKET_DTYPE.itemsize, capacity
+        words[_TAG] = _PACKETS_MAGIC
+        return cls(fd)
+
+    def put(self, cycle: int, time: float, sent: bool, packet: bytes) -> None:
+        """Keep one packet, over the oldest where there is no room."""
+        super().put(cycle, time, sent, packet)
+        self._words[_WRITTEN] = self.written
+
+
+class _RowReader:
+    """Reads rows that another process writes, from the oldest one still there.
+
+    Attributes:
+        overflow: rows that were overwritten before this reader had them.
+        capacity: of the ring.
+    """
+
+    def __init__(
+        self, fd: int, dtype: np.dtype[np.void], check: tuple[int, int, str], *, acknowledge: bool
+    ) -> None:
         mapped = memory.attach(fd)
         self._words = memoryview(mapped).cast("B")[:_HEADER_BYTES].cast("q")
-        self.capacity = _checked(self._words, n_joints)
-        self._rows: NDArray[np.void] = np.frombuffer(
-            mapped, cycle_dtype(n_joints), self.capacity, _HEADER_BYTES
-        )
+        self.capacity = _checked(self._words, *check)
+        self._rows: NDArray[np.void] = np.frombuffer(mapped, dtype, self.capacity, _HEADER_BYTES)
         self._acknowledge = acknowledge
         self._read = self._oldest()
         self.overflow = 0
@@ -114,7 +141,7 @@ class RingReader:
         return max(0, self._words[_WRITTEN] + 1 - self.capacity)
 
     def drain(self) -> NDArray[np.void]:
-        """A copy of the records not read yet, (k,), oldest first."""
+        """A copy of the rows not read yet, (k,), oldest first."""
         end = self._words[_WRITTEN]
         begin = max(self._read, self._oldest())
         records = self._rows.take(np.arange(begin, end), mode="wrap")
@@ -126,10 +153,43 @@ class RingReader:
         return records[torn:]
 
 
-def _checked(words: memoryview, n_joints: int) -> int:
-    """Capacity of the ring whose header this is."""
-    if len(words) < _HEADER_BYTES // 8 or words[_TAG] != _MAGIC:
-        raise ValueError("this memory is not a ring of cycle records")
-    if words[_JOINTS] != n_joints:
-        raise ValueError(f"this ring is for {words[_JOINTS]} joints, not {n_joints}")
+class RingReader(_RowReader):
+    """Reads a ring of cycle records; one reader acknowledges.
+
+    Args:
+        fd: descriptor of the memory.
+        n_joints: of the records.
+        acknowledge: whether the writer is told how far this reader got, so that it counts what
+            it overwrites; one reader at a time may.
+
+    Raises:
+        ValueError: it is not a ring of `n_joints` joints.
+    """
+
+    def __init__(self, fd: int, n_joints: int, *, acknowledge: bool = True) -> None:
+        check = (n_joints, _MAGIC, "cycle records")
+        super().__init__(fd, cycle_dtype(n_joints), check, acknowledge=acknowledge)
+
+
+class PacketReader(_RowReader):
+    """Reads a ring of raw packets, rows of `PACKET_DTYPE`.
+
+    Raises:
+        ValueError: it is not one.
+    """
+
+    def __init__(self, fd: int) -> None:
+        check = (PACKET_DTYPE.itemsize, _PACKETS_MAGIC, "raw packets")
+        super().__init__(fd, PACKET_DTYPE, check, acknowledge=False)
+
+
+def _checked(
+    words: memoryview, width: int, magic: int = _MAGIC, what: str = "cycle records"
+) -> int:
+    """Capacity of the ring whose header this is; `width` is joints, or bytes of a packet's row."""
+    if len(words) < _HEADER_BYTES // 8 or words[_TAG] != magic:
+        raise ValueError(f"this memory is not a ring of {what}")
+    if words[_JOINTS] != width:
+        unit = "joints" if magic == _MAGIC else "bytes a packet"
+        raise ValueError(f"this ring is for {words[_JOINTS]} {unit}, not {width}")
     return int(words[_CAPACITY])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -70,8 +70,14 @@ class MessageLayout:
 
     def is_kept_by(self, messages: NDArray[np.uint8]) -> bool:
         """Whether the constant bytes of messages, shape (k, size), are those of the template."""
-        expected = np.frombuffer(self.template, np.uint8)[self.constant]
-        return bool((messages[:, self.constant] == expected).all())
+        expected = np.frombuffer(self.template, np.uint8)
+        return all((messages[:, run] == expected[run]).all() for run in self._constant_runs)
+
+    @cached_property
+    def _constant_runs(self) -> list[slice]:
+        """The constant bytes as slices."""
+        edges = np.flatnonzero(np.diff(self.constant.astype(np.int8), prepend=0, append=0))
+        return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
 
 
 class LayoutBuilder:
@@ -83,6 +89,11 @@ class LayoutBuilder:
         self._names: list[str] = []
         self._formats: list[Any] = []
         self._offsets: list[int] = []
+
+    @property
+    def size(self) -> int:
+        """Bytes laid out so far."""
+        return len(self._template)
 
     def _align(self, size: int) -> None:
         padding = -(len(self._template) - len(ENCAPSULATION)) % size

@@ -1,14 +1,16 @@
 """The messages of a decompressed chunk, found all at once.
 
-A recording repeats itself: each cycle adds the same few messages of the same lengths. Once the
-pattern of one chunk is known, another one is taken for a matrix with a pattern per row, and that is
-*verified*: opcode, length and channel at each place where a message should begin. That is the whole
-walk, done in a few array operations. A chunk with anything else in it is walked record by record.
+A recording repeats itself: each cycle adds the same few messages of the same lengths. Once that
+pattern is known, what follows is taken for a matrix with a pattern per row, and that is *verified*:
+opcode, length and channel at each place where a message should begin. That is the whole walk, done
+in a few array operations. Anything else in between is walked record by record.
 """
 
 from __future__ import annotations
 
 import struct
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,47 +22,56 @@ from hil.archive.container import Damage
 
 Bytes = NDArray[np.uint8]
 
-_RECORD = struct.Struct("<BQ")
+_RECORD = container.RECORD
 _HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _FIXED = struct.Struct("<BQH")  # the part of it that repeats with the pattern
 _SEQUENCE = np.dtype("<u4")
 _IN_BODY = _HEAD.size - _RECORD.size  # the part of it that the record's length counts
+_WORD = np.dtype("<u8")
+_WORDS_AT = (0, _FIXED.size - _WORD.itemsize)  # two words that overlap cover the fixed part
+_LONGEST_PATTERN = 16  # messages
 
 
 @dataclass(frozen=True, eq=False)
 class Messages:
-    """The messages of one channel in one chunk.
+    """The messages of one channel in one chunk, or in several that follow each other.
 
     Attributes:
-        data: the data of each message; shape (k, size) where all have one size.
-        sequence: shape (k,), their numbers as written.
+        parts: their data in order, each an array (k, size) of messages of one size.
+        sequence: their numbers as written, shape (k,) for each part.
     """
 
-    data: Bytes | list[bytes]
-    sequence: NDArray[np.uint32]
+    parts: list[Bytes]
+    sequences: list[NDArray[np.uint32]]
 
     def __len__(self) -> int:
-        return len(self.sequence)
+        return sum(len(part) for part in self.parts)
 
-    def message(self, index: int) -> bytes:
-        """The data of one message."""
-        return bytes(self.data[index])
+    @property
+    def sequence(self) -> NDArray[np.uint32]:
+        """The numbers of all messages."""
+        return self.sequences[0] if len(self.sequences) == 1 else np.concatenate(self.sequences)
+
+    def all(self) -> list[bytes]:
+        """The data of each message."""
+        return [bytes(message) for part in self.parts for message in part]
+
+    def first(self) -> bytes:
+        """The data of the first message."""
+        return bytes(self.parts[0][0])
 
     def matrix(self, size: int) -> Bytes | None:
         """The data as bytes (k, size); None when there is a message of another size."""
-        if isinstance(self.data, np.ndarray):
-            return self.data if self.data.shape[1] == size else None
-        if any(len(message) != size for message in self.data):
+        if any(part.shape[1] != size for part in self.parts):
             return None
-        return np.frombuffer(b"".join(self.data), np.uint8).reshape(-1, size)
+        return self.parts[0] if len(self.parts) == 1 else np.concatenate(self.parts)
 
 
 class _Place(NamedTuple):
-    """Where in the pattern a message stands, and the head it must have."""
+    """Where in the pattern a message stands, and the head it must have as two words."""
 
     channel: int
-    head: Bytes
-    fixed: slice
+    words: tuple[tuple[slice, int], ...]
     sequence: slice
     data: slice
 
@@ -73,6 +84,23 @@ class ChunkParser:
         self.channels: dict[int, container.ChannelRecord] = {}
         self._pattern: list[_Place] = []
 
+    def repeats(self, chunk: bytes) -> bool:
+        """Whether a chunk may be nothing but the known pattern, to judge by its length."""
+        return bool(self._pattern) and len(chunk) % self._pattern[-1].data.stop == 0
+
+    def repeated(self, chunks: Sequence[bytes]) -> dict[str, Messages] | None:
+        """The messages of chunks by topic if they repeat the known pattern and nothing else.
+
+        The chunks must each be of a length that `repeats`.
+        """
+        data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
+        rows = self._run(data, 0)
+        if rows is None or rows.size != len(data):
+            return None
+        found: dict[int, Messages] = {}
+        self._add(rows, found)
+        return self._by_topic(found, 0)
+
     def messages(self, chunk: bytes, offset: int) -> dict[str, Messages]:
         """The messages of a chunk by topic.
 
@@ -83,55 +111,81 @@ class ChunkParser:
         Raises:
             Damage: the chunk does not hold whole records, or a channel was never announced.
         """
-        found = self._matched(chunk)
-        if found is None:
-            found = self._walk(chunk, offset)
+        found: dict[int, Messages] = {}
+        recent: deque[bytes] = deque(maxlen=_LONGEST_PATTERN)
+        at = 0
+        while at < len(chunk):
+            rows = self._run(chunk, at)
+            if rows is not None and len(rows):
+                self._add(rows, found)
+                at += rows.size
+                continue
+            opcode, end = _bounds(chunk, at, offset)
+            if opcode == container.MESSAGE:
+                head = chunk[at : at + _FIXED.size]
+                if head in recent and self._learn(list(recent)[recent.index(head) :]):
+                    recent.clear()
+                    continue
+                recent.append(head)
+                _, _, channel, sequence, _, _ = _HEAD.unpack_from(chunk, at)
+                data = np.frombuffer(chunk, np.uint8, end - at - _HEAD.size, at + _HEAD.size)
+                _append(found, channel, data[None], np.array([sequence], np.uint32))
+            else:
+                self.announce(opcode, chunk[at + _RECORD.size : end], offset)
+            at = end
+        return self._by_topic(found, offset)
+
+    def _by_topic(self, found: dict[int, Messages], offset: int) -> dict[str, Messages]:
         unknown = found.keys() - self.channels.keys()
         if unknown:
             raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
         return {self.channels[channel].topic: messages for channel, messages in found.items()}
 
-    def _matched(self, chunk: bytes) -> dict[int, Messages] | None:
-        """The messages by channel if the chunk repeats the known pattern and nothing else."""
-        if not self._pattern or len(chunk) % self._pattern[-1].data.stop:
+    def _run(self, chunk: bytes, at: int) -> Bytes | None:
+        """As many repetitions of the pattern as follow from `at` on, shape (k, size)."""
+        if not self._pattern:
             return None
-        rows = np.frombuffer(chunk, np.uint8).reshape(-1, self._pattern[-1].data.stop)
-        found = {}
+        size = self._pattern[-1].data.stop
+        count = (len(chunk) - at) // size
+        if not count:
+            return None
+        rows = np.frombuffer(chunk, np.uint8, count * size, at).reshape(-1, size)
+        kept = np.ones(count, np.bool_)
         for place in self._pattern:
-            if not (rows[:, place.fixed] == place.head).all():
-                return None
+            for where, word in place.words:
+                kept &= rows[:, where].view(_WORD)[:, 0] == word
+        return rows if kept.all() else rows[: int(kept.argmin())]
+
+    def _add(self, rows: Bytes, found: dict[int, Messages]) -> None:
+        for place in self._pattern:
             sequence = rows[:, place.sequence].view(_SEQUENCE)[:, 0]
-            found[place.channel] = Messages(rows[:, place.data], sequence)
-        return found
+            _append(found, place.channel, rows[:, place.data], sequence)
 
-    def _walk(self, chunk: bytes, offset: int) -> dict[int, Messages]:
-        """Walk a chunk record by record; remember the pattern of its messages."""
-        found: dict[int, tuple[list[bytes], list[int]]] = {}
-        heads: list[bytes] = []
-        at = 0
-        while at < len(chunk):
-            if len(chunk) - at < _RECORD.size:
-                raise Damage(offset, "(chunk) ends within a record")
-            opcode, length = _RECORD.unpack_from(chunk, at)
-            end = at + _RECORD.size + length
-            if end > len(chunk) or (opcode == container.MESSAGE and length < _IN_BODY):
-                raise Damage(offset, "(chunk) ends within a record")
-            if opcode == container.MESSAGE:
-                _, _, channel, sequence, _, _ = _HEAD.unpack_from(chunk, at)
-                data, numbers = found.setdefault(channel, ([], []))
-                data.append(chunk[at + _HEAD.size : end])
-                numbers.append(sequence)
-                heads.append(chunk[at : at + _FIXED.size])
-            else:
-                self._announce(opcode, chunk[at + _RECORD.size : end], offset)
-            at = end
-        self._pattern = _pattern(heads)
-        return {
-            channel: Messages(data, np.array(numbers, np.uint32))
-            for channel, (data, numbers) in found.items()
-        }
+    def _learn(self, heads: list[bytes]) -> bool:
+        """Take one round of heads for the pattern, if no channel comes twice in it."""
+        places, start = [], 0
+        for head in heads:
+            _, length, channel = _FIXED.unpack(head)
+            words = tuple(
+                (
+                    slice(start + at, start + at + _WORD.itemsize),
+                    int.from_bytes(head[at : at + 8], "little"),
+                )
+                for at in _WORDS_AT
+            )
+            number = start + _FIXED.size
+            end = start + _RECORD.size + length
+            sequence = slice(number, number + _SEQUENCE.itemsize)
+            places.append(_Place(channel, words, sequence, slice(start + _HEAD.size, end)))
+            start = end
+        changed = len({place.channel for place in places}) == len(places)
+        changed &= places != self._pattern
+        if changed:
+            self._pattern = places
+        return changed
 
-    def _announce(self, opcode: int, body: bytes, offset: int) -> None:
+    def announce(self, opcode: int, body: bytes, offset: int) -> None:
+        """Take a schema or channel record; others are passed over."""
         if opcode == container.SCHEMA:
             schema = container.schema(body, offset)
             self.schemas[schema.id] = schema
@@ -140,18 +194,24 @@ class ChunkParser:
             self.channels[channel.id] = channel
 
 
-def _pattern(heads: list[bytes]) -> list[_Place]:
-    """The shortest pattern with one message per channel that repeats; empty if none does."""
-    period = len(set(heads))
-    repeats = all(a == b for a, b in zip(heads, heads[period:], strict=False))
-    if not heads or not repeats or len(heads) % period:
-        return []
-    places, start = [], 0
-    for head in heads[:period]:
-        _, length, channel = _FIXED.unpack(head)
-        fixed, data, end = start + _FIXED.size, start + _HEAD.size, start + _RECORD.size + length
-        sequence = slice(fixed, fixed + _SEQUENCE.itemsize)
-        expected = np.frombuffer(head, np.uint8)
-        places.append(_Place(channel, expected, slice(start, fixed), sequence, slice(data, end)))
-        start = end
-    return places if len({place.channel for place in places}) == period else []
+def _bounds(chunk: bytes, at: int, offset: int) -> tuple[int, int]:
+    """Opcode and end of the record at `at`."""
+    if len(chunk) - at < _RECORD.size:
+        raise Damage(offset, "(chunk) ends within a record")
+    opcode, length = _RECORD.unpack_from(chunk, at)
+    end = at + _RECORD.size + length
+    if end > len(chunk) or (opcode == container.MESSAGE and length < _IN_BODY):
+        raise Damage(offset, "(chunk) ends within a record")
+    return opcode, end
+
+
+def _word(head: bytes, at: int) -> int:
+    return int.from_bytes(head[at : at + _WORD.itemsize], "little")
+
+
+def _append(
+    found: dict[int, Messages], channel: int, data: Bytes, sequence: NDArray[np.uint32]
+) -> None:
+    messages = found.setdefault(channel, Messages([], []))
+    messages.parts.append(data)
+    messages.sequences.append(sequence)

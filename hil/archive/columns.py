@@ -56,13 +56,17 @@ class Columns:
         now = slice(self._count, self._count + count)
         if now.stop > len(self._stamps):
             self._grow(max(_FIRST_CAPACITY, now.stop, 2 * self._count, expected))
-        stamp = messages.view(self._stamp)[:, 0]
-        stamps = self._stamps[now]
-        np.multiply(stamp["sec"], 10**9, out=stamps, dtype=np.int64)
-        stamps += stamp["nanosec"]
+        self._stamps[now] = self.stamps(messages)
         for (place, raw), array in zip(self._places, self._arrays, strict=True):
             array[:, now] = messages[:, place].view(raw).T
         self._count += count
+
+    def stamps(self, messages: Bytes) -> NDArray[np.int64]:
+        """Time stamps of messages, shape (k,) [ns]."""
+        stamp = messages.view(self._stamp)[:, 0]
+        stamps = np.multiply(stamp["sec"], 10**9, dtype=np.int64)
+        stamps += stamp["nanosec"]
+        return np.asarray(stamps)
 
     def finished(self) -> dict[str, NDArray[Any]]:
         """The columns, contiguous and read-only."""

@@ -9,16 +9,17 @@ Layout: https://mcap.dev/spec
 
 from __future__ import annotations
 
+import os
 import struct
-import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import BinaryIO, NamedTuple
 
 import lz4.frame
 import zstandard
+from isal.isal_zlib import crc32  # ten times as fast as that of zlib
 
 MAGIC = b"\x89MCAP0\r\n"
-LARGEST_CHUNK = 1 << 30  # bytes; a greater size is a corrupt one
+LARGEST_CHUNK = 1 << 26  # bytes; ours have a tenth of a megabyte, a greater size is a corrupt one
 
 HEADER = 0x01
 FOOTER = 0x02
@@ -26,12 +27,20 @@ SCHEMA = 0x03
 CHANNEL = 0x04
 MESSAGE = 0x05
 CHUNK = 0x06
+MESSAGE_INDEX = 0x07
+CHUNK_INDEX = 0x08
 ATTACHMENT = 0x09
+ATTACHMENT_INDEX = 0x0A
+STATISTICS = 0x0B
 METADATA = 0x0C
+METADATA_INDEX = 0x0D
+SUMMARY_OFFSET = 0x0E
 DATA_END = 0x0F
 
-_RECORD = struct.Struct("<BQ")
-_FOOTER_SIZE = _RECORD.size + 20
+RECORD = struct.Struct("<BQ")  # opcode, length of the body
+FOOTER_SIZE = RECORD.size + 20
+_CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
+_LENGTH = struct.Struct("<Q")
 _NO_CRC = 0
 
 
@@ -50,20 +59,28 @@ class Damage(Exception):  # noqa: N818 - handed on as a finding, too
 
 
 class Record(NamedTuple):
-    """One record of the data section."""
+    """One record of the data section; a body that was not asked for is empty."""
 
     offset: int
     opcode: int
     body: bytes
+    length: int
+
+    @property
+    def end(self) -> int:
+        """Where the next record begins."""
+        return self.offset + RECORD.size + self.length
 
 
 class Chunk(NamedTuple):
     """The head of a chunk record, and its compressed records."""
 
+    start_time: int
+    end_time: int
     size: int
     crc: int
     compression: str
-    data: bytes
+    data: memoryview
 
 
 class SchemaRecord(NamedTuple):
@@ -84,8 +101,13 @@ class ChannelRecord(NamedTuple):
     encoding: str
 
 
-class _Fields:
-    """Reads the fields of a record body one after the other; running out is damage."""
+class Fields:
+    """Reads the fields of a record body one after the other; running out is damage.
+
+    Args:
+        body: the record without its head.
+        offset: where the record stands in the file, for the error.
+    """
 
     def __init__(self, body: bytes, offset: int) -> None:
         self._body = body
@@ -93,21 +115,25 @@ class _Fields:
         self.at = 0
 
     def number(self, code: str) -> int:
+        """Read a number; `code` is that of `struct`."""
         size = struct.calcsize("<" + code)
         value: int
         (value,) = struct.unpack("<" + code, self._take(size))
         return value
 
     def text(self) -> str:
+        """Read a string."""
         try:
             return self._take(self.number("I")).decode()
         except UnicodeDecodeError:
             raise Damage(self._offset, "holds text that is not UTF-8") from None
 
     def data(self, code: str) -> bytes:
+        """Read bytes whose count precedes them."""
         return self._take(self.number(code))
 
     def mapping(self) -> dict[str, str]:
+        """Read strings by name."""
         end = self.number("I") + self.at
         entries = {}
         while self.at < end:
@@ -123,8 +149,32 @@ class _Fields:
         return part
 
 
-def records(stream: BinaryIO, size: int) -> Iterator[Record]:
+def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
+    """Read the record that an index says begins at `offset`, `length` with its head.
+
+    Raises:
+        Damage: it is not there.
+    """
+    stream.seek(offset)
+    data = stream.read(length)
+    if len(data) != length or length < RECORD.size:
+        raise Damage(offset, "is cut off")
+    opcode, body_length = RECORD.unpack_from(data)
+    if body_length != length - RECORD.size:
+        raise Damage(offset, "is not of the length that the index says")
+    return Record(offset, opcode, data[RECORD.size :], body_length)
+
+
+def records(
+    stream: BinaryIO, size: int, *, skip: Collection[int] = (), check_end: bool = True
+) -> Iterator[Record]:
     """Walk the records of the data section, DataEnd included; then check the end of the file.
+
+    Args:
+        stream: the file, at its beginning.
+        size: its length.
+        skip: opcodes of records whose bodies are passed over.
+        check_end: whether to check summary and footer.
 
     Raises:
         Damage: the file is cut off, or its bytes do not keep the format.
@@ -132,43 +182,49 @@ def records(stream: BinaryIO, size: int) -> Iterator[Record]:
     if stream.read(len(MAGIC)) != MAGIC:
         raise Damage(0, "is not the beginning of an MCAP file")
     offset = len(MAGIC)
+    read, seek = stream.read, stream.seek
     while True:
-        head = stream.read(_RECORD.size)
+        head = read(RECORD.size)
         if not head:
             raise Damage(offset, "is missing: the file ends before its footer")
-        if len(head) < _RECORD.size:
+        if len(head) < RECORD.size:
             raise Damage(offset, "is cut off")
-        opcode, length = _RECORD.unpack(head)
-        if length > size - offset - _RECORD.size:
+        opcode, length = RECORD.unpack(head)
+        if length > size - offset - RECORD.size:
             raise Damage(offset, "is cut off, or its length is corrupt")
-        yield Record(offset, opcode, stream.read(length))
-        offset += _RECORD.size + length
+        if opcode in skip:
+            seek(length, os.SEEK_CUR)
+            yield Record(offset, opcode, b"", length)
+        else:
+            yield Record(offset, opcode, read(length), length)
+        offset += RECORD.size + length
         if opcode == DATA_END:
-            _check_end(stream.read(), offset)
+            if check_end:
+                _check_end(read(), offset)
             return
 
 
 def _check_end(tail: bytes, offset: int) -> None:
     """Check summary and footer, which follow DataEnd."""
-    if len(tail) < _FOOTER_SIZE + len(MAGIC) or not tail.endswith(MAGIC):
+    if len(tail) < FOOTER_SIZE + len(MAGIC) or not tail.endswith(MAGIC):
         raise Damage(offset, "(index and footer) is cut off")
-    footer = tail[-_FOOTER_SIZE - len(MAGIC) : -len(MAGIC)]
-    opcode, length = _RECORD.unpack_from(footer)
-    (crc,) = struct.unpack_from("<I", footer, _FOOTER_SIZE - 4)
+    footer = tail[-FOOTER_SIZE - len(MAGIC) : -len(MAGIC)]
+    opcode, length = RECORD.unpack_from(footer)
+    (crc,) = struct.unpack_from("<I", footer, FOOTER_SIZE - 4)
     covered = tail[: -len(MAGIC) - 4]
-    if opcode != FOOTER or length != 20 or (crc != _NO_CRC and zlib.crc32(covered) != crc):
+    if opcode != FOOTER or length != 20 or (crc != _NO_CRC and crc32(covered) != crc):
         raise Damage(offset, "(index and footer) fails its checksum")
 
 
 def metadata(record: Record) -> tuple[str, dict[str, str]]:
     """Name and entries of a metadata record."""
-    fields = _Fields(record.body, record.offset)
+    fields = Fields(record.body, record.offset)
     return fields.text(), fields.mapping()
 
 
 def attachment(record: Record) -> tuple[str, bytes]:
     """Name and content of an attachment, its checksum verified."""
-    fields = _Fields(record.body, record.offset)
+    fields = Fields(record.body, record.offset)
     fields.number("Q")
     fields.number("Q")
     name = fields.text()
@@ -176,14 +232,14 @@ def attachment(record: Record) -> tuple[str, bytes]:
     data = fields.data("Q")
     covered = record.body[: fields.at]
     crc = fields.number("I")
-    if crc not in (_NO_CRC, zlib.crc32(covered)):
+    if crc != crc32(covered):
         raise Damage(record.offset, f"(attachment {name!r}) fails its checksum")
     return name, data
 
 
 def schema(body: bytes, offset: int) -> SchemaRecord:
     """Read a schema record that stands in a chunk at `offset`."""
-    fields = _Fields(body, offset)
+    fields = Fields(body, offset)
     identity, name, encoding = fields.number("H"), fields.text(), fields.text()
     definition = fields.data("I").decode(errors="replace")
     return SchemaRecord(identity, name, encoding, definition)
@@ -191,24 +247,37 @@ def schema(body: bytes, offset: int) -> SchemaRecord:
 
 def channel(body: bytes, offset: int) -> ChannelRecord:
     """Read a channel record that stands in a chunk at `offset`."""
-    fields = _Fields(body, offset)
+    fields = Fields(body, offset)
     return ChannelRecord(fields.number("H"), fields.number("H"), fields.text(), fields.text())
+
+
+def chunk(record: Record) -> Chunk:
+    """Read a chunk record, without decompressing it."""
+    body = memoryview(record.body)
+    try:
+        start_time, end_time, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
+        name_end = _CHUNK_HEAD.size + name_length
+        compression = bytes(body[_CHUNK_HEAD.size : name_end]).decode()
+        (length,) = _LENGTH.unpack_from(body, name_end)
+    except (struct.error, UnicodeDecodeError):
+        raise Damage(record.offset, "(chunk) has a head that cannot be read") from None
+    data = body[name_end + _LENGTH.size :]
+    if len(data) != length:
+        raise Damage(record.offset, "(chunk) has another length than its fields")
+    return Chunk(start_time, end_time, size, crc, compression, data)
 
 
 def chunk_data(record: Record, *, decompressor: zstandard.ZstdDecompressor) -> bytes:
     """Decompress the records of a chunk and verify their checksum."""
-    fields = _Fields(record.body, record.offset)
-    fields.number("Q")
-    fields.number("Q")
-    size, crc = fields.number("Q"), fields.number("I")
-    chunk = Chunk(size, crc, fields.text(), fields.data("Q"))
-    if size > LARGEST_CHUNK:
-        raise Damage(record.offset, f"(chunk) claims {size} bytes of content")
-    data = _decompressed(chunk, record.offset, decompressor)
-    if len(data) != size:
+    head = chunk(record)
+    if head.size > LARGEST_CHUNK:
+        raise Damage(record.offset, f"(chunk) claims {head.size} bytes of content")
+    data = _decompressed(head, record.offset, decompressor)
+    if len(data) != head.size:
         raise Damage(record.offset, "(chunk) has another length than it claims")
-    if crc != _NO_CRC and zlib.crc32(data) != crc:
-        raise Damage(record.offset, "(chunk) fails its checksum")
+    if crc32(data) != head.crc:
+        missing = head.crc == _NO_CRC
+        raise Damage(record.offset, f"(chunk) {'has no' if missing else 'fails its'} checksum")
     return data
 
 
@@ -226,5 +295,5 @@ def _decompressed(chunk: Chunk, offset: int, decompressor: zstandard.ZstdDecompr
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise Damage(offset, "(chunk) cannot be decompressed") from error
     if chunk.compression == "":
-        return chunk.data
+        return bytes(chunk.data)
     raise Damage(offset, f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4")

@@ -8,8 +8,8 @@ the end by the counts in the outcome.
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
-from typing import Any, BinaryIO
+from collections.abc import Collection, Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 import zstandard
@@ -22,46 +22,66 @@ from hil.archive.columns import Columns
 from hil.archive.container import Damage, Record
 from hil.archive.events import ArchivedEvent
 from hil.archive.messages import decode_log, joint_state_of
+from hil.archive.selection import Selection
 
 _NEEDED = ("kind", "joint_names", "attachments")
 _MARGIN = 1.3  # room for chunks that are smaller than the one the count is guessed from
+_BATCH = 1 << 20  # bytes of chunks decoded at once: few calls per chunk, and all in the cache
 _COLUMN_OF = {"effort": "torque"}  # where a message has another word for it than we
+
+
+class _Waiting(NamedTuple):
+    """A chunk that passed its checksum and is decoded with others."""
+
+    offset: int
+    data: bytes
 
 
 class Content:
     """What has been read from a file so far.
 
     Args:
-        fields: columns wanted, None for all.
+        selection: what is wanted of it.
+        gapless: whether all chunks are read, so that the messages of a channel must count on from
+            chunk to chunk; otherwise their numbers need only grow.
     """
 
-    def __init__(self, fields: Collection[str] | None = None) -> None:
+    def __init__(self, selection: Selection, *, gapless: bool = True) -> None:
         self.metadata: dict[str, str] | None = None
         self.outcome: dict[str, str] | None = None
         self.attachments: dict[str, bytes] = {}
         self.events: list[ArchivedEvent] = []
-        self._fields = fields
+        self.parser = ChunkParser()
+        self._selection = selection
+        self._gapless = gapless
         self._size = 0
         self._decompressor = zstandard.ZstdDecompressor()
-        self._parser = ChunkParser()
         self._channels: dict[str, _Channel] = {}
+        self._n_events = 0
+        self._waiting: list[_Waiting] = []
+        self._waiting_size = 0
 
-    def collect(self, stream: BinaryIO, size: int) -> Damage | None:
-        """Read a file up to its end or its first damage, which is returned."""
+    def collect(self, records: Iterable[Record], size: int) -> Damage | None:
+        """Take records up to their end or the first damage, which is returned.
+
+        Args:
+            records: of the data section, in the order of the file.
+            size: length of the file, or of the part of it that is read.
+        """
         self._size = size
+        damage = None
         try:
-            for record in container.records(stream, size):
-                if record.opcode == container.CHUNK:
-                    self._take_chunk(record)
-                elif record.opcode == container.ATTACHMENT:
-                    name, data = container.attachment(record)
-                    self.attachments[name] = data
-                elif record.opcode == container.METADATA:
-                    self._take_metadata(record)
-            self._check_counts(size)
-        except Damage as damage:
-            return damage
-        return None
+            for record in records:
+                self._take(record)
+        except Damage as found:
+            damage = found
+        try:
+            self._take_waiting()
+            if damage is None:
+                self._check_counts(size)
+        except Damage as found:  # in an earlier record
+            damage = found
+        return damage
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns read, all of the same length."""
@@ -69,6 +89,17 @@ class Content:
         for channel in self._channels.values():
             joined |= channel.finished()
         return joined
+
+    def _take(self, record: Record) -> None:
+        if record.opcode == container.CHUNK:
+            self._take_chunk(record)
+        elif record.opcode == container.ATTACHMENT:
+            name, data = container.attachment(record)
+            self.attachments[name] = data
+        elif record.opcode == container.METADATA:
+            self._take_metadata(record)
+        elif record.opcode in (container.SCHEMA, container.CHANNEL):
+            self.parser.announce(record.opcode, record.body, record.offset)
 
     def _take_metadata(self, record: Record) -> None:
         name, entries = container.metadata(record)
@@ -92,27 +123,52 @@ class Content:
         if self.metadata is None:
             return  # some other MCAP file, which will be refused as such
         data = container.chunk_data(record, decompressor=self._decompressor)
-        found = self._parser.messages(data, record.offset)
-        recorded = {channel.topic for channel in self._parser.channels.values()}
-        wanted = (
-            (schema.CYCLE,) if schema.CYCLE in recorded else (schema.MEASURED, schema.MOTOR_CURRENT)
-        )
+        if not self.parser.repeats(data):
+            self._take_waiting()
+            self._decode(self.parser.messages(data, record.offset), record.offset, len(record.body))
+            return
+        self._waiting.append(_Waiting(record.offset, data))
+        self._waiting_size += len(data)
+        if self._waiting_size >= _BATCH:
+            self._take_waiting()
+
+    def _take_waiting(self) -> None:
+        """Decode the chunks that wait: all at once, or one by one where that fails."""
+        waiting, self._waiting, self._waiting_size = self._waiting, [], 0
+        if not waiting:
+            return
+        try:
+            found = self.parser.repeated([chunk.data for chunk in waiting])
+            if found is not None:
+                self._decode(found, waiting[0].offset, 0)
+                return
+        except Damage:
+            pass  # in one of them
+        for chunk in waiting:
+            self._decode(self.parser.messages(chunk.data, chunk.offset), chunk.offset, 0)
+
+    def _decode(self, found: dict[str, Messages], offset: int, compressed: int) -> None:
+        """Decode messages, if they are what must follow now; else nothing of them counts."""
+        recorded = {channel.topic for channel in self.parser.channels.values()}
+        wanted = self._selection.numbers(recorded)
         counts = {
             len(found[topic]) if topic in found else 0 for topic in wanted if topic in recorded
         }
         if len(counts) > 1:
-            raise Damage(record.offset, "(chunk) has channels of different length")
+            raise Damage(offset, "(chunk) has channels of different length")
         decoded = []
         for topic in wanted:
             if topic in found:
-                channel = self._channel(topic, found[topic], record.offset)
-                decoded.append((channel, channel.verified(found[topic], record.offset)))
-        events = self._decoded_events(found.get(schema.EVENTS), record.offset)
+                channel = self._channel(topic, found[topic], offset)
+                decoded.append((channel, channel.verified(found[topic], offset)))
+        logs = found.get(schema.EVENTS) if self._selection.events else None
+        events = self._decoded_events(logs, offset)
         for channel, messages in decoded:
-            channel.append(
-                messages, expected=int(_MARGIN * len(messages) * self._size / len(record.body))
-            )
-        self.events += events
+            share = self._size / compressed if compressed else 0.0
+            channel.append(messages, expected=int(_MARGIN * len(messages) * share))
+        self._n_events += len(events)
+        start, stop = self._selection.times
+        self.events += [event for stamp, event in events if start <= stamp < stop]
 
     def _channel(self, topic: str, messages: Messages, offset: int) -> _Channel:
         """The decoder of a topic, made from its schema or from its first message."""
@@ -121,27 +177,30 @@ class Content:
                 layout = self._layout(topic, messages)
             except LayoutError as error:
                 raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-            self._channels[topic] = _Channel(layout, self._fields)
+            self._channels[topic] = _Channel(layout, self._selection, gapless=self._gapless)
         return self._channels[topic]
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout:
-        if topic == schema.MEASURED:
-            return joint_state_of(messages.message(0))[1]
-        channels = self._parser.channels.values()
+        if topic in (schema.MEASURED, schema.COMMANDED):
+            return joint_state_of(messages.first())[1]
+        channels = self.parser.channels.values()
         identity = next(channel.schema_id for channel in channels if channel.topic == topic)
-        if identity not in self._parser.schemas:
+        if identity not in self.parser.schemas:
             raise LayoutError("their schema is missing")
-        return fixed_layout(self._parser.schemas[identity].definition)
+        return fixed_layout(self.parser.schemas[identity].definition)
 
-    def _decoded_events(self, messages: Messages | None, offset: int) -> list[ArchivedEvent]:
+    def _decoded_events(
+        self, messages: Messages | None, offset: int
+    ) -> list[tuple[int, ArchivedEvent]]:
+        """The events with their stamps [ns]."""
         if messages is None:
             return []
-        _check_sequence(messages, len(self.events), offset)
+        _check_sequence(messages, self._n_events if self._gapless else None, offset)
         try:
-            logs = [decode_log(messages.message(index)) for index in range(len(messages))]
+            logs = [decode_log(message) for message in messages.all()]
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has an event that cannot be read: {error}") from error
-        return [ArchivedEvent.from_log(log) for log in logs]
+        return [(log.stamp, ArchivedEvent.from_log(log)) for log in logs]
 
     def _check_counts(self, size: int) -> None:
         """Compare what was read with what the writer says it wrote."""
@@ -153,27 +212,41 @@ class Content:
             raise Damage(size, f"(attachment {absent[0]!r}) is missing")
         if self.outcome is None:
             raise Damage(size, f"(metadata {schema.OUTCOME!r}) is missing")
-        counts = {"samples": len(self.columns()["stamp"]), "events": len(self.events)}
+        if not self._gapless:
+            return
+        counts = {"samples": max([channel.read for channel in self._channels.values()], default=0)}
+        if self._selection.events:
+            counts["events"] = self._n_events
+        if not self._selection.numbers(
+            {channel.topic for channel in self.parser.channels.values()}
+        ):
+            del counts["samples"]
+        elif schema.PACKETS in (self._selection.topics or ()):
+            counts["packets"] = counts.pop("samples")
         for key, count in counts.items():
-            if int(self.outcome[key]) != count:
-                raise Damage(size, f"is missing: {self.outcome[key]} {key} were written")
+            if self.outcome.get(key) != str(count):
+                raise Damage(size, f"is missing: {self.outcome.get(key)} {key} were written")
 
 
 class _Channel:
-    """Decodes the messages of one topic into columns."""
+    """Decodes the messages of one topic into columns.
 
-    def __init__(self, layout: MessageLayout, fields: Collection[str] | None) -> None:
+    Attributes:
+        read: messages read so far, whether their time is wanted or not.
+    """
+
+    def __init__(self, layout: MessageLayout, selection: Selection, *, gapless: bool) -> None:
+        self.read = 0
         self._layout = layout
-        names = layout.dtype.names or ()
-        wanted = [name for name in names if fields is None or _COLUMN_OF.get(name, name) in fields]
-        self._columns = Columns(layout, wanted)
-
-    def __len__(self) -> int:
-        return len(self._columns)
+        self._times = selection.times if selection.bounded else None
+        self._gapless = gapless
+        self._next = 0
+        self._columns = Columns(layout, _wanted(layout, selection.fields))
 
     def verified(self, messages: Messages, offset: int) -> Bytes:
         """The messages as bytes (k, size): the next of this topic, and like those before."""
-        _check_sequence(messages, len(self._columns), offset)
+        expected = self.read if self._gapless else None
+        _check_sequence(messages, expected, offset)
         data = messages.matrix(self._layout.size)
         if data is None or not self._layout.is_kept_by(data):
             raise Damage(offset, "(chunk) has messages that differ from those before")
@@ -181,6 +254,10 @@ class _Channel:
 
     def append(self, data: Bytes, expected: int) -> None:
         """Append verified messages; `expected` is a guess at the final count."""
+        self.read += len(data)
+        if self._times is not None:
+            stamp = self._columns.stamps(data)
+            data = data[(stamp >= self._times[0]) & (stamp < self._times[1])]
         self._columns.append(data, expected)
 
     def finished(self) -> dict[str, NDArray[Any]]:
@@ -189,7 +266,15 @@ class _Channel:
         return {_COLUMN_OF.get(name, name): column for name, column in columns.items()}
 
 
-def _check_sequence(messages: Messages, expected: int, offset: int) -> None:
-    wanted = np.arange(expected, expected + len(messages), dtype=np.int64) & 0xFFFFFFFF
-    if not np.array_equal(messages.sequence, wanted):
+def _wanted(layout: MessageLayout, fields: Collection[str] | None) -> list[str]:
+    names = layout.dtype.names or ()
+    return [name for name in names if fields is None or _COLUMN_OF.get(name, name) in fields]
+
+
+def _check_sequence(messages: Messages, expected: int | None, offset: int) -> None:
+    """Check that messages are numbered one by one, from `expected` on where it is known."""
+    sequence = messages.sequence
+    first = int(sequence[0]) if expected is None else expected
+    wanted = np.arange(first, first + len(sequence), dtype=np.int64) & 0xFFFFFFFF
+    if not np.array_equal(sequence, wanted):
         raise Damage(offset, "(chunk) does not continue the one before it: a chunk is missing")

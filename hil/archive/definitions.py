@@ -8,6 +8,7 @@ from __future__ import annotations
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 LOG = "rcl_interfaces/msg/Log"
+PACKET = "hil_msgs/msg/Packet"
 
 _SEPARATOR = "=" * 80
 _TIME = """\
@@ -66,6 +67,17 @@ std_msgs/Header header
 float64[{n}] motor_current        # A
 """
 
+_PACKET = """\
+# One packet of the controller link, byte by byte, in the order in which the PC received and sent.
+# header.stamp is that of the cycle in /hil/cycle to which it belongs.
+std_msgs/Header header
+int64 cycle                     # cycles of the controller since its initialisation
+float64 time                    # s, clock of the PC: when it arrived or was sent
+uint16 length                   # bytes
+uint8 sent                      # 1: sent by the PC, 0: received by it
+uint8[{size}] data               # the packet, then zeros
+"""
+
 _LOG = """\
 byte DEBUG=10
 byte INFO=20
@@ -104,6 +116,11 @@ def cycle_name(n_joints: int) -> str:
 def cycle(n_joints: int) -> str:
     """The definition of the cycle message for so many joints."""
     return _text(_CYCLE.format(n=n_joints), _HEADER, _TIME)
+
+
+def packet(size: int) -> str:
+    """The definition of the message that holds a raw packet of up to so many bytes."""
+    return _text(_PACKET.format(size=size), _HEADER, _TIME)
 
 
 def motor_current_name(n_joints: int) -> str:

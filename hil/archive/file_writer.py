@@ -6,10 +6,10 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import IO, Any, cast
 
-from mcap.writer import CompressionType, Writer
+import numpy as np
 
+from hil.archive.mcap_writer import McapWriter
 from hil.archive.messages import LogMessage, encode_log
 from hil.archive.schema import (
     EVENT_CHANNEL,
@@ -24,7 +24,7 @@ from hil.archive.schema import (
 from hil.errors import ArchiveWriteError
 
 LIBRARY = "hil"  # without version: the same recording gives the same bytes
-_ONE_CHUNK = 1 << 62  # chunks end where we flush, never because of their size
+_MOST_NUMBERS = 1 << 32  # message numbers are counted modulo this
 _MEDIA_TYPES = {
     ".toml": "application/toml",
     ".urdf": "application/xml",
@@ -35,21 +35,15 @@ _MEDIA_TYPES = {
 
 
 class _Sink:
-    """Collects what the MCAP writer produces; each flush is one write to the file."""
+    """Collects what is to be written; each flush is one write to the file."""
 
     def __init__(self, descriptor: int, *, durable: bool) -> None:
         self._descriptor = descriptor
         self._durable = durable
         self._parts: list[bytes] = []
-        self._position = 0
 
-    def write(self, data: bytes) -> int:
-        self._parts.append(bytes(data))
-        self._position += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
+    def write(self, data: bytes) -> None:
+        self._parts.append(data)
 
     def flush(self) -> None:
         data = memoryview(b"".join(self._parts))
@@ -68,7 +62,8 @@ class ArchiveFile:
 
     Args:
         path: where to write.
-        channels: the channels whose messages come in batches.
+        channels: the channels whose messages come in batches, one of each at every instant.
+        packets: a channel for raw packets, which come as they come.
         metadata: entries of the ``hil`` metadata record.
         attachments: file name to content.
         durable: wait at each flush until the disk has the data.
@@ -85,21 +80,23 @@ class ArchiveFile:
         metadata: Mapping[str, str],
         attachments: Mapping[str, bytes],
         durable: bool,
+        packets: Channel | None = None,
     ) -> None:
         self.path = path
-        self._descriptor = _create(path, durable=durable)
+        self._descriptor = _create(path)
         self._closed = False
         self._written = 0
         self._events = 0
-        self._writer: Any = Writer(  # its methods are not annotated
-            cast("IO[bytes]", _Sink(self._descriptor, durable=durable)),
-            chunk_size=_ONE_CHUNK,
-            compression=CompressionType.ZSTD,
-        )
+        self._packets = 0
+        self._sink = _Sink(self._descriptor, durable=durable)
+        self._writer = McapWriter(self._sink.write)
         with self._guarded():
             self._start(metadata, attachments)
+            if durable:  # only now: the file is empty for as short a time as possible
+                _sync_folder(path.parent)
             self._channels = [self._register(channel) for channel in channels]
             self._event_channel = self._register(EVENT_CHANNEL)
+            self._packet_channel = None if packets is None else self._register(packets)
 
     @property
     def samples(self) -> int:
@@ -112,20 +109,30 @@ class ArchiveFile:
         return self._events
 
     @property
+    def packets(self) -> int:
+        """Number of raw packets written so far."""
+        return self._packets
+
+    @property
     def closed(self) -> bool:
         """Whether the file is closed, by `finish` or by a failure of the disk."""
         return self._closed
 
     def add(self, batch: Batch) -> None:
         """Add a batch of messages to the chunk in progress."""
-        blobs = [(rows.tobytes(), rows.itemsize) for rows in batch.messages]
-        add_message = self._writer.add_message
-        with self._guarded():
-            for row, stamp in enumerate(batch.stamp.tolist()):
-                for channel, (blob, size) in zip(self._channels, blobs, strict=True):
-                    message = blob[row * size : (row + 1) * size]
-                    add_message(channel, stamp, message, stamp, self._written & 0xFFFFFFFF)
-                self._written += 1
+        self._add(self._channels, self._written, batch)
+        self._written += len(batch.stamp)
+
+    def add_packets(self, batch: Batch) -> None:
+        """Add raw packets to the chunk in progress.
+
+        Raises:
+            ValueError: the file was opened without a channel for them.
+        """
+        if self._packet_channel is None:
+            raise ValueError("this file has no channel for raw packets")
+        self._add([self._packet_channel], self._packets, batch)
+        self._packets += len(batch.stamp)
 
     def add_event(self, message: LogMessage) -> None:
         """Add an event to the chunk in progress."""
@@ -133,9 +140,8 @@ class ArchiveFile:
             self._writer.add_message(
                 self._event_channel,
                 message.stamp,
+                self._events % _MOST_NUMBERS,
                 encode_log(message),
-                message.stamp,
-                self._events & 0xFFFFFFFF,
             )
         self._events += 1
 
@@ -143,6 +149,7 @@ class ArchiveFile:
         """End the chunk in progress and hand everything to the operating system, or the disk."""
         with self._guarded():
             self._writer.flush()
+            self._sink.flush()
 
     def finish(self, outcome: Mapping[str, str]) -> None:
         """Write the outcome, index and footer, and close the file."""
@@ -152,8 +159,13 @@ class ArchiveFile:
             self._writer.flush()
             self._add_metadata(OUTCOME, outcome)
             self._writer.finish()
-            self._writer.flush()
+            self._sink.flush()
         self._close()
+
+    def _add(self, channels: Sequence[int], first: int, batch: Batch) -> None:
+        numbers = (first + np.arange(len(batch.stamp))) % _MOST_NUMBERS
+        with self._guarded():
+            self._writer.add_rows(channels, batch.stamp, numbers, batch.messages)
 
     def _start(self, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> None:
         self._writer.start(PROFILE, LIBRARY)
@@ -164,17 +176,17 @@ class ArchiveFile:
         self._add_metadata(METADATA, {**metadata, **own})
         for name, data in sorted(attachments.items()):
             media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
-            self._writer.add_attachment(0, 0, name, media_type, data)
-        self._writer.flush()
+            self._writer.add_attachment(name, media_type, data)
+        self._sink.flush()
 
     def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         self._writer.add_metadata(name, {**entries, "checksum": checksum(entries)})
 
     def _register(self, channel: Channel) -> int:
-        schema = self._writer.register_schema(
-            channel.schema, "ros2msg", channel.definition.encode()
+        definition = channel.definition.encode()
+        return self._writer.register(
+            channel.topic, "cdr", schema=channel.schema, encoding="ros2msg", definition=definition
         )
-        return int(self._writer.register_channel(channel.topic, "cdr", schema))
 
     def _guarded(self) -> _DiskGuard:
         if self._closed:
@@ -206,18 +218,15 @@ class _DiskGuard:
             ) from error
 
 
-def _create(path: Path, *, durable: bool) -> int:
+def _create(path: Path) -> int:
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        if durable:
-            _sync_folder(path.parent)
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     except FileExistsError as error:
         raise ArchiveWriteError(
             path, "exists already", remedy="archives are never overwritten; choose another name"
         ) from error
     except OSError as error:
         raise ArchiveWriteError(path, f"cannot be created: {error.strerror}") from error
-    return descriptor
 
 
 def _sync_folder(folder: Path) -> None:

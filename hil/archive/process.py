@@ -1,10 +1,11 @@
 """The archive process of a real link: drains the exchange's shared memory into files.
 
-Run as ``python -m hil.archive.process`` with the descriptors of ring, event log, control block and
-command socket. It is in a process session of its own and ignores SIGINT and SIGHUP: what is being
-recorded is completed whatever happens to the terminal. If the supervisor dies, it goes on until the
-exchange has ended the motion or is dead, closes the archive with the true outcome, and ends. If it
-cannot write, it says so in the control block, and the exchange brings the arm to rest.
+Run as ``python -m hil.archive.process`` with the descriptors of ring, event log, control block,
+command socket and exchange process, the number of joints, and the descriptor of the raw packets
+where they are kept. It is in a process session of its own and ignores SIGINT and SIGHUP: what is
+being recorded is completed whatever happens to the terminal. If the supervisor dies, it goes on
+until the exchange has ended the motion or is dead, closes the archive with the true outcome, and
+ends. If it cannot write, it says so in the control block, and the exchange brings the arm to rest.
 """
 
 from __future__ import annotations
@@ -28,8 +29,10 @@ from drivers.exchange import (
     Ended,
     EventReader,
     ExchangeEvent,
+    PacketReader,
     RingReader,
 )
+from drivers.packet_records import PACKET_DTYPE
 from hil.archive.commands import Answer, Channel, Close, Closed, End, Failed, Open, Opened
 from hil.archive.pulse import Pulse
 from hil.archive.recorder import Recorder
@@ -39,6 +42,10 @@ Records = NDArray[np.void]
 
 DRAIN_PERIOD = 0.02
 """s between two looks at the ring."""
+BEHIND = 0.005
+"""s by which raw packets may come later than the record made of them."""
+PUNCTUAL = 0.0005
+"""s after the last cycle of a chunk is due, when it is looked for."""
 BEAT_PERIOD = 0.05
 """s between two heartbeats."""
 STALL_LIMIT = 5.0
@@ -64,6 +71,7 @@ class Job:
         recorder: fills it.
         until_ended: whether it is closed when the motion ends.
         overflow: of the ring's reader when it began.
+        packets_overflow: likewise of the raw packets' reader.
         accepted, ended_count: fields of the control block when it began.
         heard: when the last record came, monotonic s.
         flushed: whether everything taken so far was written out.
@@ -75,6 +83,7 @@ class Job:
     recorder: Recorder
     until_ended: bool
     overflow: int
+    packets_overflow: int
     accepted: int
     ended_count: int
     heard: float
@@ -90,6 +99,7 @@ class ArchiveProcess:
         ring, events, control: the exchange's memory.
         commands: to the supervisor.
         exchange: descriptor of the exchange process (a pidfd), which tells its death.
+        packets: the raw packets' memory, None where they are not kept.
     """
 
     def __init__(
@@ -99,6 +109,7 @@ class ArchiveProcess:
         control: ControlBlock,
         commands: Channel,
         exchange: int,
+        packets: PacketReader | None = None,
     ) -> None:
         self._ring, self._events, self._control = ring, events, control
         self._commands: Channel | None = commands
@@ -107,7 +118,9 @@ class ArchiveProcess:
         self._progress = time.monotonic()
         self._exchange = exchange
         self._pulse = Pulse(lambda: control.exchange_heartbeat)
+        self._packets = packets
         self._recent: list[Records] = []
+        self._recent_packets: list[Records] = []
         self._recent_events: list[ExchangeEvent] = []
 
     def run(self) -> None:
@@ -132,11 +145,11 @@ class ArchiveProcess:
             time.sleep(BEAT_PERIOD)
 
     def _obey(self) -> None:
-        """Wait a drain period for a command, and carry it out."""
+        """Wait for a command until the ring is to be looked at again, and carry it out."""
         if self._commands is None:
-            time.sleep(DRAIN_PERIOD)
+            time.sleep(self._pause())
             return
-        readable, _, _ = select.select([self._commands], [], [], DRAIN_PERIOD)
+        readable, _, _ = select.select([self._commands], [], [], self._pause())
         if not readable:
             return
         try:
@@ -155,18 +168,25 @@ class ArchiveProcess:
             if self._job is not None and not self._job.until_ended:
                 self._close("stopped", "the recording was ended")
 
+    def _pause(self) -> float:
+        """Until the next look at the ring [s]: a chunk is written out as soon as it is full."""
+        if self._job is None or self._job.flushed:
+            return DRAIN_PERIOD
+        return min(DRAIN_PERIOD, self._job.recorder.writer.chunk_ends_in + PUNCTUAL)
+
     def _open(self, command: Open) -> None:
         if self._job is not None:
             self._take()
             self._close("interrupted", "another archive was begun")
         self._idle()
-        records, events = self._recent, self._recent_events
-        self._recent, self._recent_events = [], []
+        records, events, packets = self._recent, self._recent_events, self._recent_packets
+        self._recent, self._recent_events, self._recent_packets = [], [], []
         overflow, control = self._ring.overflow, self._control
         accepted, ended_count = control.program_accepted, control.ended_count
         try:
             recorder = Recorder(command.spec.open(), command.drive_train)
             if not command.from_now:
+                recorder.take_packets(_packets_of_the_last_session(packets))
                 recorder.take(*_of_the_last_session(records, events))
         except Exception as error:
             self._fail(command.job, error)
@@ -176,6 +196,7 @@ class ArchiveProcess:
             recorder,
             command.until_ended,
             overflow,
+            0 if self._packets is None else self._packets.overflow,
             accepted,
             ended_count,
             heard=time.monotonic(),
@@ -192,9 +213,14 @@ class ArchiveProcess:
         # Looked at first, so that what it left behind is taken.
         gone, ended_count = self._exchange_gone(), self._control.ended_count
         events, records = self._events.drain(), self._ring.drain()
+        packets = None if self._packets is None else self._packets.drain()
         lost, job.overflow = self._ring.overflow - job.overflow, self._ring.overflow
         now = time.monotonic()
         try:
+            if self._packets is not None and packets is not None:
+                lost_packets = self._packets.overflow - job.packets_overflow
+                job.packets_overflow = self._packets.overflow
+                job.recorder.take_packets(packets, lost_packets)
             job.recorder.take(records, events, lost)
             if ended_count != job.ended_count and job.recorder.ended is None:
                 self._believe_the_count(job.recorder)
@@ -254,6 +280,10 @@ class ArchiveProcess:
         self._recent_events = [*self._recent_events, *self._events.drain()][-RECENT:]
         while len(self._recent) > 1 and sum(map(len, self._recent[1:])) > RECENT:
             self._recent.pop(0)
+        if self._packets is not None and len(packets := self._packets.drain()):
+            self._recent_packets.append(packets)
+        while len(self._recent_packets) > 1 and sum(map(len, self._recent_packets)) > 2 * RECENT:
+            self._recent_packets.pop(0)
 
     def _close(self, outcome: str, reason: str) -> None:
         job, self._job = self._job, None
@@ -262,6 +292,9 @@ class ArchiveProcess:
         self._control.archive_state = ArchiveState.NONE
         recorder = job.recorder
         try:
+            if self._packets is not None and recorder.newest_packet < recorder.newest:
+                time.sleep(BEHIND)
+                recorder.take_packets(self._packets.drain())
             recorder.close(outcome, reason)
         except Exception as error:
             self._fail(job.number, error)
@@ -327,9 +360,18 @@ def _of_the_last_session(
     return records, events[inits[-1] + 1 :] if inits else events
 
 
+def _packets_of_the_last_session(parts: list[Records]) -> Records:
+    """Packets from the init packet on of the session that began last."""
+    if not parts:
+        return np.zeros(0, PACKET_DTYPE)
+    packets = np.concatenate(parts)
+    restarts = np.flatnonzero(np.diff(packets["cycle"]) < 0)
+    return packets[int(restarts[-1]) + 1 :] if restarts.size else packets
+
+
 def main() -> None:
     """Attach what the command line names, and work."""
-    ring, events, control, commands, exchange, n_joints = (int(text) for text in sys.argv[1:7])
+    ring, events, control, commands, exchange, n_joints, *packets = map(int, sys.argv[1:])
     for signum in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(signum, signal.SIG_IGN)
     process = ArchiveProcess(
@@ -338,6 +380,7 @@ def main() -> None:
         ControlBlock(control),
         Channel(socket(fileno=commands, type=SOCK_SEQPACKET)),
         exchange,
+        PacketReader(packets[0]) if packets else None,
     )
     signal.signal(signal.SIGTERM, process.leave)
     process.run()

@@ -7,21 +7,28 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
+from hil.archive import container
 from hil.archive.cdr import Rows
 from hil.archive.container import Damage
 from hil.archive.content import Content
 from hil.archive.events import ArchivedEvent
-from hil.archive.schema import CYCLE, FORMAT_VERSION, METADATA
+from hil.archive.index import Summary
+from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, METADATA
+from hil.archive.selection import Selection
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 
 _LATER_FIELDS = frozenset(("age",))
 """Fields of a cycle that older archives do not have; zero is what they would have held."""
+
+
+_UNREAD = frozenset((container.MESSAGE_INDEX,))
+"""Records that only other programs need."""
 
 
 @dataclass(frozen=True)
@@ -122,30 +129,50 @@ class Archive:
         return rows
 
 
-def open_archive(path: str | PathLike[str], *, fields: Collection[str] | None = None) -> Archive:
+def open_archive(
+    path: str | PathLike[str],
+    *,
+    fields: Collection[str] | None = None,
+    topics: Collection[str] | None = None,
+    start: float | None = None,
+    stop: float | None = None,
+) -> Archive:
     """Read an archive.
 
     A file that was cut off or damaged is read up to its last whole chunk before the damage; what
-    is read is what was written, or the archive says what it lost.
+    is read is what was written, or the archive says what it lost. Where only some channels or
+    times are wanted and the index of the file is whole, the rest is not even read, and its damages
+    go unnoticed.
 
     Args:
         path: the file.
         fields: columns wanted, None for all.
+        topics: channels wanted, such as ``/joint_states_commanded`` instead of ``/hil/cycle``;
+            None for those that hold the numbers and the events.
+        start: first instant wanted [s], on the clock of ``stamp`` and of the events.
+        stop: end of the time wanted [s]; what happened then is left out.
 
     Raises:
         NotAnArchiveError: another kind of file, or one torn before it held anything.
         ArchiveVersionError: written by a newer version of the profile.
-        ArchiveError: the file cannot be read.
+        ArchiveError: the file cannot be read, or has no such channel.
     """
     path = Path(path)
+    selection = Selection(fields, topics, start, stop)
     try:
         with path.open("rb") as stream:
             size = path.stat().st_size
-            content = Content(fields)
-            damage = content.collect(stream, size)
+            content = _by_index(stream, size, selection) if selection.partial else None
+            damage = None
+            if content is None:
+                stream.seek(0)
+                content = Content(selection)
+                damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
     metadata = _checked_metadata(path, size, content, damage)
+    if damage is None:
+        _check_topics(path, content, selection)
     columns = content.columns()
     return Archive(
         path=path,
@@ -157,6 +184,39 @@ def open_archive(path: str | PathLike[str], *, fields: Collection[str] | None = 
         events=tuple(content.events),
         damage=None if damage is None else _damage(damage, size, content, columns["stamp"]),
     )
+
+
+def _by_index(stream: BinaryIO, size: int, selection: Selection) -> Content | None:
+    """What is selected, found through the summary; None where that or what it names is damaged."""
+    summary = Summary.read(stream, size)
+    if summary is None:
+        return None
+    content = Content(selection, gapless=False)
+    for record in summary.announced:
+        content.parser.announce(record.opcode, record.body, record.offset)
+    channels = content.parser.channels.values()
+    topics = {*selection.numbers({channel.topic for channel in channels})}
+    if selection.events:
+        topics.add(EVENTS)
+    wanted = {channel.id for channel in channels if channel.topic in topics}
+    start, stop = selection.times
+    chunks = [chunk for chunk in summary.chunks if chunk.channels & wanted]
+    taken = [chunk for chunk in chunks if chunk.start_time < stop and chunk.end_time >= start]
+    # Where nothing falls into the range, one chunk still tells what columns there are.
+    places = [(chunk.offset, chunk.length) for chunk in taken or chunks[:1]]
+    records = (container.record_at(stream, *place) for place in sorted([*summary.others, *places]))
+    damage = content.collect(records, sum(length for _, length in places))
+    return content if damage is None and content.metadata is not None else None
+
+
+def _check_topics(path: Path, content: Content, selection: Selection) -> None:
+    """Check that the archive has the channels wanted."""
+    recorded = sorted({channel.topic for channel in content.parser.channels.values()})
+    for topic in selection.topics or ():
+        if recorded and topic not in recorded:
+            raise ArchiveError(
+                path, "has no such channel", field=topic, remedy=f"it has {', '.join(recorded)}"
+            )
 
 
 def _checked_metadata(

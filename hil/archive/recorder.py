@@ -47,6 +47,7 @@ class ArchiveSpec:
         metadata: entries of the ``hil`` record.
         attachments: content by file name.
         durable: wait at each flush until the disk has the data.
+        packets: whether the raw packets of the link are kept as well.
     """
 
     path: Path
@@ -55,6 +56,7 @@ class ArchiveSpec:
     metadata: Mapping[str, str]
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     durable: bool = True
+    packets: bool = False
 
     def with_more(self, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> Self:
         """The same archive with further metadata and attachments, which win over earlier ones."""
@@ -77,6 +79,7 @@ class ArchiveSpec:
             metadata=self.metadata,
             attachments=self.attachments,
             durable=self.durable,
+            packets=self.packets,
         )
 
 
@@ -97,9 +100,11 @@ class Recorder:
         records: how many were archived.
         records_lost: how many were overwritten before they could be archived.
         events_lost: likewise of the events.
+        packets_lost: likewise of the raw packets, where they are kept.
         missed: packets that never arrived.
         late: packets whose answer was late or left out for a newer one.
         untaken: answers that the controller did not take.
+        newest_packet: cycle of the newest raw packet archived, -1 before the first.
     """
 
     def __init__(self, writer: ArchiveWriter, drive_train: DriveTrain) -> None:
@@ -110,12 +115,35 @@ class Recorder:
         self.records = 0
         self.records_lost = 0
         self.events_lost = 0
+        self.packets_lost = 0
         self.missed = 0
         self.late = 0
         self.untaken = 0
         self._drive_train = drive_train
         self._newest = -1
         self._cut = False
+        self.newest_packet = -1
+        self._packets_cut = False
+
+    def take_packets(self, packets: Records, lost: int = 0) -> None:
+        """Archive raw packets; `lost` of them before these were overwritten unread.
+
+        To be called before `take` of what came with them. Where the archive is one without
+        packets, they are dropped.
+        """
+        if not self.writer.with_packets:
+            return
+        self.packets_lost += lost
+        if self._packets_cut or not len(packets):
+            return
+        cycles = packets["cycle"]
+        beyond = (np.diff(cycles, prepend=self.newest_packet) < 0) | (cycles > self._last_cycle)
+        if beyond.any():
+            self._packets_cut = True
+            packets = packets[: int(np.argmax(beyond))]
+        if len(packets):
+            self.writer.add_packets(packets)
+            self.newest_packet = int(packets["cycle"][-1])
 
     def take(self, records: Records, events: Sequence[ExchangeEvent], lost: int = 0) -> None:
         """Archive what has come; `lost` records before these were overwritten unread.
@@ -193,6 +221,8 @@ class Recorder:
             "late_answers": self.late,
             "answers_not_taken": self.untaken,
         }
+        if self.writer.with_packets:
+            counts["packets_lost"] = self.packets_lost
         details = {key: str(value) for key, value in counts.items()}
         self.writer.close(outcome, reason=reason, details=details)
 
@@ -205,15 +235,19 @@ class Recorder:
                 return events[: index + 1]
         return events
 
+    @property
+    def _last_cycle(self) -> int:
+        """The last cycle that may still belong to the archive, as far as is known."""
+        if self.ended is None or _at_rest(self.ended):
+            return int(np.iinfo(np.int64).max)
+        return self.ended.cycle + round(AFTERMATH / self.writer.period)
+
     def _write(self, records: Records) -> None:
         """Archive the records up to the end of the session and of the aftermath."""
         if self._cut or not len(records):
             return
         cycles = records["cycle"]
-        last = np.iinfo(np.int64).max
-        if self.ended is not None and not _at_rest(self.ended):
-            last = self.ended.cycle + round(AFTERMATH / self.writer.period)
-        beyond = (np.diff(cycles, prepend=self._newest) <= 0) | (cycles > last)
+        beyond = (np.diff(cycles, prepend=self._newest) <= 0) | (cycles > self._last_cycle)
         if beyond.any():
             self._cut = True
             records = records[: int(np.argmax(beyond))]

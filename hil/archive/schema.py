@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.packet_records import LONGEST_PACKET
 from hil.archive import definitions
 from hil.archive.cdr import MessageLayout, Rows, fixed_layout
 from hil.archive.messages import joint_state_layout
@@ -31,6 +32,7 @@ CYCLE = "/hil/cycle"
 MEASURED = "/joint_states"
 COMMANDED = "/joint_states_commanded"
 MOTOR_CURRENT = "/motor_currents"
+PACKETS = "/hil/packets"
 EVENTS = "/hil/events"
 
 _STAMP = ("sec", "nanosec")
@@ -100,6 +102,28 @@ class CycleEncoder:
         commanded["position"] = records["commanded_position"]
         commanded["velocity"] = records["commanded_velocity"]
         return Batch(stamp, (cycle, measured, commanded))
+
+
+class PacketEncoder:
+    """Turns raw packets of the link into messages.
+
+    Attributes:
+        channel: theirs.
+    """
+
+    channel = Channel(PACKETS, definitions.PACKET, definitions.packet(LONGEST_PACKET))
+
+    def __init__(self, period: float) -> None:
+        self._period_ns = period * 1e9
+        self._layout = fixed_layout(self.channel.definition)
+
+    def encode(self, packets: Rows) -> Batch:
+        """Encode k packets, rows of `drivers.packet_records.PACKET_DTYPE`."""
+        stamp = np.rint(packets["cycle"] * self._period_ns).astype(np.int64)
+        rows = _stamped(self._layout, stamp)
+        for name in packets.dtype.names or ():
+            rows[name] = packets[name]
+        return Batch(stamp, (rows,))
 
 
 class SampleEncoder:

@@ -59,8 +59,10 @@ class ArchiveProcessHandle:
     _ended_for: str = field(default="")
 
     @classmethod
-    def start(cls, memory: SharedMemory, n_joints: int) -> ArchiveProcessHandle:
-        """Start the process on the exchange's shared memory.
+    def start(
+        cls, memory: SharedMemory, n_joints: int, packets_fd: int = -1
+    ) -> ArchiveProcessHandle:
+        """Start the process on the exchange's shared memory; `packets_fd` where packets are kept.
 
         Raises:
             OSError: the system refuses a process, a socket or memory.
@@ -75,9 +77,11 @@ class ArchiveProcessHandle:
             undo.callback(theirs.close)
             undo.callback(ours.close)
             passed = (memory.ring_fd, memory.event_fd, memory.control_fd, theirs.fileno(), exchange)
+            packets = () if packets_fd < 0 else (packets_fd,)
+            numbers = map(str, (*passed, n_joints, *packets))
             process = subprocess.Popen(
-                [sys.executable, "-m", "hil.archive.process", *map(str, (*passed, n_joints))],
-                pass_fds=passed,
+                [sys.executable, "-m", "hil.archive.process", *numbers],
+                pass_fds=(*passed, *packets),
                 start_new_session=True,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

@@ -18,7 +18,7 @@ from hil.archive.cdr import Rows
 from hil.archive.events import ArchivedEvent, Level
 from hil.archive.file_writer import ArchiveFile
 from hil.archive.names import KINDS, ArchiveName
-from hil.archive.schema import CycleEncoder
+from hil.archive.schema import CycleEncoder, PacketEncoder
 from hil.errors import ArchiveWriteError
 
 Array = NDArray[np.float64]
@@ -46,6 +46,7 @@ class ArchiveWriter:
         attachments: what the archive needs to be understood alone, by file name: ``cell.toml``,
             ``robot.urdf``, ``drive_train.json``, ``plan.json``.
         durable: wait at each flush until the disk has the data.
+        packets: whether raw packets will come as well, see `add_packets`.
 
     Raises:
         ArchiveWriteError: the file exists, the disk refuses, or the metadata cannot stand.
@@ -60,6 +61,7 @@ class ArchiveWriter:
         metadata: Mapping[str, str],
         attachments: Mapping[str, bytes] | None = None,
         durable: bool = True,
+        packets: bool = False,
     ) -> None:
         self._path = Path(path)
         if not (math.isfinite(period) and period > 0.0):
@@ -69,6 +71,8 @@ class ArchiveWriter:
         self._encoder = CycleEncoder(joint_names, period)
         self._cycles_per_chunk = max(1, round(FLUSH_PERIOD / period))
         self._pending: list[tuple[Rows, Array]] = []
+        self._packet_encoder = PacketEncoder(period) if packets else None
+        self._pending_packets: list[Rows] = []
         self._first: int | None = None
         self._last: int | None = None
         self._newest = 0
@@ -81,6 +85,7 @@ class ArchiveWriter:
             ),
             attachments=attachments or {},
             durable=durable,
+            packets=self._packet_encoder.channel if self._packet_encoder else None,
         )
 
     @property
@@ -92,6 +97,17 @@ class ArchiveWriter:
     def period(self) -> float:
         """Cycle time of the controller [s]."""
         return self._period
+
+    @property
+    def chunk_ends_in(self) -> float:
+        """The controller's time until the chunk in progress is full and written [s]."""
+        begun = self._newest + 1 - (self._newest + 1 if self._first is None else self._first)
+        return (self._cycles_per_chunk - begun % self._cycles_per_chunk) * self._period
+
+    @property
+    def with_packets(self) -> bool:
+        """Whether the archive keeps raw packets."""
+        return self._packet_encoder is not None
 
     @property
     def closed(self) -> bool:
@@ -129,6 +145,24 @@ class ArchiveWriter:
         if self._slot(oldest) != self._slot(self._newest) or self._ends_slot(self._newest):
             self._emit(everything=False)
 
+    def add_packets(self, packets: Rows) -> None:
+        """Take raw packets; each is written with the chunk of its cycle.
+
+        To be called before the records of the same cycles are: a packet whose chunk is gone goes
+        into the next.
+
+        Args:
+            packets: shape (k,), structure `drivers.packet_records.PACKET_DTYPE`, cycles not
+                falling; kept until written, so hand over a copy.
+
+        Raises:
+            ValueError: the archive was opened without packets.
+        """
+        if self._packet_encoder is None:
+            raise ValueError("this archive was opened without packets")
+        if len(packets):
+            self._pending_packets.append(packets)
+
     def event(
         self,
         cycle: int | None,
@@ -155,6 +189,7 @@ class ArchiveWriter:
     def flush(self) -> None:
         """Write out what is pending, chunk or not; for links that have fallen silent."""
         self._emit(everything=True)
+        self._emit_packets(None)
         self._file.flush()
 
     def close(
@@ -170,11 +205,14 @@ class ArchiveWriter:
         if self._file.closed:
             return
         self._emit(everything=True)
+        self._emit_packets(None if self._first is None else self._newest)
         cycles = {
             "samples": self._file.samples,
             "events": self._file.events,
             "lost_packets": self._lost,
         }
+        if self._packet_encoder is not None:
+            cycles["packets"] = self._file.packets
         if self._first is not None and self._last is not None:
             cycles |= {"first_cycle": self._first, "last_cycle": self._last}
         counted = {key: str(value) for key, value in cycles.items()}
@@ -200,6 +238,17 @@ class ArchiveWriter:
     def _ends_slot(self, cycle: int) -> bool:
         return self._slot(cycle + 1) != self._slot(cycle)
 
+    def _emit_packets(self, last: int | None) -> None:
+        """Add the packets up to the cycle `last`, None for all, to the chunk in progress."""
+        if self._packet_encoder is None or not self._pending_packets:
+            return
+        packets = np.concatenate(self._pending_packets)
+        count = len(packets)
+        if last is not None:
+            count = int(np.searchsorted(packets["cycle"], last, side="right"))
+        self._file.add_packets(self._packet_encoder.encode(packets[:count]))
+        self._pending_packets = [packets[count:]] if count < len(packets) else []
+
     def _emit(self, *, everything: bool) -> None:
         """Write the pending records slot by slot; the slot still open only if all is wanted."""
         if not self._pending:
@@ -213,6 +262,7 @@ class ArchiveWriter:
         for start, stop in pairwise(cuts):
             self._file.add(self._encoder.encode(records[start:stop], torque[start:stop]))
             self._last = int(records["cycle"][stop - 1])
+            self._emit_packets(self._last)
             self._file.flush()
         rest = cuts[-1]
         self._pending = [(records[rest:], torque[rest:])] if rest < len(records) else []

@@ -8,7 +8,7 @@ waits for the PC, and only there: on a real link a slow disk must not delay a re
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 
 import numpy as np
@@ -19,11 +19,13 @@ from drivers.events import Event, MotionEnded
 from drivers.exchange import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource
+from drivers.packet_records import PacketRing
 from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
-from drivers.transports import SimulatedTransport
-from hil.archive import ArchiveSpec, Recorder
+from drivers.transports import SimulatedTransport, Transport
+from drivers.transports.tapped import TappedTransport, tapped
+from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
 from hil.cell import Cell
 from hil.errors import ControllerFault, OperatorStopError
 
@@ -47,14 +49,16 @@ class Link:
         ring: the session's records, drained here.
         finish: asks the far end to end the session.
         cycles: records archived so far.
+        packets: the raw packets, where archives keep them.
     """
 
-    transport: SimulatedTransport
+    transport: Transport
     session: Session
     ring: CycleRing
     finish: Callable[[], None] = field(default=lambda: None)
     cycles: int = 0
     connection: Connection = field(default_factory=Connection)
+    packets: PacketRing | None = None
 
     @classmethod
     def over(
@@ -82,7 +86,11 @@ class Link:
             ring,
             **cell.session_settings(accept_init=accept_init),
         )
-        return cls(transport, session, ring, finish)
+        if not cell.controller.packets:
+            return cls(transport, session, ring, finish)
+        packets = PacketRing(20 * DRAIN_CYCLES)
+        tap = tapped(transport, packets, lambda: session.cycle)
+        return cls(tap, session, ring, finish, packets=packets)
 
     @property
     def only_simulated(self) -> bool:
@@ -116,9 +124,10 @@ class Link:
 
     def run(self, source: MotionSource, spec: ArchiveSpec, stop: Stop) -> MotionEnded:
         """See `MotionLink.run`."""
-        with described(spec, self.connection, self.session.drive_train).open() as writer:
+        with self._open(spec) as writer:
             taking = _Taking(self, Recorder(writer, self.session.drive_train))
             self.ring.drain()
+            self.drain_packets()
             self._events()
             try:
                 self.session.request(source)
@@ -162,7 +171,7 @@ class Link:
         if self.connection.init is None:
             raise ControllerFault("the controller did not start a session: nothing was recorded")
         self.connection.require_usable()
-        with described(spec, self.connection, self.session.drive_train).open() as writer:
+        with self._open(spec) as writer:
             taking = _Taking(self, Recorder(writer, self.session.drive_train))
             limit = None if duration is None else round(duration / writer.period)
             until_drain = DRAIN_CYCLES
@@ -203,6 +212,7 @@ class Link:
 
         def drop() -> bool:
             self.ring.drain()
+            self.drain_packets()
             return False
 
         exchange(self.transport, self.session, until=drop)
@@ -220,6 +230,22 @@ class Link:
             state=self.session.state,
             position=newest["position"][0] if len(newest) else None,
         )
+
+    def drain_packets(self) -> NDArray[np.void] | None:
+        """Raw packets since the last call; None if they are not kept."""
+        if self.packets is None or not isinstance(self.transport, TappedTransport):
+            return None
+        self.transport.settle()
+        return self.packets.drain()
+
+    @property
+    def packets_overflow(self) -> int:
+        """Raw packets overwritten before they were drained, so far."""
+        return 0 if self.packets is None else self.packets.overflow
+
+    def _open(self, spec: ArchiveSpec) -> ArchiveWriter:
+        spec = described(spec, self.connection, self.session.drive_train)
+        return replace(spec, packets=self.packets is not None).open()
 
     def _events(self) -> list[Event]:
         events = self.session.events()
@@ -249,16 +275,22 @@ class _Taking:
         self.failure: Exception | None = None
         self._link = link
         self._overflow = link.ring.overflow
+        self._packets_overflow = link.packets_overflow
 
     def take(self) -> None:
         """Archive what has come since the last call; a failure stops the motion on its path."""
         link, recorder = self._link, self.recorder
+        packets = link.drain_packets()
         events, records, before = link._events(), link.ring.drain(), recorder.records
         lost, self._overflow = link.ring.overflow - self._overflow, link.ring.overflow
+        lost_packets = link.packets_overflow - self._packets_overflow
+        self._packets_overflow = link.packets_overflow
         if self.failure is not None:
             recorder.note(events)
             return
         try:
+            if packets is not None:
+                recorder.take_packets(packets, lost_packets)
             recorder.take(records, events, lost)
         except Exception as error:  # whatever it is, the arm comes to rest first
             self.failure = error

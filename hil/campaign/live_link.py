@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Self, get_args
 
@@ -22,6 +22,7 @@ from drivers.errors import DriverError, RequestError
 from drivers.events import MotionEnded, Outcome
 from drivers.exchange import ExchangeProcess, ExchangeSettings, RealTimeSettings, RingReader
 from drivers.motion_source import MotionSource
+from drivers.packet_records import CAPACITY
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec
@@ -111,6 +112,7 @@ class LiveLink:
             session=cell.session_settings(accept_init=accept_init),
             realtime=realtime or RealTimeSettings(),
             preload=("planner",),
+            packets=CAPACITY if cell.controller.packets else 0,
         )
         try:
             exchange = ExchangeProcess.start(settings)
@@ -119,7 +121,9 @@ class LiveLink:
         except OSError as error:
             raise ControllerFault(f"the exchange process cannot be started: {error}") from error
         try:
-            archive = ArchiveProcessHandle.start(exchange, len(cell.joint_names))
+            archive = ArchiveProcessHandle.start(
+                exchange, len(cell.joint_names), exchange.packets_fd
+            )
         except BaseException as error:
             exchange.finish()
             exchange.close()
@@ -255,6 +259,7 @@ class LiveLink:
         """
         drives = drives_in_force(self.cell, self.connection)
         spec = described(spec, self.connection, drives)
+        spec = replace(spec, packets=self.cell.controller.packets)
         self._job += 1
         self._open_path = str(spec.path)
         self.view.lost = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tomllib
 from dataclasses import dataclass
@@ -16,15 +15,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drivers.drive_train import DriveTrain
 from drivers.guard import GuardLimits
-from identification.errors import ModelError
 from identification.excitation import Box, Workspace
-from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from planner import JointLimits
+from planner.toml_value import toml_value
 
 from . import link
-from .checks import check_assumed, check_built, check_lengths, check_turning
+from .checks import check_assumed, check_built, check_lengths, check_locked, check_turning
 from .errors import CellError, first_error
+from .robot import robot_model
 from .schema import (
     BoundsTable,
     CampaignTable,
@@ -88,8 +87,9 @@ class Cell:
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
             raise CellError(
-                path, "", None, f"cannot be read ({error})", "name a TOML file"
+                path, "", None, f"cannot be read ({why})", "name a TOML file"
             ) from error
         file = _parse(path, text)
         urdf_path = path.parent / file.cell.urdf
@@ -105,13 +105,9 @@ class Cell:
     def from_texts(cls, text: str, urdf: str, path: Path) -> Cell:
         """The cell from its texts (an archive carries both); `path` only names it in errors."""
         cell = cls(path, text, urdf, _parse(path, text))
-        try:
-            _ = cell.model
-        except ModelError as error:
-            raise CellError(
-                path, "cell.urdf", cell.file.cell.urdf, str(error), "correct the URDF"
-            ) from error
+        _ = cell.model
         check_assumed(cell)
+        check_locked(cell)
         check_turning(cell)
         check_lengths(cell)
         check_built(cell)
@@ -130,7 +126,13 @@ class Cell:
     @cached_property
     def model(self) -> RobotModel:
         """Rigid body model with rotor inertias and friction law, from the URDF."""
-        return model_from(self.urdf, self.file.robot)
+        return robot_model(
+            self.path,
+            self.file.cell.urdf,
+            self.urdf,
+            self.file.robot,
+            lambda: self.drive_train.motor_from_joint,
+        )
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -172,6 +174,12 @@ class Cell:
             acceleration=np.radians(limits.acceleration_deg),
             jerk=np.radians(limits.jerk_deg),
         )
+
+    @property
+    def torque_limit(self) -> Array | None:
+        """Largest torque of each joint (n,) [N·m], at the joint; None where the file has none."""
+        limits = self.file.limits
+        return np.array(limits.torque) if limits is not None and limits.torque else None
 
     @cached_property
     def drive_train(self) -> DriveTrain:
@@ -292,14 +300,14 @@ class Cell:
 
     def with_urdf(self, path: Path, name: str) -> Cell:
         """This cell as a file `path` whose URDF is called `name`; meshes stay where they are."""
-        text = replaced_value(self.text, "cell", "urdf", json.dumps(name))  # JSON is TOML here
+        text = replaced_value(self.text, "cell", "urdf", toml_value(name))
         named = self.file.cell.mesh_folders
         if named:
             moved = [
                 folder if Path(folder).is_absolute() else os.path.relpath(place, path.parent)
                 for folder, place in zip(named, self.mesh_folders, strict=True)
             ]
-            text = replaced_value(text, "cell", "mesh_folders", json.dumps(moved))
+            text = replaced_value(text, "cell", "mesh_folders", toml_value(moved))
         return Cell.from_texts(text, self.urdf, path)
 
     @property
@@ -320,16 +328,20 @@ class Cell:
     def parameter_values(
         self, *, rotor_inertia: Array, coulomb: Array, viscous: Array, third: Array
     ) -> Array:
-        """Parameter vector (p,) of the URDF's inertias with these joint-side figures (n,)."""
+        """Parameter vector (p,) of the URDF's inertias with these joint-side figures (n,).
+
+        Everything else, such as coupling inertias, an offset or a Stribeck term, is zero.
+        """
         model = self.model
-        standard = model.nominal.copy()
-        for joint, inertia in enumerate(rotor_inertia, 1):
-            if (rotor := f"I{joint}m") in model.standard_names:
-                standard[model.standard_names.index(rotor)] = inertia
+        standard = model.nominal
+        if model.rotor_inertia:
+            standard[model.layout.rotors] = rotor_inertia
         known = {"f0": coulomb, "f1": viscous, "f2": third}
-        none = np.zeros(model.n_joints)
-        friction = [known.get(symbol, none) for symbol in model.friction.symbols]
-        return np.concatenate([model.base.grouping @ standard, *friction])
+        friction = [
+            known[term.symbol][term.owner] if term.symbol in known and not term.motor else 0.0
+            for term in model.friction.terms
+        ]
+        return np.concatenate([model.base.grouping @ standard, friction])
 
     def urdf_angles(self, controller_angles: Array) -> Array:
         """URDF angles (n,) from the teach pendant's, rad."""
@@ -351,27 +363,6 @@ class Cell:
         angles: Array = np.radians(degrees)
         limits = _required(self, self.file.limits, "limits")
         return self.urdf_angles(angles) if limits.frame == "controller" else angles
-
-
-def model_from(urdf: str, robot: RobotTable) -> RobotModel:
-    """The model a `[robot]` table describes.
-
-    Raises:
-        ModelError: the URDF cannot be used.
-    """
-    friction = robot.friction
-    return RobotModel.from_urdf(
-        urdf,
-        gravity=tuple(robot.gravity),
-        rotor_inertia=robot.rotor_inertia,
-        friction=FrictionLaw(
-            coulomb=friction.coulomb,
-            viscous=friction.viscous,
-            third=None if friction.third == "none" else friction.third,
-            offset=friction.offset,
-            standstill=friction.standstill,
-        ),
-    )
 
 
 def _parse(path: Path, text: str) -> CellFile:

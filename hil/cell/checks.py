@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drivers.errors import DriverError
-from identification.kinematics import chain_from_urdf
 
 from .errors import CellError
 from .urdf import urdf_limits
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 URDF_ROUNDING = 1e-5
 """Relative; a data sheet's degrees and a URDF's radians are rounded differently."""
 
-_MAY_BE_EMPTY = {"nominal.third", "simulation.elasticity"}
+_MAY_BE_EMPTY = {"nominal.third", "limits.torque", "simulation.elasticity"}
 _TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
 
 
@@ -67,7 +66,7 @@ def check_assumed(cell: Cell) -> None:
 def check_turning(cell: Cell) -> None:
     """What is given in degrees and revolutions is given for joints that turn."""
     tables = [name for name in _TURNING_ONLY if getattr(cell.file, name) is not None]
-    revolute = chain_from_urdf(cell.urdf).revolute
+    revolute = cell.model.chain.revolute
     for name, turns in zip(cell.joint_names, revolute, strict=True):
         if tables and not turns:
             raise CellError(
@@ -78,6 +77,19 @@ def check_turning(cell: Cell) -> None:
                 'fix it in the URDF (type = "fixed"); an arm with sliding joints can be '
                 "identified from recordings, but not moved",
             )
+
+
+def check_locked(cell: Cell) -> None:
+    """Joints are locked for identification only: a motion is checked with the whole URDF."""
+    tables = [name for name in _TURNING_ONLY if getattr(cell.file, name) is not None]
+    if tables and cell.file.robot.locked:
+        raise CellError(
+            cell.path,
+            "robot.locked",
+            ", ".join(cell.file.robot.locked),
+            f"is for arms that are identified from recordings, but there is a table [{tables[0]}]",
+            'fix these joints in the URDF (type = "fixed")',
+        )
 
 
 def check_built(cell: Cell) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import ipaddress
-import json
 from typing import TYPE_CHECKING, Any
 
 from drivers.errors import DriverError
+from planner.toml_value import toml_value
 
 from .errors import CellError
 from .schema import CanTable
@@ -94,12 +94,12 @@ def with_link(
     given = {"transport": transport, "host": host, "port": port, "bind": bind, "cycle_ms": cycle_ms}
     for key, value in given.items():
         if value is not None:
-            text = replaced_value(text, "controller", key, json.dumps(value))
+            text = replaced_value(text, "controller", key, toml_value(value))
     if can is None:
         return text
     table = "controller.can"
     if f"[{table}]" not in text:
         text += f"\n[{table}]\n"
     for key, value in can.model_dump(exclude_none=True).items():
-        text = replaced_value(text, table.replace(".", r"\."), key, json.dumps(value))
+        text = replaced_value(text, table.replace(".", r"\."), key, toml_value(value))
     return text

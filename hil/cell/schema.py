@@ -47,6 +47,29 @@ class CellTable(_Table):
     )
 
 
+class JointFrictionTable(_Table):
+    """`[robot.friction.joints.NAME]`: what of the friction is different for one joint."""
+
+    coulomb: Choice | None = Field(default=None, description="true or false: f0 sgn(qd)")
+    viscous: Choice | None = Field(default=None, description="true or false: f1 qd")
+    third: Literal["quadratic", "cubic", "none"] | None = Field(
+        default=None, description='"quadratic" (sgn(qd) qd²), "cubic" (qd³) or "none"'
+    )
+    offset: Choice | None = Field(default=None, description="true or false: a constant torque")
+    stribeck: Annotated[Number, Field(ge=0)] | None = Field(
+        default=None, description="speed in rad/s of a Stribeck term, 0 for none"
+    )
+    asymmetric: Choice | None = Field(
+        default=None, description="true or false: Coulomb and viscous friction by direction"
+    )
+    standstill: NonNegative | None = Field(
+        default=None, description="speed in rad/s (m/s) below which the joint counts as standing"
+    )
+    zone: Literal["exclude", "linear"] | None = Field(
+        default=None, description='"exclude" or "linear"'
+    )
+
+
 class FrictionTable(_Table):
     """`[robot] friction`: which friction columns each joint gets."""
 
@@ -56,8 +79,53 @@ class FrictionTable(_Table):
         default="quadratic", description='"quadratic" (sgn(qd) qd²), "cubic" (qd³) or "none"'
     )
     offset: Choice = Field(default=False, description="true or false: a constant torque per joint")
+    stribeck: Annotated[Number, Field(ge=0)] = Field(
+        default=0.0, description="speed in rad/s of a Stribeck term, 0 for none"
+    )
+    asymmetric: Choice = Field(
+        default=False, description="true or false: Coulomb and viscous friction by direction"
+    )
     standstill: NonNegative = Field(
-        default=0.02, description="speed in rad/s below which a joint's row is not used for fitting"
+        default=0.02, description="speed in rad/s (m/s) below which a joint counts as standing"
+    )
+    zone: Literal["exclude", "linear"] = Field(
+        default="exclude",
+        description='"exclude" (rows below standstill are not used) or "linear" (they are, with '
+        "qd / standstill for the sign)",
+    )
+    joints: dict[str, JointFrictionTable] = Field(
+        default_factory=dict, description="tables of what is different for a joint, by its name"
+    )
+
+
+class PayloadTable(_Table):
+    """`[robot.payload]`: a body of known mass that the arm carries; not identified."""
+
+    mass: NonNegative = Field(description="its mass in kg")
+    centre: Point = Field(description="its centre of mass in the frame, three figures in m")
+    inertia: Annotated[Vector, Field(min_length=6, max_length=6)] = Field(
+        default=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        description="its tensor about the centre of mass in the axes of the frame: xx, xy, xz, "
+        "yy, yz, zz in kg·m²",
+    )
+    frame: str = Field(
+        default="",
+        description="a link of the URDF whose frame is meant, nothing for that of the last joint",
+    )
+
+
+class CouplingTable(_Table):
+    """`[robot.coupling]`: motors that turn with several joints."""
+
+    motor_from_joint: list[Vector] | Literal["drive_train"] = Field(
+        description="motor angle per joint angle, one row per motor, each with one figure per "
+        'joint; or "drive_train" for that of [drive_train]'
+    )
+    inertia: Choice = Field(
+        default=True, description="true or false: an inertia for each pair of coupled joints"
+    )
+    friction: Choice = Field(
+        default=True, description="true or false: friction of each coupled motor"
     )
 
 
@@ -70,8 +138,18 @@ class RobotTable(_Table):
     rotor_inertia: Choice = Field(
         default=True, description="true or false: one rotor inertia per joint"
     )
+    locked: dict[str, Number] = Field(
+        default_factory=dict,
+        description="joints held at a position, by name, in rad or m: { finger_joint = 0.02 }",
+    )
     friction: FrictionTable = Field(
         default=FrictionTable(), description="a table of friction columns"
+    )
+    payload: PayloadTable | None = Field(
+        default=None, description="a table of the body of known mass that the arm carries"
+    )
+    coupling: CouplingTable | None = Field(
+        default=None, description="a table of motors that turn with several joints"
     )
 
 
@@ -103,6 +181,10 @@ class LimitsTable(_Table):
         description="maximum joint accelerations in deg/s², all above 0"
     )
     jerk_deg: PositiveVector = Field(description="maximum joint jerks in deg/s³, all above 0")
+    torque: PositiveVector = Field(
+        default_factory=list,
+        description="largest torques in N·m at the joint, one per joint; nothing for none",
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> LimitsTable:
@@ -208,6 +290,9 @@ class ControllerTable(_Table):
     current_delay_cycles: Number = Field(
         default=0.0,
         description="cycles by which the position of a packet is newer than its target current",
+    )
+    packets: bool = Field(
+        default=False, description="whether archives keep the raw packets of both directions"
     )
 
     @model_validator(mode="after")

@@ -1,7 +1,8 @@
 """The command line: a thin shell over the package.
 
-Exit status: 0 done, 1 internal error, 2 bad input, 3 refused as unsafe, 4 controller fault,
-5 done, but not good (a model, or a PC that is not fit for the cycle), 130 stopped by the operator.
+Exit status: 0 done, 1 internal error or a result that cannot be written, 2 bad input, 3 refused as
+unsafe, 4 controller fault, 5 done, but not good (a model, a PC that is not fit for the cycle,
+archives of a batch that could not be used), 130 stopped by the operator.
 """
 
 from __future__ import annotations
@@ -15,7 +16,19 @@ from hil.errors import HilError
 from identification import IdentificationError
 from planner import PlannerError
 
-from . import demo, design, doctor, identify, imports, plan, record, simulate
+from . import (
+    archive,
+    demo,
+    design,
+    doctor,
+    gains,
+    identify,
+    imports,
+    plan,
+    record,
+    reidentify,
+    simulate,
+)
 
 app = typer.Typer(
     name="hil",
@@ -31,11 +44,14 @@ app = typer.Typer(
 app.command("demo")(demo.demo)
 app.command("design")(design.design)
 app.command("identify")(identify.identify)
+app.command("reidentify")(reidentify.reidentify)
+app.command("gains")(gains.gains)
 app.command("plan")(plan.plan)
 app.command("record")(record.record)
 app.command("simulate")(simulate.simulate)
 app.command("doctor")(doctor.doctor)
 app.add_typer(imports.app, name="import")
+app.add_typer(archive.app, name="archive")
 
 
 def main() -> None:

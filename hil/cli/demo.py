@@ -23,14 +23,15 @@ from hil.campaign import (
     stop_on_interrupt,
 )
 from hil.cell import Cell
+from hil.cli.outcome import REPORT, RESULTS, write_outcome
 from hil.cli.verdict import finish
 from hil.demo_link import CAN, LOOPBACK, loopback_link
 from hil.design import DesignResult
 from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.identify import identify_campaign
+from hil.identify.exports import FILES
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
-from hil.report import write_report
 from hil.simulation import simulated_link, simulated_provenance
 from identification.excitation import Excitation
 from sim_fixtures.ns16 import CELL_PATH
@@ -126,10 +127,7 @@ def demo(
         campaign = Campaign.create(output, cell, plan)
     _run(campaign, reporter, effects=effects)
     found = identify_campaign(campaign.folder.root, reporter)
-    found.results.save(campaign.folder.results)
-    write_report(campaign.folder.report, found.results, found.series)
-    reporter.say(f"report: {campaign.folder.report}")
-    finish(found.results, json=json)
+    finish(write_outcome(campaign.folder.root, found, reporter), json=json, quiet=quiet)
 
 
 def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
@@ -194,8 +192,8 @@ def _designed(path: Path, cell: Cell, reporter: Reporter) -> Excitation:
     return result.excitation
 
 
-_OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "results.json"}
-_OURS |= {"report.html", "paper", "campaign.lock"}
+_OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "paper"}
+_OURS |= {"campaign.lock", RESULTS, REPORT, *FILES}
 
 
 def _refuse_what_is_not_ours(output: Path, *, force: bool) -> None:

@@ -117,11 +117,11 @@ def design(
 ) -> None:
     """Search the motion that excites and decouples the parameters of CELL. Nothing moves.
 
-    The motion keeps the joint limits at every instant, the motors' currents by the nominal model,
-    and the clearance to floor, walls and the arm itself; it begins and ends in the cell's home.
-    What comes of it is judged by two numbers: log det, which grows with the information on all
-    parameters together, and the coupling index I_c, which is the smaller the less the estimates
-    of different parameters get into each other's way.
+    The motion keeps the joint limits at every instant, the motors' currents (and joint torques,
+    where the cell limits them) by the nominal model, and the clearance to floor, walls and the arm
+    itself; it begins and ends in the cell's home. What comes of it is judged by two numbers: log
+    det, which grows with the information on all parameters together, and the coupling index I_c,
+    which is the smaller the less the estimates of different parameters get into each other's way.
 
     Leaves `excitation.toml` (motion, criteria, settings), `excitation.png` (what the robot is
     going to do), and a journal to resume from in OUTPUT. Ctrl-C (or SIGTERM) ends the search with

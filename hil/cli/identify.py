@@ -8,12 +8,17 @@ from typing import Annotated, Literal
 
 import typer
 
+from hil.cli.outcome import write_outcome
 from hil.cli.verdict import finish
 from hil.errors import InputError
 from hil.files import make_folder
 from hil.identify import Options, identify_archives, identify_campaign
+from hil.identify.options import ESTIMATORS, Estimator
 from hil.progress import reporter as make_reporter
-from hil.report import write_report
+from identification.preprocessing import Smoother
+
+LONGEST_DELAY = 0.5
+"""s; what lags by more belongs to another recording."""
 
 
 def identify(
@@ -28,8 +33,18 @@ def identify(
     output: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for results.json and report.html. If left out: the campaign folder (with "
-            "--paper its folder paper), or none for loose archives.",
+            "--output",
+            "-o",
+            help="Folder for results.json, report.html and the files for other tools. If left "
+            "out: the campaign folder (with --paper its folder paper), or none for loose archives.",
+            show_default=False,
+        ),
+    ] = None,
+    predict: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="ARCHIVE",
+            help="Archive that is predicted and never fitted, whatever its kind. May be repeated.",
             show_default=False,
         ),
     ] = None,
@@ -49,14 +64,36 @@ def identify(
             "rest is predicted.",
         ),
     ] = 0.7,
-    delay: Annotated[
-        float | None,
+    in_sample: Annotated[
+        bool,
         typer.Option(
-            min=-0.5,
-            max=0.5,
-            help="Time in s by which the torque lags the position; the cell's if left out.",
+            "--in-sample",
+            help="Fit everything and hold nothing out: all errors are in-sample, which no verdict "
+            "can call good.",
+        ),
+    ] = False,
+    estimator: Annotated[
+        Estimator,
+        typer.Option(
+            help="; ".join(f"{name}: {words}" for name, words in ESTIMATORS.items()) + "."
+        ),
+    ] = "wls",
+    delay: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SECONDS|auto",
+            help="Time by which the torque lags the position; the cell's if left out. auto: looked "
+            "for axis by axis, reported and compensated.",
+            show_default=False,
         ),
     ] = None,
+    smoother: Annotated[
+        Smoother,
+        typer.Option(
+            help="spline: a smoothing spline as close as the measured noise allows; butterworth: a "
+            "low-pass without phase."
+        ),
+    ] = "spline",
     torque_bandwidth: Annotated[
         str,
         typer.Option(
@@ -65,7 +102,9 @@ def identify(
         ),
     ] = "auto",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the verdict and key figures as JSON.")
+    ] = False,
 ) -> None:
     """Estimate the dynamic parameters from archives, and say whether the result is good.
 
@@ -74,22 +113,25 @@ def identify(
     Exit status 0 if the model is good, 5 if it is not.
     """
     reporter = make_reporter(quiet=quiet or json)
-    if delay is not None and not math.isfinite(delay):
-        raise InputError(None, f"{delay} is no time", field="--delay", remedy="give seconds")
     options = Options(
         method="paper" if paper else "default",
         split=split,
-        delay=delay,
-        torque_bandwidth=_bandwidth(torque_bandwidth),
+        delay=_delay(delay),
+        torque_bandwidth=bandwidth_from(torque_bandwidth),
+        smoother=smoother,
+        estimator=estimator,
+        in_sample=in_sample,
     )
+    unseen = predict or ()
     if len(archives) == 1 and archives[0].is_dir():
         output = output or (archives[0] / "paper" if paper else archives[0])
         make_folder(output)
         loose = sorted(archives[0].glob("*.mcap"))
         if loose and not (archives[0] / "manifest.json").exists():
-            found = identify_archives(loose, reporter, options)  # a folder of `hil record`
+            # A folder of `hil record`.
+            found = identify_archives(loose, reporter, options, predict=unseen)
         else:
-            found = identify_campaign(archives[0], reporter, options)
+            found = identify_campaign(archives[0], reporter, options, predict=unseen)
     else:
         folder = next((path for path in archives if path.is_dir()), None)
         if folder is not None:
@@ -98,15 +140,38 @@ def identify(
             )
         if output is not None:
             make_folder(output)
-        found = identify_archives(archives, reporter, options)
+        found = identify_archives(archives, reporter, options, predict=unseen)
+    results = found.results
     if output is not None:
-        found.results.save(output / "results.json")
-        write_report(output / "report.html", found.results, found.series)
-        reporter.say(f"report: {output / 'report.html'}")
-    finish(found.results, json=json)
+        results = write_outcome(output, found, reporter)
+    finish(results, json=json, quiet=quiet)
 
 
-def _bandwidth(text: str) -> float | Literal["auto"] | None:
+def _delay(text: str | None) -> float | Literal["auto"] | None:
+    if text is None:
+        return None
+    if text == "auto":
+        return "auto"
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= LONGEST_DELAY:
+        raise InputError(
+            None,
+            f"{text!r} is no delay",
+            field="--delay",
+            remedy=f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, or auto",
+        )
+    return value
+
+
+def bandwidth_from(text: str) -> float | Literal["auto"] | None:
+    """Bandwidth in Hz as the option says it.
+
+    Raises:
+        InputError: it is none.
+    """
     if text == "auto":
         return "auto"
     if text == "none":

@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 
 import typer
 
+from hil.archive import open_archive
 from hil.errors import InputError
-from hil.importers import ColumnMap, Robot, import_csv, import_rosbag2
+from hil.importers import ColumnMap, Findings, Robot, Use, import_log, import_rosbag2
 from identification import FrictionLaw
 
 app = typer.Typer(
@@ -29,20 +30,34 @@ Friction = Annotated[
     str,
     typer.Option(
         help="Friction terms, comma separated: coulomb, viscous, quadratic (sgn(v) v²) or cubic "
-        "(v³), offset."
+        "(v³), offset. A cell file can say more."
     ),
 ]
 Standstill = Annotated[
     float,
     typer.Option(min=0.0, help="Speed in rad/s below which a joint's row is not fitted."),
 ]
-Fixed = Annotated[
+Locked = Annotated[
     list[str] | None,
-    typer.Option("--fixed", help="A joint of the URDF to hold at zero; may be repeated."),
+    typer.Option(
+        "--locked",
+        help="A joint of the URDF that was not recorded, NAME or NAME=POSITION (rad or m), held "
+        "there (at 0); may be repeated.",
+        show_default=False,
+    ),
 ]
 Held = Annotated[
     list[str] | None,
-    typer.Option("--held", help="A joint known to have stood still; may be repeated."),
+    typer.Option(
+        "--held", help="A joint known to have stood still; may be repeated.", show_default=False
+    ),
+]
+Kind = Annotated[
+    str,
+    typer.Option(
+        help="What it is for: excitation (to be fitted), validation (only predicted) or standstill "
+        "(the noise of the positions)."
+    ),
 ]
 
 
@@ -52,7 +67,7 @@ def rosbag2(
     output: Output,
     urdf: Urdf = None,
     cell: CellFile = None,
-    friction: Friction = "coulomb,viscous,offset",
+    friction: Friction = "coulomb,viscous,quadratic,offset",
     standstill: Standstill = 0.01,
     topic: Annotated[
         str | None, typer.Option(help="Topic of the joint states, if there is more than one.")
@@ -63,10 +78,15 @@ def rosbag2(
             help="What the effort field holds: torque (N·m), motor_current (A) or ignore."
         ),
     ] = "torque",
-    fixed: Fixed = None,
+    locked: Locked = None,
     held: Held = None,
+    kind: Kind = "excitation",
 ) -> None:
-    """Import sensor_msgs/JointState from a rosbag2 (sqlite3) recording; joints go by name."""
+    """Import sensor_msgs/JointState from a rosbag2, or from any MCAP file; joints go by name.
+
+    A bag's folder, its .db3 or .mcap file, compressed or not. Messages of other types in an MCAP
+    file are imported by `hil import log` with a column map.
+    """
     kinds: dict[str, Literal["torque", "motor_current", "ignore"]] = {
         "torque": "torque",
         "motor_current": "motor_current",
@@ -79,53 +99,124 @@ def rosbag2(
     path = import_rosbag2(
         source,
         output,
-        robot=_robot(urdf, cell, friction, standstill, fixed),
+        robot=_robot(urdf, cell, friction, standstill, locked),
         topic=topic,
         effort=kinds[effort],
         held_joints=held or (),
+        use=_use(kind),
     )
-    typer.echo(f"wrote {path}")
+    _tell(path)
 
 
-@app.command("csv")
-def csv(
+def log(
     source: Source,
     output: Output,
     columns: Annotated[
         Path,
         typer.Option(
-            "--map", help="TOML file that says which columns hold what.", show_default=False
+            "--map",
+            help="TOML file that says which columns or arrays hold what.",
+            show_default=False,
         ),
     ],
     urdf: Urdf = None,
     cell: CellFile = None,
-    friction: Friction = "coulomb,viscous,offset",
+    friction: Friction = "coulomb,viscous,quadratic,offset",
     standstill: Standstill = 0.01,
-    fixed: Fixed = None,
+    locked: Locked = None,
     held: Held = None,
+    kind: Kind = "excitation",
+    uncoupled: Annotated[
+        bool,
+        typer.Option(
+            "--uncoupled",
+            help="Leave the inertias and the friction of coupled motors out of the model, to see "
+            "what they explain; angles and torques stay those of the map.",
+        ),
+    ] = False,
 ) -> None:
-    """Import a CSV log; a column map names its columns, units and sides."""
-    path = import_csv(
+    """Import a log of numbers: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
+
+    A column map names its columns or arrays, their units and sides: `docs/archive-format.md`.
+    """
+    path = import_log(
         source,
         output,
-        robot=_robot(urdf, cell, friction, standstill, fixed),
+        robot=_robot(urdf, cell, friction, standstill, locked),
         columns=ColumnMap.load(columns),
         held_joints=held or (),
+        use=_use(kind),
+        coupled=not uncoupled,
     )
+    _tell(path)
+
+
+app.command("log")(log)
+# One importer under the names that people look for.
+app.command("mcap", hidden=True)(rosbag2)
+for _name in ("csv", "npz"):
+    app.command(_name, hidden=True)(log)
+
+
+def _tell(path: Path) -> None:
+    """What was read, as the archive keeps it."""
+    found = Findings.of(open_archive(path).metadata)
+    for line in found.lines:
+        typer.echo(line)
+    for doubt in found.doubts:
+        typer.secho(f"doubtful: {doubt}", fg=typer.colors.YELLOW)
     typer.echo(f"wrote {path}")
 
 
+def _use(kind: str) -> Use:
+    kinds: dict[str, Use] = {
+        "excitation": "excitation",
+        "validation": "validation",
+        "standstill": "standstill",
+    }
+    if kind not in kinds:
+        raise InputError(
+            None, f"{kind!r} is unknown", field="--kind", remedy=f"use {', '.join(kinds)}"
+        )
+    return kinds[kind]
+
+
 def _robot(
-    urdf: Path | None, cell: Path | None, friction: str, standstill: float, fixed: list[str] | None
+    urdf: Path | None, cell: Path | None, friction: str, standstill: float, locked: list[str] | None
 ) -> Robot:
-    if (urdf is None) == (cell is None):
+    if urdf is not None and cell is not None:
+        raise InputError(
+            None,
+            "a cell file names its own URDF",
+            field="--urdf",
+            remedy="leave out one of --urdf and --cell",
+        )
+    if urdf is None and cell is None:
         raise InputError(
             None, "whose recording is it?", field="--urdf", remedy="give --urdf or --cell"
         )
+    positions = _positions(locked or [])
     if cell is not None:
-        return Robot.from_cell(cell, fixed_joints=fixed or ())
+        return Robot.from_cell(cell, locked=positions)
     assert urdf is not None
-    return Robot.from_urdf(urdf, friction=_law(friction, standstill), fixed_joints=fixed or ())
+    return Robot.from_urdf(urdf, friction=_law(friction, standstill), locked=positions)
+
+
+def _positions(locked: list[str]) -> dict[str, float]:
+    """Positions of locked joints from NAME or NAME=POSITION."""
+    positions = {}
+    for text in locked:
+        name, _, position = text.partition("=")
+        try:
+            positions[name] = float(position) if position else 0.0
+        except ValueError as error:
+            raise InputError(
+                None,
+                f"{position!r} is no position",
+                field=f"--locked {text}",
+                remedy="give rad or m, as in --locked joint_7=0.3",
+            ) from error
+    return positions
 
 
 def _law(terms: str, standstill: float) -> FrictionLaw:

@@ -1,21 +1,108 @@
-"""How a command that identifies ends: one line, and an exit status a script can use."""
+"""How a command that identifies ends: a table, what was found, one line, and an exit status."""
 
 from __future__ import annotations
 
+import json as json_module
+import math
+from collections.abc import Callable, Sequence
+from typing import Final
+
 import typer
 
+from hil.judgement import JointJudgement
 from hil.results import Results
 
 NOT_GOOD = 5
+"""Exit status of a command whose model is not good."""
+
+_MISSING: Final = "-"
+_LEVELS: Final = {"wrong": "WRONG", "doubtful": "note", "information": "info", "good": "ok"}
 
 
-def finish(results: Results, *, json: bool) -> None:
-    """Print the verdict last, doubts to stderr before it; exit 5 if the model is not good."""
+def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
+    """Print what was found to stderr and the verdict last; exit 5 if the model is not good.
+
+    Args:
+        results: of the identification.
+        json: print verdict, findings and figures as one JSON object instead.
+        quiet: print only the verdict and the doubts.
+    """
     if json:
-        typer.echo(results.verdict.model_dump_json())
+        typer.echo(as_json(results))
     else:
-        for doubt in results.verdict.doubts:
-            typer.echo(f"note: {doubt}", err=True)
+        for line in [] if quiet else table(results):
+            typer.echo(line, err=True)
+        if results.fitted is not None and not quiet:
+            typer.echo(results.fitted.words, err=True)
+        for line in sentences(results, quiet=quiet):
+            typer.echo(line, err=True)
         typer.echo(results.verdict.line)
     if not results.verdict.good:
         raise typer.Exit(NOT_GOOD)
+
+
+def as_json(results: Results) -> str:
+    """Verdict, what it rests on, and the figures per joint."""
+    found = results.verdict.model_dump(mode="json")
+    if results.judgement is not None:
+        figures = results.judgement.model_dump(mode="json")
+        found |= {key: figures[key] for key in ("next_steps", "findings", "joints", "in_sample")}
+    found["undetermined"] = [one.name for one in results.parameters if one.undetermined]
+    found["delays"] = None if results.delays is None else results.delays.model_dump(mode="json")
+    found["fitted"] = None if results.fitted is None else results.fitted.model_dump(mode="json")
+    found["exports"] = None if results.exports is None else results.exports.model_dump(mode="json")
+    return json_module.dumps(found, ensure_ascii=False)
+
+
+def table(results: Results) -> list[str]:
+    """One row per joint: error on unseen motion, and beside what."""
+    if results.judgement is None:
+        return []
+    joints, in_sample = results.judgement.joints, results.judgement.in_sample
+    columns: list[tuple[str, Callable[[JointJudgement], str]]] = [
+        ("joint", lambda joint: joint.joint),
+        ("RMS error", lambda joint: f"{joint.rms:.3g} {joint.unit}"),
+        ("in-sample" if in_sample else "relative", lambda joint: _percent(joint.relative)),
+        ("fitted", lambda joint: _MISSING if in_sample else _percent(joint.fitted_relative)),
+        ("of limit", lambda joint: _percent(joint.share_of_limit)),
+        ("explains", lambda joint: _percent(joint.explained)),
+        ("nominal", lambda joint: _percent(joint.nominal_relative)),
+        ("controller", lambda joint: _percent(joint.controller_relative)),
+    ]
+    cells = [[title, *(text(joint) for joint in joints)] for title, text in columns]
+    shown = [column for column in cells if set(column[1:]) != {_MISSING}]
+    return _aligned(list(zip(*shown, strict=True)))
+
+
+def sentences(results: Results, *, quiet: bool = False) -> list[str]:
+    """What is wrong, doubtful and in order, and what to do next."""
+    judgement = results.judgement
+    if judgement is None or quiet:
+        return [f"note: {doubt}" for doubt in results.verdict.doubts]
+    said = {finding.words for finding in judgement.findings}
+    lines = [
+        f"{_LEVELS[level]}: {finding.words}"
+        for level in ("good", "information", "doubtful", "wrong")
+        for finding in judgement.findings
+        if finding.level == level
+    ]
+    # What is known beforehand of the archives is no check of the model.
+    lines += [f"note: {doubt}" for doubt in results.verdict.doubts if doubt not in said]
+    return lines + [f"next: {step}" for step in judgement.next_steps]
+
+
+def _percent(share: float | None) -> str:
+    if share is None or math.isnan(share):
+        return _MISSING
+    return f"{share:.2%}" if abs(share) < 0.1 else f"{share:.1%}"
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if at == 0 else cell.rjust(width)
+            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

@@ -32,6 +32,7 @@ def fingerprint(cell: Cell) -> dict[str, str]:
             name: getattr(limits, name).tolist()
             for name in ("lower", "upper", "velocity", "acceleration", "jerk")
         },
+        "torque_limit": None if cell.torque_limit is None else cell.torque_limit.tolist(),
         "drive_train": _plain(cell.file.drive_train),
         "nominal": _plain(cell.file.nominal),
         "workspace": _plain(cell.file.workspace),

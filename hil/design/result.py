@@ -18,7 +18,6 @@ from hil.errors import InputError
 from hil.files import write_atomically
 from hil.version import software
 from identification.excitation import (
-    Criteria,
     Design,
     Excitation,
     Objective,
@@ -26,6 +25,7 @@ from identification.excitation import (
 )
 from planner import FourierSeries, PiecewiseCubic, PlannerError
 
+from .figures import FigureError, count, criteria_of, front_of, number
 from .fingerprint import DECISIVE, fingerprint
 from .motion_data import joints_of, motion_data, motion_digest, motion_from_data
 from .settings import RESULT_FORMAT, DesignSettings, SettingsError, settings_of
@@ -80,6 +80,20 @@ class Origin(NamedTuple):
         """Return the origin of a design."""
         criteria = design.origin_criteria
         return cls(design.origin, criteria.log10_det, criteria.coupling_index)
+
+    @classmethod
+    def read(cls, table: Mapping[str, Any]) -> Self:
+        """Return the origin that `[polished_from]` names.
+
+        Raises:
+            FigureError: a figure is none.
+        """
+        where = "polished_from"
+        return cls(
+            count(table, where, "point"),
+            number(table, where, "log10_det"),
+            number(table, where, "coupling_index", least=0.0),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +197,9 @@ class DesignResult:
         try:
             text = path.read_text("utf-8")
         except (OSError, UnicodeDecodeError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
             raise InputError(
-                path, f"cannot be read ({error})", remedy="name a file that `hil design` wrote"
+                path, f"cannot be read ({why})", remedy="name a file that `hil design` wrote"
             ) from error
         try:
             data = from_text(text)
@@ -200,6 +215,8 @@ class DesignResult:
             result = cls._from_data(data)
         except SettingsError as error:
             raise InputError(path, str(error), remedy=_REMEDY) from error
+        except FigureError as error:
+            raise InputError(path, error.problem, field=error.field, remedy=_REMEDY) from error
         except (PlannerError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
             raise InputError(
                 path, f"is not a designed excitation ({error})", remedy=_REMEDY
@@ -281,34 +298,31 @@ class DesignResult:
     @classmethod
     def _from_data(cls, data: Mapping[str, Any]) -> Self:
         settings = settings_of(data["settings"])
-        criteria, search, front = dict(data["criteria"]), data["search"], data["front"]
-        for derived in ("coupling_index_max", "duration"):
-            del criteria[derived]
+        search, front = data["search"], data["front"]
         via = settings.via_points
         excitation = Excitation(
-            criteria=Criteria(**criteria),
+            criteria=criteria_of(data["criteria"]),
             method=search["method"],
-            seed=search["seed"],
-            tried=search["tried"],
+            seed=count(search, "search", "seed"),
+            tried=count(search, "search", "tried"),
             rejected=dict(search["infeasible"]),
             **motion_from_data(data, None if via is None else via.fly),
         )
         name, parts = data["cell"]["name"], dict(data["cell"])
         del parts["name"]
-        columns = [front[column] for column in ("log10_det", "coupling_index", "duration")]
         return cls(
             cell_name=name,
             cell_parts=parts,
             joint_names=joints_of(data),
             settings=settings,
             excitation=excitation,
-            generations=search["generations"],
+            generations=count(search, "search", "generations"),
             complete=data["complete"],
-            n_parameters=search["n_parameters"],
+            n_parameters=count(search, "search", "n_parameters", least=1),
             parameters=tuple(search["parameters"]) if "parameters" in search else None,
-            front=np.array(columns, dtype=np.float64).T,
+            front=front_of(front),
             chosen=front.get("chosen"),
-            polished_from=Origin(**data["polished_from"]) if "polished_from" in data else None,
+            polished_from=Origin.read(data["polished_from"]) if "polished_from" in data else None,
             versions=data["software"],
             archives=tuple(
                 (name, digest) for name, digest in data.get("earlier", {}).get("archives", ())

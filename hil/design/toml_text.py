@@ -5,15 +5,15 @@ A field of angles is an `Angles` in the data and a name that ends in `_deg` in t
 
 from __future__ import annotations
 
-import json
-import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any
 
-from planner.degrees import degrees_text, radians_of
+from planner.decimals import radians_in, without_decimals
+from planner.degrees import degrees_text
+from planner.toml_value import toml_key, toml_value
 
 _SUFFIX = "_deg"
 
@@ -53,7 +53,7 @@ def _table(path: str, data: Mapping[str, Any], comments: Mapping[str, str]) -> l
     if fields or head or not data:
         blocks.append(f"{head}[{path}]\n{fields}" if path else head + fields)
     for name, value in data.items():
-        below = f"{path}.{_key(name)}" if path else _key(name)
+        below = f"{path}.{toml_key(name)}" if path else toml_key(name)
         if isinstance(value, Mapping):
             blocks += _table(below, value, comments)
         elif _is_table(value):
@@ -71,27 +71,8 @@ def _is_table(value: Any) -> bool:
 
 def _field(name: str, value: Any) -> str:
     if isinstance(value, Angles):
-        return f"{_key(name + _SUFFIX)} = {_degrees(value.values)}\n"
-    return f"{_key(name)} = {_value(value)}\n"
-
-
-def _key(name: str) -> str:
-    bare = name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
-    return name if bare else _text(name)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, float):
-        return repr(value) if math.isfinite(value) else str(value)  # inf, -inf, nan are TOML
-    if isinstance(value, str):
-        return _text(value)
-    if isinstance(value, Sequence):
-        return f"[{', '.join(_value(entry) for entry in value)}]"
-    return json.dumps(value)
-
-
-def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        return f"{toml_key(name + _SUFFIX)} = {_degrees(value.values)}\n"
+    return f"{toml_key(name)} = {toml_value(value)}\n"
 
 
 def _degrees(values: Any) -> str:
@@ -102,26 +83,17 @@ def _degrees(values: Any) -> str:
 
 def _items(table: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return [
-        (name.removesuffix(_SUFFIX), _radians(name, value))
+        (name.removesuffix(_SUFFIX), radians_in(name, value))
         if name.endswith(_SUFFIX)
-        else (name, _plain(value))
+        else (name, _below(value))
         for name, value in table.items()
     ]
 
 
-def _radians(name: str, value: Any) -> Any:
-    if isinstance(value, list):
-        return [_radians(name, entry) for entry in value]
-    if isinstance(value, bool) or not isinstance(value, Decimal | int):
-        raise ValueError(f"{name}: {value!r} is not a number of degrees")
-    return radians_of(value)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Decimal):
-        return float(value)
-    if isinstance(value, list):
-        return [_plain(entry) for entry in value]
+def _below(value: Any) -> Any:
+    """Return a value in which tables may be, and in them angles."""
     if isinstance(value, Mapping):
         return dict(_items(value))
-    return value
+    if isinstance(value, list):
+        return [_below(entry) for entry in value]
+    return without_decimals(value)

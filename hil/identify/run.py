@@ -10,20 +10,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.campaign.folder import CampaignFolder
+from hil.cell import Cell
 from hil.errors import InputError
 from hil.progress import Reporter
 from hil.report import ReportSeries
 from hil.results import Results
+from identification.consistency_check import ConsistencyCheck
+from identification.essential_choice import EssentialChoice
 from identification.evidence import gather
-from identification.preprocessing import Preprocessing, Samples, prepare
-from identification.repetitions import RepeatedEstimate, estimate_repetitions
-from identification.torque_channel import find_torque_bandwidth
+from identification.phase_factor import PhaseFactor
+from identification.preprocessing import Samples
+from identification.repetitions import RepeatedEstimate
 from identification.validation import for_figure
 from identification.verdict import Verdict, judge
 
+from .estimating import Estimation, estimate_with
+from .extras import consistency_of, essential_of, extras_doubts, extras_reasons
+from .judging import judgement_result
 from .options import Options
-from .sources import Source, Sources, gather_sources
+from .prepared import Prepared, prepare_sources
+from .sources import Sources, gather_sources
 from .summary import moving_rows, summarise
+from .surroundings import nominal_of, surroundings_of
 
 Array = NDArray[np.float64]
 
@@ -33,18 +41,42 @@ FIGURE_SAMPLES = 4000
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """What an identification found, and the series its figures need."""
+    """What an identification found, and the series its figures need.
 
-    estimate: RepeatedEstimate
+    Attributes:
+        paths: the archives.
+        cell: whose they are.
+        estimation: the estimate, and what was computed beside it.
+        essential: the essential parameters; in words why there are none.
+        consistency: parameters that a machine can have; in words why there are none.
+        verdict: on the estimate.
+        results: as they go into `results.json`.
+        series: for the figures of the report.
+    """
+
+    paths: tuple[Path, ...]
+    cell: Cell
+    estimation: Estimation
+    essential: EssentialChoice | str
+    consistency: ConsistencyCheck | str
     verdict: Verdict
     results: Results
     series: ReportSeries
 
+    @property
+    def estimate(self) -> RepeatedEstimate:
+        """Pooled and per repetition."""
+        return self.estimation.result
+
 
 def identify_campaign(
-    root: Path, reporter: Reporter, options: Options = Options()
+    root: Path,
+    reporter: Reporter,
+    options: Options = Options(),
+    *,
+    predict: Sequence[Path] = (),
 ) -> Identification:
-    """Identify from the whole archives of a campaign folder.
+    """Identify from the whole archives of a campaign folder, and predict others beside them.
 
     Raises:
         InputError: no whole excitation is in the folder.
@@ -62,6 +94,7 @@ def identify_campaign(
         [*paths, *folder.completed("standstill")],
         reporter,
         options,
+        predict=predict,
         name=root.resolve().name,
         doubts=folder.damaged(),
     )
@@ -72,87 +105,90 @@ def identify_archives(
     reporter: Reporter,
     options: Options = Options(),
     *,
+    predict: Sequence[Path] = (),
     name: str = "",
     doubts: Sequence[str] = (),
 ) -> Identification:
-    """Identify from archives; `doubts` is what is known beforehand to be wrong with them.
+    """Identify from archives.
+
+    Args:
+        paths: what is fitted, predicted or rested at, according to what the archives say.
+        reporter: of progress.
+        options: how.
+        predict: archives that are predicted and not fitted, whatever they say.
+        name: of the result; that of the first archive if left out.
+        doubts: what is known beforehand to be wrong with the archives.
 
     Raises:
-        InputError: the archives cannot be used, or not together.
+        InputError: the archives cannot be used, or not together, or not by the chosen estimator.
     """
-    sources = gather_sources(paths, options.split)
+    sources = gather_sources(paths, options.split, predict, in_sample=options.in_sample)
     for doubt in doubts:
         sources = sources.with_doubt(doubt)
-    model = sources.cell.model
-    preprocessing = _preprocessing(sources, options)
-    if options.torque_bandwidth == "auto" and preprocessing.torque_bandwidth is not None:
-        sources = sources.with_doubt(
-            "the recorded torque seems to have come through a low-pass of "
-            f"{preprocessing.torque_bandwidth:.3g} Hz before it was recorded (found on what was "
-            "fitted); the model is filtered alike"
-        )
-    total = len(sources.training) + len(sources.held_out)
-    with reporter.task("smoothing recordings", total) as task:
+    prepared = prepare_sources(sources, options, reporter)
+    estimation = estimate_with(prepared, options, reporter)
+    for doubt in estimation.doubts:
+        prepared = replace(prepared, sources=prepared.sources.with_doubt(doubt))
+    return _judged(name or paths[0].stem, (*paths, *predict), prepared, estimation, reporter)
 
-        def ready(source: Source, how: Preprocessing) -> Samples:
-            samples = prepare(
-                source.recording,
-                model,
-                noise_variance=sources.noise_variance,
-                torque_variance=sources.torque_variance,
-                options=how,
-                origin=source.origin,
-            )
-            task.advance(1, source.name)
-            return samples
 
-        fitted = [ready(source, preprocessing) for source in sources.training]
-        # A verdict on smoothed torque would flatter: what is judged is the torque as recorded.
-        judged = replace(preprocessing, smooth_torque=False)
-        training = (
-            fitted
-            if judged == preprocessing
-            else [ready(source, judged) for source in sources.training]
-        )
-        held_out = [ready(source, judged) for source in sources.held_out]
-    with reporter.task("estimating", 2) as task:
-        estimate = estimate_repetitions(model, fitted)
-        task.advance(1, "validating")
-        nominal = sources.cell.nominal_values() if sources.cell.file.nominal else None
+def _judged(
+    name: str,
+    paths: tuple[Path, ...],
+    prepared: Prepared,
+    estimation: Estimation,
+    reporter: Reporter,
+) -> Identification:
+    """Compare, judge and sum up."""
+    cell, result = prepared.sources.cell, estimation.result
+    with reporter.task("validating", 3) as task:
+        unseen = sum(estimation.held_out, PhaseFactor.zero(cell.model)).total
+        consistency = consistency_of(cell.model, result.phase, unseen)
+        if prepared.sources.in_sample and isinstance(consistency, ConsistencyCheck):
+            consistency = replace(consistency, judged_on="in-sample")
+        task.advance(1, "essential parameters")
+        essential: EssentialChoice | str = "nothing was held out to choose them by"
+        if not prepared.sources.in_sample:
+            essential = essential_of(cell.model, result.phase, estimation.held_out)
+        task.advance(1, "verdict")
+        sources = prepared.sources
+        for doubt in extras_doubts(essential, consistency):
+            sources = sources.with_doubt(doubt)
+        nominal = nominal_of(cell)
         evidence = gather(
-            model,
-            estimate,
-            training,
-            held_out,
+            cell.model,
+            result,
+            prepared.training,
+            prepared.held_out,
             same_motion=sources.same_motion,
-            nominal=nominal,
+            nominal=None if nominal is None else nominal.values,
+            surroundings=surroundings_of(paths, prepared, result.pooled),
+            in_sample=sources.in_sample,
         )
-        verdict = judge(model.joint_names, evidence, tested_on=sources.tested_on)
+        impossible = (*evidence.implausible.impossible, *extras_reasons(consistency))
+        evidence = replace(
+            evidence, implausible=evidence.implausible._replace(impossible=impossible)
+        )
+        verdict = judge(cell.model.joint_names, evidence, tested_on=sources.tested_on)
         task.advance(1)
-    results = summarise(
-        name or paths[0].stem, sources, estimate, verdict, training=training, held_out=held_out
+    prepared = replace(prepared, sources=sources)
+    results = summarise(name, prepared, estimation, verdict, essential, consistency)
+    judgement = judgement_result(
+        cell.model.joint_names,
+        evidence,
+        verdict,
+        nominal=None if nominal is None else nominal.words,
     )
     return Identification(
-        estimate, verdict, results, _series(sources, estimate, training[0], held_out[0])
+        paths=paths,
+        cell=cell,
+        estimation=estimation,
+        essential=essential,
+        consistency=consistency,
+        verdict=verdict,
+        results=results.model_copy(update={"judgement": judgement}),
+        series=_series(sources, result, prepared.training[0], prepared.held_out[0]),
     )
-
-
-def _preprocessing(sources: Sources, options: Options) -> Preprocessing:
-    cell = sources.cell
-    delay = options.delay
-    if delay is None:
-        controller = cell.file.controller
-        delay = controller.current_delay_cycles * cell.period if controller else 0.0
-    plain = Preprocessing(smooth_torque=options.method == "paper", torque_delay=delay)
-    bandwidth = options.torque_bandwidth
-    if bandwidth == "auto":
-        recording = sources.training[0].recording
-        bandwidth = None
-        if not plain.smooth_torque and recording.motor_current is None:
-            bandwidth = find_torque_bandwidth(
-                recording, cell.model, noise_variance=sources.noise_variance, options=plain
-            )
-    return replace(plain, torque_bandwidth=bandwidth)
 
 
 def _series(

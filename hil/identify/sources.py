@@ -16,9 +16,11 @@ from drivers.packets import DRIVE_ON
 from hil.archive import CONTROLLERS_OWN, Archive, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
+from hil.importers import Findings
 from hil.recordings import recording_of
-from identification.preprocessing import standstill_variance
+from identification.noise import standstill_variance
 from identification.recording import Recording, RecordingError
+from identification.resampling import without_repeats
 
 Array = NDArray[np.float64]
 
@@ -34,11 +36,13 @@ class Source:
         name: file name.
         recording: joints in the order of the model.
         origin: time of the first set-point [s].
+        merged: samples that had the time stamp of the one before, and were averaged with it.
     """
 
     name: str
     recording: Recording
     origin: float
+    merged: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +60,7 @@ class Sources:
         torque_variance: of the torques at standstill (n,) [N²·m²]; None likewise.
         doubts: what a reader must know about the archives.
         tested_on: what is predicted, in words.
+        in_sample: whether nothing was held out: `held_out` is `training` then.
     """
 
     cell: Cell
@@ -68,6 +73,7 @@ class Sources:
     torque_variance: Array | None
     doubts: tuple[str, ...]
     tested_on: str
+    in_sample: bool = False
 
     def with_doubt(self, doubt: str) -> Sources:
         """These sources with one more thing a reader must know."""
@@ -91,22 +97,36 @@ def cell_of(archive: Archive) -> Cell:
     return Cell.from_texts(text.decode(), urdf.decode(), archive.path)
 
 
-def gather_sources(paths: Sequence[Path], split: float) -> Sources:
+def gather_sources(
+    paths: Sequence[Path], split: float, predict: Sequence[Path] = (), *, in_sample: bool = False
+) -> Sources:
     """Open archives and sort them into what is fitted and what is predicted.
 
-    Excitations are fitted and validation runs predicted. Where there is no validation run, the
-    last part of a single recording, or the last of several, is held out.
+    Excitations and imported recordings are fitted, validation runs predicted, and imported ones
+    used as they were declared. Where there is nothing to predict, the last part of a single
+    recording, or the last of several, is held out.
+
+    Args:
+        paths: the archives.
+        split: see :class:`hil.identify.options.Options`.
+        predict: archives that are predicted and not fitted, whatever their kind.
+        in_sample: fit whatever moves, validation runs too, and hold nothing out.
 
     Raises:
-        InputError: there is nothing to fit, or an archive is named twice.
+        InputError: there is nothing to fit, an archive is named twice, or something is to be
+            predicted and all of it to be fitted.
         ArchiveError: an archive cannot be read, is not fit, or belongs to another cell.
     """
-    _refuse_duplicates(paths)
-    archives = [open_archive(path) for path in paths]
-    by_kind: dict[str, list[Archive]] = {}
-    for archive in archives:
-        by_kind.setdefault(archive.kind, []).append(archive)
-    fitted = by_kind.get("excitation", []) + by_kind.get("imported", [])
+    if in_sample and predict:
+        raise InputError(
+            predict[0], "cannot be held out where all is fitted", remedy="leave out --in-sample"
+        )
+    _refuse_duplicates([*paths, *predict])
+    archives = [open_archive(path) for path in [*paths, *predict]]
+    by_kind = _by_kind(archives[: len(paths)], archives[len(paths) :])
+    fitted = by_kind.get("excitation", [])
+    if in_sample:
+        fitted = [*fitted, *by_kind.pop("validation", [])]
     if not fitted:
         raise InputError(
             paths[0] if paths else None,
@@ -115,12 +135,19 @@ def gather_sources(paths: Sequence[Path], split: float) -> Sources:
         )
     cell = cell_of(fitted[0])
     _refuse_strangers(archives)
-    training = [_source(archive, cell) for archive in fitted]
-    held_out = [_source(archive, cell) for archive in by_kind.get("validation", [])]
+    training = [source_of(archive, cell) for archive in fitted]
+    held_out = [source_of(archive, cell) for archive in by_kind.get("validation", [])]
     doubts = [*_doubts_of(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
+    doubts += [
+        f"{archive.path.name}: {doubt}"
+        for archive in archives
+        for doubt in Findings.of(archive.metadata).doubts
+    ]
     same_motion = len({archive.attachments.get("plan.json") for archive in fitted}) == 1
     tested_on = "unseen motion"
-    if not held_out:
+    if in_sample:
+        held_out, tested_on = training, "the motion that was fitted"
+    elif not held_out:
         whole = len(training) == 1
         tested_on = (
             "the rest of the same motion"
@@ -131,7 +158,7 @@ def gather_sources(paths: Sequence[Path], split: float) -> Sources:
         )
         training, held_out, doubt = _split(training, split)
         doubts.append(doubt)
-    rest = [_source(archive, cell) for archive in by_kind.get("standstill", [])]
+    rest = [source_of(archive, cell, to_fit=False) for archive in by_kind.get("standstill", [])]
     plan = fitted[0].attachments.get("plan.json")
     return Sources(
         cell=cell,
@@ -140,11 +167,25 @@ def gather_sources(paths: Sequence[Path], split: float) -> Sources:
         training=tuple(training),
         same_motion=same_motion and plan is not None,
         held_out=tuple(held_out),
-        noise_variance=_noise_variance(cell, rest[0].recording) if rest else None,
+        noise_variance=position_noise(cell, rest[0].recording) if rest else None,
         torque_variance=_torque_variance(rest[0].recording) if rest else None,
         doubts=tuple(doubts),
         tested_on=tested_on,
+        in_sample=in_sample,
     )
+
+
+def _by_kind(archives: Sequence[Archive], predicted: Sequence[Archive]) -> dict[str, list[Archive]]:
+    sorted_out: dict[str, list[Archive]] = {}
+    for archive in archives:
+        sorted_out.setdefault(_kind(archive), []).append(archive)
+    sorted_out.setdefault("validation", []).extend(predicted)
+    return sorted_out
+
+
+def _kind(archive: Archive) -> str:
+    """What an archive is for; an imported one says so beside its kind."""
+    return archive.metadata.get("use", "excitation") if archive.kind == "imported" else archive.kind
 
 
 def _refuse_duplicates(paths: Sequence[Path]) -> None:
@@ -198,30 +239,31 @@ def _doubts_of(cell: Cell, archive: Archive) -> list[str]:
     return doubts
 
 
-def _source(archive: Archive, cell: Cell) -> Source:
+def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
     """The recording of an archive, as far as it is of use.
 
     Raises:
         ArchiveError: the recording is not fit to be identified from; names file and reason.
     """
     recording = recording_of(archive)
-    if recording.torque is None:
+    if to_fit and recording.torque is None and recording.motor_current is None:
         raise ArchiveError(
             archive.path,
-            "holds no joint torques to fit",
+            "holds no joint torques to fit, and no motor currents",
             remedy="import torques, or motor currents with gear ratios and torque constants",
         )
-    useful = _useful(archive, recording)
+    useful = useful_part(archive, recording)
     if useful is not None:
         recording = recording.between(useful.start, useful.stop)
     try:
-        recording.checked(cell.joint_names)
+        single = without_repeats(recording).checked(cell.joint_names)
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
-    return Source(archive.path.name, recording, float(recording.time[0]))
+    merged = recording.n_samples - single.n_samples
+    return Source(archive.path.name, single, float(single.time[0]), merged)
 
 
-def _useful(archive: Archive, recording: Recording) -> range | None:
+def useful_part(archive: Archive, recording: Recording) -> range | None:
     """The samples that identification may look at; None for all of an imported recording.
 
     Where the PC moved the arm, those it commanded. Where the controller's own program did, those
@@ -249,7 +291,9 @@ def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Sour
         )
     whole = sources[0]
     cut = round(share * whole.recording.n_samples)
-    first = Source(f"{whole.name} (first part)", whole.recording.between(0, cut), whole.origin)
+    first = replace(
+        whole, name=f"{whole.name} (first part)", recording=whole.recording.between(0, cut)
+    )
     time = float(whole.recording.time[min(cut, whole.recording.n_samples - 1)])
     last = Source(
         f"{whole.name} (last part)",
@@ -263,13 +307,15 @@ def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Sour
     return [first], [last], doubt
 
 
-def _noise_variance(cell: Cell, rest: Recording) -> Array:
+def position_noise(cell: Cell, rest: Recording) -> Array:
     """Variance of the measured positions at standstill, at least that of their resolution (n,).
 
     An arm that rests may show the same count for seconds; rounding to a count is noise all the
     same, uniform over the step.
     """
     measured = standstill_variance(rest.time, rest.position)
+    if cell.file.drive_train is None:
+        return np.asarray(np.maximum(measured, _smallest_step(rest.position) ** 2 / 12.0))
     drives = cell.drive_train
     revolutions = drives.motor_revolutions(rest.position)
     step = np.maximum(
@@ -279,6 +325,15 @@ def _noise_variance(cell: Cell, rest: Recording) -> Array:
     joint_step = np.abs(drives.joint_from_motor) * (2.0 * np.pi * step)
     resolution = (joint_step**2).sum(axis=1) / 12.0
     return np.asarray(np.maximum(measured, resolution))
+
+
+def _smallest_step(position: Array) -> Array:
+    """Resolution of each channel (n,): the least that two readings differ by, 0 for none."""
+    smallest = np.zeros(position.shape[1])
+    for joint, channel in enumerate(position.T):
+        steps = np.diff(np.unique(channel))
+        smallest[joint] = steps.min() if steps.size else 0.0
+    return smallest
 
 
 def _torque_variance(rest: Recording) -> Array | None:

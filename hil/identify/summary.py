@@ -14,16 +14,19 @@ from hil.errors import InputError
 from hil.results import (
     CoverageResult,
     CriteriaResult,
+    DelaysResult,
     ExcitationResult,
+    FittedResult,
     ParameterResult,
     Results,
-    UncertaintyResult,
     ValidationResult,
     VerdictResult,
 )
 from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, Motion, RobotModel
+from identification.consistency_check import ConsistencyCheck
+from identification.essential_choice import EssentialChoice
 from identification.excitation import (
     Excitation,
     condition_number,
@@ -36,11 +39,15 @@ from identification.excitation import (
 )
 from identification.preprocessing import Samples
 from identification.repetitions import RepeatedEstimate
-from identification.validation import prediction_error
+from identification.validation import PredictionError, over_all, prediction_error
 from identification.verdict import Verdict
 from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, urdf_text
 
+from .estimating import Estimation
+from .estimation_summary import endogeneity_result, estimator_result, uncertainty_result
+from .extras import consistency_result, essential_result
+from .prepared import Prepared
 from .sources import Source, Sources
 
 Array = NDArray[np.float64]
@@ -48,14 +55,14 @@ Array = NDArray[np.float64]
 
 def summarise(
     name: str,
-    sources: Sources,
-    estimate: RepeatedEstimate,
+    prepared: Prepared,
+    estimation: Estimation,
     verdict: Verdict,
-    *,
-    training: Sequence[Samples],
-    held_out: Sequence[Samples],
+    essential: EssentialChoice | str,
+    consistency: ConsistencyCheck | str,
 ) -> Results:
     """Everything that was found, as it goes into `results.json`."""
+    sources, training, estimate = prepared.sources, prepared.training, estimation.result
     cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
     rows = [
         executed_rows(source, samples)
@@ -64,7 +71,6 @@ def summarise(
     gram = information(_executed(cell.model, training, rows))
     simulated = sources.metadata.get("simulated") == "yes"
     truth = planted_values(cell) if simulated and cell.file.simulation else None
-    many = len(training) > 1
     return Results(
         name=name,
         cell=cell.name,
@@ -74,22 +80,22 @@ def summarise(
         period=_period(training[0]),
         software=software(),
         excitation=_excitation(sources, gram, training, rows),
-        parameters=_parameters(cell, estimate, truth),
-        n_base=len(model.base.names),
-        uncertainty=UncertaintyResult(
-            reported="phase_clustered",
-            method=pooled.method,
-            interval_factor=pooled.interval_factor,
-            least_squares=estimate.classical_std.tolist(),
-            independent_repetitions=estimate.independent_std.tolist() if many else None,
-            phase_clustered=pooled.std.tolist(),
-            scatter_of_mean=estimate.scatter_std.tolist() if many else None,
+        estimator=estimator_result(model, estimation),
+        endogeneity=endogeneity_result(estimation),
+        endogeneity_untested=(
+            estimation.endogeneity if isinstance(estimation.endogeneity, str) else None
         ),
+        notes=list(prepared.notes),
+        parameters=_parameters(cell, estimation, truth),
+        n_base=len(model.base.names),
+        uncertainty=uncertainty_result(estimation),
         repetitions=[source.name for source in sources.training],
         repetition_values=[one.values.tolist() for one in estimate.repetitions],
         noise_std=pooled.noise_std.tolist(),
         correlation=correlation(gram).tolist(),
-        validation=_validation(sources, estimate, held_out),
+        validation=[] if sources.in_sample else _validation(sources, estimate, prepared.held_out),
+        fitted=_fitted(model, pooled.values, prepared),
+        delays=_delays(prepared),
         coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
         verdict=VerdictResult(
             good=verdict.good,
@@ -97,6 +103,8 @@ def summarise(
             reasons=[*verdict.reasons],
             doubts=[*verdict.doubts, *sources.doubts],
         ),
+        essential=essential_result(essential),
+        consistency=consistency_result(model, consistency),
     )
 
 
@@ -196,10 +204,9 @@ def _criteria(gram: Array, n_samples: int) -> CriteriaResult:
     )
 
 
-def _parameters(
-    cell: Cell, estimate: RepeatedEstimate, truth: Array | None
-) -> list[ParameterResult]:
-    model, pooled = cell.model, estimate.pooled
+def _parameters(cell: Cell, estimation: Estimation, truth: Array | None) -> list[ParameterResult]:
+    model, estimate, posterior = cell.model, estimation.result, estimation.posterior
+    pooled = estimate.pooled
     expressions = [*model.base.expressions(), *model.parameter_names[len(model.base.names) :]]
     std = estimate.std if len(estimate.repetitions) > 1 else None
     printed = _table2_ids() if cell.urdf == urdf_text() else {}
@@ -214,6 +221,10 @@ def _parameters(
             repetition_mean=float(estimate.mean[i]),
             repetition_std=None if std is None else float(std[i]),
             truth=None if truth is None else float(truth[i]),
+            undetermined=parameter in pooled.undetermined,
+            prior_std=None if isinstance(posterior, str) else float(posterior.prior_std[i]),
+            prior_ratio=None if isinstance(posterior, str) else float(posterior.ratio[i]),
+            learned=None if isinstance(posterior, str) else bool(posterior.learned[i]),
         )
         for i, parameter in enumerate(model.parameter_names)
     ]
@@ -243,6 +254,38 @@ def _validation(
         )
         for source, error, all_rows in zip(sources.held_out, errors, everywhere, strict=True)
     ]
+
+
+def _fitted(model: RobotModel, values: Array, prepared: Prepared) -> FittedResult:
+    """In-sample errors: of the torque as recorded, and as it was fitted where that differs."""
+
+    def error(samples: Sequence[Samples], *, all_rows: bool) -> PredictionError:
+        return over_all(prediction_error(model, values, samples, all_rows=all_rows))
+
+    moving = error(prepared.training, all_rows=False)
+    smoothed = (
+        error(prepared.fitted, all_rows=True) if prepared.preprocessing.smooth_torque else None
+    )
+    return FittedResult(
+        relative_error=moving.relative.tolist(),
+        overall_relative_error=moving.overall,
+        all_rows_relative_error=error(prepared.training, all_rows=True).overall,
+        smoothed_relative_error=None if smoothed is None else smoothed.relative.tolist(),
+        smoothed_overall_relative_error=None if smoothed is None else smoothed.overall,
+    )
+
+
+def _delays(prepared: Prepared) -> DelaysResult | None:
+    found = prepared.delays
+    if found is None:
+        return None
+    known = found.determined.tolist()
+    half = (found.interval_factor * found.std).tolist()
+    return DelaysResult(
+        found=[d if k else None for d, k in zip(found.delays.tolist(), known, strict=True)],
+        interval=[h if k else None for h, k in zip(half, known, strict=True)],
+        applied=prepared.assumed_delay.tolist(),
+    )
 
 
 def _coverage(values: Array, std: Array, truth: Array) -> CoverageResult:

@@ -1,6 +1,7 @@
-"""Which columns of a log hold what: the map that makes a CSV file readable.
+"""Which columns or arrays of a log hold what: the map that makes any log of numbers readable.
 
-It is a small TOML file, or the same built in Python. `docs/archive-format.md` has an example.
+It is a small TOML file, or the same built in Python. `docs/archive-format.md` describes it,
+`docs/bring-your-own-robot.md` shows it at work.
 """
 
 from __future__ import annotations
@@ -10,17 +11,26 @@ from os import PathLike
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from hil.errors import SourceError
 
-ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "rev": 6.283185307179586, "m": 1.0}
+ANGLES = {
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "deg": 0.017453292519943295,
+    "rev": 6.283185307179586,
+    "m": 1.0,
+    "mm": 1e-3,
+}
 RATES = {
     "rad/s": 1.0,
     "deg/s": ANGLES["deg"],
     "rev/s": ANGLES["rev"],
     "rpm": ANGLES["rev"] / 60.0,
     "m/s": 1.0,
+    "mm/s": 1e-3,
 }
 TORQUES = {"N.m": 1.0, "N·m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "kN.m": 1e3, "N": 1.0}
 CURRENTS = {"A": 1.0, "mA": 1e-3}
@@ -41,24 +51,41 @@ class Quantity(_Table):
 
     Attributes:
         columns: one per joint, by name or by index from 0; or one name with ``{}`` in the place of
-            the joint's number, from 1.
+            the joint's number, from 1. In files of arrays a name is that of an array. None: all
+            columns, one per joint.
+        array: in files of arrays, the matrix that `columns` are columns of.
         file: the file, relative to the log that is imported; None for that log itself.
+        joints_along: whether the joints of a whole matrix lie along its ``columns`` or ``rows``;
+            None: time lies along the longer side.
         unit: a unit of the quantity; None for the SI one.
-        scale: further factor, one for all joints or one each; a sign, or a current sensor's gain.
+        offset: added to the numbers in the file, one for all joints or one each: a sensor's zero.
+        scale: factor after that, one for all joints or one each; a sign, or a sensor's gain.
         side: ``joint``, or ``motor`` when it was measured before the gears.
     """
 
-    columns: Annotated[tuple[Column, ...], Field(min_length=1)] | str
+    columns: Annotated[tuple[Column, ...], Field(min_length=1)] | str | None = None
+    array: str | None = None
     file: str | None = None
+    joints_along: Literal["columns", "rows"] | None = None
     unit: str | None = None
+    offset: FiniteFloat | Vector = 0.0
     scale: FiniteFloat | Vector = 1.0
     side: Literal["joint", "motor"] = "joint"
 
 
 class TimeColumn(_Table):
-    """Where the time stands: a column by name or index, in s, ms, us or ns."""
+    """Where the time stands, in s, ms, us or ns.
 
-    column: Column
+    Attributes:
+        column: by name or index from 0; in files of arrays the name of an array.
+        array: in files of arrays, the matrix that `column` is a column of.
+        file: the file, relative to the log that is imported; None for that of the positions.
+        unit: of the numbers.
+    """
+
+    column: Column = 0
+    array: str | None = None
+    file: str | None = None
     unit: Literal["s", "ms", "us", "ns"] = "s"
 
 
@@ -69,6 +96,7 @@ class Drive(_Table):
         gear_ratio: motor turns per joint turn, with sign.
         coupling: further influences ``[motor, joint, motor turns per joint turn]``, numbered from
             1: ``[6, 5, 32.0]`` says that joint 5 turns motor 6.
+        motor_from_joint: all of that as one matrix, motor turns per joint turn (n, n), instead.
         joint_offset: angle of the URDF where the recorded angle is zero [rad].
         torque_constant: N·m/A on the motor side; makes torques of motor currents where the log
             has no torque.
@@ -78,8 +106,14 @@ class Drive(_Table):
     coupling: tuple[
         tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], FiniteFloat], ...
     ] = ()
+    motor_from_joint: tuple[Vector, ...] | None = None
     joint_offset: Vector | None = None
     torque_constant: Vector | None = None
+
+    @property
+    def geared(self) -> bool:
+        """Whether anything is known of the gears."""
+        return bool(self.gear_ratio or self.motor_from_joint)
 
 
 class Format(_Table):
@@ -90,12 +124,17 @@ class Format(_Table):
         decimal: the decimal mark.
         skip_rows: lines before the header, or before the data.
         header: whether a line of column names comes first.
+        transposed: whether the channels lie along the lines of the file instead of its columns.
+        missing: what a row with a number missing or not finite is: ``refuse`` the log, or ``drop``
+            the row from all quantities.
     """
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = None
-    decimal: Literal[".", ","] = "."
+    decimal: Literal[".", ","] | None = None
     skip_rows: Annotated[int, Field(ge=0)] = 0
     header: bool | None = None
+    transposed: bool = False
+    missing: Literal["refuse", "drop"] = "refuse"
 
 
 class ColumnMap(_Table):
@@ -106,7 +145,8 @@ class ColumnMap(_Table):
         velocity, torque, motor_current: as far as they were recorded.
         time: the time column; either it or `sample_rate`.
         sample_rate: samples per second of a log without time column [Hz].
-        joints: the URDF's joint of each column, where their order is not that of the URDF.
+        joints: the URDF's joint of each column, where their order is not that of the URDF, or
+            where the log has joints that the URDF has not: their columns are not used.
         drive: gears, for quantities of the motor side.
         format: delimiter and the like.
     """
@@ -130,8 +170,18 @@ class ColumnMap(_Table):
                 raise ValueError(
                     f"{quantity.unit!r} is no unit of {name}; known are {', '.join(UNITS[name])}"
                 )
-            if quantity.side == "motor" and name != "motor_current" and not self.drive.gear_ratio:
+            if quantity.side == "motor" and name != "motor_current" and not self.drive.geared:
                 raise ValueError(f"{name} is of the motor side, so drive.gear_ratio is needed")
+            if 0.0 in np.atleast_1d(quantity.scale):
+                raise ValueError(
+                    f"{name}.scale holds a 0, which leaves nothing of what was measured"
+                )
+        if any(motor == joint for motor, joint, _ in self.drive.coupling):
+            raise ValueError(
+                "drive.coupling is of a motor with another joint; its own is gear_ratio"
+            )
+        if self.drive.motor_from_joint and (self.drive.gear_ratio or self.drive.coupling):
+            raise ValueError("give either drive.motor_from_joint or gear_ratio and coupling")
         return self
 
     def quantities(self) -> dict[str, Quantity]:

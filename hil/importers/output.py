@@ -7,12 +7,16 @@ import json
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from hil.archive import Samples, write_samples
 from hil.errors import SourceError
+from hil.importers.findings import METADATA, examine
 from hil.importers.robot import Robot
+
+Use = Literal["excitation", "validation", "standstill"]
 
 
 def write_imported(
@@ -24,8 +28,21 @@ def write_imported(
     metadata: Mapping[str, str],
     held_joints: Sequence[str] = (),
     period: float | None = None,
+    use: Use = "excitation",
 ) -> Path:
     """Write the samples of a recording, joints in the order of the robot's, as an archive.
+
+    What they look like (:mod:`hil.importers.findings`) goes into its metadata.
+
+    Args:
+        output: the archive.
+        samples: joint side, SI units.
+        source: the files they come from.
+        robot: whose they are.
+        metadata: what else is to be kept of them.
+        held_joints: joints known to have been held still.
+        period: step [s] of a recording at a fixed rate.
+        use: what identification may do with them: fit, only predict, or take the noise from.
 
     Raises:
         SourceError: no sample, or a value that is not finite.
@@ -45,6 +62,8 @@ def write_imported(
         "source": json.dumps([path.name for path in source]),
         "source_sha256": json.dumps([_digest(path) for path in source]),
         "held_joints": json.dumps(list(held_joints)),
+        "use": use,
+        METADATA: examine(samples, robot.joint_names, robot.urdf).text(),
     }
     return write_samples(
         output,

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.errors import InputError, SourceError
+from hil.cell.text import replaced_value
+from hil.errors import SourceError
 from identification import FrictionLaw
+from planner.toml_value import toml_value
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.81)
-_MOVING_ONLY = ("axis", "limit", "mimic", "dynamics", "safety_controller", "calibration")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +26,7 @@ class Robot:
     Attributes:
         cell: text of a cell file; the robot's table is all that identification needs of it.
         urdf: text of the robot description.
-        joint_names: its moving joints, in the order of the model.
+        joint_names: its joints that move and are not locked, in the order of the model.
     """
 
     cell: str
@@ -39,7 +41,7 @@ class Robot:
         friction: FrictionLaw | None = None,
         gravity: Sequence[float] = STANDARD_GRAVITY,
         rotor_inertia: bool = True,
-        fixed_joints: Sequence[str] = (),
+        locked: Mapping[str, float] | None = None,
     ) -> Robot:
         """Describe a robot by its URDF and the settings of its model.
 
@@ -48,7 +50,8 @@ class Robot:
             friction: friction law of every joint, None for the default one.
             gravity: in the base frame [m/s²].
             rotor_inertia: give every joint a rotor inertia.
-            fixed_joints: joints to hold at zero, such as those of a gripper that was not recorded.
+            locked: position [rad or m] of joints that are none of the model, such as those of a
+                gripper that was not recorded.
 
         Raises:
             InputError: the file cannot be read, is no usable URDF, or has no such joint.
@@ -60,20 +63,40 @@ class Robot:
             raise SourceError(
                 path, f"cannot be read ({error})", remedy="name a URDF file"
             ) from error
-        text = _cell_text(path.stem, friction or FrictionLaw(), gravity, rotor_inertia)
-        return cls._checked(text, _held(urdf, fixed_joints, path), path)
+        law = friction or FrictionLaw()
+        text = _cell_text(path.stem, law, gravity, rotor_inertia, locked or {})
+        return cls._checked(text, urdf, path)
 
     @classmethod
-    def from_cell(cls, path: str | PathLike[str], *, fixed_joints: Sequence[str] = ()) -> Robot:
-        """Describe a robot by a cell file; see `from_urdf` for `fixed_joints`.
+    def from_cell(
+        cls, path: str | PathLike[str], *, locked: Mapping[str, float] | None = None
+    ) -> Robot:
+        """Describe a robot by a cell file; see `from_urdf` for `locked`.
 
         Raises:
             InputError: the cell file or its URDF cannot be used, or has no such joint.
         """
         cell = Cell.load(Path(path))
-        if not fixed_joints:
+        if not locked:
             return cls(cell.text, cell.urdf, cell.joint_names)
-        return cls._checked(cell.text, _held(cell.urdf, fixed_joints, Path(path)), Path(path))
+        text = _with_robot_entry(cell.text, "locked", {**cell.file.robot.locked, **locked})
+        return cls._checked(text, cell.urdf, Path(path))
+
+    def with_coupling(self, motor_from_joint: NDArray[np.float64]) -> Robot:
+        """This robot with motors that turn with several joints, unless it says so itself.
+
+        Args:
+            motor_from_joint: motor angles per joint angle (n, n), in the order of its joints.
+
+        Raises:
+            InputError: the matrix does not fit.
+        """
+        path = Path("cell.toml")
+        if Cell.from_texts(self.cell, self.urdf, path).file.robot.coupling is not None:
+            return self
+        rows = toml_value(motor_from_joint.tolist())
+        text = f"{self.cell}\n[robot.coupling]\nmotor_from_joint = {rows}\n"
+        return self._checked(text, self.urdf, path)
 
     @classmethod
     def _checked(cls, text: str, urdf: str, path: Path) -> Robot:
@@ -85,7 +108,11 @@ class Robot:
 
 
 def _cell_text(
-    name: str, friction: FrictionLaw, gravity: Sequence[float], rotor_inertia: bool
+    name: str,
+    friction: FrictionLaw,
+    gravity: Sequence[float],
+    rotor_inertia: bool,
+    locked: Mapping[str, float],
 ) -> str:
     """The smallest cell file: the robot alone, without limits, drive train or controller."""
     law = {
@@ -94,43 +121,37 @@ def _cell_text(
         "third": friction.third or "none",
         "offset": friction.offset,
         "standstill": friction.standstill,
+        "stribeck": friction.stribeck or 0.0,
+        "asymmetric": friction.asymmetric,
+        "zone": friction.zone,
     }
-    # JSON strings, numbers and booleans are TOML as well.
     lines = [
         "[cell]",
-        f"name = {json.dumps(name[:80] or 'robot')}",
+        f"name = {toml_value(_writable(name)[:80] or 'robot')}",
         'urdf = "robot.urdf"',
         "",
         "[robot]",
-        f"gravity = {json.dumps([float(g) for g in gravity])}",
-        f"rotor_inertia = {json.dumps(rotor_inertia)}",
+        f"gravity = {toml_value([float(g) for g in gravity])}",
+        f"rotor_inertia = {toml_value(rotor_inertia)}",
+        *([f"locked = {_inline(locked)}"] if locked else []),
         "",
         "[robot.friction]",
-        *(f"{key} = {json.dumps(value)}" for key, value in law.items()),
+        *(f"{key} = {toml_value(value)}" for key, value in law.items()),
     ]
     return "\n".join(lines) + "\n"
 
 
-def _held(urdf: str, joints: Sequence[str], path: Path) -> str:
-    """The description with these joints fixed at zero."""
-    if not joints:
-        return urdf
+def _inline(table: Mapping[str, float]) -> str:
+    return toml_value({_writable(name): float(position) for name, position in table.items()})
+
+
+def _writable(name: str) -> str:
+    """Return a name without what UTF-8 cannot hold, as names of files can."""
+    return name.encode("utf-8", "replace").decode("utf-8")
+
+
+def _with_robot_entry(text: str, key: str, table: Mapping[str, float]) -> str:
     try:
-        root = ElementTree.fromstring(urdf)
-    except ElementTree.ParseError as error:
-        raise SourceError(path, f"is not a readable URDF: {error}") from error
-    found = {joint.get("name", ""): joint for joint in root.findall("joint")}
-    for name in joints:
-        if name not in found:
-            raise InputError(
-                path,
-                f"has no joint {name!r} to hold",
-                field="fixed joints",
-                remedy=f"its joints are {', '.join(found)}",
-            )
-        joint = found[name]
-        joint.set("type", "fixed")
-        for tag in _MOVING_ONLY:
-            for child in joint.findall(tag):
-                joint.remove(child)
-    return ElementTree.tostring(root, encoding="unicode")
+        return replaced_value(text, "robot", key, _inline(table))
+    except ValueError:
+        return f"{text}\n[robot]\n{key} = {_inline(table)}\n"

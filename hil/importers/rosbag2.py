@@ -1,10 +1,8 @@
-"""Imports joint states from a rosbag2 recording (sqlite3 storage)."""
+"""Imports joint states from a rosbag2 recording, or from any MCAP file with ROS 2 messages."""
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -17,7 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from hil.archive import Samples
 from hil.errors import SourceError
-from hil.importers.output import write_imported
+from hil.importers import bags
+from hil.importers.mcap_messages import JOINT_STATES, Topic
+from hil.importers.output import Use, write_imported
 from hil.importers.robot import Robot
 
 Array = NDArray[np.float64]
@@ -35,6 +35,7 @@ def import_rosbag2(
     effort: Effort = "torque",
     joint_names: Mapping[str, str] | None = None,
     held_joints: Sequence[str] = (),
+    use: Use = "excitation",
 ) -> Path:
     """Turn the joint states of a bag into an archive of kind ``imported``.
 
@@ -43,7 +44,7 @@ def import_rosbag2(
     all headers are empty, the bag's.
 
     Args:
-        source: the ``.db3`` file, or the bag's folder.
+        source: a ``.db3`` or ``.mcap`` file, or the folder of a bag; compressed ones as well.
         output: the archive to write.
         robot: whose joints these are.
         topic: the topic, None where only one carries joint states.
@@ -51,6 +52,7 @@ def import_rosbag2(
             current [A] as some drivers have it, or nothing to be relied on.
         joint_names: name in the URDF by name in the bag, for the joints where they differ.
         held_joints: joints known to have been held still.
+        use: what it is to be used for.
 
     Returns:
         The archive's path.
@@ -59,82 +61,61 @@ def import_rosbag2(
         SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.
         ArchiveWriteError: the archive cannot be written.
     """
-    files = _files(Path(source))
+    files = bags.bag_files(Path(source))
     states = _States(files[0], robot.joint_names, joint_names or {})
-    for file in files:
-        with closing(_connect(file)) as bag:
-            topic = _choose(bag, file, topic)
-            for stamp, data in _messages(bag, topic):
-                states.add(stamp, data)
+    with bags.unpacked(files) as plain:
+        known = [bags.topics(file) for file in plain]
+        topic = _choose(
+            {name: t for topics in known for name, t in topics.items()}, files[0], topic
+        )
+        for file, topics in zip(plain, known, strict=True):
+            if topic in topics:  # a part of a split bag may lack it
+                for stamp, data in bags.messages(file, topic):
+                    states.add(stamp, data)
     samples = states.samples(effort)
     metadata = {"importer": "rosbag2", "topic": str(topic), "effort": effort, "clock": states.clock}
     return write_imported(
-        output, samples, source=files, robot=robot, metadata=metadata, held_joints=held_joints
+        output,
+        samples,
+        source=files,
+        robot=robot,
+        metadata=metadata,
+        held_joints=held_joints,
+        use=use,
     )
 
 
-def _files(source: Path) -> list[Path]:
-    if not source.exists():
-        raise SourceError(source, "does not exist", remedy="name a .db3 file or a bag's folder")
-    files = sorted(source.glob("*.db3")) if source.is_dir() else [source]
-    if not files:
-        raise SourceError(
-            source, "has no .db3 file in it", remedy="only bags in sqlite3 storage can be imported"
-        )
-    return files
-
-
-def _connect(file: Path) -> sqlite3.Connection:
-    """Open for reading only; leave no side files beside a bag that nobody writes."""
-    options = "mode=ro" if file.with_name(file.name + "-wal").exists() else "mode=ro&immutable=1"
-    try:
-        bag = sqlite3.connect(f"{file.resolve().as_uri()}?{options}", uri=True)
-        bag.execute("SELECT id, name, type, serialization_format FROM topics").close()
-        bag.execute("SELECT topic_id, timestamp, data FROM messages LIMIT 1").close()
-    except sqlite3.Error as error:
-        raise SourceError(
-            file, f"is not a rosbag2 in sqlite3 storage ({error})", remedy="name the .db3 file"
-        ) from error
-    return bag
-
-
-def _choose(bag: sqlite3.Connection, file: Path, topic: str | None) -> str:
+def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
     """The topic asked for, or the only one that carries joint states."""
-    query = "SELECT name, type, serialization_format FROM topics ORDER BY name"
-    topics = {name: (kind, encoding) for name, kind, encoding in bag.execute(query)}
-    listing = ", ".join(f"{name} ({kind})" for name, (kind, _) in topics.items()) or "none"
-    fitting = [name for name, (kind, _) in topics.items() if kind == JOINT_STATE]
+    listing = ", ".join(f"{name} ({found})" for name, found in topics.items()) or "none"
+    fitting = [name for name, found in topics.items() if _fits(found)]
     if topic is None:
         if len(fitting) != 1:
             raise SourceError(
                 file,
                 f"{len(fitting) or 'no'} topics carry {JOINT_STATE}",
                 field="topic",
-                remedy=f"name one of its topics: {listing}",
+                remedy=f"name one of its topics: {listing}; `hil import log` reads other messages, "
+                "with a column map",
             )
         topic = fitting[0]
     if topic not in topics:
         raise SourceError(
             file, f"there is no topic {topic}", field="topic", remedy=f"its topics are: {listing}"
         )
-    kind, encoding = topics[topic]
-    if kind != JOINT_STATE or encoding != "cdr":
+    if not _fits(topics[topic]):
+        found = topics[topic]
         raise SourceError(
             file,
-            f"topic {topic} carries {kind} in {encoding}, not measured joint states",
+            f"topic {topic} carries {found.kind} in {found.encoding}, not measured joint states",
             field="topic",
             remedy=f"name a topic of type {JOINT_STATE}; the bag has: {listing}",
         )
     return topic
 
 
-def _messages(bag: sqlite3.Connection, topic: str) -> Iterator[tuple[int, bytes]]:
-    yield from bag.execute(
-        "SELECT messages.timestamp, messages.data FROM messages"
-        " JOIN topics ON topics.id = messages.topic_id WHERE topics.name = ?"
-        " ORDER BY messages.timestamp, messages.id",
-        (topic,),
-    )
+def _fits(topic: Topic) -> bool:
+    return topic.is_ros2 and topic.kind in JOINT_STATES
 
 
 @dataclass(eq=False)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -16,8 +17,16 @@ from hil.importers.column_map import Column, Format
 
 Array = NDArray[np.float64]
 
-_DELIMITERS = (",", ";", "\t", "|")
 _COMMENTS = ("#", "%", "//")
+# Tried in this order; a decimal comma only where the comma separates nothing.
+_WRITTEN = (
+    (",", "."), (";", "."), ("\t", "."), ("|", "."), (None, "."),
+    (";", ","), ("\t", ","), ("|", ","), (None, ","),
+)  # fmt: skip
+_PROBED = 20  # lines
+# 1.0D+03: double precision as Fortran writes it.
+_FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d)")
+_MISSING = frozenset({"", "-", "--", "na", "n/a", "null", "none"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,61 +37,72 @@ class Table:
         path: the file.
         names: column names, empty when the file has none.
         width: number of columns.
-        lines: the rows of numbers as text.
-        first_line: number of the first of them in the file, from 1.
+        lines: the rows of numbers as text, with decimal points and exponents as Python reads them.
+        numbered: the number in the file of each of them, from 1.
         delimiter: between columns, None for white space.
+        gaps: whether rows may lack numbers.
     """
 
     path: Path
     names: tuple[str, ...]
     width: int
-    lines: list[str]
-    first_line: int
+    lines: list[str] = field(repr=False)
+    numbered: Sequence[int] = field(repr=False)
     delimiter: str | None
+    gaps: bool
 
     @classmethod
     def read(cls, path: Path, form: Format) -> Table:
-        """Read a file and find out its delimiter and header.
+        """Read a file and find out its delimiter, decimal mark and header.
 
         Raises:
-            SourceError: it cannot be read, or has no row of numbers.
+            SourceError: it cannot be read, has no row of numbers, or a line without any.
         """
         try:
             text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             raise SourceError(
-                path, f"cannot be read ({error})", remedy="name a text file"
+                path,
+                f"cannot be read ({error})",
+                remedy="name a text file, or one that ends in .npz, .npy, .mat or .m",
             ) from error
-        lines = text.splitlines()
-        start = form.skip_rows
-        while start < len(lines) and _is_empty(lines[start]):
-            start += 1
-        delimiter = form.delimiter or _delimiter(lines[start : start + 2], form.decimal)
+        kept = [
+            (number, line)
+            for number, line in enumerate(text.splitlines(), 1)
+            if number > form.skip_rows and not line.lstrip().startswith(_COMMENTS)
+        ]
+        kept = _inside(kept, path)
+        delimiter, decimal = _written([line for _, line in kept[:_PROBED]], form)
+        if form.transposed:
+            kept = _transposed(kept, delimiter, path)
+        numbers, lines = [number for number, _ in kept], [line for _, line in kept]
         names: tuple[str, ...] = ()
-        if start < len(lines):
-            cells = _cells(lines[start], delimiter)
-            if form.header or (form.header is None and not _are_numbers(cells, form.decimal)):
+        if lines:
+            cells = _cells(lines[0], delimiter)
+            if form.header or (form.header is None and not _are_numbers(cells, decimal)):
                 names = tuple(cell.strip().strip("\"'").strip() for cell in cells)
-                start += 1
-        while lines and _is_empty(lines[-1]):
-            lines.pop()
-        rows = lines[start:]
-        if not rows:
+                numbers, lines = numbers[1:], lines[1:]
+        if not lines:
             raise SourceError(path, "has no row of numbers")
-        if form.decimal == ",":
-            rows = [row.replace(",", ".") for row in rows]
-        width = len(_cells(rows[0], delimiter))
-        return cls(path, names, width, rows, start + 1, delimiter)
+        if decimal == ",":
+            lines = [line.replace(",", ".") for line in lines]
+        if _FORTRAN.search(lines[0]):
+            lines = [_FORTRAN.sub("e", line) for line in lines]
+        width = len(_cells(lines[0], delimiter))
+        if not names and width > 1 and not _cells(lines[0], delimiter)[-1].strip():
+            width -= 1  # each line ends with a delimiter
+        return cls(path, names, width, lines, numbers, delimiter, form.missing == "drop")
 
-    def numbers(self, columns: Sequence[Column], field: str) -> Array:
-        """Columns as numbers, shape (rows, columns).
+    def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:
+        """Columns as numbers, shape (rows, columns), NaN where missing ones are allowed.
 
         Raises:
-            SourceError: no such column, or a cell that is no number.
+            SourceError: no such column, or a cell that is no finite number.
         """
+        self._no_arrays(array, field)
         indices = [self._index(column, field) for column in columns]
         try:
-            return np.loadtxt(
+            values = np.loadtxt(
                 io.StringIO("\n".join(self.lines)),
                 delimiter=self.delimiter,
                 usecols=indices,
@@ -91,30 +111,59 @@ class Table:
                 dtype=np.float64,
             )
         except ValueError:
-            self._blame(indices, field)
-            raise
+            values = self._cell_by_cell(indices, field)
+        if not self.gaps and not np.isfinite(values).all():
+            return self._cell_by_cell(indices, field)
+        return np.asarray(values)
 
-    def stamps(self, column: Column, decimals: int) -> NDArray[np.int64]:
-        """A column of times as whole nanoseconds, exactly as written; shape (rows,).
+    def matrix(self, name: str | None, field: str) -> Array:
+        """All columns, as they stand in the file.
+
+        Raises:
+            SourceError: a cell is no finite number.
+        """
+        self._no_arrays(name, field)
+        return self.numbers(range(self.width), field)
+
+    def times(self, column: Column, decimals: int) -> list[int]:
+        """A column of times as whole nanoseconds, exactly as written; of a single line, the line.
 
         Args:
             column: name or index.
             decimals: decimal places between the column's unit and the second.
+
+        Raises:
+            SourceError: no such column, or a time that is no number.
         """
         index = self._index(column, "time")
-        stamps = []
-        for row, line in enumerate(self.lines):
-            cells = _cells(line, self.delimiter)
+        alone = len(self.lines) == 1 and not self.names
+        texts = (
+            [(self.numbered[0], cell) for cell in _cells(self.lines[0], self.delimiter)]
+            if alone
+            else [
+                (number, (_cells(line, self.delimiter)[index : index + 1] or [""])[0])
+                for number, line in zip(self.numbered, self.lines, strict=True)
+            ]
+        )
+        found = []
+        for number, text in texts:
             try:
-                stamps.append(int(Decimal(cells[index].strip()).scaleb(9 - decimals).to_integral()))
-            except (IndexError, InvalidOperation, ValueError, OverflowError) as error:
-                found = repr(cells[index].strip()) if index < len(cells) else "nothing"
+                found.append(int(Decimal(text.strip()).scaleb(9 - decimals).to_integral()))
+            except (InvalidOperation, ValueError, OverflowError) as error:
+                found_there = repr(text.strip()) if text.strip() else "nothing"
                 raise SourceError(
                     self.path,
-                    f"line {self.first_line + row} has {found} for the time",
+                    f"line {number} has {found_there} for the time",
                     field="time",
                 ) from error
-        return np.array(stamps, np.int64)
+        return found
+
+    def _no_arrays(self, name: str | None, field: str) -> None:
+        if name is not None:
+            raise SourceError(
+                self.path, f"is text in columns, without an array {name!r}", field=field,
+                remedy="give columns, by name or by index from 0",
+            )  # fmt: skip
 
     def _index(self, column: Column, field: str) -> int:
         if isinstance(column, str):
@@ -128,26 +177,85 @@ class Table:
             remedy = f"it has {self.width} columns and no header; count them from 0"
         raise SourceError(self.path, f"there is no column {column!r}", field=field, remedy=remedy)
 
-    def _blame(self, indices: Sequence[int], field: str) -> None:
-        """Raise the error that names the first cell that is no number."""
+    def _cell_by_cell(self, indices: Sequence[int], field: str) -> Array:
+        """What `numbers` returns; raises the error that names the first bad cell."""
+        values = np.full((len(self.lines), len(indices)), np.nan)
         for row, line in enumerate(self.lines):
             cells = _cells(line, self.delimiter)
-            for index in indices:
-                cell = cells[index].strip() if index < len(cells) else None
-                if cell is None or not _is_number(cell):
-                    name = self.names[index] if index < len(self.names) else str(index)
-                    raise SourceError(
-                        self.path,
-                        f"line {self.first_line + row} has "
-                        f"{'nothing' if not cell else repr(cell)} in column {name}, not a number",
-                        field=field,
-                        remedy="correct the line, or cut the log before it",
-                    )
+            for place, index in enumerate(indices):
+                cell = cells[index].strip() if index < len(cells) else ""
+                if _is_number(cell):
+                    values[row, place] = float(cell)
+                if np.isfinite(values[row, place]):
+                    continue
+                if self.gaps and (cell.lower() in _MISSING or _is_number(cell)):
+                    values[row, place] = np.nan
+                    continue
+                name = self.names[index] if index < len(self.names) else str(index)
+                raise SourceError(
+                    self.path,
+                    f"line {self.numbered[row]} has {repr(cell) if cell else 'nothing'} in column "
+                    f"{name}, not a number",
+                    field=field,
+                    remedy='correct it, or leave such rows out: [format] missing = "drop"',
+                )
+        return values
 
 
-def _is_empty(line: str) -> bool:
-    text = line.strip()
-    return not text or text.startswith(_COMMENTS)
+def _inside(kept: list[tuple[int, str]], path: Path) -> list[tuple[int, str]]:
+    """Without empty lines before and after the numbers; one between them would shift a channel."""
+    filled = [place for place, (_, line) in enumerate(kept) if line.strip()]
+    if not filled:
+        raise SourceError(path, "has no row of numbers")
+    kept = kept[filled[0] : filled[-1] + 1]
+    header = next((place for place, (_, line) in enumerate(kept[1:], 1) if line.strip()), 1)
+    kept = kept[:1] + kept[header:]
+    empty = next((number for number, line in kept if not line.strip()), None)
+    if empty is not None:
+        raise SourceError(
+            path,
+            f"line {empty} is empty",
+            remedy="take it out, or cut the log there; skip lines of a header: [format] skip_rows",
+        )
+    return kept
+
+
+def _transposed(
+    kept: list[tuple[int, str]], delimiter: str | None, path: Path
+) -> list[tuple[int, str]]:
+    """Columns as lines, numbered by sample."""
+    cells = [_cells(line, delimiter) for _, line in kept]
+    widths = {len(row) for row in cells}
+    if len(widths) > 1:
+        raise SourceError(
+            path, f"its lines have from {min(widths)} to {max(widths)} numbers",
+            field="format.transposed", remedy="all channels must be equally long",
+        )  # fmt: skip
+    joiner = " " if delimiter is None else delimiter
+    return [(sample, joiner.join(row)) for sample, row in enumerate(zip(*cells, strict=True))]
+
+
+def _written(lines: Sequence[str], form: Format) -> tuple[str | None, str]:
+    """Delimiter (None for white space) and decimal mark: the first pair that makes numbers of all.
+
+    The first line may be a header; where nothing fits, the delimiter that all lines have alike.
+    """
+    marks = [form.decimal] if form.decimal else [".", ","]
+    tried = [(d, m) for d, m in _WRITTEN if m in marks and form.delimiter in (None, d)]
+    if form.delimiter is not None and not tried:
+        tried = [(form.delimiter, marks[0])]
+    body = lines[1:] or lines
+    for delimiter, mark in tried:
+        split = [_cells(line, delimiter) for line in body]
+        width = {len(row) for row in split}
+        if len(width) > 1 or (width == {1} and delimiter is not None):
+            continue
+        if all(_are_numbers(row, mark) for row in split):
+            return delimiter, mark
+    for delimiter, mark in tried:
+        if delimiter is not None and all(delimiter in line for line in lines[:2]):
+            return delimiter, mark
+    return form.delimiter, marks[0]
 
 
 def _cells(line: str, delimiter: str | None) -> list[str]:
@@ -163,13 +271,10 @@ def _is_number(text: str) -> bool:
 
 
 def _are_numbers(cells: Sequence[str], decimal: str) -> bool:
-    return all(_is_number(cell.strip().replace(decimal, ".")) for cell in cells if cell.strip())
-
-
-def _delimiter(lines: Sequence[str], decimal: str) -> str | None:
-    """The delimiter that the first lines have alike; None for white space."""
-    for candidate in _DELIMITERS:
-        counts = {line.count(candidate) for line in lines}
-        if candidate != decimal and counts and 0 not in counts:
-            return candidate
-    return None
+    """Whether every cell that is filled is a number, and some cell is."""
+    filled = [cell.strip() for cell in cells if cell.strip().lower() not in _MISSING]
+    if decimal == "," and any("." in cell for cell in filled):
+        return False
+    return bool(filled) and all(
+        _is_number(_FORTRAN.sub("e", cell.replace(decimal, "."))) for cell in filled
+    )

@@ -9,7 +9,16 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from hil.report import figures, overview, parameters, validation
+from hil.report import (
+    consistency,
+    essential,
+    estimation,
+    figures,
+    overview,
+    parameters,
+    validation,
+    verdict,
+)
 from hil.report.series import ReportSeries
 from hil.results import Results
 
@@ -29,15 +38,14 @@ class _Numbering:
         return next(self._tables)
 
 
-def write_report(path: Path, results: Results, series: ReportSeries) -> None:
-    """Write the report as one HTML file; the same input gives the same bytes.
+def report_bytes(results: Results, series: ReportSeries) -> bytes:
+    """The report as one HTML file; the same input gives the same bytes.
 
     Raises:
         SeriesError: the series belong to another number of joints than the results.
     """
-    page = render_report(results, series)
     # A name read from an archive may hold what UTF-8 cannot; the page must come out all the same.
-    path.write_bytes(page.encode("utf-8", errors="replace"))
+    return render_report(results, series).encode("utf-8", errors="replace")
 
 
 def render_report(results: Results, series: ReportSeries) -> str:
@@ -73,6 +81,7 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "results": results,
         "series": series,
         "facts": overview.facts(results),
+        "estimation_facts": estimation.facts(results),
         "criteria": overview.criteria(results),
         "overall": validation.overall(results),
         "joint_errors": validation.joint_errors(results) if results.validation else [],
@@ -93,4 +102,7 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "correlation": figures.correlation_matrix(results),
         "box_panels": figures.error_boxes(results),
         "torque_panels": figures.torque_panels(series, results.joint_names),
+        **verdict.verdict_context(results),
+        **essential.context(results),
+        **consistency.context(results),
     }

@@ -14,8 +14,6 @@ from hil.results import ParameterResult, Results
 
 Array = NDArray[np.float64]
 
-"""Half-width of the 95 % interval in standard deviations (normal distribution)."""
-
 # Shares of a normal distribution outside 2 and 3 standard deviations.
 _OUTSIDE_2, _OUTSIDE_3 = 0.045500, 0.002700
 _VISCOUS_UNITS = frozenset({"N·m·s/rad", "N·m/(rad/s)", "N m s/rad", "Nms/rad"})
@@ -97,6 +95,19 @@ _ROUTES = {
         " Blind to an error that all of them share",
         "■",
     ),
+    "posterior": (
+        "Posterior",
+        "what was believed before the data, and residuals of the colour they have",
+        "▲",
+    ),
+}
+# The posterior stands in for the phase-clustered route, never beside it.
+_SLOTS = {
+    "least_squares": 0,
+    "independent_repetitions": 1,
+    "phase_clustered": 2,
+    "posterior": 2,
+    "scatter_of_mean": 3,
 }
 
 
@@ -187,10 +198,10 @@ def routes(results: Results) -> list[Route]:
     """The standard-deviation routes that were computed, compared with the reported one."""
     reported = np.array([p.std for p in results.parameters])
     found = []
-    for slot, key in enumerate(_ROUTES):
+    for key in _ROUTES:
         values: list[float] | None = getattr(results.uncertainty, key)
         if values is not None:
-            found.append(_route(results, key, slot, np.asarray(values, float), reported))
+            found.append(_route(results, key, _SLOTS[key], np.asarray(values, float), reported))
     return found
 
 

@@ -57,10 +57,9 @@ class CurrentModel:
                 raise ShapeError(name, np.shape(array), str(shape))
 
     def torque(self, motion: Motion) -> Array:
-        """Return the joint torques (m, n) [N·m] that a motion needs at most."""
-        nominal = self.model.torque(
-            self.values, motion.position, motion.velocity, motion.acceleration
-        )
+        """Return the joint torques (m, n) [N·m] that a motion needs at most, payload included."""
+        _, q, qd, qdd = motion
+        nominal = self.model.torque(self.values, q, qd, qdd) + self.model.load_torque(q, qd, qdd)
         return (1.0 + self.uncertainty) * nominal
 
     def current(self, torque: Array) -> Array:

@@ -1,4 +1,6 @@
-"""What every transport has to do; a test of one subclasses this and builds a link.
+"""What every transport has to do; a test of one subclasses this and has a fixture `link`.
+
+The fixture gives a transport (`Transport`) and its far end (`FarEnd`).
 
 The controller's end is driven by the test: `far.send` lets the controller send a packet, and
 `far.replies` is what reached it, in order. `far.wait` gives real links the time they need.
@@ -11,7 +13,6 @@ from typing import Protocol
 import pytest
 
 from drivers import TransportClosed
-from drivers.transports.base import Transport
 
 PATIENCE = 0.5
 
@@ -25,10 +26,6 @@ class FarEnd(Protocol):
 
 
 class TransportContract:
-    @pytest.fixture
-    def link(self) -> tuple[Transport, FarEnd]:
-        raise NotImplementedError("a subclass builds a transport and its far end")
-
     def test_a_packet_arrives_unchanged(self, link):
         near, far = link
         packet = bytes(range(228))

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import random
+import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
@@ -231,6 +234,92 @@ def test_a_corrupt_size_fills_no_memory(archive_bytes: bytes, tmp_path: Path) ->
         archive = read_changed(bytes(changed), path)
         assert archive is not None
         assert archive.n_samples == 0
+
+
+def with_chunk(data: bytes, path: Path, body: bytes) -> bytes:
+    """The archive with its first chunk replaced."""
+    path.write_bytes(data)
+    with path.open("rb") as stream:
+        first = next(
+            record
+            for record in container.records(stream, len(data))
+            if record.opcode == container.CHUNK
+        )
+    record = container.RECORD.pack(container.CHUNK, len(body)) + body
+    return data[: first.offset] + record + data[first.end :]
+
+
+def chunk_body(
+    content: bytes, *, size: int, crc: int, compressor: zstandard.ZstdCompressor
+) -> bytes:
+    packed = compressor.compress(content)
+    head = struct.pack("<QQQI", 0, 0, size, crc) + struct.pack("<I", 4) + b"zstd"
+    return head + struct.pack("<Q", len(packed)) + packed
+
+
+@pytest.mark.parametrize("content_size", [True, False])
+@pytest.mark.parametrize("claimed", [1000, 1 << 26, 1 << 28])
+def test_a_chunk_that_swells_is_refused(
+    archive_bytes: bytes, tmp_path: Path, claimed: int, content_size: bool
+) -> None:
+    """256 MB of zeros in 8 kB, with an honest size or a false one: not decompressed, or not far."""
+    compressor = zstandard.ZstdCompressor(write_content_size=content_size)
+    body = chunk_body(bytes(1 << 28), size=claimed, crc=1, compressor=compressor)
+    assert len(body) < 40_000
+    changed = with_chunk(archive_bytes, tmp_path / NAME, body)
+    tracemalloc.start()
+    archive = read_changed(changed, tmp_path / NAME)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert archive is not None
+    assert archive.n_samples == 0
+    assert not archive.complete
+    assert peak < 1 << 27
+
+
+def test_a_chunk_without_checksum_is_not_believed(archive_bytes: bytes, tmp_path: Path) -> None:
+    path = tmp_path / NAME
+    path.write_bytes(archive_bytes)
+    with path.open("rb") as stream:
+        first = next(
+            record
+            for record in container.records(stream, len(archive_bytes))
+            if record.opcode == container.CHUNK
+        )
+    changed = bytearray(archive_bytes)
+    changed[first.offset + 9 + 24 : first.offset + 9 + 28] = bytes(4)
+    archive = read_changed(bytes(changed), path)
+    assert archive is not None
+    assert archive.n_samples == 0
+    assert "(chunk) has no checksum" in str(archive.missing)
+
+
+@pytest.mark.slow
+def test_ten_thousand_flipped_bits_never_give_a_wrong_sample(
+    archive_bytes: bytes, tmp_path: Path
+) -> None:
+    """Read whole, and by index: a range of times and a channel."""
+    rng = random.Random(10_000)
+    for _ in range(10_000):
+        changed = bytearray(archive_bytes)
+        changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
+        archive = read_changed(bytes(changed), tmp_path / NAME)
+        if archive is not None and archive.complete:
+            assert_nothing_lost(archive)
+        try:
+            part = open_archive(tmp_path / NAME, start=50.1, stop=50.3)
+            alone = open_archive(tmp_path / NAME, topics=[schema.MEASURED])
+        except ArchiveError:
+            continue
+        if part.n_samples:
+            cycle = part.columns["cycle"] - 5000
+            assert np.array_equal(cycle, np.arange(10, 10 + len(cycle)))
+            assert np.array_equal(part.columns["position"], ROWS["position"][cycle])
+        assert len(part.columns["stamp"]) == 20 or not part.complete
+        count = alone.n_samples
+        assert count == CYCLES or not alone.complete
+        if count:
+            assert np.array_equal(alone.columns["position"], ROWS["position"][:count])
 
 
 def test_metadata_are_guarded_by_their_own_checksum(archive_bytes: bytes, tmp_path: Path) -> None:

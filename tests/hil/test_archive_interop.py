@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from drivers.packet_records import LONGEST_PACKET, PacketRing
 from drivers.record import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
 from hil.archive import schema as profile
@@ -22,6 +23,17 @@ from hil.archive.messages import joint_state_of
 JOINTS = ("shoulder", "elbow", "a_joint_with_a_long_name", "wrist")
 COUNT = 250
 STATE = {"position": "position", "velocity": "velocity", "effort": "torque"}
+
+
+def packets() -> NDArray[np.void]:
+    """Two packets for each cycle, of different lengths."""
+    rng = np.random.default_rng(6)
+    ring = PacketRing(2 * COUNT)
+    for cycle in range(COUNT):
+        for sent in (False, True):
+            data = rng.bytes(int(rng.integers(12, LONGEST_PACKET + 1)))
+            ring.put(2_000_000 + cycle, rng.normal(), sent, data)
+    return ring.drain()
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +55,10 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         metadata={},
         attachments={"cell.toml": b"[cell]"},
         durable=False,
+        packets=True,
     ) as archive:
         archive.event(2_000_000, "MotionStarted", "off we go")
+        archive.add_packets(packets())
         archive.write(rows, rng.normal(size=(COUNT, len(JOINTS))))
         archive.close("completed")
     return file
@@ -58,7 +72,10 @@ def ours(path: Path) -> Archive:
 
 
 def stacked(messages: list[Any], field: str) -> NDArray[Any]:
-    return np.array([getattr(message, field) for message in messages])
+    values = [getattr(message, field) for message in messages]
+    if isinstance(values[0], bytes):  # what some readers make of uint8[]
+        values = [np.frombuffer(value, np.uint8) for value in values]
+    return np.array(values)
 
 
 def bits(values: Any, like: NDArray[Any]) -> bytes:
@@ -84,9 +101,19 @@ def assert_same_messages(found: dict[str, list[Any]], ours: Archive) -> None:
         stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
         assert stamps == ours.columns["stamp"].tolist()
         assert {message.header.frame_id for message in messages} == {""}
+    assert_same_packets(found[profile.PACKETS], ours)
     (event,) = found[profile.EVENTS]
     assert (event.name, event.msg, event.level) == ("MotionStarted", "off we go", 20)
     assert event.stamp.sec == 4000
+
+
+def assert_same_packets(found: list[Any], ours: Archive) -> None:
+    columns, written = open_archive(ours.path, topics=[profile.PACKETS]).columns, packets()
+    for name in written.dtype.names or ():
+        assert columns[name].tobytes() == written[name].tobytes(), name
+        assert bits(stacked(found, name), written[name]) == written[name].tobytes(), name
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in found]
+    assert stamps == columns["stamp"].tolist() == (columns["cycle"] * 2_000_000).tolist()
 
 
 @pytest.mark.parametrize("reader", [make_reader, NonSeekingReader])
@@ -109,7 +136,7 @@ def test_mcap_finds_index_statistics_metadata_and_attachments(path: Path, ours: 
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None
-        assert summary.statistics.message_count == 3 * COUNT + 1
+        assert summary.statistics.message_count == 5 * COUNT + 1
         assert len(summary.chunk_indexes) == 5
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         attachments = {record.name: record.data for record in reader.iter_attachments()}

@@ -289,3 +289,86 @@ def test_a_sliding_joint_is_refused_by_name_where_degrees_are_given(folder: Path
     assert 'type = "fixed"' in sentence
     (folder / "cell.toml").write_text('[cell]\nname = "x"\nurdf = "ns16.urdf"\n', "utf-8")
     assert Cell.load(folder / "cell.toml").model.n_joints == 6  # recordings of it can be used
+
+
+def test_a_joint_may_have_friction_of_its_own(folder: Path) -> None:
+    path = folder / "cell.toml"
+    path.write_text(
+        path.read_text("utf-8")
+        + '\n[robot.friction.joints.joint_5]\nthird = "none"\nstribeck = 0.1\nzone = "linear"\n',
+        "utf-8",
+    )
+    friction = Cell.load(path).model.friction
+    assert friction.laws[4].symbols == ("f0", "f1", "fs")
+    assert friction.laws[4].stribeck == 0.1
+    # What is not said there is what holds for all.
+    assert friction.laws[4].standstill == friction.laws[0].standstill
+    assert friction.laws[0].symbols == ("f0", "f1", "f2")
+
+
+def test_the_coupled_wrist_of_the_drive_train_is_a_parameter_when_asked_for(folder: Path) -> None:
+    path = folder / "cell.toml"
+    assert Cell.load(path).model.base.rank == 40
+    text = path.read_text("utf-8")
+    path.write_text(text + '\n[robot.coupling]\nmotor_from_joint = "drive_train"\n', "utf-8")
+    cell = Cell.load(path)
+    assert cell.model.base.rank == 43
+    assert cell.model.parameter_names[40:43] == ("I45", "I46", "I56")
+    values = dict(zip(cell.model.parameter_names, cell.nominal_values(), strict=True))
+    assert values["I45"] == values["f0_m6"] == 0.0
+
+
+def test_a_payload_is_known_torque(folder: Path) -> None:
+    path = folder / "cell.toml"
+    text = path.read_text("utf-8")
+    path.write_text(
+        text + '\n[robot.payload]\nmass = 16.0\ncentre = [0.1, 0.0, 0.2]\nframe = "link_6"\n',
+        "utf-8",
+    )
+    model = Cell.load(path).model
+    assert model.payload is not None
+    still = np.zeros((1, 6))
+    assert np.abs(model.load_torque(still, still, still)).max() > 100.0
+
+
+ROBOT_FAULTS = {
+    '[robot.friction.joints.joint_9]\nthird = "none"': ("robot.friction.joints", "joint_9"),
+    '[robot.friction.joints.joint_5]\nthirds = "none"': ("robot.friction.joints.joint_5", "third"),
+    '[robot.friction.joints.joint_5]\nstandstill = 0.0\nzone = "linear"': (
+        "robot.friction.joints.joint_5", "standstill",
+    ),
+    "[robot.coupling]\nmotor_from_joint = [[1.0]]": ("robot.coupling.motor_from_joint", "6 rows"),
+    "[robot.coupling]\nmotor_from_joint = 3": ("robot.coupling.motor_from_joint", "row per motor"),
+    '[robot.payload]\nmass = 1.0\ncentre = [0.0, 0.0, 0.0]\nframe = "hand"': (
+        "robot.payload", "link_6",
+    ),
+    "[robot.payload]\nmass = -1.0\ncentre = [0.0, 0.0, 0.0]": ("robot.payload.mass", "-1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("table", ROBOT_FAULTS)
+def test_slips_in_the_robots_tables_are_named_with_field_and_remedy(
+    folder: Path, table: str
+) -> None:
+    path = folder / "cell.toml"
+    path.write_text(path.read_text("utf-8") + f"\n{table}\n", "utf-8")
+    with pytest.raises(CellError) as caught:
+        Cell.load(path)
+    for words in ROBOT_FAULTS[table]:
+        assert words in str(caught.value)
+
+
+def test_joints_are_locked_for_recordings_only(folder: Path) -> None:
+    words = complaint(folder, r"^\[robot\]$", "[robot]\nlocked = { joint_6 = 0.1 }")
+    assert "robot.locked" in words
+    assert "[limits]" in words
+
+
+def test_a_cell_of_recordings_locks_joints(folder: Path) -> None:
+    path = folder / "small.toml"
+    text = '[cell]\nname = "six"\nurdf = "ns16.urdf"\n[robot]\nlocked = { joint_6 = 0.1 }\n'
+    path.write_text(text, "utf-8")
+    assert Cell.load(path).joint_names == tuple(f"joint_{i}" for i in range(1, 6))
+    path.write_text(text.replace("joint_6 =", "joint_7 ="), "utf-8")
+    with pytest.raises(CellError, match=r"robot\.locked.*joint_7.*joint_6"):
+        Cell.load(path)

@@ -13,6 +13,7 @@ from hil.campaign import MotionRefusedError
 from hil.cell import Cell
 from hil.cli import demo as demo_module
 from hil.design import preset
+from hil.identify.exports import FILES
 from identification.excitation import Criteria, Excitation
 from planner import FourierSeries
 
@@ -28,8 +29,10 @@ def wild(cell: Cell) -> Excitation:
 def test_an_earlier_campaign_is_not_removed_for_a_motion_that_may_not_run(
     tmp_path: Path, wild: Excitation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Whatever an earlier one left: what identification writes for other tools is no stranger."""
     earlier = tmp_path / "manifest.json"
-    earlier.write_text("{}")
+    for name in ("manifest.json", "results.json", "report.html", *FILES):
+        (tmp_path / name).write_text("{}")
     monkeypatch.setattr(demo_module, "_designed", lambda *arguments: wild)
     with pytest.raises(MotionRefusedError, match=r"the excitation .*design another motion\."):
         demo_module.demo(output=tmp_path, excitation=tmp_path / "x.toml", force=True, quiet=True)

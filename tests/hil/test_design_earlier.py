@@ -41,12 +41,13 @@ def test_joints_count_by_the_noise_of_their_torque(known, campaign):
 
 def test_running_the_same_motion_again_says_about_the_same_again(excitations, cell, plan):
     # The archives hold a sample for each cycle of 1 ms, the search takes one every 8 ms. A fit
-    # also leaves out rows near reversals, where a smoothed acceleration says little.
+    # also leaves out rows near reversals, where a smoothed acceleration says little: up to one in
+    # twenty of those in which a joint accelerates.
     known = known_from(excitations, cell, Silent())
     objective = problem_of(cell, preset("b").kinematic(), known).objective
     assert objective.repetitions == len(excitations) == 3
     both = objective.information(midpoints(plan.excitation.trajectory))
-    np.testing.assert_allclose(np.diag(known.gram) / np.diag(both), 0.5, atol=0.02)
+    np.testing.assert_allclose(np.diag(known.gram) / np.diag(both), 0.5, atol=0.03)
 
 
 @pytest.fixture(scope="module")

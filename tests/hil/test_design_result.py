@@ -10,6 +10,7 @@ from hil.cell.text import replaced_value
 from hil.design import DesignResult, load_design, preset, problem_of
 from hil.design.fingerprint import fingerprint
 from hil.design.folder import DesignFolder
+from hil.design.result import _seal
 from hil.design.run import Designed, run_design
 from hil.errors import InputError
 from hil.progress import Silent
@@ -112,6 +113,54 @@ def test_a_motion_that_was_changed_is_refused(made, text, tmp_path):
         path = written(tmp_path, changed_digit(text, name))
         with pytest.raises(InputError, match=r"excitation\.toml: was changed after.*restore it"):
             load_design(path)
+
+
+def resealed(text: str) -> str:
+    """The text with the seal that belongs to what it says now."""
+    digest = _seal(text)
+    new, count = re.subn(r'(?m)^sha256 = "\w+"', f'sha256 = "{digest}"', text)
+    assert count == 1
+    return new
+
+
+@pytest.mark.parametrize(
+    ("line", "field"),
+    [
+        ("log10_det = nan", "criteria.log10_det"),
+        ("log10_det = -inf", "criteria.log10_det"),
+        ('coupling_index = "59"', "criteria.coupling_index"),
+        ("coupling_index = -1.0", "criteria.coupling_index"),
+        ("fitness = true", "criteria.fitness"),
+        ("n_samples = 0", "criteria.n_samples"),
+        ("n_samples = 20001.0", "criteria.n_samples"),
+        ("scaled_condition = nan", "criteria.scaled_condition"),
+        ("condition = [1.0]", "criteria.condition"),
+        ('seed = "1"', "search.seed"),
+        ("generations = -1", "search.generations"),
+        ("n_parameters = 0", "search.n_parameters"),
+    ],
+)
+def test_figures_that_are_none_are_refused_even_with_a_new_seal(text, tmp_path, line, field):
+    name = line.partition(" ")[0]
+    table = field.partition(".")[0]
+    head, mark, tail = text.partition(f"[{table}]\n")
+    tail, count = re.subn(rf"(?m)^{name} = .*$", line, tail, count=1)
+    assert mark and count == 1
+    path = written(tmp_path, resealed(head + mark + tail))
+    with pytest.raises(InputError, match="design it again") as caught:
+        load_design(path)
+    assert caught.value.field == field
+    assert caught.value.path == path and "not a" in caught.value.problem
+
+
+@pytest.mark.parametrize("entry", ["nan", '"59"', "true"])
+def test_a_front_of_what_is_no_number_is_refused(text, tmp_path, entry):
+    head, mark, tail = text.partition("[front]\n")
+    tail, count = re.subn(r"(?m)^(coupling_index = \[)[^,\]]+", rf"\g<1>{entry}", tail, count=1)
+    assert mark and count == 1
+    with pytest.raises(InputError, match="design it again") as caught:
+        load_design(written(tmp_path, resealed(head + mark + tail)))
+    assert caught.value.field == "front.coupling_index[0]"
 
 
 def test_comments_and_blank_lines_may_be_changed(text, tmp_path, made):

@@ -92,6 +92,8 @@ def test_sines_can_be_searched_by_any_method_and_via_points_by_method_a():
         ("[via_points]\nn = 6", ["via_points.n", "known are", "n_via"]),
         ("[via_points]\nslowest = 0.0", ["via_points.slowest = 0.0", "above 0, at most 1"]),
         ("[via_points]\n[sines]", ["both", "[via_points]", "[sines]", "give one"]),
+        ("[sines]\nramp = 0.04", ["sines", "a ramp of 0.04 s is a blow", "0.05 s or longer"]),
+        ("[sines]\nramp = -0.1", ["sines.ramp = -0.1", "0 for none"]),
         ("[sines]\nramp = 11.0", ["sines", "two ramps of 11 s", "20 s"]),
         ("[sines]\nfastest = [1.0, -1.0]", ["sines.fastest", "rad/s"]),
         ('[sines]\noffset = "nowhere"', ["sines.offset = 'nowhere'", '"middle"', '"home"']),

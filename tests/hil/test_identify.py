@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 
 from hil.archive import Samples, write_samples
 from hil.campaign import Campaign
-from hil.errors import ArchiveError, InputError
+from hil.cli.outcome import write_outcome
+from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Identification, Options, identify_archives, identify_campaign
 from hil.importers import Robot
 from hil.progress import Silent
@@ -71,6 +73,22 @@ def test_the_papers_way_of_filtering_finds_the_same_parameters(
     for ours, theirs in zip(found.results.parameters, paper.results.parameters, strict=True):
         both = np.hypot(ours.std, theirs.std)
         assert abs(ours.estimate - theirs.estimate) < 5.0 * both, ours.name
+
+
+def test_the_outcome_is_all_of_one_generation_or_untouched(
+    found: Identification, tmp_path: Path
+) -> None:
+    write_outcome(tmp_path, found, Silent())
+    first = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert {"results.json", "report.html", "parameters.csv", "identified.urdf"} <= set(first)
+    assert Results.load(tmp_path / "results.json").exports is not None
+    (tmp_path / "report.html").unlink()
+    (tmp_path / "report.html").mkdir()
+    other = replace(found, results=found.results.model_copy(update={"name": "other"}))
+    with pytest.raises(OutputError, match=r"report\.html is a folder"):
+        write_outcome(tmp_path, other, Silent())
+    del first["report.html"]
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == first
 
 
 def test_results_survive_their_file(found: Identification, tmp_path: Path) -> None:
@@ -156,7 +174,6 @@ def imported(
     [
         ({"nan": (700, 2)}, r"position of joint joint_3 is nan at sample 700"),
         ({"stuck": 4}, r"joint joint_5 is stuck"),
-        ({"repeat": 300}, r"clock repeats at sample 300"),
         ({"fall": 300}, r"clock falls back at sample 300"),
     ],
 )
@@ -165,6 +182,11 @@ def test_a_bad_recording_is_refused_by_name(
 ) -> None:
     with pytest.raises(ArchiveError, match=r"bad\.mcap.*" + sentence):
         identify_archives([imported(tmp_path / "bad.mcap", **spoilt)], Silent())
+
+
+def test_a_repeated_time_stamp_is_averaged_and_told(tmp_path: Path) -> None:
+    found = identify_archives([imported(tmp_path / "twice.mcap", repeat=300)], Silent())
+    assert any("1 samples had the time stamp" in note for note in found.results.notes)
 
 
 def test_joints_in_another_order_than_the_urdfs_are_refused_by_name(tmp_path: Path) -> None:

@@ -141,3 +141,34 @@ def test_imported_stamps_become_seconds_from_the_first_on(tmp_path: Path) -> Non
 def test_an_opened_archive_serves_as_well(tmp_path: Path) -> None:
     path = archive(tmp_path / NAME, records())
     assert np.array_equal(recording_of(open_archive(path)).time, open_recording(path).time)
+
+
+def test_a_part_of_the_time_is_that_part_of_the_whole(tmp_path: Path) -> None:
+    path = archive(tmp_path / NAME, records(first=1000))
+    whole = open_recording(path)
+    part = open_recording(path, start=2.1, stop=2.3)  # s; the first cycle is at 2 s
+    assert np.array_equal(part.position, whole.position[50:150])
+    assert part.torque is not None
+    assert whole.torque is not None
+    assert np.array_equal(part.torque, whole.torque[50:150])
+    assert part.time == pytest.approx(0.002 * np.arange(100))
+    assert part.provenance["part"] == "2.1 s to 2.3 s"
+    assert np.array_equal(open_recording(path, start=2.7).position, whole.position[350:])
+    assert np.array_equal(open_recording(path, stop=2.01).position, whole.position[:5])
+
+
+def test_a_time_at_which_nothing_was_recorded_is_refused_as_such(tmp_path: Path) -> None:
+    path = archive(tmp_path / NAME, records(first=1000))
+    with pytest.raises(ArchiveError, match="holds no sample from 90 s to its end"):
+        open_recording(path, start=90.0)
+
+
+def test_only_the_channels_wanted_are_read(tmp_path: Path) -> None:
+    path = archive(tmp_path / NAME, records())
+    recording = open_recording(path, channels=["torque"])
+    assert recording.torque is not None
+    assert recording.motor_current is None
+    assert recording.commanded_position is None
+    assert open_recording(path, channels=[]).torque is None
+    with pytest.raises(ValueError, match="recordings have no 'speed'; they have torque"):
+        open_recording(path, channels=["speed"])

@@ -10,7 +10,6 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -20,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
 
-from hil.report import ReportSeries, SeriesError, numbers, render_report, validation, write_report
+from hil.report import ReportSeries, SeriesError, numbers, render_report, report_bytes, validation
 from hil.report.figures import correlation_matrix
 from hil.report.figures.canvas import thinned
 from hil.results import Results
@@ -46,11 +45,21 @@ def make_results(**changes: Any) -> Results:
         "software": {"hil": "0.1.0", "numpy": "2.4.6", "pinocchio": "4.1.0"},
         "excitation": {"duration": 14.85, "n_via": 6, "fly": 0.5,
                        "planned": _criteria(88.12, 118.4), "executed": _criteria(87.63, 119.2)},
+        "estimator": {"name": "wls", "words": "weighted least squares (eq. 4)",
+                      "prior": "nominal parameters to 10 %", "condition": 26.4,
+                      "grouping": "40 of 66 standard parameters are kept."},
+        "endogeneity": {"sentence": "Nothing says that noise has biased least squares.",
+                        "biased": False, "statistic": 1.2, "p_value": 0.33,
+                        "degrees_of_freedom": [6, 33], "noise": [0.001] * 6, "shifted": [],
+                        "shift": [0.0] * size},
+        "endogeneity_untested": None,
+        "notes": ["the noise of the positions was measured at standstill"],
         "parameters": [
             {"name": row.pivot or row.parameter, "expression": row.parameter,
              "unit": _unit(row.pivot or row.parameter), "table2_id": row.id, "truth": truth[i],
              "estimate": estimate[i], "std": std[i], "repetition_mean": values[:, i].mean(),
-             "repetition_std": values[:, i].std(ddof=1)}
+             "repetition_std": values[:, i].std(ddof=1), "prior_std": 10.0 * std[i],
+             "prior_ratio": 0.1, "learned": True}
             for i, row in enumerate(TABLE2)
         ],
         "n_base": N_ESSENTIAL,
@@ -83,7 +92,8 @@ def real_recording() -> Results:
     unknown = {"truth": None, "table2_id": None, "repetition_std": None}
     none = dict.fromkeys(("independent_repetitions", "phase_clustered", "scatter_of_mean"))
     return make_results(
-        simulated=False, effects=[], coverage=None, repetitions=["log.mcap"],
+        simulated=False, effects=[], coverage=None, repetitions=["log.mcap"], endogeneity=None,
+        endogeneity_untested="The recordings hold no commanded positions.", notes=[],
         excitation={"duration": 9.0, "n_via": None, "fly": None, "planned": None,
                     "executed": _criteria(70.0, 130.0)},
         parameters=[p.model_dump() | unknown for p in whole.parameters],
@@ -231,13 +241,12 @@ def test_every_id_is_the_only_one_and_every_reference_finds_its_own(page: Page, 
     assert wanted <= set(ids)
 
 
-def test_the_same_input_gives_the_same_bytes_whoever_draws(tmp_path: Path, html: str) -> None:
-    paths = [tmp_path / f"{k}.html" for k in range(2)]
+def test_the_same_input_gives_the_same_bytes_whoever_draws(html: str) -> None:
     settings = {"lines.linestyle": ":", "svg.fonttype": "path", "text.usetex": True}
     with mpl.rc_context(settings), ThreadPoolExecutor(2) as pool:
-        list(pool.map(lambda path: write_report(path, make_results(), make_series()), paths))
+        pages = list(pool.map(lambda _: report_bytes(make_results(), make_series()), range(2)))
         assert {key: mpl.rcParams[key] for key in settings} == settings
-    assert {path.read_bytes() for path in paths} == {html.encode()}
+    assert set(pages) == {html.encode()}
 
 
 def test_a_full_campaign_stays_small() -> None:
@@ -368,7 +377,39 @@ def test_an_arm_of_one_joint_without_friction_or_validation_has_a_report_too() -
     # fmt: on
     none = {"example_time": empty[:, 0], "example_measured": empty, "example_predicted": empty}
     page = Page(render_report(Results.model_validate(alone), replace(series, **none)))
-    assert "No validation motion was run" in page.text
+    assert "Nothing was held out" in page.text
+
+
+def test_it_says_how_the_estimate_was_made_and_what_stands_behind_it(page: Page) -> None:
+    results = make_results()
+    assert results.estimator.words in page.text
+    assert results.estimator.grouping in page.text
+    assert results.notes[0] in page.text
+    assert results.endogeneity is not None
+    assert results.endogeneity.sentence in page.text
+    size = len(results.parameters)
+    assert f"{size} of {size} parameters were learned from the data" in page.text
+
+
+def test_what_was_not_tested_or_believed_is_said_too() -> None:
+    estimator = make_results().estimator.model_dump() | {"prior": "the URDF gives no inertia"}
+    parameters = [p.model_dump() | {"learned": None} for p in real_recording().parameters]
+    recording = real_recording().model_copy(
+        update={"estimator": make_results(estimator=estimator).estimator,
+                "parameters": make_results(parameters=parameters).parameters}
+    )  # fmt: skip
+    text = Page(render_report(recording, make_series())).text
+    assert "The recordings hold no commanded positions." in text
+    assert "Nothing: the URDF gives no inertia." in text
+
+
+def test_the_posterior_takes_the_place_of_the_phase_clustered_route() -> None:
+    uncertainty = make_results().uncertainty.model_dump()
+    std = uncertainty["phase_clustered"]
+    changed = uncertainty | {"phase_clustered": None, "posterior": std, "reported": "posterior"}
+    page = Page(render_report(make_results(uncertainty=changed), make_series()))
+    assert "Posterior (reported)" in page.text
+    assert "Phase-clustered" not in page.text
 
 
 def test_series_that_do_not_belong_together_are_refused_by_name() -> None:

@@ -75,6 +75,11 @@ def test_a_joint_limit_is_told_in_the_angles_of_the_file(cell: Cell) -> None:
     assert "J3 -175.0" in text
     fast = Violation("joint limit", "velocity of joint 1", 3.0, np.radians(155.0), 0.5)
     assert "velocity of J2: 171.9 deg/s, at most 155 deg/s is wanted" in violation_text(fast, frame)
+    # A rate is told as its size, also of J3, which the teach pendant counts the other way round.
+    assert frame.sign[2] == -1.0
+    backwards = Violation("joint limit", "velocity of joint 2", 6.9726, np.radians(155.0), 0.5)
+    told = violation_text(backwards, frame)
+    assert "velocity of J3: 399.5 deg/s, at most 155 deg/s is wanted" in told
     assert str(fast) == "joint limit of velocity of joint 1: 3, at most 2.705 is wanted, at 0.500 s"
 
 

@@ -116,3 +116,37 @@ def test_expressions_read_like_the_table(model: RobotModel) -> None:
     )
     assert expression["mc4z"] == "mc4z - mc5y"
     assert expression["I3m"] == "I3m"
+
+
+def test_the_rank_decision_is_explained_by_the_gap(model: RobotModel) -> None:
+    text = model.base.explanation()
+    assert text.startswith("40 of 66 standard parameters are kept, 16 are grouped")
+    assert "10 act on no torque" in text
+    assert "1e-05" in text
+    assert "the decision is clear" in text
+    rounded = urdf_text().replace("1.5707963267948966", "1.5708")
+    assert (
+        "figures of the robot description that are rounded"
+        in RobotModel.from_urdf(rounded).base.explanation()
+    )
+
+
+def test_a_rank_that_hangs_on_a_hair_is_said_to(model: RobotModel) -> None:
+    """The first axis a ten-thousandth of a radian off gravity: more is felt, but hardly."""
+    skewed = urdf_text().replace("1.5707963267948966", "1.5709")
+    base = RobotModel.from_urdf(skewed).base
+    assert base.rank > model.base.rank
+    assert base.smallest_kept < 1e-4
+    assert "That is close" in base.explanation()
+    weakest = base.names[int(np.argmin(base.shares[base.kept]))]
+    assert f"whether {weakest} is a parameter of its own" in base.explanation()
+
+
+def test_an_arm_without_choice_needs_no_decision() -> None:
+    slider = (
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="s" type="prismatic">'
+        '<parent link="a"/><child link="b"/><axis xyz="1 0 0"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    base = RobotModel.from_urdf(slider, rotor_inertia=False).base
+    assert base.explanation().startswith("1 of 10 standard parameters are kept, 0 are grouped")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import butter, filtfilt
 
-from identification.butterworth import butterworth_motion, choose_cutoff, prepare_butterworth
+from identification.butterworth import butterworth_motion, choose_cutoff
 from identification.errors import ShapeError
 from identification.estimation import estimate
 from identification.friction import FrictionLaw
@@ -23,6 +23,7 @@ from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]
 URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+BUTTERWORTH = Preprocessing(smoother="butterworth")
 
 
 @pytest.fixture(scope="module")
@@ -128,9 +129,10 @@ def test_the_cutoff_is_as_good_as_the_best_for_the_acceleration(
 
 def test_little_noise_means_the_widest_cutoff(model: RobotModel, truth: Array) -> None:
     recording = a_recording(model, truth, EVEN, noise=1e-7)
-    np.testing.assert_array_equal(choose_cutoff(recording, np.full(2, 1e-14)), 40.0)
+    sharp = np.full(2, 1e-14)
+    np.testing.assert_array_equal(choose_cutoff(recording, sharp, widest=40.0), 40.0)
     slow = a_recording(model, truth, np.arange(800) * 0.02, noise=1e-7)  # 50 Hz
-    np.testing.assert_allclose(choose_cutoff(slow, np.full(2, 1e-14)), 20.0)
+    np.testing.assert_allclose(choose_cutoff(slow, sharp, widest=40.0), 20.0)
 
 
 @pytest.mark.parametrize("uneven", [False, True])
@@ -141,7 +143,8 @@ def test_a_fit_to_it_is_as_good_as_one_to_the_spline(
     time = np.cumsum(1e-3 * rng.uniform(0.6, 1.4, 8000)) if uneven else EVEN
     recording = a_recording(model, truth, time, delay=2e-3)
     variance = np.full(2, (2e-5) ** 2)
-    samples, _ = prepare_butterworth(recording, model, noise_variance=variance, delay=2e-3)
+    filtered = replace(BUTTERWORTH, torque_delay=2e-3)
+    samples = prepare(recording, model, noise_variance=variance, options=filtered)
     there = estimate(model, samples.factor(model))
 
     spline = prepare(
@@ -158,9 +161,13 @@ def test_rows_beside_ends_and_gaps_do_not_count_and_say_why(
     recording = a_recording(model, truth, EVEN)
     gap = np.zeros(len(EVEN), dtype=np.bool_)
     gap[4000] = True
-    samples, mask = prepare_butterworth(
-        replace(recording, gap_before=gap), model, cutoff=np.full(2, 20.0)
+    samples = prepare(
+        replace(recording, gap_before=gap),
+        model,
+        noise_variance=np.full(2, 1e-16),
+        options=replace(BUTTERWORTH, rigid_bandwidth=20.0),
     )
+    np.testing.assert_array_equal(samples.position_bandwidth, 20.0)
     reach = 100  # two periods of 20 Hz
     for edge in (0, 4000, len(EVEN)):
         assert not samples.usable[max(0, edge - reach) : edge + reach].any()
@@ -168,7 +175,8 @@ def test_rows_beside_ends_and_gaps_do_not_count_and_say_why(
     for smoothed, true in zip(samples.motion[1:], exact, strict=True):
         error = (smoothed - true)[samples.usable.all(axis=1)]
         assert np.sqrt(np.mean(error**2)) < 5e-3 * np.std(true)
-    assert any("gap" in line for line in mask.describe(model.joint_names))
+    assert samples.mask is not None
+    assert any("gap" in line for line in samples.mask.describe(model.joint_names))
 
 
 def test_a_stretch_too_short_to_filter_is_at_rest_and_does_not_count(
@@ -177,9 +185,7 @@ def test_a_stretch_too_short_to_filter_is_at_rest_and_does_not_count(
     recording = a_recording(model, truth, EVEN)
     gap = np.zeros(len(EVEN), dtype=np.bool_)
     gap[[4000, 4010]] = True
-    samples, _ = prepare_butterworth(
-        replace(recording, gap_before=gap), model, cutoff=np.full(2, 20.0)
-    )
+    samples = prepare(replace(recording, gap_before=gap), model, options=BUTTERWORTH)
     assert not samples.usable[4000:4010].any()
     assert not samples.motion.velocity[4000:4010].any()
 
@@ -191,7 +197,7 @@ def test_what_cannot_be_filtered_is_refused(model: RobotModel, truth: Array) -> 
     with pytest.raises(ValueError, match="Nyquist"):
         butterworth_motion(recording, np.array([20.0, 600.0]))
     with pytest.raises(RecordingError, match="no joint torque"):
-        prepare_butterworth(replace(recording, torque=None), model)
+        prepare(replace(recording, torque=None), model, options=BUTTERWORTH)
     with pytest.raises(RecordingError, match="24 samples"):
         choose_cutoff(recording.between(0, 20))
 
@@ -199,7 +205,7 @@ def test_what_cannot_be_filtered_is_refused(model: RobotModel, truth: Array) -> 
 def test_on_a_real_ur10_it_is_as_good_as_the_spline(shared_data: Path) -> None:
     model, recording = ur10(shared_data)
     assert time_base(recording.time).uniform
-    filtered, mask = prepare_butterworth(recording, model)
+    filtered = prepare(recording, model, options=BUTTERWORTH)
     splined = prepare(recording, model)
     errors = []
     for samples in (filtered, splined):
@@ -207,4 +213,4 @@ def test_on_a_real_ur10_it_is_as_good_as_the_spline(shared_data: Path) -> None:
         errors.append(prediction_error(model, fit.values, [samples])[0].overall)
     assert errors[0] == pytest.approx(errors[1], abs=0.001)
     assert errors[0] < 0.0515  # what a plain fit with the quadratic term reaches on this bag
-    assert np.all(mask.usable.mean(axis=0) > 0.9)
+    assert np.all(filtered.usable.mean(axis=0) > 0.9)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
-from identification.consistent_polish import Smooth, follow_path, polish
+from identification.consistent_polish import Cone, Smooth, follow_path, polish
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ def a_problem(seed: int, *, equations: int = 0) -> Smooth:
         R=rng.normal(size=(12, 23)),
         z=rng.normal(scale=5.0, size=12),
         weight=10.0 ** rng.uniform(-1, 1),
-        entries=entries,
+        cones=(Cone(np.arange(20).reshape(2, 10), entries),),
         centre=np.zeros(3),
         not_negative=np.array([20, 21]),
         equal=equal,

@@ -106,7 +106,7 @@ def test_the_standard_error_is_the_scatter_over_seeds(repeated: list[DelayEstima
     assert np.all(np.abs(np.log(claimed / scatter)) < 3 * 0.18)
 
 
-@pytest.mark.parametrize("planted", [[-0.031, -0.0297], [0.04, 0.0421]])
+@pytest.mark.parametrize("planted", [[-0.031, -0.0297], [0.04, 0.0421], [-0.045, 0.045]])
 def test_a_delay_of_many_cycles_is_found_from_anywhere(
     model: RobotModel, truth: Array, planted: list[float]
 ) -> None:
@@ -114,6 +114,54 @@ def test_a_delay_of_many_cycles_is_found_from_anywhere(
     found = estimate_delays(recording, model)
     assert found.delays == pytest.approx(planted, abs=0.3e-3)
     assert not found.agree
+
+
+def test_a_wrist_whose_friction_outweighs_its_inertia_may_have_two_delays() -> None:
+    """Viscous friction a little later is viscous friction and less inertia: both fit."""
+    arm = ns16_model()
+    time = np.arange(0.0, 20.0, 0.004)
+    rng = np.random.default_rng(100)
+    sines = np.array([
+        (rng.uniform(0.1, 1.2), rng.standard_normal(), rng.uniform(0.0, 2.0 * np.pi))
+        for _ in range(30)
+    ]).reshape(6, 5, 3)  # fmt: skip
+    hertz, size, phase = sines.transpose(2, 1, 0)
+    rate, size = 2.0 * np.pi * hertz, 0.35 * size / (1.0 + hertz)
+
+    def moved(at: Array) -> tuple[Array, Array, Array]:
+        angle = rate * at[:, None, None] + phase
+        return (
+            (size * np.sin(angle)).sum(axis=1),
+            (size * rate * np.cos(angle)).sum(axis=1),
+            (-size * rate**2 * np.sin(angle)).sum(axis=1),
+        )
+
+    values = np.zeros(arm.n_parameters)
+    standard = arm.nominal.copy()
+    standard[10::11] = 5.0, 5.0, 3.0, 0.2, 0.2, 0.1  # rotors
+    values[: arm.base.rank] = arm.base.grouping @ standard
+    for symbol, own in (("f0", (68, 108, 50, 9, 9, 5)), ("f1", (41, 63, 39, 3, 16, 9))):
+        for joint, value in enumerate(own):
+            values[arm.parameter_names.index(f"{symbol}_{joint + 1}")] = value
+    planted = np.array([0.3, -0.7, 1.6, 2.4, 0.0, 5.2]) * 0.004
+    noise = np.array([3.0, 3.0, 1.0, 0.1, 0.1, 0.1])
+    for seed in range(3):
+        draw = np.random.default_rng(seed)
+        torque = np.column_stack(
+            [arm.torque(values, *moved(time - late))[:, j] for j, late in enumerate(planted)]
+        )
+        recording = Recording(
+            time=time,
+            position=moved(time)[0] + 2e-6 * draw.standard_normal(torque.shape),
+            joint_names=arm.joint_names,
+            torque=torque + noise * draw.standard_normal(torque.shape),
+        )
+        found = estimate_delays(recording, arm, noise_variance=np.full(6, 4e-12))
+        known = found.determined
+        np.testing.assert_allclose(found.cycles[known], planted[known] / 0.004, atol=0.2)
+        assert known.sum() >= 4
+        assert not known[5]
+        assert "explains its torque as well" in str(found.reasons[5])
 
 
 def test_uneven_time_does_not_matter(model: RobotModel, truth: Array) -> None:

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
-import sqlite3
 import time
 from dataclasses import replace
-from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,18 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.covariance import PhaseFactor
 from identification.errors import IdentificationError
 from identification.essential import CutRule, eliminate
 from identification.estimation import estimate
 from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from identification.motion import Motion
+from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Preprocessing, Samples, prepare
-from identification.recording import Recording
 from identification.torque_channel import find_torque_bandwidth
 from identification.validation import prediction_error
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]
 
@@ -218,7 +216,7 @@ def test_wrong_or_empty_factors_are_refused(model: RobotModel, truth: Array) -> 
     other = replace(unseen, parameter_names=tuple(reversed(unseen.parameter_names)))
     with pytest.raises(IdentificationError, match="held-out samples belong"):
         eliminate(model, training, other)
-    empty = PhaseFactor(0.0 * training.gram, 0 * training.samples, training.parameter_names)
+    empty = PhaseFactor.zero(model)
     with pytest.raises(IdentificationError, match="not one usable fitted"):
         eliminate(model, empty, unseen)
 
@@ -247,38 +245,8 @@ def test_the_ns16_loses_parameters_and_predicts_no_worse() -> None:
     assert time.process_time() - begin < 0.3  # 0.07 s on a quiet machine
 
 
-def ur10_recording(folder: Path) -> tuple[str, Recording]:
-    rosbags = pytest.importorskip("rosbags.typesys")
-    files = metadata.files("example-robot-data") or ()
-    urdf = next((f.locate() for f in files if f.name == "ur10_robot.urdf"), None)
-    if urdf is None:
-        pytest.skip("the package example-robot-data, which has the UR10's URDF, is not installed")
-    bag = folder / "ur10_unisa" / "ur10_exciting_trajectory.db3"
-    if not bag.is_file():
-        pytest.skip(f"no {bag.name} beside this checkout")
-    store = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
-    with sqlite3.connect(f"file:{bag}?mode=ro&immutable=1", uri=True) as database:
-        rows = database.execute(
-            "select data from messages where topic_id in (select id from topics where type ="
-            " 'sensor_msgs/msg/JointState') order by timestamp"
-        ).fetchall()
-    database.close()
-    states = [store.deserialize_cdr(data, "sensor_msgs/msg/JointState") for (data,) in rows]
-    text = Path(str(urdf)).read_text()
-    names = RobotModel.from_urdf(text).joint_names
-    order = [states[0].name.index(name) for name in names]
-    stamps = np.array([s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in states])
-    return text, Recording(
-        time=stamps - stamps[0],
-        position=np.array([s.position for s in states])[:, order],
-        joint_names=names,
-        torque=np.array([s.effort for s in states])[:, order],
-    )
-
-
 def test_a_real_ur10_needs_20_to_30_of_58_parameters(shared_data: Path) -> None:
-    text, recording = ur10_recording(shared_data)
-    model = RobotModel.from_urdf(text, friction=FrictionLaw(third=None, offset=True))
+    model, recording = ur10(shared_data, FrictionLaw(third=None, offset=True))
     cut = round(0.7 * recording.n_samples)
     fitted, rest = recording.between(0, cut), recording.between(cut, recording.n_samples)
     options = Preprocessing(torque_bandwidth=find_torque_bandwidth(fitted, model))
@@ -301,8 +269,7 @@ def test_a_real_ur10_needs_20_to_30_of_58_parameters(shared_data: Path) -> None:
 def test_the_essential_parameters_of_the_ur10_predict_a_stretch_that_did_not_choose_them(
     shared_data: Path,
 ) -> None:
-    text, recording = ur10_recording(shared_data)
-    model = RobotModel.from_urdf(text, friction=FrictionLaw(offset=True))
+    model, recording = ur10(shared_data)
     edges = [round(share * recording.n_samples) for share in (0.0, 0.6, 0.8, 1.0)]
     parts = [recording.between(a, b) for a, b in pairwise(edges)]
     options = Preprocessing(torque_bandwidth=find_torque_bandwidth(parts[0], model))

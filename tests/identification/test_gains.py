@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
 from identification.friction import FrictionLaw
-from identification.gain_factor import GainFactor, Payload, payload_torque
+from identification.gain_factor import GainFactor
 from identification.gains import GainMethod, Gains, identify_gains
 from identification.model import RobotModel
 from identification.motion import Motion
+from identification.payload import Load, Payload
 from identification.preprocessing import Samples
 from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
 
@@ -34,6 +35,10 @@ LIFT_AND_TURN = """<robot name="lift"><link name="base"/>
 <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="50" velocity="6"/></joint>
 <link name="hand"><inertial><mass value="3"/>
 <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.03"/></inertial></link></robot>"""
+
+
+def load_torque(model: RobotModel, payload: Payload, motion: Motion) -> Array:
+    return Load(model.chain, model.gravity, payload).torque(*motion[1:])
 
 
 def two_link() -> tuple[RobotModel, Array]:
@@ -86,7 +91,7 @@ def factor_of(
     turns = np.eye(model.n_joints) if transmission is None else transmission
     total = None
     for payload in (None, load):
-        joint = torque if payload is None else torque + payload_torque(model, payload, *motion[1:])
+        joint = torque if payload is None else torque + load_torque(model, payload, motion)
         current = np.linalg.solve(turns.T, joint.T).T / gains
         current = current + noise * rng.standard_normal(current.shape)
         one = GainFactor.from_samples(
@@ -110,9 +115,7 @@ def test_the_torque_of_a_payload_is_the_difference_pinocchio_sees() -> None:
         pin.rnea(loaded, loaded.createData(), *state) - pin.rnea(plain, plain.createData(), *state)
         for state in zip(*motion[1:], strict=True)
     ]
-    np.testing.assert_allclose(
-        payload_torque(model, load, *motion[1:]), difference, rtol=1e-9, atol=1e-9
-    )
+    np.testing.assert_allclose(load_torque(model, load, motion), difference, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("method", ["weighted", "total"])
@@ -160,7 +163,7 @@ def test_plain_least_squares_would_shrink_them() -> None:
     model, truth = two_link()
     motion, rng = lively(2), np.random.default_rng(1)
     torque = model.torque(truth, *motion[1:])
-    load = payload_torque(model, LOAD, *motion[1:])
+    load = load_torque(model, LOAD, motion)
     dense = model.regressor(*motion[1:]).dense(model.n_parameters)
     noise, rows, wanted = 10.0 * NOISE, [], []
     for extra in (np.zeros_like(load), load):

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from identification import instrument_motion
 from identification.closed_loop import JointServo, simulated_motion, standard_parameters
 from identification.endogeneity import EndogeneityTest, endogeneity_test
 from identification.errors import IdentificationError, ShapeError
 from identification.friction import FrictionLaw
 from identification.instrument_factor import InstrumentFactor
-from identification.instrument_motion import planned_motion
+from identification.instrument_motion import planned_motion, same_plan
 from identification.instrumental import (
     InstrumentalEstimate,
     estimate_instrumental,
@@ -303,7 +304,26 @@ def test_a_bias_too_small_to_matter_is_called_that(model: RobotModel, truth: Arr
     test = examine(model, executed(model, truth, 0, position_noise=2e-5))
     assert test.biased
     assert test.predicted.max() < 0.005
+    assert not test.matters
     assert "too small to matter" in test.words
+
+
+def test_a_bias_of_many_standard_deviations_matters_only_if_it_moves_torques(
+    model: RobotModel, truth: Array
+) -> None:
+    factor, result = fit(model, executed(model, truth, 0, position_noise=2e-5), PLAN)
+    # As from so many samples that parameters are known far better than torques need them.
+    least = replace(result.least_squares, covariance=1e-4 * result.least_squares.covariance)
+    test = endogeneity_test(model, factor, replace(result, least_squares=least))
+    assert test.biased
+    assert np.any(np.abs(test.shift) > 3.0 * least.std)
+    assert test.predicted.max() < 0.005
+    assert not test.matters
+    assert "too small to matter" in test.words
+    assert "Use the instrumental variables" not in test.words
+    noisy = examine(model, executed(model, truth, 0, position_noise=LARGE))
+    assert noisy.matters
+    assert "Use the instrumental variables" in noisy.words
 
 
 def test_instruments_that_are_the_measured_motion_leave_nothing_to_test(
@@ -426,6 +446,31 @@ def test_the_lag_of_each_axis_is_found_and_the_plan_shifted_by_it(
     assert instruments.usable[inside].all()
 
 
+def test_a_lag_that_is_known_is_not_sought_again(
+    model: RobotModel, truth: Array, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    samples = executed(model, truth, 0)
+    found = planned_motion(samples, PLAN.position)
+    monkeypatch.setattr(instrument_motion, "tracking_lag", lambda *_: pytest.fail("sought"))
+    again = planned_motion(samples, PLAN.position, lag=found.lag)
+    np.testing.assert_array_equal(again.motion.position, found.motion.position)
+    np.testing.assert_array_equal(again.usable, found.usable)
+
+
+def test_repetitions_share_a_plan_whatever_their_clocks_and_other_motions_do_not() -> None:
+    plan = TIME, PLAN.position
+    spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
+    later = TIME[20:-20] + 0.3 * STEP
+    torn = spline(later)
+    torn[100:120] = np.nan
+    assert same_plan(plan, (later, torn))
+    assert not same_plan(plan, (TIME, 0.9 * PLAN.position))
+    assert not same_plan(plan, (TIME, PLAN.position[::-1]))
+    assert not same_plan(plan, (TIME[: len(TIME) // 2], PLAN.position[: len(TIME) // 2]))
+    assert not same_plan(plan, (TIME, PLAN.position[:, :1]))
+    assert not same_plan(plan, (TIME, np.full_like(PLAN.position, np.nan)))
+
+
 def test_rows_without_a_command_and_recordings_without_any(model: RobotModel, truth: Array) -> None:
     samples = executed(model, truth, 0)
     command = PLAN.position.copy()
@@ -486,14 +531,14 @@ def test_bodies_equivalent_to_base_parameters_make_the_same_torques() -> None:
     values = nominal * rng.uniform(0.7, 1.3, len(nominal))
     links, rotors = standard_parameters(model, values)
     assert np.all(links[:, 9] > 0.0)
-    both = np.column_stack([links, rotors]).ravel()
+    both = np.column_stack([links, np.diag(rotors)]).ravel()
     np.testing.assert_allclose(model.base.grouping @ both, values, rtol=1e-8, atol=1e-9)
     # The mass matrix, as pinocchio makes it of the URDF's own bodies.
     arm = pin.buildModelFromXML(urdf_text())
     q, qd, qdd = rng.uniform(-1.0, 1.0, (3, 6))
     links, rotors = standard_parameters(model, nominal)
     expected = pin.rnea(arm, arm.createData(), q, qd, qdd)
-    both = np.column_stack([links, rotors]).ravel()
+    both = np.column_stack([links, np.diag(rotors)]).ravel()
     torque = model.torque(model.base.grouping @ both, q[None], qd[None], qdd[None])[0]
     np.testing.assert_allclose(torque, expected, rtol=1e-8, atol=1e-8)
 

@@ -1,75 +1,34 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
-from identification.covariance import PhaseFactor, with_block_covariance
+from identification.covariance import with_block_covariance
 from identification.errors import IdentificationError
 from identification.estimation import estimate, joint_weights
-from identification.friction import FrictionLaw
 from identification.least_squares import (
     fit_least_squares,
     ordinary_least_squares,
     weighted_least_squares,
 )
-from identification.model import RobotModel
 from identification.motion import Motion
-from identification.preprocessing import Samples
+from identification.phase_factor import PhaseFactor
 from identification.qr_factor import QRFactor
 from identification.robust import robust_estimate
+from tests.identification.two_link import (
+    MODEL,
+    P,
+    a_motion,
+    coloured,
+    gaussian,
+    recording,
+    truth,
+)
 
 Array = NDArray[np.float64]
-
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
-MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
-P = MODEL.n_parameters
-NOISE = np.array([3.0, 0.2])
-
-
-def truth() -> Array:
-    standard = MODEL.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
-
-
-def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
-    time = np.arange(0.0, duration, step)
-    rng = np.random.default_rng(12)
-    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
-    angle = w * time[:, None, None] + phase
-    return Motion(
-        time,
-        (a * np.sin(angle)).sum(axis=1),
-        (a * w * np.cos(angle)).sum(axis=1),
-        (-a * w**2 * np.sin(angle)).sum(axis=1),
-    )
-
-
-def recording(error: Array, motion: Motion) -> Samples:
-    return Samples(
-        motion=motion,
-        torque=MODEL.torque(truth(), *motion[1:]) + error,
-        usable=MODEL.moving(motion.velocity),
-        segments=(slice(0, len(motion.time)),),
-        origin=float(motion.time[0]),
-        position_bandwidth=np.full(2, np.inf),
-    )
-
-
-def gaussian(rng: np.random.Generator, motion: Motion) -> Array:
-    return NOISE * rng.standard_normal((len(motion.time), 2))
-
-
-def coloured(rng: np.random.Generator, length: int, step: float, correlation: float) -> Array:
-    r = np.exp(-step / correlation) if correlation else 0.0
-    start = rng.standard_normal((1, 2)) * r
-    white = np.sqrt(1.0 - r**2) * rng.standard_normal((length, 2))
-    return NOISE * lfilter([1.0], [1.0, -r], white, axis=0, zi=start)[0]
 
 
 def test_ordinary_least_squares_is_the_stacked_unweighted_solution() -> None:

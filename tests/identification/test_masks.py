@@ -8,9 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from identification.coupling import Coupling
 from identification.errors import ShapeError
 from identification.friction import FrictionLaw
 from identification.masks import (
+    END_PERIODS,
+    LONGEST_END,
     REVERSAL,
     SATURATED,
     STANDSTILL,
@@ -21,7 +24,7 @@ from identification.masks import (
 )
 from identification.model import RobotModel
 from identification.motion import Motion
-from identification.preprocessing import prepare
+from identification.preprocessing import Preprocessing, prepare
 from identification.recording import Recording
 
 Array = NDArray[np.float64]
@@ -99,6 +102,35 @@ def test_every_row_left_out_has_a_reason_and_counts_add_up(model: RobotModel) ->
         assert np.all(mask.counts[reason] > 0)
 
 
+@pytest.mark.parametrize("friction", [True, False])
+def test_rows_beside_a_reversal_of_a_coupled_motor_are_left_out(friction: bool) -> None:
+    turns = np.array([[1.0, 0.0], [-0.8, 1.0]])
+    model = RobotModel.from_urdf(
+        URDF,
+        friction=FrictionLaw(standstill=0.05),
+        coupling=Coupling(turns, friction=friction),
+    )
+    motion, recording = motion_and_recording(model)
+    reversals = mask_rows(recording, model, motion, np.array([40.0, 20.0])).reasons[REVERSAL]
+    motor = motion.velocity @ turns[1]
+    assert model.friction.motors == ((1,) if friction else ())
+
+    def beside(speed: Array, reach: float) -> NDArray[np.bool_]:
+        at = TIME[:-1][speed[1:] * speed[:-1] < 0.0]
+        assert len(at)
+        return np.asarray(np.abs(TIME[:, None] - at).min(axis=1) <= reach)
+
+    # As far as the slower of its joints is smoothed; the joints' own reversals as ever.
+    for joint, reach in enumerate((1.0 / 40.0, 1.0 / 20.0)):
+        own = beside(motion.velocity[:, joint], reach)
+        expected = own | beside(motor, 1.0 / 20.0) if friction else own
+        apart = np.flatnonzero(expected != reversals[:, joint])
+        # But for the sample at the edge.
+        assert len(apart) <= 2 * np.count_nonzero(np.diff(expected))
+        assert np.count_nonzero(expected) > 10 * len(apart)
+        assert (np.count_nonzero(expected & ~own) > 50) == friction
+
+
 def test_the_words_name_the_joint_the_number_and_the_reason(model: RobotModel) -> None:
     motion, recording = motion_and_recording(model, clip=15.0)
     mask = mask_rows(recording, model, motion, np.full(2, 40.0))
@@ -107,11 +139,27 @@ def test_the_words_name_the_joint_the_number_and_the_reason(model: RobotModel) -
     assert f"{mask.counts[SATURATED][1]} torque or current saturated" in line
 
 
-def test_without_saturation_the_rows_are_those_the_spline_leaves(model: RobotModel) -> None:
+@pytest.mark.parametrize("delay", [-0.08, 0.0, 0.08])
+def test_a_row_read_earlier_is_torn_where_it_is_read(model: RobotModel, delay: float) -> None:
+    """Its motion comes from `delay` before; there has to be some, and not at an end."""
     _, recording = motion_and_recording(model)
-    samples = prepare(recording, model)
-    mask = mask_rows(recording, model, samples.motion, samples.position_bandwidth)
-    np.testing.assert_array_equal(mask.usable, samples.usable)
+    samples = prepare(recording, model, options=Preprocessing(torque_delay=delay))
+    assert samples.mask is not None
+    end = min(LONGEST_END, END_PERIODS / float(samples.position_bandwidth.min()))
+    read = recording.time - delay
+    inside = (read >= recording.time[0] + end) & (read <= recording.time[-1] - end)
+    np.testing.assert_array_equal(samples.mask.reasons[TORN][:, 0], ~inside)
+    assert not samples.usable[~inside].any()
+
+
+def test_ends_of_a_low_passed_torque_are_torn_as_far_as_the_low_pass_reaches(
+    model: RobotModel,
+) -> None:
+    _, recording = motion_and_recording(model)
+    samples = prepare(recording, model, options=Preprocessing(torque_bandwidth=10.0))
+    beside = recording.time < recording.time[0] + END_PERIODS / 10.0
+    assert not samples.usable[beside].any()
+    assert samples.usable[recording.time > recording.time[0] + LONGEST_END][:100].any()
 
 
 def test_rows_beside_a_gap_and_short_stretches_are_torn(model: RobotModel) -> None:

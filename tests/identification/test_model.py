@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import pickle
 import time
-from importlib.metadata import PackageNotFoundError, distribution
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -11,49 +9,9 @@ import pytest
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.robots import one_joint, random_urdf, robot_text
 
 TILTED = (2.0, -3.0, -9.0)
-
-
-def robot_text(path: str) -> str:
-    try:
-        package = distribution("example-robot-data")
-    except PackageNotFoundError:
-        pytest.skip("the example-robot-data package is not installed")
-    root = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
-    return (root / path).read_text(encoding="utf-8")
-
-
-def random_urdf(seed: int, n_joints: int = 7) -> str:
-    """A random tree: any axis, any placement, all four kinds of joint that are allowed."""
-    random = np.random.default_rng(seed)
-    parts = ['<robot name="random"><link name="l0"/>']
-
-    def numbers(*values: float) -> str:
-        return " ".join(f"{value:.6f}" for value in values)
-
-    for i in range(1, n_joints + 1):
-        kind = random.choice(
-            ["revolute", "prismatic", "continuous", "fixed"], p=[0.4, 0.3, 0.2, 0.1]
-        )
-        if i == 1:
-            kind = "revolute"
-        parent = int(random.integers(max(0, i - 3), i))  # branches now and then
-        half = random.normal(size=(3, 3))
-        inertia = half @ half.T + np.eye(3)
-        axis = np.eye(3)[random.integers(3)] if random.random() < 0.5 else random.normal(size=3)
-        parts.append(
-            f'<link name="l{i}"><inertial><origin xyz="{numbers(*random.normal(size=3))}"/>'
-            f'<mass value="{random.uniform(1, 5):.6f}"/><inertia ixx="{inertia[0, 0]}" '
-            f'ixy="{inertia[0, 1]}" ixz="{inertia[0, 2]}" iyy="{inertia[1, 1]}" '
-            f'iyz="{inertia[1, 2]}" izz="{inertia[2, 2]}"/></inertial></link>'
-            f'<joint name="j{i}" type="{kind}"><parent link="l{parent}"/><child link="l{i}"/>'
-            f'<origin xyz="{numbers(*random.normal(size=3))}" '
-            f'rpy="{numbers(*random.normal(size=3))}"/>'
-            f'<axis xyz="{numbers(*axis)}"/>'
-            '<limit lower="-9" upper="9" effort="9" velocity="9"/></joint>'
-        )
-    return "".join(parts) + "</robot>"
 
 
 def inverse_dynamics(
@@ -166,27 +124,18 @@ def test_a_model_survives_the_way_to_another_process() -> None:
     assert np.array_equal(again.torque(values, q, qd, qdd), before)
 
 
-def joint(kind: str, axis: str = "0 0 1") -> str:
-    return (
-        '<robot name="r"><link name="a"/><link name="b"><inertial><mass value="2"/>'
-        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
-        f'<joint name="strange" type="{kind}"><parent link="a"/><child link="b"/>'
-        f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
-    )
-
-
 def slider(axis: str) -> str:
-    return joint("prismatic", axis)
+    return one_joint("prismatic", axis)
 
 
 @pytest.mark.parametrize("kind", ["floating", "planar"])
 def test_other_joints_are_refused_by_name(kind: str) -> None:
     with pytest.raises(ModelError, match="'strange'") as caught:
-        RobotModel.from_urdf(joint(kind))
+        RobotModel.from_urdf(one_joint(kind))
     assert caught.value.joint == "strange"
 
 
-@pytest.mark.parametrize("text", ["", "no xml", "<robot name='r'/>", joint("fixed")])
+@pytest.mark.parametrize("text", ["", "no xml", "<robot name='r'/>", one_joint("fixed")])
 def test_a_text_without_a_robot_that_moves_is_refused(text: str) -> None:
     with pytest.raises(ModelError, match="robot description"):
         RobotModel.from_urdf(text)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,6 +96,22 @@ def test_standard_parameters_are_a_table_of_joints(fit: Fit) -> None:
     assert float(rows[1]["m"]) == consistent.standard[20]
     assert float(rows[1]["Im"]) == consistent.standard[21]
     assert all(float(row["margin"]) > 0.0 for row in rows)
+
+
+@pytest.mark.parametrize(
+    "evil", ["=HYPERLINK('http://a')", "@SUM(1)", "-1+1", "+1", " =1", "a&#10;#b"]
+)
+def test_no_name_is_a_formula_to_a_spreadsheet_or_breaks_its_row(fit: Fit, evil: str) -> None:
+    _, _, consistent = fit
+    model = RobotModel.from_urdf(URDF.replace("shoulder", evil), friction=FrictionLaw(third=None))
+    text = standard_csv(model, consistent, provenance={"archives": "a,=1+1.mcap;@b, -3"})
+    lines = text.splitlines()
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    assert [row["joint"][-1] for row in rows] == [model.joint_names[0][-1], "w"]
+    cells = [cell for line in lines for cell in re.split("[,;]", line)]
+    formulas = [cell for cell in cells if cell.startswith(tuple("=@+-"))]
+    assert all(isinstance(float(cell), float) for cell in formulas), formulas
+    assert "a,'=1+1.mcap;'@b, -3" in text
 
 
 def test_parameters_of_another_model_are_refused(fit: Fit) -> None:

@@ -8,8 +8,10 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
+from identification.coupling import Coupling
 from identification.estimation import Estimate
 from identification.factor import Factor
+from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from identification.motion import Motion
 from identification.plausibility import Implausible, _inertia_columns, implausibilities
@@ -138,3 +140,28 @@ def test_the_inertia_matrix_is_pinocchios(model: RobotModel, estimate: Estimate)
         upper = np.triu(pin.crba(reference, data, q))
         expected = upper + np.triu(upper, 1).T
         np.testing.assert_allclose(matrix, expected, atol=1e-12)
+
+
+def test_a_coupled_motor_that_drives_is_named() -> None:
+    coupled = RobotModel.from_urdf(
+        URDF,
+        friction=FrictionLaw(third=None),
+        coupling=Coupling(np.array([[1.0, 0.0], [0.5, 1.0]]), inertia=False),
+    )
+    standard = coupled.nominal
+    standard[coupled.layout.rotors] = 0.4, 0.1
+    friction = np.array([4.0, 2.0, 1.5, 0.8, 1.0, -1.0])
+    values = np.concatenate([coupled.base.grouping @ standard, friction])
+    estimate = Estimate(
+        names=coupled.parameter_names,
+        units=coupled.units,
+        values=values,
+        covariance=np.diag((0.01 * np.maximum(np.abs(values), 0.1)) ** 2),
+        noise_std=np.ones(2),
+        samples=np.full(2, 1000),
+        method="",
+        condition=10.0,
+    )
+    (words,) = found(coupled, estimate).impossible
+    assert words.startswith("friction f1_m2 of motor 2 is negative: -1")
+    assert found(coupled, with_value(estimate, "f1_m2", 1.0)) == Implausible((), ())

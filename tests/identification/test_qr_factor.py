@@ -3,7 +3,6 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from identification.augmented_rows import augmented_rows
 from identification.errors import IdentificationError, ShapeError
 from identification.estimation import estimate, joint_weights, residual_variance, solve, total
 from identification.factor import Factor
-from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from identification.motion import Motion
 from identification.preprocessing import Samples
@@ -28,19 +26,9 @@ from identification.qr_factor import (
     reduced,
 )
 from identification.row_solution import rows_of, solve_rows
+from tests.identification.two_link import MODEL, NOISE, URDF, P, recording, truth
 
 Array = NDArray[np.float64]
-
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
-MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
-P = MODEL.n_parameters
-NOISE = np.array([3.0, 0.2])
-
-
-def truth() -> Array:
-    standard = MODEL.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
 
 
 def a_motion(samples: int = 3000, speed_ripple: float = 1.0) -> Motion:
@@ -60,17 +48,9 @@ def a_motion(samples: int = 3000, speed_ripple: float = 1.0) -> Motion:
     )
 
 
-def recording(motion: Motion, noise: Array | float = 0.0, seed: int = 0) -> Samples:
-    torque = MODEL.torque(truth(), *motion[1:])
-    torque += noise * np.random.default_rng(seed).standard_normal(torque.shape)
-    return Samples(
-        motion=motion,
-        torque=torque,
-        usable=MODEL.moving(motion.velocity),
-        segments=(slice(0, len(motion.time)),),
-        origin=float(motion.time[0]),
-        position_bandwidth=np.full(2, np.inf),
-    )
+def noisy(motion: Motion, noise: Array | float = 0.0, seed: int = 0) -> Samples:
+    error = noise * np.random.default_rng(seed).standard_normal((len(motion.time), 2))
+    return recording(error, motion)
 
 
 def cut(samples: Samples, edges: Array) -> list[Samples]:
@@ -108,7 +88,7 @@ def exact_solution(samples: Samples) -> Array:
 
 @pytest.mark.parametrize("bandwidth", [None, np.array([60.0, 80.0])])
 def test_rows_are_the_regressor_and_the_torque_of_what_is_usable(bandwidth: Array | None) -> None:
-    samples = replace(recording(a_motion(3000), NOISE), torque_bandwidth=bandwidth)
+    samples = replace(noisy(a_motion(3000), NOISE), torque_bandwidth=bandwidth)
     samples.torque[~samples.usable] = np.nan
     blocks, columns = samples.regressor(MODEL)
     chunks = [(part, [b.copy() for b in rows]) for part, rows in augmented_rows(MODEL, samples)]
@@ -124,7 +104,7 @@ def test_rows_are_the_regressor_and_the_torque_of_what_is_usable(bandwidth: Arra
 
 
 def test_rows_of_the_wrong_shape_are_refused_by_name() -> None:
-    samples = recording(a_motion(100))
+    samples = noisy(a_motion(100))
     with pytest.raises(ShapeError, match="torque"):
         list(augmented_rows(MODEL, replace(samples, torque=samples.torque[:99])))
     with pytest.raises(ShapeError, match="usable"):
@@ -135,7 +115,7 @@ def test_rows_of_the_wrong_shape_are_refused_by_name() -> None:
 
 
 def test_the_triangles_are_triangular_and_their_squares_are_the_gram_matrices() -> None:
-    samples = recording(a_motion(), NOISE)
+    samples = noisy(a_motion(), NOISE)
     factor, gram = QRFactor.from_samples(MODEL, samples), samples.factor(MODEL)
     assert np.array_equal(factor.triangle, np.triu(factor.triangle))
     size = np.abs(gram.gram).max(axis=(1, 2), keepdims=True)
@@ -148,7 +128,7 @@ def test_the_triangles_are_triangular_and_their_squares_are_the_gram_matrices() 
 def test_where_gram_matrices_are_good_both_give_the_same_to_nine_digits(
     weights: Array | None,
 ) -> None:
-    samples = recording(a_motion(), NOISE)
+    samples = noisy(a_motion(), NOISE)
     gram, factor = samples.factor(MODEL), QRFactor.from_samples(MODEL, samples)
     expected, found = estimate(MODEL, gram, weights), qr_estimate(MODEL, factor, weights)
     np.testing.assert_allclose(found.values, expected.values, rtol=1e-9)
@@ -165,7 +145,7 @@ def test_where_gram_matrices_are_good_both_give_the_same_to_nine_digits(
 @given(pieces=st.integers(1, 1000), seed=st.integers(0, 2**16))
 @settings(max_examples=6)
 def test_one_chunk_or_a_thousand_give_the_same_to_nine_digits(pieces: int, seed: int) -> None:
-    samples = recording(a_motion(1500), NOISE, seed)
+    samples = noisy(a_motion(1500), NOISE, seed)
     inner = np.random.default_rng(seed).integers(0, 1501, pieces - 1)
     edges = np.sort(np.concatenate([[0], inner, [1500]]))
     parts = cut(samples, np.unique(edges))
@@ -182,14 +162,14 @@ def test_one_chunk_or_a_thousand_give_the_same_to_nine_digits(pieces: int, seed:
 
 
 def test_a_sum_may_start_from_zero() -> None:
-    samples = recording(a_motion(200))
+    samples = noisy(a_motion(200))
     one = QRFactor.from_samples(MODEL, samples)
     again = QRFactor.zero(MODEL) + one
     np.testing.assert_allclose(again.gram.gram, one.gram.gram, rtol=1e-12, atol=1e-12)
 
 
 def test_factors_of_different_models_do_not_add_and_weights_are_one_per_joint() -> None:
-    one = QRFactor.from_samples(MODEL, recording(a_motion(50)))
+    one = QRFactor.from_samples(MODEL, noisy(a_motion(50)))
     other = QRFactor.zero(RobotModel.from_urdf(URDF, rotor_inertia=False))
     with pytest.raises(IdentificationError, match="cannot be added"):
         _ = one + other
@@ -202,7 +182,7 @@ def test_factors_of_different_models_do_not_add_and_weights_are_one_per_joint() 
 
 def ill() -> Samples:
     """A scaled condition of some 1e7: the elbow turns one way, at very nearly one speed."""
-    return recording(a_motion(400, speed_ripple=1e-5))
+    return noisy(a_motion(400, speed_ripple=1e-5))
 
 
 def test_triangles_keep_digits_where_gram_matrices_have_lost_them() -> None:
@@ -223,7 +203,7 @@ def test_triangles_keep_digits_where_gram_matrices_have_lost_them() -> None:
 
 def test_the_residual_does_not_drown_in_the_torque() -> None:
     # A residual 1e-9 of the torque: its square is below what a Gram matrix can hold.
-    samples = recording(a_motion(), 1e-9 * NOISE)
+    samples = noisy(a_motion(), 1e-9 * NOISE)
     factor, ordinary = QRFactor.from_samples(MODEL, samples), np.ones(2)
     variance = qr_residual_variance(factor, factor.solve(ordinary), ordinary)
     np.testing.assert_allclose(np.sqrt(variance), 1e-9 * NOISE, rtol=0.05)
@@ -234,7 +214,7 @@ def test_the_residual_does_not_drown_in_the_torque() -> None:
 
 
 def test_the_condition_decides_which_kind_of_factor_is_made() -> None:
-    good, bad = recording(a_motion(), NOISE), ill()
+    good, bad = noisy(a_motion(), NOISE), ill()
     assert isinstance(reduced(MODEL, [good]), Factor)
     factor = reduced(MODEL, [bad, bad])
     assert isinstance(factor, QRFactor)
@@ -253,7 +233,7 @@ def test_what_is_dependent_by_construction_is_named() -> None:
     motion = a_motion()
     still = Motion(*(array.copy() for array in motion))
     still.position[:, 1], still.velocity[:, 1], still.acceleration[:, 1] = 0.4, 0.0, 0.0
-    samples = replace(recording(still), usable=np.ones((3000, 2), dtype=bool))
+    samples = replace(noisy(still), usable=np.ones((3000, 2), dtype=bool))
     gram, qr = samples.factor(MODEL), QRFactor.from_samples(MODEL, samples)
     found, expected = qr_estimate(MODEL, qr), estimate(MODEL, gram)
     assert {"f0_2", "f1_2", "I2m"} <= set(found.undetermined)
@@ -270,7 +250,7 @@ def test_no_rows_are_an_error() -> None:
 
 
 def test_a_joint_without_rows_has_no_noise_and_no_weight() -> None:
-    samples = recording(a_motion(), NOISE)
+    samples = noisy(a_motion(), NOISE)
     samples.usable[:, 1] = False
     factor = QRFactor.from_samples(MODEL, samples)
     assert qr_joint_weights(factor)[1] == 0.0
@@ -296,7 +276,7 @@ def test_rows_are_solved_as_by_the_pseudo_inverse(k: int, p: int, seed: int) -> 
 
 
 def test_normal_equations_become_rows_with_the_same_squares() -> None:
-    equations = recording(a_motion(), NOISE).factor(MODEL).weighted(1.0 / NOISE**2)
+    equations = noisy(a_motion(), NOISE).factor(MODEL).weighted(1.0 / NOISE**2)
     rows, target = rows_of(equations)
     scale = np.sqrt(np.diag(equations.A))
     np.testing.assert_allclose(

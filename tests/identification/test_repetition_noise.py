@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.preprocessing import standstill_variance
+from identification.noise import standstill_variance
 from identification.recording import Recording
 from identification.repetition_noise import repetition_noise
 

@@ -45,6 +45,20 @@ def test_jitter_is_measured_against_the_usual_step() -> None:
     assert "uneven" in base.describe()[1]
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_stamps_that_come_late_are_not_taken_for_missing_samples(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    late = 0.01 * (np.arange(4000) + random.uniform(-0.3, 0.3, 4000))
+    lost = np.sort(random.choice(np.arange(100, 3900, 40), 25, replace=False))
+
+    whole, torn = time_base(late), time_base(np.delete(late, lost))
+
+    assert whole.dropped == 0
+    assert torn.dropped == 25
+    assert whole.rate == pytest.approx(100.0, rel=1e-3)
+    assert torn.rate == pytest.approx(100.0, rel=1e-3)
+
+
 def test_repeats_falls_drops_and_gaps_are_counted_apart() -> None:
     index = np.arange(1000.0)
     index[100] = index[99]  # repeats
@@ -53,8 +67,8 @@ def test_repeats_falls_drops_and_gaps_are_counted_apart() -> None:
     index[600:] += 50.0  # a gap
     base = time_base(index * 1e-3)
     assert (base.repeated, base.backward, base.gaps) == (1, 1, 1)
-    # The steps after the repeat and the fall look like a missing sample each, or half.
-    assert base.dropped == 3 + 2
+    # The long steps after the repeat and the fall make up for the short ones: nothing is missing.
+    assert base.dropped == 3
     assert not base.uniform
     words = " ".join(base.describe())
     for part in ("repeat", "older", "missing", "gaps", "resampled"):

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 
 from hil.importers import Robot, import_rosbag2
 from hil.recordings import open_recording
@@ -24,55 +23,19 @@ from identification.motion import Motion
 from identification.preprocessing import Samples, prepare
 from identification.robust import robust_estimate, robust_weights
 from identification.validation import prediction_error
+from tests.identification.two_link import (
+    MODEL,
+    NOISE,
+    P,
+    a_motion,
+    coloured,
+    gaussian,
+    recording,
+    truth,
+)
 
 Array = NDArray[np.float64]
-
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
-MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
-P = MODEL.n_parameters
-NOISE = np.array([3.0, 0.2])
 LOSSES = [Huber(), Tukey()]
-
-
-def truth() -> Array:
-    standard = MODEL.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
-
-
-def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
-    time = np.arange(0.0, duration, step)
-    rng = np.random.default_rng(12)
-    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
-    angle = w * time[:, None, None] + phase
-    return Motion(
-        time,
-        (a * np.sin(angle)).sum(axis=1),
-        (a * w * np.cos(angle)).sum(axis=1),
-        (-a * w**2 * np.sin(angle)).sum(axis=1),
-    )
-
-
-def recording(error: Array, motion: Motion) -> Samples:
-    return Samples(
-        motion=motion,
-        torque=MODEL.torque(truth(), *motion[1:]) + error,
-        usable=MODEL.moving(motion.velocity),
-        segments=(slice(0, len(motion.time)),),
-        origin=float(motion.time[0]),
-        position_bandwidth=np.full(2, np.inf),
-    )
-
-
-def gaussian(rng: np.random.Generator, motion: Motion) -> Array:
-    return NOISE * rng.standard_normal((len(motion.time), 2))
-
-
-def coloured(rng: np.random.Generator, length: int, step: float, correlation: float) -> Array:
-    r = np.exp(-step / correlation) if correlation else 0.0
-    start = rng.standard_normal((1, 2)) * r
-    white = np.sqrt(1.0 - r**2) * rng.standard_normal((length, 2))
-    return NOISE * lfilter([1.0], [1.0, -r], white, axis=0, zi=start)[0]
 
 
 def spoiled(rng: np.random.Generator, error: Array, share: float, size: float) -> Array:

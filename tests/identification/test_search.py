@@ -305,6 +305,26 @@ def test_a_polish_that_is_worse_at_a_millisecond_is_left_alone(population, metho
     assert design.excitation.criteria == design.origin_criteria == plain.excitation.criteria
 
 
+class Alike(Watched):
+    """Genes other than `best` that are the same motion at a millisecond."""
+
+    def __init__(self, best):
+        super().__init__(problem())
+        self._best = best
+
+    def judged(self, genes, period):
+        return super().judged(self._best, period)
+
+
+def test_other_genes_of_the_same_motion_are_no_polish(population):
+    plain = search(population, settings("front"))
+    assert search(population.begin(), settings("front", polish=60)).chosen is None
+    with Alike(plain.genes) as alike:
+        design = search(alike, settings("front", polish=60))
+    assert design.chosen == design.origin == plain.chosen
+    assert design.genes.tobytes() == plain.genes.tobytes()
+
+
 def test_a_polished_motion_tells_what_it_grew_from(population):
     plain = search(population, settings("front"))
     design = search(population.begin(), settings("front", polish=60))

@@ -13,9 +13,11 @@ from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from identification.recording import Recording
 
+ALL_TERMS = FrictionLaw(offset=True)
 
-def ur10(folder: Path) -> tuple[RobotModel, Recording]:
-    """Model with all friction terms, and 27.5 s at 125 Hz; skips where either is missing."""
+
+def ur10(folder: Path, friction: FrictionLaw = ALL_TERMS) -> tuple[RobotModel, Recording]:
+    """Model with this friction, and 27.5 s at 125 Hz; skips where either is missing."""
     typesys = pytest.importorskip("rosbags.typesys")
     files = metadata.files("example-robot-data") or ()
     urdf = next((f.locate() for f in files if f.name == "ur10_robot.urdf"), None)
@@ -29,7 +31,7 @@ def ur10(folder: Path) -> tuple[RobotModel, Recording]:
     rows = database.execute("select data from messages order by timestamp").fetchall()
     database.close()
     states = [store.deserialize_cdr(data, "sensor_msgs/msg/JointState") for (data,) in rows]
-    model = RobotModel.from_urdf(Path(str(urdf)).read_text(), friction=FrictionLaw(offset=True))
+    model = RobotModel.from_urdf(Path(str(urdf)).read_text(), friction=friction)
     order = [states[0].name.index(name) for name in model.joint_names]
     stamps = [s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in states]
     return model, Recording(

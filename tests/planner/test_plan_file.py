@@ -58,7 +58,9 @@ def files(draw):
     )
     start = np.array(draw(st.lists(positions, min_size=n, max_size=n)))
     names = tuple(
-        draw(st.lists(st.text('aé"\\ .=\n#', min_size=1), min_size=n, max_size=n, unique=True))
+        draw(
+            st.lists(st.text('aé🤖\x7f"\\ .=\n#', min_size=1), min_size=n, max_size=n, unique=True)
+        )
     )
     return PlanFile(names, start, tuple(draw(st.lists(moves(n), max_size=4))), overrides, limits)
 

@@ -78,7 +78,7 @@ def _deviation_panel(
         f" {outside} outside 2, {sum(abs(z) > 3.0 for _, z in shown)} outside 3."
     )
     with drawing():
-        figure, axes = _rows(results, members)
+        figure, axes = parameter_rows(results, members)
         axes.axvspan(-2.0, 2.0, color=BAND, linewidth=0.0)
         for limit in (-3.0, 3.0):
             axes.axvline(limit, color=MUTED, linewidth=0.8, linestyle=(0, (3, 3)))
@@ -141,7 +141,7 @@ def _uncertainty_panel(
         f"{title}: standard deviation of {len(members)} parameters by each route over the reported."
     )
     with drawing():
-        figure, axes = _rows(results, members)
+        figure, axes = parameter_rows(results, members)
         axes.set_xscale("log")
         axes.axvline(1.0, color=MUTED, linewidth=0.9)
         for route in routes:
@@ -175,7 +175,7 @@ def _route_dots(axes: Axes, route: Route, members: list[int]) -> None:
     )
 
 
-def _rows(results: Results, members: list[int]) -> tuple[Figure, Axes]:
+def parameter_rows(results: Results, members: list[int]) -> tuple[Figure, Axes]:
     """A figure whose axes have one ruled, labelled row per parameter, the first on top."""
     height = _ROW * len(members)
     figure = blank(_WIDTH, _TOP + height + _BOTTOM)

@@ -45,7 +45,7 @@ def _feed(summary: hashlib._Hash, value: object) -> None:
     """Add a value, each part under its kind and size, so that no two values read alike."""
     if isinstance(value, RobotModel):
         # The rest of a model is computed from these, maybe with another last bit elsewhere.
-        own = (value.chain, value.gravity, value.rotor_inertia, value.friction)
+        own = (value.chain, value.gravity, value.rotor_inertia, value.friction, value.payload)
         _feed(summary, ("RobotModel", *own, value.parameter_names))
     elif isinstance(value, np.ndarray | np.generic):
         array = np.asarray(value)

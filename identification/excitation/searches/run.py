@@ -112,7 +112,8 @@ class _Search:
             genes = self._polished(goal, front, winner)
         if genes.tobytes() != start.tobytes():
             trajectory, criteria = self._population.judged(genes, RESCORE_PERIOD)
-            if goal.is_worse(criteria, origin[1]):  # better only as the search samples
+            # Better only as the search samples, or other genes of the same motion.
+            if criteria == origin[1] or goal.is_worse(criteria, origin[1]):
                 genes, (trajectory, criteria) = start, origin
         return Design(
             settings=self._settings,

@@ -1,4 +1,4 @@
-"""Logs of numbers become archives: columns by name, pattern or index, units, gears, refusals."""
+"""Logs of text in columns become archives: by name, pattern or index, units, gears, refusals."""
 
 from __future__ import annotations
 
@@ -10,27 +10,15 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.errors import SourceError
-from hil.importers import ColumnMap, Robot, import_csv
+from hil.importers import ColumnMap, Robot, import_log
 from hil.importers.column_map import UNITS
 from hil.recordings import open_recording
-
-JOINTS = ("hip", "knee", "ankle")
+from tests.hil.three_joints import JOINTS, three_joint_robot
 
 
 @pytest.fixture
 def robot(tmp_path: Path) -> Robot:
-    parts = ["<robot name='three'><link name='l0'/>"]
-    for number, name in enumerate(JOINTS):
-        parts.append(
-            f"<link name='l{number + 1}'><inertial><mass value='1'/><origin xyz='0 0 0.2'/>"
-            "<inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
-            f"<joint name='{name}' type='revolute'><parent link='l{number}'/>"
-            f"<child link='l{number + 1}'/><axis xyz='0 1 0'/><origin xyz='0 0 0.4'/>"
-            "<limit lower='-3' upper='3' effort='9' velocity='9'/></joint>"
-        )
-    path = tmp_path / "three.urdf"
-    path.write_text("".join([*parts, "</robot>"]))
-    return Robot.from_urdf(path)
+    return three_joint_robot(tmp_path)
 
 
 def log(path: Path, values: NDArray[np.float64], header: str = "", delimiter: str = ",") -> Path:
@@ -55,7 +43,7 @@ class TestColumns:
     def test_by_pattern_name_and_index(self, tmp_path, robot, position):
         file = log(tmp_path / "a.csv", VALUES, HEADER)
         columns = column_map(position={"columns": position}, torque={"columns": "tau{}"})
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         recording = open_recording(path)
         assert recording.joint_names == JOINTS
         assert np.array_equal(recording.position, VALUES[:, 1:4])
@@ -67,32 +55,32 @@ class TestColumns:
     def test_the_delimiter_is_found_out(self, tmp_path, robot, delimiter):
         header = HEADER.replace(",", delimiter)
         file = log(tmp_path / "a.txt", VALUES, header, delimiter)
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
         assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
 
     def test_a_file_without_header_is_read_by_index(self, tmp_path, robot):
         file = log(tmp_path / "a.txt", VALUES)
         columns = column_map(position={"columns": (4, 5, 6)})
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         assert np.array_equal(open_recording(path).position, VALUES[:, 4:])
 
     def test_comments_and_quotes_before_the_data(self, tmp_path, robot):
         header = '# made by hand\n% 2020\n\n"t", "q1", "q2", "q3", "a", "b", "c"'
         file = log(tmp_path / "a.txt", VALUES, header)
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
         assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
 
     def test_a_decimal_comma(self, tmp_path, robot):
         file = log(tmp_path / "a.csv", VALUES, HEADER.replace(",", ";"), ";")
         file.write_text(file.read_text().replace(".", ","))
         columns = column_map(format={"decimal": ","})
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
 
     def test_joints_in_another_order(self, tmp_path, robot):
         file = log(tmp_path / "a.csv", VALUES, HEADER)
         columns = column_map(joints=("ankle", "hip", "knee"))
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         assert np.array_equal(open_recording(path).position, VALUES[:, [2, 3, 1]])
 
 
@@ -100,7 +88,7 @@ class TestTime:
     def test_a_sample_rate_counts_samples(self, tmp_path, robot):
         file = log(tmp_path / "a.csv", VALUES, HEADER)
         columns = column_map(sample_rate=3000.0)
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         assert np.array_equal(open_recording(path).time, np.arange(20) * (1 / 3000.0))
 
     @pytest.mark.parametrize(
@@ -117,7 +105,7 @@ class TestTime:
         lines = [f"{time},1,2,{row}" for row, time in enumerate(times)]
         (tmp_path / "a.csv").write_text("t,q1,q2,q3\n" + "\n".join(lines))
         columns = column_map(time={"column": "t", "unit": unit}, sample_rate=None)
-        path = import_csv(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
         stamp = open_archive(path).columns["stamp"]
         assert (stamp - stamp[0]).tolist() == expected
         assert open_recording(path).time.tolist() == pytest.approx(
@@ -130,7 +118,7 @@ class TestTime:
         values[:, 0] = steps
         file = log(tmp_path / "a.csv", values, HEADER)
         columns = column_map(time={"column": 0}, sample_rate=None)
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         assert open_recording(path).time == pytest.approx(steps, abs=1e-9)
 
 
@@ -141,7 +129,7 @@ class TestUnitsAndGears:
             position={"columns": "q{}", "unit": "deg", "scale": (1, -1, 2)},
             motor_current={"columns": "tau{}", "unit": "mA"},
         )
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         recording = open_recording(path)
         expected = np.radians(VALUES[:, 1:4]) * [1, -1, 2]
         assert recording.position == pytest.approx(expected, rel=1e-15)
@@ -171,7 +159,7 @@ class TestUnitsAndGears:
                 "joint_offset": (0.5, 0.0, -0.5),
             },
         )
-        path = import_csv(file, tmp_path / "m.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "m.mcap", robot=robot, columns=columns)
         back = open_archive(path).columns
         assert back["position"] == pytest.approx(q + np.array([0.5, 0.0, -0.5]), rel=1e-12)
         assert back["velocity"] == pytest.approx(qd, rel=1e-12)
@@ -185,7 +173,7 @@ class TestUnitsAndGears:
             motor_current={"columns": "tau{}"},
             drive={"gear_ratio": (100, -80, 50), "torque_constant": (0.1, 0.2, 0.3)},
         )
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         recording = open_recording(path)
         assert recording.motor_current is not None
         assert np.array_equal(recording.motor_current, VALUES[:, 4:])
@@ -198,7 +186,7 @@ class TestUnitsAndGears:
             joints=("ankle", "hip", "knee"),
             drive={"gear_ratio": (10, 20, 40), "joint_offset": (1, 2, 3)},
         )
-        path = import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         expected = (VALUES[:, 1:4] / [10, 20, 40] + [1, 2, 3])[:, [1, 2, 0]]
         assert open_recording(path).position == pytest.approx(expected)
 
@@ -207,7 +195,10 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("entries", "sentence"),
         [
-            ({"position": {"columns": "pos{}"}}, "no column 'pos1'; its columns are t, q1, q2"),
+            (
+                {"position": {"columns": "pos{}"}},
+                "no column 'pos1' for hip.*its columns are t, q1, q2",
+            ),
             ({"torque": {"columns": (4, 5, 9)}}, r"torque.columns: there is no column 9"),
             ({"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
             ({"torque": {"columns": "tau"}}, "no place for the joint's number"),
@@ -223,7 +214,7 @@ class TestBadInput:
     ):
         file = log(tmp_path / "a.csv", VALUES, HEADER)
         with pytest.raises(SourceError, match=sentence):
-            import_csv(file, tmp_path / "a.mcap", robot=robot, columns=column_map(**entries))
+            import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map(**entries))
         assert not (tmp_path / "a.mcap").exists()
 
     @pytest.mark.parametrize(
@@ -232,8 +223,8 @@ class TestBadInput:
             ("0.1,1,x,3,4,5,6", "line 12 has 'x' in column q2, not a number"),
             ("0.1,1", "line 12 has nothing in column q2, not a number"),
             ("0.1,1,,3,4,5,6", "line 12 has nothing in column q2"),
-            ("0.1,1,nan,3,4,5,6", "position of joint knee is nan in sample 10"),
-            ("0.1,1,inf,3,4,5,6", "position of joint knee is inf in sample 10"),
+            ("0.1,1,nan,3,4,5,6", "line 12 has 'nan' in column q2, not a number"),
+            ("0.1,1,inf,3,4,5,6", "line 12 has 'inf' in column q2, not a number"),
         ],
     )
     def test_a_cell_that_is_no_number_is_named_by_line_and_column(
@@ -243,26 +234,26 @@ class TestBadInput:
         lines = file.read_text().splitlines()
         file.write_text("\n".join([*lines[:11], line, *lines[12:]]))
         with pytest.raises(SourceError, match=sentence):
-            import_csv(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+            import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
 
     @pytest.mark.parametrize("time", ["", "soon", "nan", "inf"])
     def test_a_time_that_is_no_number_is_named(self, tmp_path, robot, time):
         (tmp_path / "a.csv").write_text(f"t,q1,q2,q3\n0,1,2,3\n{time},1,2,3\n")
         columns = column_map(time={"column": "t"}, sample_rate=None)
-        with pytest.raises(SourceError, match=r"time: line 3 has '.*' for the time"):
-            import_csv(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
+        with pytest.raises(SourceError, match=r"time: line 3 has ('.*'|nothing) for the time"):
+            import_log(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
 
     def test_files_of_different_length_are_refused(self, tmp_path, robot):
         file = log(tmp_path / "q.csv", VALUES, HEADER)
         log(tmp_path / "tau.csv", VALUES[:-1], HEADER)
         columns = column_map(torque={"columns": "tau{}", "file": "tau.csv"})
         with pytest.raises(SourceError, match="differ in length: position 20, torque 19"):
-            import_csv(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+            import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
 
     def test_a_file_without_numbers_is_refused(self, tmp_path, robot):
         (tmp_path / "a.csv").write_text("t,q1\n")
         with pytest.raises(SourceError, match="has no row of numbers"):
-            import_csv(tmp_path / "a.csv", tmp_path / "x.mcap", robot=robot, columns=column_map())
+            import_log(tmp_path / "a.csv", tmp_path / "x.mcap", robot=robot, columns=column_map())
 
 
 class TestMapFile:
@@ -315,7 +306,7 @@ def test_tx40_positions_and_torques_in_two_files(tmp_path: Path, shared_data: Pa
         joint_offset = [0.0, -1.5707963267948966, 1.5707963267948966, 0.0, 0.0, 0.0]
         """
     )
-    path = import_csv(
+    path = import_log(
         folder / "pos_read_data.csv",
         tmp_path / "tx40.mcap",
         robot=Robot.from_urdf(folder / "tx40_mdh_modified.urdf"),

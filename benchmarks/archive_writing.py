@@ -1,0 +1,161 @@
+"""What writing an archive costs: processor time of the real archive process at 1 kHz.
+
+Run with ``python -m benchmarks.archive_writing [--json] [--seconds S]``. This program is the
+exchange: it fills the shared memory with a cycle of six joints every millisecond, the values of a
+recorded excitation (`benchmarks.archive_files`). The archive process drains, encodes, compresses
+and writes it to the disk of the present folder with fdatasync, as on a real link. Its processor
+time, that of both its threads, from the opening of the archive to its closing is set against the
+time it took: ``writing_share_of_core``, and ``writing_share_of_core_with_packets`` where raw
+packets of both directions are kept as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.archive_files import JOINTS, PERIOD, drive_train, records
+from drivers.exchange import ControlBlock, EventWriter, SharedCycleRing, SharedPacketRing, event_log
+from drivers.exchange import control as control_memory
+from drivers.packets import AXIS_DTYPE, HEADER_LENGTH, Mode, next_number
+from hil.archive import ArchiveSpec, open_archive
+from hil.archive.commands import Close, Closed, Open, Opened
+from hil.archive.supervised import ArchiveProcessHandle
+
+Array = NDArray[np.float64]
+
+SECONDS = 60.0
+NAMES = tuple(f"joint_{number + 1}" for number in range(JOINTS))
+ANSWER = 30.0  # s
+
+
+class Exchange:
+    """The memory of an exchange, and its descriptors."""
+
+    def __init__(self, *, packets: bool) -> None:
+        self.ring = SharedCycleRing.create(JOINTS, 20_000)
+        self.ring_fd, self.event_fd = self.ring.fd, event_log.create()
+        self.control_fd = control_memory.create()
+        self.events, self.control = EventWriter(self.event_fd), ControlBlock(self.control_fd)
+        self.packets = SharedPacketRing.create() if packets else None
+        self.pid = os.getpid()
+        self._rows = records(0)
+
+    @property
+    def packets_fd(self) -> int:
+        """Descriptor of the raw packets, -1 without."""
+        return -1 if self.packets is None else self.packets.fd
+
+    def run(self, seconds: float) -> None:
+        """A cycle every millisecond."""
+        started = time.monotonic()
+        count = round(seconds / PERIOD)
+        while self.ring.written < count:
+            due = min(count, int((time.monotonic() - started) / PERIOD))
+            while self.ring.written < due:
+                self._commit(self.ring.written)
+            time.sleep(PERIOD / 2)
+
+    def _commit(self, cycle: int) -> None:
+        slot = self.ring.slot
+        self.ring.rows[slot] = self._rows[cycle % len(self._rows)]
+        self.ring.cycle[slot] = cycle
+        self.ring.commit()
+        if self.packets is not None:
+            number = int(self.ring.number[slot])
+            received = _packet(number, self.ring.measured[slot])
+            sent = _packet(next_number(number), self.ring.commanded[slot])
+            self.packets.put(cycle, cycle * PERIOD, False, received)
+            self.packets.put(cycle, cycle * PERIOD, True, sent)
+
+    def close(self) -> None:
+        """Give the memory up."""
+        for fd in (self.ring_fd, self.event_fd, self.control_fd, self.packets_fd):
+            if fd >= 0:
+                os.close(fd)
+
+
+def _packet(number: int, values: Array) -> bytes:
+    """A packet whose axes have these values, (k, joints), in their first places."""
+    axes = np.zeros(JOINTS, AXIS_DTYPE)
+    axes["mode"] = Mode.POSITION
+    axes["d"][:, : len(values[:5])] = values[:5].T
+    axes["extra"][:, : len(values[5:])] = values[5:].T
+    return number.to_bytes(4, "little") + bytes(HEADER_LENGTH - 4) + axes.tobytes()
+
+
+def measure(folder: Path, seconds: float, *, packets: bool) -> dict[str, Any]:
+    """Share of one core and size, of one archive of so many seconds."""
+    exchange = Exchange(packets=packets)
+    process = ArchiveProcessHandle.start(exchange, JOINTS, exchange.packets_fd)
+    path = folder / f"excitation_{int(packets):03d}_a1.mcap"
+    try:
+        spec = ArchiveSpec(path, NAMES, PERIOD, metadata={}, packets=packets)
+        process.send(Open(1, spec, drive_train(), from_now=True, until_ended=False))
+        _require(process.answer(ANSWER, 1), Opened)
+        used, started = _processor_time(process.process.pid), time.monotonic()
+        exchange.run(seconds)
+        elapsed = time.monotonic() - started
+        process.send(Close(1, "completed", "as long as was asked for"))
+        closed = _require(process.answer(ANSWER, 1), Closed)
+        used = _processor_time(process.process.pid) - used
+    finally:
+        process.end()
+        exchange.close()
+    archive = open_archive(path, fields=["cycle"])
+    assert archive.complete, archive.missing
+    assert archive.n_samples == closed.records == round(seconds / PERIOD)
+    return {
+        "share": used / elapsed,
+        "megabytes_per_minute": path.stat().st_size / seconds * 60.0 / 1e6,
+        "records_lost": closed.records_lost,
+    }
+
+
+def _require(answer: Any, kind: type) -> Any:
+    if not isinstance(answer, kind):
+        raise SystemExit(f"the archive process answered {answer}")
+    return answer
+
+
+def _processor_time(pid: int) -> float:
+    """User and system time of a process so far [s]; of its threads, to the nanosecond."""
+    threads = Path(f"/proc/{pid}/task").iterdir()
+    return sum(int((thread / "schedstat").read_text().split()[0]) for thread in threads) * 1e-9
+
+
+def main() -> None:
+    """Measure, and print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="length of each archive")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
+        plain, rich = (
+            measure(Path(folder), arguments.seconds, packets=packets) for packets in (False, True)
+        )
+    result = {
+        "writing_share_of_core": round(plain["share"], 4),
+        "writing_share_of_core_with_packets": round(rich["share"], 4),
+        "megabytes_per_minute": round(plain["megabytes_per_minute"], 1),
+        "megabytes_per_minute_with_packets": round(rich["megabytes_per_minute"], 1),
+        "records_lost": plain["records_lost"] + rich["records_lost"],
+        "seconds": arguments.seconds,
+        "cycles_per_second": round(1.0 / PERIOD),
+    }
+    if not arguments.json:
+        print(f"writing costs {plain['share']:.1%} of one core at 1 kHz, {rich['share']:.1%} with "
+              "raw packets")  # fmt: skip
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

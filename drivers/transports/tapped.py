@@ -1,0 +1,118 @@
+"""A link whose packets are kept as they were, both ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.packet_records import PacketSink
+from drivers.transports.base import Stamped, Transport
+
+
+class _Passed(NamedTuple):
+    """A packet that went through."""
+
+    time: float
+    sent: bool
+    packet: bytes
+
+
+class TappedTransport:
+    """Passes everything on to another link, and its packets to a sink as well.
+
+    A packet reaches the sink when its answer is out, before the next one is waited for: nothing
+    but its place in a list is taken note of between the two. Its cycle is known by then; packets
+    that had piled up and were left out have that of the one answered.
+
+    Args:
+        transport: the link.
+        sink: where the packets go.
+        cycle: the controller's cycle of the packet answered last.
+    """
+
+    def __init__(self, transport: Transport, sink: PacketSink, cycle: Callable[[], int]) -> None:
+        self._transport = transport
+        self._sink = sink
+        self._cycle = cycle
+        self._passed: list[_Passed] = []
+
+    @property
+    def now(self) -> float:
+        """Time on the link's clock."""
+        return self._transport.now
+
+    @property
+    def ages(self) -> NDArray[np.uint16] | None:
+        """See `Transport.ages`."""
+        return self._transport.ages
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Options that the system refused, in words, of a link that has such."""
+        return tuple(getattr(self._transport, "notes", ()))
+
+    def receive(self, timeout: float) -> bytes | None:
+        """See `Transport.receive`."""
+        if self._passed and timeout > 0.0:
+            self.settle()
+        packet = self._transport.receive(timeout)
+        if packet is not None:
+            self._passed.append(_Passed(self._arrival(), False, packet))
+        return packet
+
+    def send(self, packet: bytes) -> None:
+        """See `Transport.send`."""
+        self._transport.send(packet)
+        self._passed.append(_Passed(self._transport.now, True, packet))
+
+    def rejected(self) -> dict[str, int]:
+        """See `Transport.rejected`."""
+        return self._transport.rejected()
+
+    def forget_peer(self) -> None:
+        """See `Transport.forget_peer`."""
+        self._transport.forget_peer()
+
+    def close(self) -> None:
+        """Give the link up."""
+        self.settle()
+        self._transport.close()
+
+    def settle(self) -> None:
+        """Hand to the sink what has passed; called between an answer and the next packet."""
+        cycle = self._cycle()
+        for time, sent, packet in self._passed:
+            self._sink.put(cycle, time, sent, packet)
+        self._passed.clear()
+
+    def _arrival(self) -> float:
+        """When the packet received last arrived."""
+        return self._transport.now
+
+
+class _StampedTap(TappedTransport):
+    """The same for a link that knows when a packet arrived."""
+
+    _transport: _StampedTransport
+
+    @property
+    def arrived(self) -> float | None:
+        """See `Stamped.arrived`."""
+        return self._transport.arrived
+
+    def _arrival(self) -> float:
+        arrived = self._transport.arrived
+        return self._transport.now if arrived is None else arrived
+
+
+class _StampedTransport(Transport, Stamped, Protocol):
+    """A link that knows when a packet arrived."""
+
+
+def tapped(transport: Transport, sink: PacketSink, cycle: Callable[[], int]) -> TappedTransport:
+    """The same link, tapped; see `TappedTransport`."""
+    kind = _StampedTap if isinstance(transport, Stamped) else TappedTransport
+    return kind(transport, sink, cycle)

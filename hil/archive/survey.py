@@ -1,0 +1,400 @@
+"""Goes through a whole archive, past its damages, and says what of it stands.
+
+The reader stops at the first damage; a survey goes on, so that what follows can be saved. What it
+keeps has passed the same checks: checksums, and numbers of messages that count on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import zstandard
+
+from hil.archive import container, index, schema
+from hil.archive.container import Damage, Record
+from hil.archive.index import IndexBuilder, MessageHead, Summary
+from hil.errors import ArchiveError
+
+HEADER = index.record(container.HEADER, index.text(schema.PROFILE) + index.text("hil"))
+_NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
+_BETWEEN = (container.MESSAGE_INDEX, container.HEADER, container.DATA_END)
+
+
+class Fault(NamedTuple):
+    """Something that is not as it must be.
+
+    Attributes:
+        aspect: part of the profile: container, metadata, attachments, chunks, sequence, outcome
+            or index.
+        text: what is wrong, as a sentence without its end.
+        loss: whether content is lost by it; otherwise it follows from what is there.
+    """
+
+    aspect: str
+    text: str
+    loss: bool
+
+
+class Piece(NamedTuple):
+    """A record that stands.
+
+    Attributes:
+        offset: where it begins in the file.
+        length: with its head.
+        opcode: kind of record.
+        shift: of a chunk behind a loss, how much too high its messages count, by channel.
+        times: of a chunk, first and last log time of its messages [ns].
+    """
+
+    offset: int
+    length: int
+    opcode: int
+    shift: dict[int, int] | None = None
+    times: tuple[int, int] | None = None
+
+
+@dataclass
+class Survey:
+    """What stands of a file, and what does not.
+
+    Attributes:
+        path: the file.
+        size: its length.
+        header: profile and library, None where the record is damaged.
+        metadata: entries of the ``hil`` record, None where it is missing or damaged.
+        outcome: entries of ``hil.outcome``, likewise.
+        attachments: names of those that stand.
+        pieces: records that stand, but for ``hil`` and ``hil.outcome``, in the order of the file.
+        announced: schemas and channels that only the summary still has.
+        faults: what is wrong.
+        counts: messages that stand, by topic.
+        types: of their messages, by topic.
+        missing: messages missing between those that stand, by topic.
+    """
+
+    path: Path
+    size: int
+    header: tuple[str, str] | None = None
+    metadata: dict[str, str] | None = None
+    outcome: dict[str, str] | None = None
+    attachments: list[str] = field(default_factory=list)
+    pieces: list[Piece] = field(default_factory=list)
+    announced: tuple[Record, ...] = ()
+    faults: list[Fault] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    types: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def losses(self) -> list[str]:
+        """What is lost, and where; empty if everything that was written is there."""
+        if not any(fault.loss for fault in self.faults):
+            return []
+        return [fault.text for fault in self.faults if fault.loss or fault.aspect == "container"]
+
+    @property
+    def samples(self) -> int:
+        """Samples that stand."""
+        return max((self.counts.get(topic, 0) for topic in _NUMBERS), default=0)
+
+    @property
+    def events(self) -> int:
+        """Events that stand."""
+        return self.counts.get(schema.EVENTS, 0)
+
+
+def survey(path: str | PathLike[str]) -> Survey:
+    """Go through a file.
+
+    Raises:
+        ArchiveError: it cannot be read.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            surveyor = _Surveyor(stream, Survey(path, path.stat().st_size))
+            surveyor.run()
+    except OSError as error:
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+    return surveyor.survey
+
+
+class _Surveyor:
+    """Fills a survey from a file."""
+
+    def __init__(self, stream: BinaryIO, survey: Survey) -> None:
+        self.survey = survey
+        self._stream = stream
+        self._summary = Summary.read(stream, survey.size)
+        self._decompressor = zstandard.ZstdDecompressor()
+        self._types: dict[int, str] = {}
+        self._channels: dict[int, str] = {}
+        self._next: dict[int, int] = {}
+        self._shift: dict[int, int] = {}
+        self._seen: set[int] = set()
+        self._lost_since = False
+        self._ended = False
+        self._index = IndexBuilder()
+        self._indexes: list[bytes] = []  # message indexes that must come now
+        self._tail: bytes | None = None
+
+    def run(self) -> None:
+        """Survey the file."""
+        self._stream.seek(0)
+        try:
+            for record in container.records(self._stream, self.survey.size, check_end=False):
+                self._visit(record)
+        except Damage as damage:
+            self._lost_since = True  # and what is lost, counts and outcome will tell
+            self._fault("container", damage, loss=False)
+        for record in self._listed():
+            self._visit(record)
+        self._finish()
+
+    def _listed(self) -> Iterator[Record]:
+        """Records that the summary knows and the walk did not reach."""
+        if self._summary is None:
+            return
+        chunks = [(chunk.offset, chunk.length) for chunk in self._summary.chunks]
+        for place in sorted([*chunks, *self._summary.others]):
+            if place[0] not in self._seen:
+                try:
+                    yield container.record_at(self._stream, *place)
+                except Damage as damage:
+                    self._fault("container", damage, loss=True)
+
+    def _fault(self, aspect: str, problem: Damage | str, *, loss: bool) -> None:
+        self._lost_since |= loss
+        text = problem
+        if isinstance(problem, Damage):
+            text = f"the record at byte {problem.offset} {problem.reason}"
+        fault = Fault(aspect, str(text), loss)
+        if fault not in self.survey.faults:
+            self.survey.faults.append(fault)
+
+    def _visit(self, record: Record) -> None:
+        self._seen.add(record.offset)
+        self._check_indexes(record)
+        try:
+            if record.opcode == container.HEADER:
+                fields = container.Fields(record.body, record.offset)
+                self.survey.header = fields.text(), fields.text()
+            elif record.opcode == container.METADATA:
+                self._metadata(record)
+            elif record.opcode == container.ATTACHMENT:
+                self._attachment(record)
+            elif record.opcode == container.CHUNK:
+                self._chunk(record)
+            elif record.opcode in (container.SCHEMA, container.CHANNEL):
+                self._announce(record.opcode, record.body, record.offset)
+                self._keep(record)
+            elif record.opcode == container.DATA_END:
+                self._data_end(record)
+            elif record.opcode not in _BETWEEN:
+                self._fault("container", Damage(record.offset, "is of an unknown kind"), loss=False)
+        except Damage as damage:
+            aspect = _ASPECTS.get(record.opcode, "container")
+            self._fault(aspect, damage, loss=record.opcode != container.HEADER)
+
+    def _check_indexes(self, record: Record) -> None:
+        """Compare the message indexes behind a chunk with those it must have."""
+        if record.opcode == container.MESSAGE_INDEX:
+            data = index.record(record.opcode, record.body)
+            if data in self._indexes:
+                self._indexes.remove(data)
+            else:
+                self._fault("index", Damage(record.offset, "(message index) is wrong"), loss=False)
+        elif self._indexes:
+            self._indexes = []
+            self._fault("index", Damage(record.offset, "lacks a message index before"), loss=False)
+
+    def _keep(self, record: Record, shift: dict[int, int] | None = None) -> None:
+        length = record.end - record.offset
+        self.survey.pieces.append(Piece(record.offset, length, record.opcode, shift))
+
+    def _metadata(self, record: Record) -> None:
+        name, entries = container.metadata(record)
+        self._index.add_metadata(record.offset, record.end - record.offset, name)
+        if name not in (schema.METADATA, schema.OUTCOME):
+            self._keep(record)
+            return
+        if entries.pop("checksum", None) != schema.checksum(entries):
+            raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
+        known = self.survey.metadata if name == schema.METADATA else self.survey.outcome
+        if known is not None:
+            raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
+        if name == schema.METADATA:
+            self.survey.metadata = entries
+        else:
+            self.survey.outcome = entries
+
+    def _attachment(self, record: Record) -> None:
+        name, _ = container.attachment(record)
+        if name in self.survey.attachments:
+            raise Damage(record.offset, f"(attachment {name!r}) is there a second time")
+        self._index.add_attachment(record.offset, record)
+        self.survey.attachments.append(name)
+        self._keep(record)
+
+    def _announce(self, opcode: int, body: bytes, offset: int) -> None:
+        if opcode == container.CHANNEL:
+            channel = container.channel(body, offset)
+            self._channels[channel.id] = channel.topic
+            self.survey.types[channel.topic] = self._types.get(channel.schema_id, "")
+        else:
+            found = container.schema(body, offset)
+            self._types[found.id] = found.name
+        self._index.announce(opcode, body)
+
+    def _chunk(self, record: Record) -> None:
+        if self.survey.metadata is None:
+            return  # some other MCAP file
+        if self._ended:
+            raise Damage(record.offset, "(chunk) comes after a gap that nothing would show")
+        data = container.chunk_data(record, decompressor=self._decompressor)
+        numbered: dict[int, list[int]] = {}
+        announced = []
+        stamps: list[int] = []
+        for item in index.messages(data, record.offset):
+            if isinstance(item, MessageHead):
+                numbered.setdefault(item.channel, []).append(item.sequence)
+                stamps.append(item.log_time)
+            else:
+                announced.append(item)
+        for item in announced:
+            if item.opcode in (container.SCHEMA, container.CHANNEL):
+                self._announce(item.opcode, item.body, record.offset)
+        shift = self._continued(numbered, record.offset)
+        times = min(stamps, default=0), max(stamps, default=0)
+        head = container.chunk(record)
+        if (head.start_time, head.end_time) != times:
+            self._fault("index", Damage(record.offset, "(chunk) states other times"), loss=False)
+        indexes = self._index.add_chunk(record.offset, record.end - record.offset, head, data)
+        self._indexes = _split(indexes)
+        moved = shift if any(shift.values()) else None
+        self._keep(record, moved)
+        self.survey.pieces[-1] = self.survey.pieces[-1]._replace(times=times)
+        self._lost_since = False
+
+    def _continued(self, numbered: dict[int, list[int]], offset: int) -> dict[int, int]:
+        """Check that the messages of a chunk count on; by how much they are ahead, by channel."""
+        self._recover_channels(numbered, offset)
+        shift = {}
+        for channel, sequence in numbered.items():
+            first = sequence[0]
+            if sequence != list(range(first, first + len(sequence))):
+                raise Damage(offset, "(chunk) has messages out of order")
+            if first < self._next.get(channel, 0):
+                raise Damage(offset, "(chunk) repeats messages that were before")
+            shift[channel] = first - self._standing(channel)
+        numbers = [channel for channel in numbered if self._channels[channel] in _NUMBERS]
+        if len({(len(numbered[channel]), shift[channel]) for channel in numbers}) > 1:
+            raise Damage(offset, "(chunk) has channels of different length")
+        gaps = {channel: numbered[channel][0] - self._next.get(channel, 0) for channel in numbered}
+        if any(gaps.values()):
+            self._gap(gaps, offset)
+        for channel, sequence in numbered.items():
+            topic = self._channels[channel]
+            self._next[channel] = sequence[-1] + 1
+            self.survey.counts[topic] = self.survey.counts.get(topic, 0) + len(sequence)
+            missing = self.survey.missing.get(topic, 0) + gaps[channel]
+            self.survey.missing[topic] = missing
+        return shift
+
+    def _standing(self, channel: int) -> int:
+        return self.survey.counts.get(self._channels[channel], 0)
+
+    def _recover_channels(self, numbered: dict[int, list[int]], offset: int) -> None:
+        """Take channels that no record before announces from the summary."""
+        if numbered.keys() <= self._channels.keys():
+            return
+        announced = self._summary.announced if self._summary else ()
+        for item in announced:
+            self._announce(item.opcode, item.body, offset)
+        unknown = numbered.keys() - self._channels.keys()
+        if unknown:
+            raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
+        self.survey.announced = announced
+
+    def _gap(self, gaps: dict[int, int], offset: int) -> None:
+        """Note that messages are missing; a gap in samples must show in the samples behind it."""
+        samples = any(gap for channel, gap in gaps.items() if self._channels[channel] in _NUMBERS)
+        if samples and schema.CYCLE not in self._channels.values():
+            self._ended = True
+            raise Damage(offset, "(chunk) comes after a gap that nothing would show")
+        if not self._lost_since:
+            self._fault(
+                "sequence", Damage(offset, "(chunk) does not continue the one before"), loss=True
+            )
+
+    def _data_end(self, record: Record) -> None:
+        if record.body != bytes(4):
+            self._fault("index", Damage(record.offset, "(DataEnd) is wrong"), loss=False)
+        self._tail = self._index.tail(record.offset)
+
+    def _finish(self) -> None:
+        survey = self.survey
+        if survey.metadata is None:
+            return
+        if survey.header != (schema.PROFILE, "hil"):
+            self._fault("container", "the header is not that of the profile", loss=False)
+        for name in announced_attachments(survey.metadata):
+            if name not in survey.attachments:
+                self._fault("attachments", f"attachment {name!r} is missing", loss=True)
+        self._check_outcome()
+        self._check_summary()
+
+    def _check_outcome(self) -> None:
+        outcome = self.survey.outcome
+        if outcome is None:
+            self._fault("outcome", "the outcome is missing", loss=True)
+            return
+        counts = {"samples": self.survey.samples, "events": self.survey.events}
+        if "packets" in outcome:
+            counts["packets"] = self.survey.counts.get(schema.PACKETS, 0)
+        for key, count in counts.items():
+            if outcome.get(key) != str(count):
+                text = f"{outcome.get(key)} {key} were written, {count} are there"
+                self._fault("outcome", text, loss=True)
+
+    def _check_summary(self) -> None:
+        if self._summary is None or self._tail is None:
+            self._fault(
+                "index", "the index at the end is missing or fails its checksum", loss=False
+            )
+        elif not self.survey.counts:
+            return  # channels without messages stand in the summary alone
+        elif self._summary != Summary.of(self._tail):
+            self._fault("index", "the index at the end does not fit the file", loss=False)
+
+
+_ASPECTS = {
+    container.METADATA: "metadata",
+    container.ATTACHMENT: "attachments",
+    container.CHUNK: "chunks",
+}
+
+
+def _split(indexes: bytes) -> list[bytes]:
+    """The records one by one."""
+    found, at = [], 0
+    while at < len(indexes):
+        _, length = container.RECORD.unpack_from(indexes, at)
+        end = at + container.RECORD.size + length
+        found.append(indexes[at:end])
+        at = end
+    return found
+
+
+def announced_attachments(metadata: dict[str, str]) -> list[str]:
+    """Names of the attachments that must be there."""
+    try:
+        names = json.loads(metadata.get("attachments", "[]"))
+    except ValueError:
+        return []
+    return [str(name) for name in names] if isinstance(names, list) else []

@@ -1,0 +1,1 @@
+"""Re-identification from any number of archives, by arm and campaign."""

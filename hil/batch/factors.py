@@ -1,0 +1,236 @@
+"""From archives to factors: one alone, and several of a campaign added up.
+
+Everything here is a pure function of the bytes of archives and of settings; what is kept on a disk
+is only what would be computed again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from hil.archive import CONTROLLERS_OWN, Archive, open_archive
+from hil.cell import Cell
+from hil.errors import ArchiveError, HilError
+from hil.identify.sources import Source, source_of
+from identification import IdentificationError
+from identification.covariance import block_covariance
+from identification.estimation import Estimate
+from identification.least_squares import Weighting, fit_least_squares, weights_of
+from identification.model import RobotModel
+from identification.phase_factor import PhaseFactor
+from identification.preprocessing import Preprocessing, Samples, prepare
+
+from .errors import ChangedError, TornError
+from .types import ArchiveFactor, ArchiveRef, Broken, Bundle, FileStamp, Fit, Settings, Summary
+
+BUNDLE: Final = 16
+"""Archives of a campaign that are reduced together. Of each a summary is kept, of all of them one
+sum, which is fifty times the size of a summary."""
+
+WEIGHTINGS: Final[tuple[Weighting, ...]] = ("weighted", "ordinary")
+
+_FIELDS: Final = (
+    "cycle",
+    "gap",
+    "position",
+    "torque",
+    "target_current",
+    "motor_current",
+    "commanded_position",
+)
+
+
+def archive_factor(ref: ArchiveRef, settings: Settings) -> ArchiveFactor:
+    """Reduce one archive.
+
+    Raises:
+        HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
+        IdentificationError: there is not one usable row in it.
+    """
+    with opened(ref) as archive:
+        cell = cell_in(archive)
+        source = source_of(archive, cell)
+    model, recording = cell.model, source.recording
+    if recording.torque is None:
+        raise ArchiveError(
+            ref.location,
+            "holds motor currents and no torques",
+            remedy="find the torque constants with `hil gains` and import it again",
+        )
+    noise = None if settings.noise_variance is None else np.array(settings.noise_variance)
+    drives = cell.file.drive_train
+    samples = prepare(
+        recording,
+        model,
+        noise_variance=noise,
+        options=preprocessing(settings),
+        origin=source.origin,
+        current_limit=None if drives is None else np.array(cell.drive_table.current_limit),
+    )
+    phase = PhaseFactor.from_samples(model, samples)
+    summary = Summary(
+        ref=ref,
+        total=phase.merged(max(1, len(phase))),
+        fits=_fits(model, samples, phase) if ref.use == "excitation" else {},
+        duration=float(recording.time[-1] - recording.time[0]),
+        doubts=_doubts(archive, source),
+    )
+    return ArchiveFactor(summary, phase)
+
+
+def reduce_bundle(
+    refs: Sequence[ArchiveRef], settings: Settings, begin: Bundle | None = None
+) -> Bundle:
+    """Reduce archives of one campaign one after the other, and add up what is fitted.
+
+    The sum goes from first to last, so that one that is known of the first ones can be continued.
+
+    Args:
+        refs: in their canonical order.
+        settings: of the campaign.
+        begin: what is known of the first of them, if anything.
+
+    Returns:
+        With a reason for each archive that could not be used; nothing of it is in the sum.
+    """
+    summaries, broken, phase = [], [], None
+    known, lasting = 0, True
+    if begin is not None:
+        summaries, broken = list(begin.summaries), list(begin.broken)
+        phase, known, lasting = begin.phase, len(begin.refs), begin.lasting
+    for ref in refs[known:]:
+        try:
+            one = archive_factor(ref, settings)
+        except (HilError, IdentificationError) as error:
+            broken.append(Broken(ref.location, str(error)))
+            lasting &= not (isinstance(error, ChangedError) or isinstance(error.__cause__, OSError))
+            continue
+        except Exception as error:  # a fault of ours: it costs this archive, not the batch
+            broken.append(Broken(ref.location, f"{type(error).__name__}: {error}"))
+            lasting = False
+            continue
+        summaries.append(one.summary)
+        if ref.use == "excitation":
+            phase = one.phase if phase is None else phase + one.phase
+    return Bundle(tuple(refs), tuple(summaries), phase, tuple(broken), lasting)
+
+
+@contextmanager
+def opened(ref: ArchiveRef) -> Iterator[Archive]:
+    """The archive with what identification reads, as long as its file is there.
+
+    Raises:
+        TornError: it is not whole.
+        ChangedError: it is not the file that was found.
+        ArchiveError: it cannot be read.
+    """
+    with local_file(ref.location) as path:
+        if ref.stamp is not None and stamp_of(path) != ref.stamp:
+            raise ChangedError(ref.location)
+        archive = open_archive(path, fields=_FIELDS)
+        if archive.metadata.get("motion") == CONTROLLERS_OWN:
+            archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
+        if archive.damage is not None:
+            raise TornError(ref.location, str(archive.damage))
+        yield archive
+
+
+@contextmanager
+def local_file(location: str) -> Iterator[Path]:
+    """The file at a path or URL, fetched if need be."""
+    if "://" not in location:
+        yield Path(location)
+        return
+    from .remote_files import local_copy  # needs an extra
+
+    with local_copy(location) as path:
+        yield path
+
+
+def stamp_of(path: Path) -> FileStamp:
+    """What the file system says about a file.
+
+    Raises:
+        ArchiveError: there is none.
+    """
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+    return FileStamp(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino)
+
+
+def cell_in(archive: Archive) -> Cell:
+    """The cell that travels in an archive; those of one campaign share theirs.
+
+    Raises:
+        ArchiveError: the archive carries no cell or no URDF.
+        CellError: the cell is not right.
+    """
+    absent = [name for name in ("cell.toml", "robot.urdf") if name not in archive.attachments]
+    if absent:
+        raise ArchiveError(
+            archive.path,
+            f"carries no {absent[0]}",
+            remedy="import the recording again with a URDF or a cell file",
+        )
+    return cell_from(
+        archive.attachments["cell.toml"].decode(), archive.attachments["robot.urdf"].decode()
+    )
+
+
+@lru_cache(maxsize=8)
+def cell_from(text: str, urdf: str) -> Cell:
+    """The cell of these texts."""
+    return Cell.from_texts(text, urdf, Path("cell.toml"))
+
+
+def preprocessing(settings: Settings) -> Preprocessing:
+    """The settings as `identification.preprocessing` has them."""
+    return Preprocessing(
+        smoother=settings.smoother,
+        torque_delay=settings.torque_delay,
+        torque_bandwidth=settings.torque_bandwidth,
+    )
+
+
+def _fits(model: RobotModel, samples: Samples, phase: PhaseFactor) -> dict[str, Fit]:
+    fits: dict[str, Fit] = {}
+    for weighting in WEIGHTINGS:
+        one = fit_least_squares(model, [samples], weighting, phase=phase)
+        fits[weighting] = Fit(one, design_effect(one, phase, weighting))
+    return fits
+
+
+def design_effect(estimate: Estimate, phase: PhaseFactor, weighting: Weighting) -> float:
+    """Mean ratio of the estimate's variances to those of white residuals."""
+    total = phase.total
+    weights = np.ones(phase.n_joints) if weighting == "ordinary" else weights_of(total)
+    if estimate.undetermined:
+        return block_covariance(phase, weights, estimate.values).design_effect
+    information = total.weighted(weights).A
+    return float(np.einsum("ij,ji->", information, estimate.covariance)) / phase.n_parameters
+
+
+def _doubts(archive: Archive, source: Source) -> tuple[str, ...]:
+    doubts = []
+    if source.merged:
+        doubts.append(
+            f"{source.merged} samples had the time stamp of the one before and were averaged "
+            "with it"
+        )
+    if (archive.outcome or {}).get("repaired") == "yes":
+        doubts.append("it was repaired, and something is lost")
+    return tuple(doubts)
+
+
+def without_sum(bundle: Bundle) -> Bundle:
+    """The bundle without its large part."""
+    return replace(bundle, phase=None)

@@ -1,0 +1,102 @@
+"""Digests: of programs, arms, settings, and of what is kept under them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import drivers
+import hil
+import identification
+from hil.cell import Cell
+
+from .types import ArchiveRef, Choices, Settings
+
+# What stands between the bytes of an archive and its factor.
+_PROGRAMS: Final = (
+    (drivers, ("*.py",)),
+    (identification, ("*.py",)),
+    (hil, ("recordings.py", "archive/*.py", "cell/*.py", "identify/sources.py")),
+    (hil, ("batch/factors.py", "batch/settling.py", "batch/keeping.py")),
+)
+_LIBRARIES: Final = ("numpy", "scipy", "pin")
+
+
+@cache
+def code_digest() -> str:
+    """Digest of the programs that make a factor and of the libraries they compute with.
+
+    The programs' own text is read, so that a change counts even where nobody has raised a version.
+    """
+    found = hashlib.sha256()
+    for package, patterns in _PROGRAMS:
+        root = Path(os.fspath(package.__path__[0]))
+        for path in sorted({path for pattern in patterns for path in root.glob(pattern)}):
+            found.update(f"{package.__name__}/{path.relative_to(root).as_posix()}\0".encode())
+            found.update(hashlib.sha256(path.read_bytes()).digest())
+    for name in _LIBRARIES:
+        found.update(f"{name} {version(name)}\0".encode())
+    return found.hexdigest()
+
+
+def arm_digest(cell: Cell, drive_train: bytes | None) -> str:
+    """Digest of what makes a robot the same one: links, joints, friction law, drives.
+
+    Not of a payload: an arm that carries something else is the same arm.
+
+    Args:
+        cell: as it travels in the archive.
+        drive_train: the drive train in force, if the archive has one.
+    """
+    drives = cell.file.drive_train
+    return _digest(
+        {
+            "urdf": hashlib.sha256(cell.urdf.encode()).hexdigest(),
+            "robot": cell.file.robot.model_dump(mode="json", exclude={"payload"}),
+            "drives": drives.model_dump(mode="json") if drives is not None else None,
+            "in force": None if drive_train is None else hashlib.sha256(drive_train).hexdigest(),
+        }
+    )
+
+
+def settings_digest(settings: Settings) -> str:
+    """Digest of all that, beside its bytes, decides about the factor of an archive."""
+    entries = asdict(settings)
+    del entries["noise"]
+    return _digest(entries)
+
+
+def choices_digest(choices: Choices, refs: Sequence[ArchiveRef]) -> str:
+    """Digest of what settings are settled from: choices, archives, programs."""
+    return _digest([asdict(choices), [ref.sha256 for ref in refs], code_digest()])
+
+
+def summary_key(ref: ArchiveRef, settings: str) -> str:
+    """Name under which the summary of an archive is kept; settings by their digest."""
+    return _digest(["summary", ref.sha256, settings])
+
+
+def sum_key(refs: Sequence[ArchiveRef], settings: str) -> str:
+    """Name under which the sum over archives, added from first to last, is kept."""
+    return _digest(["sum", [ref.sha256 for ref in refs], settings])
+
+
+def text_digest(*texts: str | bytes) -> str:
+    """Digest of some texts, one after the other."""
+    found = hashlib.sha256()
+    for text in texts:
+        data = text.encode() if isinstance(text, str) else text
+        found.update(len(data).to_bytes(8, "little") + data)
+    return found.hexdigest()
+
+
+def _digest(value: Any) -> str:
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,308 @@
+"""The result of a batch as tables that any other program can read: CSV, and Parquet with pyarrow.
+
+`parameters` has a row per estimate and parameter, `axes` a row per estimate and joint, `not_used`
+one per archive that was left out. `docs/batch.md` describes every column.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from hil.batch.types import Arm, BatchResult, LevelEstimate
+from hil.version import software
+
+SCHEMA_VERSION: Final = 1
+"""Raised when a column changes its meaning or goes; new columns do not raise it."""
+
+Kind = Literal["text", "number", "count", "truth", "time", "numbers"]
+Row = dict[str, Any]
+
+# Rows in memory at a time, however large the batch.
+_PORTION = 20_000
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: its columns and where its rows come from.
+
+    Attributes:
+        name: of the files, without their endings.
+        columns: kind of each column by name.
+        rows: of a result.
+    """
+
+    name: str
+    columns: Mapping[str, Kind]
+    rows: Callable[[BatchResult], Iterator[Row]]
+
+    @property
+    def plain_columns(self) -> list[str]:
+        """Those that CSV has: all but lists."""
+        return [name for name, kind in self.columns.items() if kind != "numbers"]
+
+
+_ESTIMATE_COLUMNS: Final[Mapping[str, Kind]] = {
+    "level": "text",
+    "arm": "text",
+    "arm_digest": "text",
+    "campaign": "text",
+    "archive": "text",
+    "archive_sha256": "text",
+    "when": "time",
+}
+
+
+def write_tables(folder: Path, result: BatchResult) -> list[Path]:
+    """Write all tables into a folder that exists, and return their paths.
+
+    Parquet files are written if pyarrow is installed. Each file is replaced whole.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    written = []
+    for table in TABLES:
+        path = folder / f"{table.name}.csv"
+        _write_csv(path, table, result)
+        written.append(path)
+        if has_parquet():
+            path = folder / f"{table.name}.parquet"
+            _write_parquet(path, table, result)
+            written.append(path)
+    return written
+
+
+def has_parquet() -> bool:
+    """Whether Parquet can be written: whether pyarrow is installed."""
+    return find_spec("pyarrow") is not None
+
+
+def _levels(result: BatchResult) -> Iterator[LevelEstimate]:
+    yield from result.repetitions
+    yield from result.campaigns
+    yield from result.pooled
+
+
+def _estimate_columns(arm: Arm, level: LevelEstimate) -> Row:
+    return {
+        "level": level.level,
+        "arm": arm.name,
+        "arm_digest": level.arm,
+        "campaign": level.campaign,
+        "archive": level.archive,
+        "archive_sha256": level.sha256,
+        "when": _instant(level.when),
+    }
+
+
+def _parameter_rows(result: BatchResult) -> Iterator[Row]:
+    made_with = ", ".join(f"{name} {version}" for name, version in software().items())
+    for level in _levels(result):
+        model = result.arms[level.arm].cell.model
+        shared = {
+            **_estimate_columns(result.arms[level.arm], level),
+            "archives": level.repetitions,
+            "samples": int(level.samples.sum()),
+            "condition": level.condition,
+            "relative_error": _relative(level.noise_std, level.torque_rms, level.samples),
+            "unseen_relative_error": _relative(level.unseen_rms, level.unseen_torque_rms),
+            "method": level.method,
+            "doubts": "; ".join(level.doubts),
+            "estimator": result.estimator,
+            "settings": level.settings,
+            "code": result.code,
+            "software": made_with,
+        }
+        friction = {term.name: term for term in model.friction.terms}
+        for k, name in enumerate(level.names):
+            value, std = float(level.values[k]), float(level.std[k])
+            half = level.interval_factor * std
+            term = friction.get(name)
+            yield {
+                **shared,
+                "parameter": name,
+                "kind": "inertial" if term is None else "friction",
+                "axis": "" if term is None else model.joint_names[term.owner],
+                "unit": level.units[k],
+                "value": value,
+                "std": std,
+                "low": value - half,
+                "high": value + half,
+                "determined": math.isfinite(std),
+                "covariance": None if level.covariance is None else level.covariance[k],
+            }
+
+
+def _axis_rows(result: BatchResult) -> Iterator[Row]:
+    for level in _levels(result):
+        arm = result.arms[level.arm]
+        shared = _estimate_columns(arm, level)
+        for j, joint in enumerate(arm.cell.model.joint_names):
+            yield {
+                **shared,
+                "axis": joint,
+                "unit": "N·m" if arm.cell.model.chain.revolute[j] else "N",
+                "samples": int(level.samples[j]),
+                "torque_rms": float(level.torque_rms[j]),
+                "error_std": float(level.noise_std[j]),
+                "unseen_torque_rms": float(level.unseen_torque_rms[j]),
+                "unseen_error_rms": float(level.unseen_rms[j]),
+            }
+
+
+def _unused_rows(result: BatchResult) -> Iterator[Row]:
+    for kind, ones in (("broken", result.broken), ("skipped", result.skipped)):
+        for one in ones:
+            yield {"path": one.path, "kind": kind, "reason": one.reason}
+
+
+TABLES: Final = (
+    Table(
+        "parameters",
+        {
+            **_ESTIMATE_COLUMNS,
+            "parameter": "text",
+            "kind": "text",
+            "axis": "text",
+            "unit": "text",
+            "value": "number",
+            "std": "number",
+            "low": "number",
+            "high": "number",
+            "determined": "truth",
+            "archives": "count",
+            "samples": "count",
+            "condition": "number",
+            "relative_error": "number",
+            "unseen_relative_error": "number",
+            "method": "text",
+            "doubts": "text",
+            "estimator": "text",
+            "settings": "text",
+            "code": "text",
+            "software": "text",
+            "covariance": "numbers",
+        },
+        _parameter_rows,
+    ),
+    Table(
+        "axes",
+        {
+            **_ESTIMATE_COLUMNS,
+            "axis": "text",
+            "unit": "text",
+            "samples": "count",
+            "torque_rms": "number",
+            "error_std": "number",
+            "unseen_torque_rms": "number",
+            "unseen_error_rms": "number",
+        },
+        _axis_rows,
+    ),
+    Table("not_used", {"path": "text", "kind": "text", "reason": "text"}, _unused_rows),
+)
+
+
+def _relative(
+    error: np.ndarray[Any, np.dtype[np.float64]],
+    torque: np.ndarray[Any, np.dtype[np.float64]],
+    rows: np.ndarray[Any, np.dtype[np.intp]] | None = None,
+) -> float:
+    """Error over torque, root of the sums of squares over all joints; NaN where unknown."""
+    count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
+    known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
+    if not known.any():
+        return math.nan
+    whole = float(count[known] @ torque[known] ** 2)
+    return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
+
+
+def _instant(when: str) -> datetime | None:
+    try:
+        at = datetime.fromisoformat(when)
+    except ValueError:
+        return None
+    return (at if at.tzinfo else at.replace(tzinfo=UTC)).astimezone(UTC)
+
+
+def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
+    columns = table.plain_columns
+    with _replaced(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        for row in table.rows(result):
+            writer.writerow([_as_text(row[name]) for name in columns])
+
+
+def _as_text(value: Any) -> Any:
+    """Numbers in full precision; time in ISO 8601; nothing for what is not known."""
+    if value is None:
+        return ""
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # A file name may hold bytes that are no text.
+        return value.encode("utf-8", "replace").decode("utf-8")
+    return value
+
+
+def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
+    # Half a second to import, and not installed everywhere.
+    import pyarrow
+    import pyarrow.parquet
+
+    types = {
+        "text": pyarrow.string(),
+        "number": pyarrow.float64(),
+        "count": pyarrow.int64(),
+        "truth": pyarrow.bool_(),
+        "time": pyarrow.timestamp("us", tz="UTC"),
+        "numbers": pyarrow.list_(pyarrow.float64()),
+    }
+    facts = {"schema_version": SCHEMA_VERSION, "code": result.code, "software": software()}
+    schema = pyarrow.schema(
+        [(name, types[kind]) for name, kind in table.columns.items()],
+        metadata={"hil": json.dumps(facts)},
+    )
+    rows = table.rows(result)
+    with (
+        _replaced(path) as temporary,
+        pyarrow.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,
+    ):
+        while portion := list(islice(rows, _PORTION)):
+            arrays = [
+                pyarrow.array([_cell(row[name]) for row in portion], types[kind])
+                for name, kind in table.columns.items()
+            ]
+            writer.write_table(pyarrow.Table.from_arrays(arrays, schema=schema))
+
+
+def _cell(value: Any) -> Any:
+    return value.encode("utf-8", "replace").decode("utf-8") if isinstance(value, str) else value
+
+
+@contextmanager
+def _replaced(path: Path) -> Iterator[Path]:
+    """A file to write in place of another, which is kept if the writing fails."""
+    temporary = path.with_name(f"{path.name}.tmp")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise

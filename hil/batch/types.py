@@ -1,0 +1,310 @@
+"""What passes between the parts of the batch: references, settings, factors, results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.errors import InputError
+from identification.estimation import Estimate
+from identification.phase_factor import PhaseFactor
+from identification.preprocessing import Smoother
+
+Array = NDArray[np.float64]
+
+Level = Literal["repetition", "campaign", "pooled"]
+BatchEstimator = Literal["wls", "ols", "prior", "consistent"]
+
+ESTIMATORS: Final[tuple[BatchEstimator, ...]] = get_args(BatchEstimator)
+"""The estimators that need factors only, and no sample."""
+
+
+class GroupKey(NamedTuple):
+    """Archives that are fitted together.
+
+    Attributes:
+        arm: digest of URDF, model, friction law and drive train.
+        campaign: the folder the archives were recorded into.
+    """
+
+    arm: str
+    campaign: str
+
+
+class FileStamp(NamedTuple):
+    """What changes when a file is written to, as the file system says it."""
+
+    size: int
+    mtime_ns: int
+    ctime_ns: int
+    inode: int
+
+
+@dataclass(frozen=True)
+class ArchiveRef:
+    """One archive: where it lies, and what it is, without its samples.
+
+    Attributes:
+        location: path or URL.
+        sha256: of all bytes.
+        use: "excitation" (fitted), "validation" (predicted), "standstill" (noise).
+        arm: see :class:`GroupKey`.
+        campaign: see :class:`GroupKey`.
+        index: of the interval within its kind; 0 for imported ones.
+        cell: digest of the texts of cell file and URDF.
+        motion: digest of the planned motion, "" where none is known.
+        when: time of recording, ISO 8601; "" in simulation.
+        stamp: of the file when it was hashed; None of a remote one.
+    """
+
+    location: str
+    sha256: str
+    use: str
+    arm: str
+    campaign: str
+    index: int
+    cell: str
+    motion: str
+    when: str = ""
+    stamp: FileStamp | None = None
+
+    @property
+    def name(self) -> str:
+        """File name."""
+        return self.location.rsplit("/", 1)[-1]
+
+    @property
+    def key(self) -> GroupKey:
+        """The group it belongs to."""
+        return GroupKey(self.arm, self.campaign)
+
+    @property
+    def order(self) -> tuple[str, str, int, str, str]:
+        """Sums go in this order, whatever order archives were found in."""
+        return self.arm, self.campaign, self.index, self.name, self.sha256
+
+
+class Broken(NamedTuple):
+    """An archive of which nothing was used, and why."""
+
+    path: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a person may choose about the preprocessing.
+
+    Attributes:
+        smoother: of the positions.
+        delay: time by which the torque lags the position [s]; None takes it from the cell.
+        torque_bandwidth: low-pass [Hz] the torque has come through; None for none, "auto" looks
+            for one in imported torques.
+
+    Raises:
+        InputError: a name is unknown.
+    """
+
+    smoother: Smoother = "spline"
+    delay: float | None = None
+    torque_bandwidth: float | Literal["auto"] | None = "auto"
+
+    def __post_init__(self) -> None:
+        if self.smoother not in get_args(Smoother):
+            known = ", ".join(get_args(Smoother))
+            raise InputError(
+                None, f"{self.smoother!r} is no smoother", field="smoother", remedy=f"use {known}"
+            )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the archives of one campaign become factors: choices, and what the campaign settled.
+
+    With the bytes of an archive they determine its factor.
+
+    Attributes:
+        smoother: of the positions.
+        torque_delay: [s].
+        torque_bandwidth: [Hz]; None for none.
+        noise_variance: of the positions (n,) [rad² or m²]; None takes each archive's own.
+        code: digest of the programs that make factors.
+        noise: where `noise_variance` comes from, in words.
+    """
+
+    smoother: Smoother
+    torque_delay: float
+    torque_bandwidth: float | None
+    noise_variance: tuple[float, ...] | None
+    code: str
+    noise: str = field(default="", compare=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The estimate from one archive alone.
+
+    Attributes:
+        estimate: with cluster-robust covariance.
+        design_effect: by how much its mean variance is that of white residuals.
+    """
+
+    estimate: Estimate
+    design_effect: float
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """What is kept of each archive beside the sum of all: some ten kilobytes.
+
+    Attributes:
+        ref: the archive.
+        total: its factor as one block.
+        fits: by weighting, "weighted" and "ordinary"; none of a validation run.
+        duration: from first to last sample [s].
+        doubts: what a reader must know of it.
+    """
+
+    ref: ArchiveRef
+    total: PhaseFactor
+    fits: Mapping[str, Fit]
+    duration: float
+    doubts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ArchiveFactor:
+    """An archive reduced: its summary, and its factor block by block of time."""
+
+    summary: Summary
+    phase: PhaseFactor
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Some archives of one campaign, reduced together: what travels from a worker.
+
+    Attributes:
+        refs: those asked for, in their order.
+        summaries: of those that could be read, in their order.
+        phase: sum of the factors of those that are fitted; None where none is.
+        broken: the others.
+        lasting: whether those would be broken another time as well, as long as they stay the same.
+    """
+
+    refs: tuple[ArchiveRef, ...]
+    summaries: tuple[Summary, ...]
+    phase: PhaseFactor | None
+    broken: tuple[Broken, ...] = ()
+    lasting: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A robot that archives belong to.
+
+    Attributes:
+        digest: see :class:`GroupKey`.
+        cell: of one of its archives.
+    """
+
+    digest: str
+    cell: Cell
+
+    @property
+    def name(self) -> str:
+        """The cell's name, and enough of the digest to tell arms with one name apart."""
+        return f"{self.cell.name}-{self.digest[:8]}"
+
+
+@dataclass(frozen=True, eq=False)
+class LevelEstimate:
+    """Parameters from one repetition, one campaign, or all campaigns of an arm.
+
+    Attributes:
+        level: which of these.
+        arm: digest of the arm, a key of `BatchResult.arms`.
+        campaign: folder; "" if pooled.
+        archive: location of the archive of a repetition; "" otherwise.
+        sha256: of the archive of a repetition; "" otherwise.
+        when: time of the (first) recording, ISO 8601, "" if unknown.
+        repetitions: archives that were fitted.
+        names: of the parameters (p,).
+        units: (p,).
+        values: (p,).
+        std: (p,), infinite where undetermined.
+        covariance: (p, p); None for a repetition, of which there may be very many.
+        interval_factor: standard deviations in half a 95 % interval.
+        samples: fitted rows per joint (n,).
+        noise_std: of the torque residual per joint (n,) [N·m or N].
+        torque_rms: of the fitted rows per joint (n,).
+        unseen_rms: torque error per joint (n,) on the campaign's validation runs; NaN if none.
+        unseen_torque_rms: torque per joint (n,) there; NaN if none.
+        condition: of the scaled regressor.
+        undetermined: names.
+        method: in words.
+        settings: digest of the settings; "" where campaigns with different ones are pooled.
+        doubts: what a reader must know.
+        speed_rms: per axis (n,), see :mod:`hil.batch.axis_figures`; None for a repetition.
+        information: weighted Gram matrix (p, p) of the fitted rows; None for a repetition.
+    """
+
+    level: Level
+    arm: str
+    campaign: str
+    archive: str
+    sha256: str
+    when: str
+    repetitions: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    std: Array
+    covariance: Array | None
+    interval_factor: float
+    samples: NDArray[np.intp]
+    noise_std: Array
+    torque_rms: Array
+    unseen_rms: Array
+    unseen_torque_rms: Array
+    condition: float
+    undetermined: tuple[str, ...]
+    method: str
+    settings: str
+    doubts: tuple[str, ...] = ()
+    speed_rms: Array | None = None
+    information: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult:
+    """Everything a batch found.
+
+    Attributes:
+        estimator: by name.
+        arms: by digest.
+        repetitions: of all campaigns, in the order of `ArchiveRef.order`.
+        campaigns: likewise, by arm and time.
+        pooled: one per arm.
+        broken: archives, and campaigns (by folder), that could not be used.
+        skipped: archives that are not meant to be fitted, and why.
+        read: archives whose factor was computed.
+        cached: archives whose factor was known.
+        code: digest of the programs.
+    """
+
+    estimator: BatchEstimator
+    arms: Mapping[str, Arm]
+    repetitions: tuple[LevelEstimate, ...]
+    campaigns: tuple[LevelEstimate, ...]
+    pooled: tuple[LevelEstimate, ...]
+    broken: tuple[Broken, ...]
+    skipped: tuple[Broken, ...]
+    read: int
+    cached: int
+    code: str

@@ -1,0 +1,251 @@
+"""The work on archives: settling campaigns, reducing bundles, and whatever goes wrong in that."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from hil.progress import Reporter
+from identification.phase_factor import PhaseFactor
+
+from .cache import Where
+from .errors import CacheError
+from .keeping import bundles, is_kept, kept_bundle
+from .local import Workers
+from .on_workers import ArchiveTask, Summed
+from .settling import Settled, consulted, known_settings
+from .tasks import Done, bundle_kept, bundle_sent, campaign_settled, opened_once
+from .tree_sum import TreeSum
+from .types import ArchiveRef, Broken, Bundle, Choices, GroupKey, Settings
+
+_ROUNDS: Final = 3
+"""How often a campaign is added up far away before what still ends its process is left out."""
+
+
+@dataclass(eq=False)
+class Campaign:
+    """Archives of one group on their way.
+
+    Attributes:
+        key: of the group.
+        refs: archives, without those found to be broken.
+        settings: None until they are settled.
+        bundles: archives that are reduced together.
+        reason: why it could not be settled, "" if it could.
+    """
+
+    key: GroupKey
+    refs: tuple[ArchiveRef, ...]
+    settings: Settings | None = None
+    bundles: list[tuple[ArchiveRef, ...]] = field(default_factory=list)
+    reason: str = ""
+
+    @property
+    def ready(self) -> Settings:
+        """The settings, once they are settled."""
+        assert self.settings is not None
+        return self.settings
+
+
+class Collected:
+    """Bundles of a campaign, one in memory at a time, and their sum when all have been seen."""
+
+    def __init__(self, found: Iterator[Bundle], total: PhaseFactor | None = None) -> None:
+        self._found, self._total = found, total
+        self._sums = TreeSum[PhaseFactor]()
+
+    def __iter__(self) -> Iterator[Bundle]:
+        for bundle in self._found:
+            self._sums.add(bundle.phase)
+            yield bundle
+
+    @property
+    def total(self) -> PhaseFactor | None:
+        """The sum; None if nothing is fitted."""
+        return self._sums.result() if self._total is None else self._total
+
+
+class Work:
+    """Hands out work and takes back what comes of it.
+
+    Args:
+        workers: who does it.
+        choices: of the preprocessing.
+        where: results of single archives are kept.
+        reporter: of progress.
+
+    Attributes:
+        broken: archives that could not be used, campaigns that could not be settled.
+        read: archives that were read.
+    """
+
+    def __init__(
+        self, workers: Workers, choices: Choices, where: Where, reporter: Reporter
+    ) -> None:
+        self.broken: list[Broken] = []
+        self.read = 0
+        self._workers, self._choices = workers, choices
+        self._where, self._reporter = where, reporter
+        self._loose: dict[tuple[ArchiveRef, ...], Bundle] = {}
+        self._far_sums: Iterator[Summed[PhaseFactor, Done]] = iter(())
+
+    def settle(self, campaigns: Sequence[Campaign]) -> list[Campaign]:
+        """Give each campaign its settings; returns those that have some."""
+        waiting = []
+        for one in campaigns:
+            one.settings = known_settings(consulted(one.refs), self._choices, self._where)
+            if one.settings is None:
+                waiting.append(one)
+        self._settle(waiting)
+        failed = [one for one in waiting if one.reason]
+        for one in failed:
+            self._drop(one, self._unreadable(consulted(one.refs)))
+        self._settle([one for one in failed if one.refs])
+        self.broken += [Broken(one.key.campaign, one.reason) for one in failed if one.reason]
+        return [one for one in campaigns if one.settings is not None]
+
+    def reduce(self, campaigns: Sequence[Campaign]) -> None:
+        """Have all bundles of the campaigns reduced and kept.
+
+        Where that cannot be seen here the work only begins, and campaigns are to be collected in
+        the same order.
+        """
+        for one in campaigns:
+            one.bundles = bundles([ref for ref in one.refs if ref.use != "standstill"])
+        if not self._workers.near:
+            self._far_sums = self._workers.sums_in_turn(
+                [[self._task(one, refs) for refs in one.bundles] for one in campaigns],
+                operator.add,
+            )
+            return
+        missing = []
+        for one in campaigns:
+            missing += [
+                (one, k)
+                for k, refs in enumerate(one.bundles)
+                if not is_kept(refs, one.ready, self._where)
+            ]
+        notes = self._ask(
+            [self._task(one, one.bundles[k]) for one, k in missing],
+            "reading archives",
+            sum(len(one.bundles[k]) for one, k in missing),
+        )
+        for (one, k), note in zip(missing, notes, strict=True):
+            if isinstance(note, Done):
+                self._take(one.bundles[k], note)
+            else:
+                one.bundles[k] = self._one_by_one(one, one.bundles[k])
+
+    def collected(self, one: Campaign) -> Collected:
+        """The bundles of a campaign, once it is settled and reduced."""
+        if not self._workers.near:
+            return self._far(one, next(self._far_sums))
+        return Collected(self._bundle(one, refs) for refs in one.bundles)
+
+    def _settle(self, campaigns: Sequence[Campaign]) -> None:
+        tasks = [
+            ArchiveTask(
+                one.key.campaign,
+                campaign_settled,
+                (consulted(one.refs), self._choices, self._where),
+            )
+            for one in campaigns
+        ]
+        for one, note in zip(campaigns, self._ask(tasks, "settling campaigns"), strict=True):
+            one.reason = ""
+            if isinstance(note, Settled):
+                one.settings = note.settings
+                self._drop(one, note.broken)
+            else:
+                one.reason = note.reason
+
+    def _one_by_one(self, one: Campaign, refs: Sequence[ArchiveRef]) -> tuple[ArchiveRef, ...]:
+        """Reduce a bundle that ended its process archive by archive; returns those that do not."""
+        good: tuple[ArchiveRef, ...] = ()
+        for ref in refs:
+            longer = (*good, ref)
+            (note,) = self._ask([self._task(one, longer)], f"reading {ref.name} by itself")
+            if isinstance(note, Done):
+                self._loose.pop(good, None)
+                self._take(longer, note)
+                good = longer
+            else:
+                self.broken.append(Broken(ref.location, note.reason))
+        return good
+
+    def _bundle(self, one: Campaign, refs: tuple[ArchiveRef, ...]) -> Bundle:
+        """What was kept of a bundle; read anew where that is damaged."""
+        if not refs:
+            return Bundle((), (), None)
+        found = self._loose.pop(refs, None) or kept_bundle(refs, one.ready, self._where)
+        if found is not None:
+            return found
+        (note,) = self._ask([self._task(one, refs)], f"reading {refs[0].name} again")
+        if isinstance(note, Done):
+            self._take(refs, note)
+        else:
+            refs = self._one_by_one(one, refs)
+        found = self._loose.pop(refs, None) or kept_bundle(refs, one.ready, self._where)
+        if found is None:
+            raise CacheError(
+                one.key.campaign, "what was kept of it vanished", remedy="run the batch again"
+            )
+        return found
+
+    def _far(self, one: Campaign, found: Summed[PhaseFactor, Done]) -> Collected:
+        """A campaign reduced and added up where its archives are; again without what crashed."""
+        for attempt in range(_ROUNDS):
+            crashed = {k: note for k, note in enumerate(found.notes) if isinstance(note, Broken)}
+            if not crashed:
+                break
+            for k, note in crashed.items():
+                if attempt == _ROUNDS - 1:
+                    self.broken += [Broken(ref.location, note.reason) for ref in one.bundles[k]]
+                else:
+                    one.bundles[k] = self._one_by_one(one, one.bundles[k])
+            one.bundles = [refs for refs in one.bundles if refs]
+            if attempt < _ROUNDS - 1:
+                tasks = [self._task(one, refs) for refs in one.bundles]
+                (found,) = self._workers.sums([tasks], operator.add)
+        notes = [note for note in found.notes if isinstance(note, Done)]
+        self.read += sum(note.read for note in notes)
+        without_sums = (note.bundle for note in notes if note.bundle is not None)
+        return Collected(without_sums, found.total)
+
+    def _task(self, one: Campaign, refs: tuple[ArchiveRef, ...]) -> ArchiveTask[Any, Done]:
+        function = bundle_kept if self._workers.near else bundle_sent
+        return ArchiveTask(refs[0].location, function, (refs, one.ready, self._where))
+
+    def _take(self, refs: tuple[ArchiveRef, ...], done: Done) -> None:
+        if self._workers.near:
+            self.read += done.read
+            if done.bundle is not None:
+                self._loose[refs] = done.bundle
+
+    def _unreadable(self, refs: Sequence[ArchiveRef]) -> list[Broken]:
+        """Those that cannot be opened, or end the process that does."""
+        tasks = [ArchiveTask(ref.location, opened_once, (ref,)) for ref in refs]
+        notes = self._ask(tasks, "opening archives one by one")
+        return [note for note in notes if isinstance(note, Broken)]
+
+    def _drop(self, one: Campaign, broken: Sequence[Broken]) -> None:
+        paths = {each.path for each in broken}
+        self.broken += broken
+        one.refs = tuple(ref for ref in one.refs if ref.location not in paths)
+
+    def _ask(
+        self, tasks: Sequence[ArchiveTask[Any, Any]], title: str, total: float | None = None
+    ) -> list[Any]:
+        """The notes of tasks, each by itself."""
+        if not tasks:
+            return []
+        share = (total or len(tasks)) / len(tasks)
+        with self._reporter.task(title, total or len(tasks)) as progress:
+            done = self._workers.sums(
+                [[one] for one in tasks],
+                operator.add,
+                done=lambda count: progress.advance(share * count),
+            )
+        return [one.notes[0] for one in done]

@@ -1,0 +1,148 @@
+"""The model that `[robot]` describes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.coupling import Coupling
+from identification.errors import ModelError
+from identification.friction import FrictionLaw
+from identification.kinematics import Chain, chain_from_urdf
+from identification.model import RobotModel
+from identification.payload import Payload
+
+from .errors import CellError
+from .schema import CouplingTable, FrictionTable, PayloadTable, RobotTable
+
+Array = NDArray[np.float64]
+
+
+def robot_model(
+    path: Path, urdf_name: str, urdf: str, robot: RobotTable, drive_train: Callable[[], Array]
+) -> RobotModel:
+    """Build the model of a cell.
+
+    Args:
+        path: of the cell file, for errors.
+        urdf_name: of the robot description, as the file names it.
+        urdf: its text.
+        robot: the table.
+        drive_train: gives the motor angles per joint angle (n, n) of `[drive_train]`.
+
+    Raises:
+        CellError: names the field that is to blame.
+    """
+    with _blamed(path, "cell.urdf", urdf_name, "correct the URDF"):
+        names = chain_from_urdf(urdf).joint_names if not robot.locked else _all_names(urdf)
+    _known(path, "robot.locked", robot.locked, names)
+    with _blamed(path, "cell.urdf", urdf_name, "correct the URDF"):
+        chain = chain_from_urdf(urdf, robot.locked)
+    _known(path, "robot.friction.joints", robot.friction.joints, chain.joint_names)
+    coupling = _coupling(path, robot.coupling, chain, drive_train)
+    payload = _payload(path, robot.payload, chain)
+    laws = {
+        name: _law(path, f"robot.friction.joints.{name}", _override(robot.friction, name))
+        for name in robot.friction.joints
+    }
+    common = _law(path, "robot.friction", robot.friction)
+    with _blamed(path, "cell.urdf", urdf_name, "correct the URDF or [robot]"):
+        return RobotModel.from_urdf(
+            urdf,
+            gravity=tuple(robot.gravity),
+            rotor_inertia=robot.rotor_inertia,
+            friction=common,
+            joint_friction=laws,
+            locked=robot.locked,
+            coupling=coupling,
+            payload=payload,
+        )
+
+
+def _all_names(urdf: str) -> tuple[str, ...]:
+    """Every joint that moves, also of kinds that the model knows only when they are locked."""
+    import pinocchio
+
+    try:
+        return tuple(pinocchio.buildModelFromXML(urdf).names)[1:]
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(f"the robot description is not a readable URDF: {error}") from error
+
+
+def _override(friction: FrictionTable, name: str) -> FrictionTable:
+    different = friction.joints[name].model_dump(exclude_none=True)
+    return friction.model_copy(update=different)
+
+
+def _law(path: Path, field: str, table: FrictionTable) -> FrictionLaw:
+    with _blamed(path, field, None, "correct that table"):
+        return FrictionLaw(
+            coulomb=table.coulomb,
+            viscous=table.viscous,
+            third=None if table.third == "none" else table.third,
+            offset=table.offset,
+            standstill=table.standstill,
+            stribeck=table.stribeck or None,
+            asymmetric=table.asymmetric,
+            zone=table.zone,
+        )
+
+
+def _coupling(
+    path: Path, table: CouplingTable | None, chain: Chain, drive_train: Callable[[], Array]
+) -> Coupling | None:
+    if table is None:
+        return None
+    field, given, n = "robot.coupling.motor_from_joint", table.motor_from_joint, chain.n_joints
+    if given == "drive_train":
+        matrix = drive_train()
+    else:
+        widths = {len(row) for row in given} | {len(given)}
+        if widths != {n}:
+            raise CellError(
+                path,
+                field,
+                None,
+                f"is not {n} rows of {n} figures",
+                f"give a row for each motor, in it a figure for each of "
+                f"{', '.join(chain.joint_names)}",
+            )
+        matrix = np.array(given, dtype=np.float64)
+    with _blamed(path, field, None, "correct that matrix"):
+        return Coupling(matrix, inertia=table.inertia, friction=table.friction)
+
+
+def _payload(path: Path, table: PayloadTable | None, chain: Chain) -> Payload | None:
+    if table is None:
+        return None
+    xx, xy, xz, yy, yz, zz = table.inertia
+    with _blamed(path, "robot.payload", None, "correct that table"):
+        payload = Payload(
+            table.mass, table.centre, (xx, xy, xz, yy, yz, zz), frame=table.frame or None
+        )
+        payload.carried_by(chain)
+        return payload
+
+
+def _known(path: Path, field: str, named: Mapping[str, object], joints: tuple[str, ...]) -> None:
+    for name in named:
+        if name not in joints:
+            raise CellError(
+                path,
+                field,
+                name,
+                "is no moving joint of the URDF",
+                f"its joints are {', '.join(joints)}",
+            )
+
+
+@contextmanager
+def _blamed(path: Path, field: str, value: object, remedy: str) -> Iterator[None]:
+    try:
+        yield
+    except ModelError as error:
+        raise CellError(path, field, value, str(error), remedy) from error

@@ -1,0 +1,184 @@
+"""`hil archive`: what an archive holds, whether it keeps the profile, and its repair."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hil.archive.check import ASPECTS, Check, check_archive
+from hil.archive.overview import Overview, overview
+from hil.archive.repair import repair as repair_archive
+from hil.archive.repair import repaired_name
+from hil.errors import ArchiveError, InputError
+
+app = typer.Typer(help="Look into archives, check and repair them.", no_args_is_help=True)
+
+NOT_KEPT = 5
+NO_ARCHIVE = 2
+FAILED = 1
+LOST = 3
+
+Files = Annotated[list[Path], typer.Argument(help="The archives.", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object per file instead.")]
+
+
+@app.command("info")
+def info(files: Files, as_json: Json = False) -> None:
+    """Say what archives hold: motion, joints, channels, sizes, attachments."""
+    failed = 0
+    for path in files:
+        try:
+            found = overview(path)
+        except ArchiveError as error:
+            failed = error.exit_code
+            _say_error(path, error, as_json=as_json)
+            continue
+        typer.echo(json.dumps(found.to_dict()) if as_json else "\n".join(_info_lines(found)))
+    raise typer.Exit(failed)
+
+
+@app.command("check")
+def check(files: Files, as_json: Json = False) -> None:
+    """Say whether files keep the archive profile (docs/archive-format.md), aspect by aspect.
+
+    Exit status: 0 all keep it, 5 one does not, 2 one is no archive.
+    """
+    status = 0
+    for path in files:
+        try:
+            found = check_archive(path)
+        except ArchiveError as error:
+            status = NO_ARCHIVE
+            _say_error(path, error, as_json=as_json)
+            continue
+        if not found.keeps and not status:
+            status = NOT_KEPT
+        typer.echo(json.dumps(_check_dict(found)) if as_json else "\n".join(_check_lines(found)))
+    raise typer.Exit(status)
+
+
+@app.command("repair")
+def repair(
+    file: Annotated[Path, typer.Argument(help="The archive.", show_default=False)],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The file to write; FILE_repaired.mcap by default."),
+    ] = None,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Replace the archive, once the repair has succeeded.")
+    ] = False,
+) -> None:
+    """Rewrite a torn or damaged archive so that every reader accepts it.
+
+    Exit status: 0 nothing is lost, 3 something is, 1 nothing could be saved.
+    """
+    if in_place and output is not None:
+        raise InputError(None, "contradicts --output", field="--in-place", remedy="give one")
+    try:
+        done = repair_archive(file, output, in_place=in_place)
+    except ArchiveError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(FAILED) from error
+    for loss in done.losses:
+        typer.echo(f"lost: {loss}", err=True)
+    if done.output is None:
+        typer.echo(f"{file}: whole, nothing to repair")
+    else:
+        typer.echo(f"wrote {done.output}: {_saved(done.samples, done.samples_lost)}")
+    raise typer.Exit(LOST if done.losses else 0)
+
+
+def _saved(samples: int, lost: int | None) -> str:
+    if lost is None:
+        return f"{samples} samples; how many are lost is not known"
+    return f"{samples} samples, {lost} lost" if lost else f"{samples} samples, none lost"
+
+
+def _say_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps({"file": str(path), "archive": False, "error": str(error)}))
+    else:
+        typer.echo(f"error: {error}", err=True)
+
+
+def _check_lines(found: Check) -> list[str]:
+    verdict = "keeps" if found.keeps else "does not keep"
+    lines = [f"{found.path}: {verdict} profile {found.version}, {found.samples} samples"]
+    if found.repaired:
+        lines[0] += ", repaired with loss"
+    for aspect, meaning in ASPECTS.items():
+        faults = found.faults.get(aspect, ())
+        lines.append(f"  {aspect:<13} {'no' if faults else 'ok':<3} {meaning}")
+        lines += [f"  {'':<13}     {fault}" for fault in faults]
+    if not found.keeps:
+        lines.append(f"  to mend what can be: hil archive repair {found.path}")
+    return lines
+
+
+def _check_dict(found: Check) -> dict[str, Any]:
+    return {
+        "file": str(found.path),
+        "archive": True,
+        "keeps": found.keeps,
+        "version": found.version,
+        "samples": found.samples,
+        "repaired": found.repaired,
+        "aspects": {
+            aspect: {
+                "keeps": aspect not in found.faults,
+                "faults": list(found.faults.get(aspect, ())),
+            }
+            for aspect in ASPECTS
+        },
+    }
+
+
+def _info_lines(found: Overview) -> list[str]:
+    rate = "" if found.period is None else f" at {1.0 / found.period:g} Hz"
+    lines = [
+        f"{found.path}",
+        *_table(
+            {
+                "kind": found.title,
+                "outcome": found.outcome,
+                "recorded": f"{found.samples} samples, {found.duration:.3f} s{rate}",
+                "lost": found.lost,
+                "joints": ", ".join(found.joint_names),
+                "file": f"{_size(found.size)}, {found.chunks} chunks"
+                + (f", {_size(found.per_minute)} per minute" if found.per_minute else ""),
+                "damage": found.damage or "none",
+            }
+        ),
+        "  channels",
+    ]
+    lines += [f"    {topic:<26} {count:>9}  {kind}" for topic, kind, count in found.channels]
+    lines.append("  attachments")
+    lines += [f"    {name:<26} {_size(size):>9}" for name, size in found.attachments.items()]
+    lines.append("  metadata")
+    lines += [f"    {key:<26} {value}" for key, value in found.metadata.items()]
+    if found.events:
+        lines.append("  events")
+        lines += [f"    {time:>10.3f} s  {name}: {text}" for time, name, text in found.events]
+    if found.damage:
+        lines.append(f"  to mend it: hil archive repair {found.path}, {_mended(found.path)}")
+    return lines
+
+
+def _mended(path: Path) -> str:
+    return f"which writes {repaired_name(path).name}"
+
+
+def _table(rows: dict[str, str]) -> Sequence[str]:
+    return [f"  {key:<10} {value}" for key, value in rows.items() if value]
+
+
+def _size(size: float) -> str:
+    for unit in ("B", "kB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}" if unit != "B" else f"{size:.0f} B"
+        size /= 1000
+    return f"{size:.3g} MB"

@@ -1,0 +1,182 @@
+"""`hil gains`: torque constants from recordings with a known payload."""
+
+from __future__ import annotations
+
+import json as json_module
+import math
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hil.cli.verdict import NOT_GOOD
+from hil.errors import InputError
+from hil.identify.gain_run import GainsFound, find_gains
+from hil.progress import reporter as make_reporter
+from identification.gains import GainMethod
+from identification.payload import Payload
+
+LONGEST_DELAY = 0.5
+"""s; what is longer is a slip of the unit."""
+
+_ROUNDING = 1e-9
+
+
+def gains(
+    archives: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Archives with motor currents (*.mcap). One whose cell has a [robot.payload] was "
+            "recorded with it, the others without load.",
+            show_default=False,
+            metavar="ARCHIVE...",
+        ),
+    ],
+    loaded: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--loaded",
+            help="Archive recorded with the payload of --mass; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    mass: Annotated[
+        float | None, typer.Option(help="Mass of that payload in kg.", show_default=False)
+    ] = None,
+    centre: Annotated[
+        str, typer.Option(help="Its centre of mass in the frame, x,y,z in m.")
+    ] = "0,0,0",
+    inertia: Annotated[
+        str,
+        typer.Option(
+            help="Its tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes of "
+            "the frame."
+        ),
+    ] = "0,0,0,0,0,0",
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="Link of the URDF whose frame that is; the last joint's if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    method: Annotated[
+        str, typer.Option(help="weighted or total (least squares with errors in the currents).")
+    ] = "weighted",
+    delay: Annotated[
+        float | None,
+        typer.Option(
+            help="Time in s by which currents lag positions; the cell's if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the result.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Find the torque constant of every motor, from recordings with and without a known payload.
+
+    Prints TOML to paste into a cell or a column map, with 95 % intervals. A motor whose constant
+    the data cannot determine is named, and gets no number: exit status 5.
+    """
+    methods: dict[str, GainMethod] = {"weighted": "weighted", "total": "total"}
+    if method not in methods:
+        raise InputError(
+            None, f"{method!r} is unknown", field="--method", remedy=f"use {', '.join(methods)}"
+        )
+    if delay is not None and not abs(delay) <= LONGEST_DELAY:
+        raise InputError(
+            None, f"{delay} is no delay", field="--delay", remedy=f"give s, at most {LONGEST_DELAY}"
+        )
+    twice = {path.resolve() for path in archives} & {path.resolve() for path in loaded or []}
+    if twice:
+        raise InputError(twice.pop(), "is named with load and without", remedy="name it once")
+    payload = _payload(mass, centre, inertia, frame, bool(loaded))
+    found = find_gains(
+        archives,
+        dict.fromkeys(loaded or [], payload) if payload is not None else {},
+        make_reporter(quiet=quiet or json),
+        method=methods[method],
+        delay=delay,
+    )
+    typer.echo(json_module.dumps(_as_json(found), indent=1) if json else _as_toml(found))
+    if not found.gains.determined.all():
+        raise typer.Exit(NOT_GOOD)
+
+
+def _payload(
+    mass: float | None, centre: str, inertia: str, frame: str | None, wanted: bool
+) -> Payload | None:
+    if not wanted:
+        if mass is not None:
+            raise InputError(
+                None, "which recording was made with it?", field="--mass", remedy="add --loaded"
+            )
+        return None
+    if mass is None or not (math.isfinite(mass) and mass > 0.0):
+        raise InputError(
+            None, "the payload needs a mass above 0", field="--mass", remedy="give it in kg"
+        )
+    x, y, z = _numbers(centre, 3, "--centre")
+    xx, xy, xz, yy, yz, zz = _numbers(inertia, 6, "--inertia")
+    least, middle, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if least < -_ROUNDING * most or most > (1.0 + _ROUNDING) * (least + middle):
+        raise InputError(
+            None,
+            "no body has this tensor",
+            field="--inertia",
+            remedy="principal moments are not negative, and none exceeds the sum of the others",
+        )
+    return Payload(mass, (x, y, z), (xx, xy, xz, yy, yz, zz), frame)
+
+
+def _numbers(text: str, count: int, field: str) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise InputError(
+            None, f"{text!r} is not {count} numbers", field=field, remedy="separate them by commas"
+        )
+    return values
+
+
+def _as_toml(found: GainsFound) -> str:
+    gains, side = found.gains, "motor side" if found.motor_side else "joint side, gears included"
+    lines = [
+        f"# N·m/A ({side}), 95 % intervals, {gains.method} least squares",
+        "torque_constant = [",
+    ]
+    for motor, name in enumerate(gains.motor_names):
+        reason = gains.reasons[motor]
+        if reason is None:
+            half = gains.interval_factor * gains.std[motor]
+            lines.append(f"    {gains.values[motor]:.6g},  # {name} ± {half:.2g}")
+        else:
+            lines.append(f"    # {name}: not determined; {reason}")
+    return "\n".join([*lines, "]"])
+
+
+def _as_json(found: GainsFound) -> dict[str, object]:
+    gains = found.gains
+    return {
+        "motors": [
+            {
+                "name": name,
+                "torque_constant": float(gains.values[m]) if gains.determined[m] else None,
+                "std": float(gains.std[m]) if gains.determined[m] else None,
+                "half_interval": (
+                    float(gains.interval_factor * gains.std[m]) if gains.determined[m] else None
+                ),
+                "not_determined": gains.reasons[m],
+            }
+            for m, name in enumerate(gains.motor_names)
+        ],
+        "unit": "N·m/A",
+        "side": "motor" if found.motor_side else "joint",
+        "method": gains.method,
+        "payload_kg": {
+            name: None if load is None else load.mass for name, load in found.loads.items()
+        },
+    }

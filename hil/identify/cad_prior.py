@@ -1,0 +1,51 @@
+"""What is believed of a robot before any data: its URDF and the cell's `[nominal]`."""
+
+from __future__ import annotations
+
+from hil.cell import Cell
+from hil.cell.schema import NominalTable
+from identification import IdentificationError, RobotModel
+from identification.nominal_prior import nominal_prior
+from identification.prior import GaussianPrior
+
+# Friction changes with temperature, lubricant and wear by tens of per cent (Bittencourt and
+# Gunnarsson 2012): a data sheet's is no better than to half of itself.
+FRICTION_SHARE = 0.5
+
+
+def cad_prior(cell: Cell) -> GaussianPrior | str:
+    """Prior of a cell; in words why it has none.
+
+    The URDF's inertias are believed to `[nominal] uncertainty` (10 % without that table), rotor
+    inertias of the table likewise, its friction to `FRICTION_SHARE`. Of what neither gives
+    nothing is believed.
+    """
+    table = cell.file.nominal
+    try:
+        if table is None or table.uncertainty == 0.0:
+            return nominal_prior(cell.model, known=_known(cell.model, table, 0.0))
+        known = _known(cell.model, table, table.uncertainty)
+        return nominal_prior(cell.model, table.uncertainty, known)
+    except IdentificationError as error:
+        return str(error)
+
+
+def _known(
+    model: RobotModel, table: NominalTable | None, share: float
+) -> dict[str, tuple[float, float]]:
+    """Mean and standard deviation by name of what the table gives and the model has."""
+    if table is None:
+        return {}
+    columns = {
+        "I{}m": (table.rotor_inertia, share or FRICTION_SHARE),
+        "f0_{}": (table.coulomb, FRICTION_SHARE),
+        "f1_{}": (table.viscous, FRICTION_SHARE),
+        "f2_{}": (table.third, FRICTION_SHARE),
+    }
+    names = {*model.standard_names, *model.parameter_names[model.base.rank :]}
+    return {
+        name: (value, part * abs(value))
+        for pattern, (values, part) in columns.items()
+        for joint, value in enumerate(values, 1)
+        if value != 0.0 and (name := pattern.format(joint)) in names
+    }

@@ -1,0 +1,255 @@
+"""From samples to an estimate, by the estimator that was chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from hil.errors import InputError
+from hil.progress import Reporter
+from identification import IdentificationError, RobotModel
+from identification.consistent import consistent_estimate
+from identification.endogeneity import EndogeneityTest
+from identification.estimation import Estimate
+from identification.least_squares import Weighting, fit_least_squares
+from identification.losses import Huber, Loss, Tukey
+from identification.phase_factor import PhaseFactor
+from identification.preprocessing import Samples
+from identification.prior import GaussianPrior, PosteriorEstimate, fit_with_prior
+from identification.qr_factor import QR_CONDITION
+from identification.repetitions import RepeatedEstimate, estimate_repetitions
+from identification.robust import RobustEstimate, robust_estimate
+
+from .cad_prior import cad_prior
+from .instruments import InstrumentalFit, fit_instrumental, widely_smoothed
+from .options import Estimator, Options
+from .prepared import Prepared
+
+# Change by the data, in the deviations that the prior allows, beyond which one of the two is wrong.
+_SURPRISING: Final = 4.0
+_UNTESTED: Final = "Whether noise in the positions biases least squares could not be tested"
+
+
+@dataclass(frozen=True, eq=False)
+class Estimation:
+    """An estimate, and what was computed beside it.
+
+    Attributes:
+        estimator: by name.
+        result: pooled and per repetition.
+        held_out: factors of what is predicted, one per recording.
+        posterior: the estimate with the prior from CAD, which says of each parameter whether it
+            was learned from the data; in words why there is none.
+        endogeneity: whether noise in the regressor has biased least squares; in words why that
+            could not be tested.
+        doubts: what a reader must know of the estimate.
+    """
+
+    estimator: Estimator
+    result: RepeatedEstimate
+    held_out: tuple[PhaseFactor, ...]
+    posterior: PosteriorEstimate | str
+    endogeneity: EndogeneityTest | str
+    doubts: tuple[str, ...]
+
+
+class _Case:
+    """What estimators read: the recordings, and what else is known of them."""
+
+    def __init__(
+        self,
+        model: RobotModel,
+        fitted: Sequence[Samples],
+        prior: GaussianPrior | str,
+        instrumental: InstrumentalFit | str,
+    ) -> None:
+        self.model, self.fitted = model, fitted
+        self.prior, self.instrumental = prior, instrumental
+
+
+_Found = tuple[RepeatedEstimate, list[str]]
+
+
+def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> Estimation:
+    """Estimate by `options.estimator`, and say beside it what can be said.
+
+    Raises:
+        InputError: the estimator needs something that the archives do not have.
+        IdentificationError: a recording without a usable row.
+    """
+    model = prepared.sources.cell.model
+    with reporter.task("estimating", 4) as task:
+        # The test is of the very samples that least squares reads.
+        fitted = prepared.fitted
+        if options.estimator == "iv":
+            fitted = widely_smoothed(model, prepared)
+        instrumental = fit_instrumental(model, prepared, fitted)
+        task.advance(1, options.estimator)
+        prior = cad_prior(prepared.sources.cell)
+        case = _Case(model, fitted, prior, instrumental)
+        result, doubts = _ESTIMATORS[options.estimator](case)
+        task.advance(1, "prior")
+        posterior = _posterior(case, result.phase)
+        task.advance(1, "held-out motion")
+        held_out = tuple(PhaseFactor.from_samples(model, one) for one in prepared.held_out)
+        task.advance(1)
+    return Estimation(
+        estimator=options.estimator,
+        result=result,
+        held_out=held_out,
+        posterior=posterior,
+        endogeneity=(
+            f"{_UNTESTED}: {instrumental}." if isinstance(instrumental, str) else instrumental.test
+        ),
+        doubts=(*doubts, *_conditioning(result.pooled), *_bias(options.estimator, instrumental)),
+    )
+
+
+def _least_squares(weighting: Weighting) -> Callable[[_Case], _Found]:
+    def run(case: _Case) -> _Found:
+        def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+            return fit_least_squares(case.model, some, weighting, phase=phase)
+
+        return estimate_repetitions(case.model, case.fitted, fit), []
+
+    return run
+
+
+def _robust(loss: Loss) -> Callable[[_Case], _Found]:
+    def run(case: _Case) -> _Found:
+        fits: list[RobustEstimate] = []
+
+        def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+            fits.append(robust_estimate(case.model, some, loss, gram=phase.total))
+            return fits[-1].estimate
+
+        result = estimate_repetitions(case.model, case.fitted, fit)
+        return result, _robust_doubts(case.model, fits[-1])  # the last is that of all
+
+    return run
+
+
+def _robust_doubts(model: RobotModel, found: RobustEstimate) -> list[str]:
+    doubts = [
+        f"{found.outlying[joint]:.0%} of the rows of {model.joint_names[joint]} lie beyond four "
+        "deviations: that is no gross error but something the model leaves out, and a robust loss "
+        "looks away from it; use --estimator wls"
+        for joint in np.flatnonzero(found.doubtful)
+    ]
+    if not found.converged:
+        doubts.append(f"the reweighting had not settled after {found.iterations} passes")
+    return doubts
+
+
+def _with_prior(case: _Case) -> _Found:
+    prior = case.prior
+    if isinstance(prior, str):
+        raise InputError(
+            None,
+            f"there is no prior to be had: {prior}",
+            field="--estimator prior",
+            remedy="give inertias in the URDF, or use --estimator wls",
+        )
+    fits: list[PosteriorEstimate] = []
+
+    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+        fits.append(fit_with_prior(case.model, some, prior, phase=phase))
+        return fits[-1].estimate
+
+    result = estimate_repetitions(case.model, case.fitted, fit)
+    surprise = np.nan_to_num(fits[-1].surprise)
+    far = np.flatnonzero(np.abs(surprise) > _SURPRISING)
+    if not far.size:
+        return result, []
+    listed = ", ".join(case.model.parameter_names[k] for k in far[:6])
+    more = f" and {far.size - 6} more" if far.size > 6 else ""
+    return result, [
+        f"data and prior contradict each other in {listed}{more} (more than {_SURPRISING:g} "
+        "deviations): the CAD figures, or their uncertainty in [nominal], are wrong"
+    ]
+
+
+def _consistent(case: _Case) -> _Found:
+    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+        free = fit_least_squares(case.model, some, phase=phase)
+        return consistent_estimate(case.model, phase.total, free).estimate
+
+    def free(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+        return fit_least_squares(case.model, some, phase=phase)
+
+    try:
+        # The scatter over repetitions is about noise: no need of a program for each.
+        return estimate_repetitions(case.model, case.fitted, fit, each=free), []
+    except IdentificationError as error:
+        raise InputError(
+            None,
+            f"no physically consistent parameters were found: {error}",
+            field="--estimator consistent",
+            remedy="use --estimator wls and read what its verdict says about consistency",
+        ) from error
+
+
+def _instrumental(case: _Case) -> _Found:
+    found = case.instrumental
+    if isinstance(found, str):
+        raise InputError(
+            None,
+            f"there are no instruments: {found}",
+            field="--estimator iv",
+            remedy="record the commanded positions as well, or use --estimator wls",
+        )
+    phase = PhaseFactor.zero(case.model)
+    for samples in case.fitted:
+        phase = phase + PhaseFactor.from_samples(case.model, samples)
+    result = RepeatedEstimate.of(case.model, found.pooled.estimate, found.each, phase)
+    weak = found.pooled.weak
+    if not weak:
+        return result, []
+    more = f" and {len(weak) - 6} more" if len(weak) > 6 else ""
+    return result, [f"the instruments are too weak for {', '.join(weak[:6])}{more}"]
+
+
+_ESTIMATORS: Final[dict[Estimator, Callable[[_Case], _Found]]] = {
+    "wls": _least_squares("weighted"),
+    "ols": _least_squares("ordinary"),
+    "huber": _robust(Huber()),
+    "tukey": _robust(Tukey()),
+    "prior": _with_prior,
+    "consistent": _consistent,
+    "iv": _instrumental,
+}
+
+
+def _posterior(case: _Case, phase: PhaseFactor) -> PosteriorEstimate | str:
+    if isinstance(case.prior, str):
+        return case.prior
+    try:
+        return fit_with_prior(case.model, case.fitted, case.prior, phase=phase)
+    except IdentificationError as error:
+        return str(error)
+
+
+def _conditioning(pooled: Estimate) -> list[str]:
+    if pooled.undetermined or pooled.condition <= QR_CONDITION:
+        return []
+    return [
+        f"the scaled condition number is {pooled.condition:.2g}, so the fit was solved by QR: the "
+        "motion hardly tells some parameters apart"
+    ]
+
+
+def _bias(estimator: Estimator, found: InstrumentalFit | str) -> list[str]:
+    """That noise in the positions moves the result; figures of the test stand in the report."""
+    if estimator == "iv" or isinstance(found, str) or not found.bias_matters:
+        return []
+    if found.pooled.estimate.undetermined:
+        return []  # what the motion does not determine differs by any amount
+    moved = float(np.max(found.test.predicted))
+    return [
+        "noise in the measured positions biases least squares: instrumental variables differ from"
+        f" it by up to {moved:.1%} of an axis's torque; compare with --estimator iv, or measure"
+        " positions with less noise"
+    ]

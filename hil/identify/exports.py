@@ -1,0 +1,174 @@
+"""The way back into a user's tools: the identified model as files beside `results.json`."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.extras_results import ExportResult
+from hil.results import Results
+from identification import Estimate, IdentificationError, RobotModel
+from identification.consistent import ConsistentEstimate
+from identification.friction_text import friction_in_words, friction_source
+from identification.parameter_text import parameters_csv, parameters_json, standard_csv
+from identification.urdf_write import write_urdf
+from identification.xml_source import Edit, XmlSource, comment_text
+
+Array = NDArray[np.float64]
+
+URDF = "identified.urdf"
+PARAMETERS_JSON, PARAMETERS_CSV = "parameters.json", "parameters.csv"
+STANDARD_CSV = "standard.csv"
+FRICTION_TEXT, FRICTION_SOURCE = "friction.txt", "friction.py"
+FILES = (PARAMETERS_JSON, PARAMETERS_CSV, FRICTION_TEXT, FRICTION_SOURCE, STANDARD_CSV, URDF)
+"""All that an identification can leave for other tools."""
+
+
+@dataclass(frozen=True)
+class Exports:
+    """The files for other tools, and what is not among them.
+
+    Attributes:
+        contents: text of each file by name, in the order of writing; None for one that is to be
+            taken away if it is there: it would be of other parameters than its neighbours.
+        withheld: why there is none, by the name of each such file.
+    """
+
+    contents: Mapping[str, str | None]
+    withheld: Mapping[str, str]
+
+    @property
+    def written(self) -> tuple[str, ...]:
+        """Names of the files that there are."""
+        return tuple(name for name, text in self.contents.items() if text is not None)
+
+    @property
+    def result(self) -> ExportResult:
+        """As it goes into `results.json`."""
+        return ExportResult(written=list(self.written), withheld=dict(self.withheld))
+
+
+def exports_of(
+    cell: Cell,
+    estimate: Estimate,
+    consistent: ConsistentEstimate | str,
+    *,
+    essential: Collection[str] | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> Exports:
+    """Return the identified model as files for other tools.
+
+    Args:
+        cell: whose URDF and model the parameters belong to.
+        estimate: of the model's parameters.
+        consistent: the physically consistent estimate, or why there is none. Without it there is
+            no URDF and no full standard parameters.
+        essential: names of the essential parameters, where they were looked for.
+        provenance: what the parameters come from; see :func:`provenance_of`.
+
+    Raises:
+        IdentificationError: the estimate is not of the cell's model.
+    """
+    model = cell.model
+    origin = {key: _line(value) for key, value in (provenance or {}).items()}
+    possible = None if isinstance(consistent, str) else consistent
+    contents: dict[str, str | None] = {
+        PARAMETERS_JSON: parameters_json(
+            model, estimate, consistent=possible, essential=essential, provenance=origin
+        ),
+        PARAMETERS_CSV: parameters_csv(model, estimate, provenance=origin),
+        **_friction(model, estimate, possible, origin),
+    }
+    withheld = {}
+    if possible is None:
+        why = f"there are no physically consistent parameters: {consistent}"
+        withheld = {STANDARD_CSV: why, URDF: why}
+    else:
+        contents[STANDARD_CSV] = standard_csv(model, possible, provenance=origin)
+        try:
+            contents[URDF] = _urdf(cell, estimate, possible, origin)
+        except IdentificationError as error:
+            withheld[URDF] = str(error)
+    return Exports({**contents, **dict.fromkeys(withheld)}, withheld)
+
+
+def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:
+    """Where a result comes from: cell, archives with their digests, software and verdict."""
+    digests = (f"{path.name} sha256 {_digest(path)}" for path in archives)
+    return {
+        "robot": results.cell,
+        "simulated": "yes" if results.simulated else "no",
+        "archives": ", ".join(digests),
+        "software": ", ".join(f"{name} {version}" for name, version in results.software.items()),
+        "verdict": ("good" if results.verdict.good else "NOT GOOD") + f": {results.verdict.line}",
+    }
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _friction(
+    model: RobotModel,
+    estimate: Estimate,
+    consistent: ConsistentEstimate | None,
+    origin: Mapping[str, str],
+) -> dict[str, str | None]:
+    """The friction law in words and as source: that of the URDF beside it, if there is one."""
+    if consistent is None:
+        values, whose = estimate.values[model.base.rank :], "least squares"
+    else:
+        values, whose = consistent.friction, f"the physically consistent parameters of {URDF}"
+    remarks = [f"friction of {whose}", *(f"{key}: {value}" for key, value in origin.items())]
+    unknown = [
+        name for name in model.parameter_names[model.base.rank :] if name in estimate.undetermined
+    ]
+    if unknown:
+        remarks.insert(
+            1,
+            f"NOT DETERMINED by the data, what stands for them is no figure: {', '.join(unknown)}",
+        )
+    header = "".join(f"# {line}\n" for line in remarks)
+    return {
+        FRICTION_TEXT: header + "\n" + friction_in_words(model, values),
+        FRICTION_SOURCE: header + friction_source(model, values),
+    }
+
+
+def _urdf(
+    cell: Cell, estimate: Estimate, consistent: ConsistentEstimate, origin: Mapping[str, str]
+) -> str:
+    """The user's URDF with the consistent parameters, and a comment that says so."""
+    model = cell.model
+    names = model.parameter_names[model.base.rank :]
+    # A joint that never moved keeps the friction that its URDF gives it.
+    unknown = np.array([name in estimate.undetermined for name in names], dtype=np.bool_)
+    friction = np.where(unknown, np.nan, consistent.friction)
+    lines = ["Inertia and joint friction were identified by hil; everything else is as it was."]
+    if estimate.undetermined:
+        lines.append(
+            f"Not determined by the data, but nominal: {', '.join(estimate.undetermined)}."
+        )
+    lines += [f"{key}: {value}" for key, value in origin.items()]
+    return write_urdf(_with_comment(cell.urdf, lines), model, consistent.standard, friction)
+
+
+def _with_comment(urdf: str, lines: Sequence[str]) -> str:
+    """A URDF text with a comment in front of its first element."""
+    source = XmlSource(urdf)
+    text = comment_text(source.newline.join(f"  {line}" for line in lines))
+    comment = f"<!--{source.newline}{text}{source.newline}-->{source.newline}"
+    at = source.root.start
+    return source.edited([Edit(at, at, comment)])
+
+
+def _line(text: str) -> str:
+    """Text fit for one line of any of the files: names of archives come from anywhere."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -1,0 +1,130 @@
+"""What the cell says beside its model: limits, drive train, delay, the controller's own model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from identification.estimation import Estimate
+from identification.evidence import Surroundings
+from identification.masks import SATURATED
+from identification.nominal_prior import NOMINAL_SHARE
+from identification.nominal_scale import NominalScale, nominal_scale
+from identification.position_jumps import position_jumps
+
+from .controller_model import controller_error, controller_inertia
+from .prepared import Prepared
+
+Array = NDArray[np.float64]
+
+
+def surroundings_of(paths: Sequence[Path], prepared: Prepared, estimate: Estimate) -> Surroundings:
+    """What a verdict needs to know of the cell.
+
+    Args:
+        paths: the archives that were identified from.
+        prepared: what was made of them.
+        estimate: what was estimated from that.
+    """
+    cell, sources = prepared.sources.cell, prepared.sources
+    recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
+    driven = cell.file.drive_train is not None
+    return Surroundings(
+        torque_limit=torque_limits(cell),
+        saturated=_saturated(prepared),
+        motor_from_joint=cell.drive_train.motor_from_joint if driven else None,
+        controller=controller_error(paths, cell, prepared.sources.held_out, prepared.held_out),
+        nominal_scale=_scale(cell, prepared),
+        jumps=tuple(jump for one in recorded for jump in position_jumps(one.recording, one.name)),
+        controller_inertia=controller_inertia(
+            paths, cell, estimate, (*sources.training, *sources.held_out)
+        ),
+        delays=prepared.delays,
+        assumed_delay=prepared.assumed_delay,
+    )
+
+
+class Nominal(NamedTuple):
+    """The model that an arm would have by its papers.
+
+    Attributes:
+        values: parameters (p,).
+        words: what it is.
+        rotors_known: whether it has the rotors' inertias.
+        share: relative uncertainty of its torque.
+    """
+
+    values: Array
+    words: str
+    rotors_known: bool
+    share: float
+
+
+def nominal_of(cell: Cell) -> Nominal | None:
+    """The cell's `[nominal]`, or the URDF's inertias without friction; None of a URDF of none."""
+    table, model = cell.file.nominal, cell.model
+    if table is not None:
+        known = bool(np.any(table.rotor_inertia))
+        return Nominal(cell.nominal_values(), "the maker's figures", known, table.uncertainty)
+    standard = model.nominal
+    if not np.any(standard):
+        return None
+    friction = np.zeros(model.n_parameters - model.base.rank)
+    return Nominal(
+        np.concatenate([model.base.grouping @ standard, friction]),
+        "the URDF's inertias, without friction and rotors",
+        False,
+        NOMINAL_SHARE,
+    )
+
+
+def _scale(cell: Cell, prepared: Prepared) -> NominalScale | None:
+    nominal = nominal_of(cell)
+    if nominal is None:
+        return None
+    return nominal_scale(
+        cell.model,
+        nominal.values,
+        prepared.training,
+        rotors_known=nominal.rotors_known,
+        share=nominal.share,
+    )
+
+
+def torque_limits(cell: Cell) -> Array | None:
+    """Largest torque of each joint (n,) [N·m or N], NaN where unknown; None without any.
+
+    What its own motor can give through its gear at the current limit, or the URDF's effort limit
+    where no drive train is known.
+    """
+    if cell.file.drive_train is not None:
+        drives = cell.drive_train
+        gear = np.abs(np.diag(drives.motor_from_joint))
+        return np.asarray(gear * drives.torque_constant * drives.current_limit)
+    efforts = {}
+    for joint in ElementTree.fromstring(cell.urdf).iter("joint"):
+        limit = joint.find("limit")
+        if limit is not None:
+            efforts[joint.get("name")] = _positive(limit.get("effort", ""))
+    limits = np.array([efforts.get(name, np.nan) for name in cell.joint_names])
+    return None if np.isnan(limits).all() else limits
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        return np.nan
+    return value if 0.0 < value < np.inf else np.nan
+
+
+def _saturated(prepared: Prepared) -> Array | None:
+    """Share of each joint's rows that were left out because something was at its limit (n,)."""
+    rows = prepared.masked.get(SATURATED)
+    return None if rows is None else np.asarray(rows / max(prepared.rows, 1))

@@ -1,0 +1,312 @@
+"""Files of named arrays: .npz and .npy of numpy, .mat of MATLAB, matrices in MATLAB's notation."""
+
+from __future__ import annotations
+
+import atexit
+import math
+import re
+import resource
+import threading
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, Final, NamedTuple, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+from scipy.io import loadmat, whosmat
+
+from hil.errors import SourceError
+from hil.importers.column_map import Column
+from hil.importers.mcap_arrays import read_mcap
+from planner.errors import PlannerCrashed, PlanningTimedOut
+from planner.isolation import PlanningChild
+
+Array = NDArray[np.float64]
+P = ParamSpec("P")
+T = TypeVar("T")
+
+MOST_NUMBERS: Final = 2**28
+"""In one array: 2 GiB of doubles, hours of an arm at 5 kHz."""
+
+ALONE = "array"
+"""Name of the only array of a .npy file."""
+
+_NUMBERS: Final = "fiubmM"
+_MATLAB_NUMBERS: Final = {"double", "single", "logical"} | {
+    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
+}
+_ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
+_COMMENT: Final = re.compile(r"[%#].*")
+# Of the process that reads a .mat: the largest array, what it is packed in and its copy.
+_MEMORY: Final = 8 * 2**30
+_PATIENCE: Final = 120.0  # s
+
+
+class Stored(NamedTuple):
+    """An array that is still in its file.
+
+    Attributes:
+        shape: as the file says.
+        load: reads it.
+    """
+
+    shape: tuple[int, ...]
+    load: Callable[[], NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayFile:
+    """Arrays of one file, by name; each is read when it is first asked for.
+
+    Attributes:
+        path: the file.
+        stored: those of one or two dimensions that hold numbers.
+    """
+
+    path: Path
+    stored: Mapping[str, Stored]
+    _loaded: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: Path) -> ArrayFile:
+        """Look into a file; its suffix says what it is.
+
+        Raises:
+            SourceError: it cannot be read, or holds no array of numbers.
+        """
+        with _readable(path):
+            found = READERS[path.suffix.lower()](path)
+        usable = {
+            name: array
+            for name, array in found.items()
+            if len(array.shape) in (1, 2) and math.prod(array.shape) > 0
+        }
+        if not usable:
+            raise SourceError(path, "holds no array of numbers with one or two dimensions")
+        return cls(path, usable)
+
+    def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:
+        """Columns side by side, shape (m, columns).
+
+        Args:
+            columns: names of arrays; or of the named `array`, indices of its columns.
+            field: of the map, for errors.
+            array: the matrix that indices count in.
+
+        Raises:
+            SourceError: no such array or column, or arrays of different lengths.
+        """
+        found = [self.column(column, field, array).astype(np.float64) for column in columns]
+        if len({len(one) for one in found}) > 1:
+            lengths = ", ".join(f"{c} {len(one)}" for c, one in zip(columns, found, strict=True))
+            raise SourceError(
+                self.path, f"its arrays differ in length: {lengths}", field=field, remedy="cut them"
+            )
+        return np.column_stack(found)
+
+    def matrix(self, name: str | None, field: str) -> Array:
+        """An array of two dimensions as stored; without a name the only one there is.
+
+        Raises:
+            SourceError: no such array.
+        """
+        array = self._named(name, field).astype(np.float64)
+        return array[:, None] if array.ndim == 1 else array
+
+    def column(self, column: Column, field: str, array: str | None = None) -> NDArray[Any]:
+        """One column (m,), in its own type.
+
+        Raises:
+            SourceError: no such array or column.
+        """
+        if array is None and isinstance(column, str):
+            found = self._named(column, field)
+            if found.ndim == 2 and 1 not in found.shape:
+                raise SourceError(
+                    self.path,
+                    f"array {column!r} has the shape {found.shape}",
+                    field=field,
+                    remedy="name an array of one dimension, or a column of it by index",
+                )
+            return found.ravel()
+        whole = self._named(array, field)
+        whole = whole[:, None] if whole.ndim == 1 else whole
+        if not isinstance(column, int) or column >= whole.shape[1]:
+            raise SourceError(
+                self.path,
+                f"array {array or self._only()!r} has no column {column!r}",
+                field=field,
+                remedy=f"it has {whole.shape[1]}, counted from 0",
+            )
+        return np.asarray(whole[:, column])
+
+    def _only(self) -> str:
+        return next(iter(self.stored))
+
+    def _named(self, name: str | None, field: str) -> NDArray[Any]:
+        if name is None and len(self.stored) == 1:
+            return self._array(self._only())
+        if name is not None and name in self.stored:
+            return self._array(name)
+        shapes = ", ".join(f"{key} {value.shape}" for key, value in self.stored.items())
+        problem = (
+            "which of its arrays is not said" if name is None else f"there is no array {name!r}"
+        )
+        raise SourceError(self.path, problem, field=field, remedy=f"its arrays are {shapes}")
+
+    def _array(self, name: str) -> NDArray[Any]:
+        if name not in self._loaded:
+            stored = self.stored[name]
+            if math.prod(stored.shape) > MOST_NUMBERS:
+                raise SourceError(
+                    self.path,
+                    f"array {name!r} has the shape {stored.shape}: too large to be read at once",
+                    remedy="save the log in parts",
+                )
+            with _readable(self.path):
+                array = stored.load()
+            if array.dtype.kind not in _NUMBERS or array.shape != stored.shape:
+                raise SourceError(self.path, f"array {name!r} does not hold real numbers")
+            self._loaded[name] = array
+        return self._loaded[name]
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file makes numpy, scipy or zlib raise into one sentence."""
+    try:
+        yield
+    except SourceError:
+        raise
+    except Exception as error:
+        raise SourceError(
+            path,
+            f"cannot be read ({error or type(error).__name__})",
+            remedy="save the arrays again as .npz, without objects (MATLAB: save -v7)",
+        ) from error
+
+
+def _npz(path: Path) -> dict[str, Stored]:
+    with zipfile.ZipFile(path) as archive:
+        members = [name for name in archive.namelist() if name.endswith(".npy")]
+        heads = {}
+        for name in members:
+            with archive.open(name) as stream:
+                heads[name] = _head(stream)
+    return {
+        name.removesuffix(".npy"): Stored(head[0], partial(_member, path, name))
+        for name, head in heads.items()
+        if head is not None and head[1].kind in _NUMBERS
+    }
+
+
+def _member(path: Path, name: str) -> NDArray[Any]:
+    with zipfile.ZipFile(path) as archive, archive.open(name) as stream:
+        return np.asarray(npy.read_array(stream, allow_pickle=False))
+
+
+def _npy(path: Path) -> dict[str, Stored]:
+    with path.open("rb") as stream:
+        head = _head(stream)
+    if head is None:
+        raise ValueError("its header is of a kind that is not known")
+    shape, dtype = head
+    if math.prod(shape) * dtype.itemsize > path.stat().st_size:
+        raise ValueError("it is shorter than it says")
+    if dtype.names:  # a structured array: one column per field
+        return {
+            name: Stored(shape, partial(_field, path, name))
+            for name in dtype.names
+            if dtype[name].kind in _NUMBERS
+        }
+    return {ALONE: Stored(shape, partial(_field, path, None))} if dtype.kind in _NUMBERS else {}
+
+
+def _field(path: Path, name: str | None) -> NDArray[Any]:
+    with path.open("rb") as stream:
+        whole = npy.read_array(stream, allow_pickle=False)
+    return np.asarray(whole if name is None else whole[name])
+
+
+def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
+    """Shape and type of the numbers in a .npy stream; None for a version that is not known."""
+    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    reader = readers.get(npy.read_magic(stream))
+    if reader is None:
+        return None
+    shape, _, dtype = reader(stream)
+    return shape, dtype
+
+
+def _mat(path: Path) -> dict[str, Stored]:
+    return {
+        name: Stored(shape, partial(_matlab_variable, path, name))
+        for name, shape, kind in _elsewhere(whosmat, str(path))
+        if kind in _MATLAB_NUMBERS and not name.startswith("__")
+    }
+
+
+def _matlab_variable(path: Path, name: str) -> NDArray[Any]:
+    return np.asarray(_elsewhere(loadmat, str(path), variable_names=[name])[name])
+
+
+def _elsewhere(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call scipy's reader in a process of its own: a damaged file can kill it."""
+    with _lock:
+        if not _readers:
+            _readers.append(PlanningChild(timeout=_PATIENCE))
+        try:
+            # Sizes in the file are not to be trusted.
+            _readers[0].call(resource.setrlimit, resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+            return _readers[0].call(function, *args, **kwargs)
+        except PlannerCrashed as error:
+            raise ValueError("it is damaged") from error
+        except PlanningTimedOut as error:
+            raise ValueError(f"that takes longer than {_PATIENCE:g} s") from error
+
+
+def _close() -> None:
+    while _readers:
+        _readers.pop().close()
+
+
+_lock = threading.Lock()
+_readers: list[PlanningChild] = []
+atexit.register(_close)
+
+
+def _matlab_text(path: Path) -> dict[str, Stored]:
+    """Matrices of a MATLAB or Octave script."""
+    text = _COMMENT.sub("", path.read_text(encoding="utf-8-sig")).replace("...", " ")
+    found = {}
+    for name, body in _ASSIGNED.findall(text):
+        rows = [row.replace(",", " ").split() for row in re.split(r"[;\n]", body)]
+        found[name] = np.array([[float(cell) for cell in row] for row in rows if row])
+    return _in_memory(found)
+
+
+def _mcap(path: Path) -> dict[str, Stored]:
+    return _in_memory(read_mcap(path))
+
+
+def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Stored]:
+    return {
+        name: Stored(array.shape, partial(np.asarray, array))
+        for name, array in arrays.items()
+        if array.dtype.kind in _NUMBERS
+    }
+
+
+READERS: Mapping[str, Callable[[Path], dict[str, Stored]]] = {
+    ".npz": _npz,
+    ".npy": _npy,
+    ".mat": _mat,
+    ".m": _matlab_text,
+    ".mcap": _mcap,
+}
+"""By suffix, what looks into a file of arrays; every other file is text in columns."""

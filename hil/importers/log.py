@@ -1,0 +1,344 @@
+"""Imports logs of numbers: text in columns, text matrices, files of arrays."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import Samples
+from hil.errors import SourceError
+from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.column_map import TIMES, UNITS, Column, ColumnMap, Quantity
+from hil.importers.output import Use, write_imported
+from hil.importers.robot import Robot
+from hil.importers.table import Table
+
+Array = NDArray[np.float64]
+
+_LATEST = 2**31 * 10**9  # ns, what a stamp of an archive can hold
+
+
+def import_log(
+    source: str | PathLike[str],
+    output: str | PathLike[str],
+    *,
+    robot: Robot,
+    columns: ColumnMap,
+    held_joints: Sequence[str] = (),
+    use: Use = "excitation",
+    coupled: bool = True,
+) -> Path:
+    """Turn a log into an archive of kind ``imported``.
+
+    Args:
+        source: the log; with quantities in several files, the one the others lie beside. Files
+            that end in .npz, .npy, .mat or .m hold arrays, all others text.
+        output: the archive to write.
+        robot: whose joints these are. Where the map couples joints, its model gets the inertias
+            and the friction of the coupled motors, unless its cell says otherwise.
+        columns: which columns or arrays hold what.
+        held_joints: joints known to have been held still.
+        use: what it is to be used for.
+        coupled: whether the model gets these; angles and torques are those of the map in any case.
+
+    Returns:
+        The archive's path.
+
+    Raises:
+        SourceError: a file cannot be read, a column is missing, a cell is no number, or the map
+            does not fit the robot.
+        ArchiveWriteError: the archive cannot be written.
+    """
+    log = _Log(Path(source), columns, robot)
+    values, stamp, origin = _read(log, columns)
+    metadata = {"importer": "log", "clock_origin_ns": str(origin)}
+    if columns.format.missing == "drop":
+        whole = np.all([np.isfinite(array).all(axis=1) for array in values.values()], axis=0)
+        if not whole.any():
+            raise SourceError(log.path, "no row has all of its numbers")
+        metadata["dropped_rows"] = str(np.count_nonzero(~whole))
+        stamp, values = stamp[whole], {name: array[whole] for name, array in values.items()}
+    if columns.drive.geared:
+        matrix = log.matrix[np.ix_(log.order, log.order)]
+        metadata["motor_from_joint"] = json.dumps(matrix.tolist())
+        if coupled and np.any(matrix != np.diag(np.diag(matrix))):
+            robot = robot.with_coupling(matrix)
+    return write_imported(
+        output,
+        Samples(stamp, **_joint_side(values, columns, log)),
+        source=log.files,
+        robot=robot,
+        metadata=metadata,
+        held_joints=held_joints,
+        period=None if columns.sample_rate is None else 1.0 / columns.sample_rate,
+        use=use,
+    )
+
+
+class _Log:
+    """The files of a log, and the map that says where things stand in them.
+
+    Attributes:
+        path: the log itself.
+        joints: of the log, in its order.
+        order: the log's column of each joint of the robot.
+        matrix: motor angles per joint angle (k, k), in the log's order.
+    """
+
+    def __init__(self, path: Path, columns: ColumnMap, robot: Robot) -> None:
+        self.path = path
+        self._map = columns
+        self._files: dict[Path, Table | ArrayFile] = {}
+        self.joints = columns.joints or robot.joint_names
+        self.order = self._joint_order(robot)
+        self.matrix = self._motor_from_joint()
+
+    @property
+    def files(self) -> list[Path]:
+        """The files read, the log itself first."""
+        return list(self._files)
+
+    def read(self, name: str) -> Array:
+        """A quantity in SI units, (m, k), columns as in the log's joint order."""
+        quantity = self._map.quantities()[name]
+        values = self._numbers(name, quantity)
+        factor = UNITS[name][quantity.unit] if quantity.unit else 1.0
+        scale, offset = (
+            self._per_joint(value, f"{name}.{key}")
+            for key, value in (("scale", quantity.scale), ("offset", quantity.offset))
+        )
+        return np.asarray((values + offset) * (factor * scale))
+
+    def stamps(self, count: int) -> tuple[NDArray[np.int64], int]:
+        """The samples' stamps [ns], and what was taken off to make them storable."""
+        if self._map.sample_rate is not None:
+            return np.rint(np.arange(count) * (1e9 / self._map.sample_rate)).astype(np.int64), 0
+        time = self._map.time
+        assert time is not None
+        file = self._file(time.file or self._map.position.file)
+        if isinstance(file, Table):
+            times = file.times(time.column, TIMES[time.unit])
+        elif isinstance(time.column, int) and time.array is None:
+            times = _nanoseconds(file.matrix(None, "time").ravel(), TIMES[time.unit], file.path)
+        else:
+            column = file.column(time.column, "time", time.array)
+            times = _nanoseconds(column, TIMES[time.unit], file.path)
+        origin = 0 if min(times) >= 0 and max(times) < _LATEST else min(times)
+        if max(times) - origin >= _LATEST:
+            raise SourceError(
+                file.path,
+                f"spans {(max(times) - min(times)) * 1e-9:.3g} s",
+                field="time",
+                remedy="give the unit of its time: s, ms, us or ns",
+            )
+        return np.array([one - origin for one in times], np.int64), origin
+
+    def _numbers(self, name: str, quantity: Quantity) -> Array:
+        """The numbers of a quantity as in the file, (m, k)."""
+        file, field = self._file(quantity.file), f"{name}.columns"
+        columns = quantity.columns
+        if columns is None or (
+            isinstance(columns, str) and "{}" not in columns and isinstance(file, ArrayFile)
+        ):
+            matrix = file.matrix(columns or quantity.array, field)
+            return self._upright(matrix, quantity, file.path, name)
+        if isinstance(columns, str):
+            if "{}" not in columns:
+                raise SourceError(
+                    self.path,
+                    f"the pattern {columns!r} has no place for the joint's number",
+                    field=field,
+                    remedy='write {} there, as in "q{}"',
+                )
+            some = self._numbered(columns, file, field)
+        else:
+            self._check_length(columns, field)
+            some = list(columns)
+        if quantity.joints_along == "rows" and isinstance(file, ArrayFile):
+            return np.asarray(file.matrix(quantity.array, field)[_indices(some, file, field)].T)
+        return file.numbers(some, field, quantity.array)
+
+    def _numbered(self, pattern: str, file: Table | ArrayFile, field: str) -> list[Column]:
+        """Column names from a pattern, counted from 1, or from 0 where the file does.
+
+        Raises:
+            SourceError: a joint has no such column; names the joint.
+        """
+        count = len(self.joints)
+        known = file.names if isinstance(file, Table) else ()
+        names = [pattern.replace("{}", str(joint)) for joint in range(count + 1)]
+        from_zero = names[0] in known and names[count] not in known
+        found: list[Column] = [*(names[:count] if from_zero else names[1:])]
+        missing = [name for name in found if known and name not in known]
+        if missing:
+            joint = found.index(missing[0])
+            raise SourceError(
+                self.path,
+                f"there is no column {missing[0]!r} for {self.joints[joint]}, joint {joint + 1} of"
+                f" {count}",
+                field=field,
+                remedy="lock joints that were not recorded (--locked NAME), name the joints of the"
+                " log in joints, or its columns, or skip lines before their names ([format]"
+                f" skip_rows); its columns are {', '.join(known)}",
+            )
+        return found
+
+    def _upright(self, matrix: Array, quantity: Quantity, path: Path, name: str) -> Array:
+        """A whole matrix with time along its rows."""
+        count, along = len(self.joints), quantity.joints_along
+        if along is None:
+            if matrix.shape == (count, count):
+                raise SourceError(
+                    path,
+                    f"{name} is a square matrix",
+                    field=f"{name}.joints_along",
+                    remedy='say whether joints lie along "columns" or "rows"',
+                )
+            along = "rows" if matrix.shape[0] < matrix.shape[1] else "columns"
+        upright = matrix.T if along == "rows" else matrix
+        if upright.shape[1] != count:
+            raise SourceError(
+                path,
+                f"{name} has the shape {matrix.shape}, joints along its {along}, and there are "
+                f"{count} joints: {', '.join(self.joints)}",
+                field=name,
+                remedy="lock joints that were not recorded (--locked NAME), name the joints of the"
+                " log in joints, or give the columns of the joints",
+            )
+        return upright
+
+    def _file(self, name: str | None) -> Table | ArrayFile:
+        path = self.path if name is None else self.path.parent / name
+        if path not in self._files:
+            arrays = path.suffix.lower() in READERS
+            self._files[path] = (
+                ArrayFile.read(path) if arrays else Table.read(path, self._map.format)
+            )
+        return self._files[path]
+
+    def _joint_order(self, robot: Robot) -> list[int]:
+        """Which column of the log each joint of the robot has."""
+        missing = [name for name in robot.joint_names if name not in self.joints]
+        if missing or len(set(self.joints)) < len(self.joints):
+            raise SourceError(
+                self.path,
+                f"the map names the joints {', '.join(self.joints)}",
+                field="joints",
+                remedy=f"the robot's joints are {', '.join(robot.joint_names)}"
+                + (
+                    "; lock those that were not recorded (--locked NAME)"
+                    if missing
+                    else ", each named once"
+                ),
+            )
+        return [self.joints.index(name) for name in robot.joint_names]
+
+    def _motor_from_joint(self) -> Array:
+        """Motor angles per joint angle (k, k), in the log's order."""
+        drive, n = self._map.drive, len(self.joints)
+        for name in ("gear_ratio", "joint_offset", "torque_constant", "motor_from_joint"):
+            values = getattr(drive, name)
+            if values is not None:
+                self._check_length(values, f"drive.{name}")
+        for row in drive.motor_from_joint or ():
+            self._check_length(row, "drive.motor_from_joint")
+        if drive.motor_from_joint is not None:
+            matrix = np.array(drive.motor_from_joint, np.float64)
+        else:
+            matrix = np.diag(drive.gear_ratio or np.ones(n)).astype(np.float64)
+        for motor, joint, ratio in drive.coupling:
+            if max(motor, joint) > n:
+                raise SourceError(
+                    self.path,
+                    f"there are {n} joints, not {max(motor, joint)}",
+                    field="drive.coupling",
+                )
+            matrix[motor - 1, joint - 1] = ratio
+        if np.linalg.matrix_rank(matrix) < n:
+            raise SourceError(
+                self.path, "a joint would not be moved by any motor", field="drive.gear_ratio"
+            )
+        return matrix
+
+    def _per_joint(self, value: float | Sequence[float], field: str) -> Array:
+        values = np.asarray(value, np.float64)
+        if values.ndim:
+            self._check_length(values, field)
+        return values
+
+    def _check_length(self, values: Sequence[object] | Array, field: str) -> None:
+        if len(values) != len(self.joints):
+            raise SourceError(
+                self.path,
+                f"has {len(values)} entries",
+                field=field,
+                remedy=f"one for each of the joints {', '.join(self.joints)}",
+            )
+
+
+def _read(log: _Log, columns: ColumnMap) -> tuple[dict[str, Array], NDArray[np.int64], int]:
+    """All quantities, their stamps and the origin of these."""
+    values = {name: log.read(name) for name in columns.quantities()}
+    stamp, origin = log.stamps(len(values["position"]))
+    lengths = {name: len(array) for name, array in values.items()} | {"time": len(stamp)}
+    if len(set(lengths.values())) > 1:
+        listing = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise SourceError(
+            log.path, f"the quantities differ in length: {listing}", remedy="cut them alike"
+        )
+    return values, stamp, origin
+
+
+def _indices(columns: Sequence[Column], file: ArrayFile, field: str) -> list[int]:
+    found = [column for column in columns if isinstance(column, int)]
+    if len(found) < len(columns):
+        raise SourceError(
+            file.path, "rows of a matrix have no names", field=field, remedy="count them from 0"
+        )
+    return found
+
+
+def _nanoseconds(times: NDArray[np.generic], decimals: int, path: Path) -> list[int]:
+    """Whole nanoseconds of times (m,) in a unit of 10^-decimals s; dates as they are."""
+    if times.dtype.kind in "mM":
+        kind = "datetime64[ns]" if times.dtype.kind == "M" else "timedelta64[ns]"
+        return [int(one) for one in times.astype(kind).astype(np.int64)]
+    if times.dtype.kind in "iu":
+        factor = 10 ** (9 - decimals)
+        return [int(one) * factor for one in times.tolist()]
+    values = times.astype(np.float64)
+    if not np.isfinite(values).all():
+        sample = int(np.argmin(np.isfinite(values)))
+        raise SourceError(path, f"is {values[sample]} in sample {sample}", field="time")
+    # Apart, since an epoch in nanoseconds has more digits than a float.
+    whole = np.floor(values)
+    part = np.rint((values - whole) * 10.0 ** (9 - decimals))
+    factor = 10 ** (9 - decimals)
+    return [int(w) * factor + int(p) for w, p in zip(whole, part, strict=True)]
+
+
+def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict[str, Array]:
+    """Bring the quantities to the joint side and into the robot's order; power stays the same.
+
+    With motor angles M q, joint torques are M^T times the motors'.
+    """
+    matrix = log.matrix
+    sides = {name: quantity.side for name, quantity in columns.quantities().items()}
+    joint = dict(values)
+    for name in ("position", "velocity"):
+        if sides.get(name) == "motor":
+            joint[name] = np.asarray(np.linalg.solve(matrix, values[name].T).T, np.float64)
+    if sides.get("torque") == "motor":
+        joint["torque"] = values["torque"] @ matrix
+    drive = columns.drive
+    if drive.joint_offset is not None:
+        joint["position"] = joint["position"] + np.asarray(drive.joint_offset)
+    if "torque" not in joint and "motor_current" in joint and drive.torque_constant is not None:
+        motor_torque = joint["motor_current"] * np.asarray(drive.torque_constant, np.float64)
+        joint["torque"] = motor_torque @ matrix
+    return {name: array[:, log.order] for name, array in joint.items()}

@@ -1,0 +1,85 @@
+r"""Motors that turn with several joints: the coupled wrists of industrial arms.
+
+With motor angles per joint angle K (n, n), rotors with inertias J and friction in the motors act
+on the joints as
+
+.. math:: \tau = K^T J K \ddot q + \sum_m c_m^T\, f_m(c_m \dot q), \qquad c_m = K_m / K_{mm}
+
+so that a pair of joints that one motor turns with shares a constant inertia, and friction of a
+coupled motor depends on the sum of speeds that it turns with (Gautier 1997; for the Staeubli TX40
+Gandhi 2007).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import ModelError
+
+Array = NDArray[np.float64]
+
+# Of the motor's own joint: a wrist couples by a tenth at least, rounding of a file by much less.
+_UNCOUPLED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Coupling:
+    """How motors turn with joints, and what of it is to be identified.
+
+    Attributes:
+        motor_from_joint: motor angle per joint angle (n, n), gears and signs included or not:
+            only the ratios within a row matter.
+        inertia: give each pair of coupled joints its coupling inertia.
+        friction: give each coupled motor Coulomb and viscous friction of its own.
+    """
+
+    motor_from_joint: Array
+    inertia: bool = True
+    friction: bool = True
+
+    def __post_init__(self) -> None:
+        matrix = np.array(self.motor_from_joint, dtype=np.float64)
+        if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+            raise ModelError(f"the coupling has shape {matrix.shape}; it must be square")
+        if not np.all(np.isfinite(matrix)):
+            raise ModelError("the coupling holds a number that is not finite")
+        if not np.all(np.diag(matrix)):
+            motor = int(np.argmin(np.abs(np.diag(matrix)))) + 1
+            raise ModelError(
+                f"motor {motor} of the coupling does not turn with joint {motor}: order motors so"
+                " that each stands in the row of the joint that it drives"
+            )
+        if np.linalg.matrix_rank(self._relative(matrix)) < len(matrix):
+            raise ModelError("the coupling is singular: joints cannot be moved independently")
+        matrix.setflags(write=False)
+        object.__setattr__(self, "motor_from_joint", matrix)
+
+    @property
+    def n_joints(self) -> int:
+        """Number n of joints."""
+        return len(self.motor_from_joint)
+
+    @property
+    def speeds(self) -> Array:
+        """Speed of each motor per joint speed, one for its own joint (n, n)."""
+        return self._relative(self.motor_from_joint)
+
+    @property
+    def coupled_motors(self) -> tuple[int, ...]:
+        """Motors, from 0, that turn with other joints than their own."""
+        return tuple(np.flatnonzero(np.count_nonzero(self.speeds, axis=1) > 1).tolist())
+
+    @property
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """Joints (i, j), i < j from 0, that some motor turns with both of."""
+        turns = self.speeds != 0.0
+        together = turns.T.astype(np.intp) @ turns.astype(np.intp)
+        return tuple((int(i), int(j)) for i, j in np.argwhere(np.triu(together, 1) > 0))
+
+    @staticmethod
+    def _relative(matrix: Array) -> Array:
+        speeds = matrix / np.diag(matrix)[:, None]
+        return np.where(np.abs(speeds) < _UNCOUPLED, 0.0, speeds)

@@ -1,0 +1,32 @@
+"""What is known beside the fit: jumps of the encoders, nominal inertias, the controller's own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+from identification.evidence import Evidence
+from identification.finding import Finding
+from identification.position_jumps import jump_findings
+from identification.thresholds import Thresholds
+
+
+def jumps(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Finding]:
+    """Positions that stepped where no arm can follow."""
+    for finding in jump_findings(evidence.surroundings.jumps):
+        yield replace(finding, role="cause")
+
+
+def scale(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Finding]:
+    """Torques that are not as large as the nominal inertias ask for."""
+    found = evidence.surroundings.nominal_scale
+    if found is not None:
+        for finding in found.findings():
+            yield replace(finding, role="cause")
+
+
+def inertia(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Finding]:
+    """The controller's own diagonal inertia against the model's."""
+    found = evidence.surroundings.controller_inertia
+    if found is not None:
+        yield from found.findings()

@@ -1,0 +1,259 @@
+"""Whether a file keeps the profile: each rule of docs/archive-format.md, broken one at a time.
+
+The files are written by the mcap library, so what is checked is the file and not our writer.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from hil.archive import Samples, container, schema, write_samples
+from hil.archive.check import ASPECTS, check_archive
+from hil.errors import NotAnArchiveError
+
+
+@dataclass(frozen=True)
+class Message:
+    topic: str
+    schema: str
+    text: str
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
+
+
+@dataclass
+class Content:
+    """What the library writes."""
+
+    messages: list[Message]
+    metadata: dict[str, str]
+    outcome: dict[str, str]
+    attachments: dict[str, bytes]
+    profile: str = "ros2"
+    library: str = "hil"
+    compression: CompressionType = CompressionType.ZSTD
+    indexes: IndexType = IndexType.ALL
+    encoding: str = "cdr"
+    cycles_per_chunk: int = 10
+
+    def write(self, path: Path) -> Path:
+        with path.open("wb") as stream:
+            writer = Writer(stream, 1 << 40, compression=self.compression, index_types=self.indexes)
+            writer.start(self.profile, self.library)
+            self._describe(writer, "hil", self.metadata)
+            for name, data in sorted(self.attachments.items()):
+                writer.add_attachment(0, 0, name, "text/plain", data)
+            channels: dict[str, int] = {}
+            cycles = 0
+            for message in self.messages:
+                if message.topic not in channels:
+                    kind = writer.register_schema(message.schema, "ros2msg", message.text.encode())
+                    channel = writer.register_channel(message.topic, self.encoding, kind)
+                    channels[message.topic] = channel
+                if message.topic == schema.CYCLE:
+                    if cycles and cycles % self.cycles_per_chunk == 0:
+                        writer.flush()
+                    cycles += 1
+                writer.add_message(
+                    channels[message.topic],
+                    message.log_time,
+                    message.data,
+                    message.publish_time,
+                    message.sequence,
+                )
+            writer.flush()
+            self._describe(writer, "hil.outcome", self.outcome)
+            writer.finish()
+        return path
+
+    @staticmethod
+    def _describe(writer: Any, name: str, entries: dict[str, str]) -> None:
+        writer.add_metadata(name, {**entries, "checksum": schema.checksum(entries)})
+
+
+@pytest.fixture
+def content(written) -> Content:
+    with written.path.open("rb") as stream:
+        reader = make_reader(stream)
+        messages = [
+            Message(
+                channel.topic,
+                kind.name,
+                kind.data.decode(),
+                message.log_time,
+                message.publish_time,
+                message.sequence,
+                message.data,
+            )
+            for kind, channel, message in reader.iter_messages(log_time_order=False)
+        ]
+        metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+    for entries in metadata.values():
+        entries.pop("checksum")
+    return Content(messages, metadata["hil"], metadata["hil.outcome"], dict(written.attachments))
+
+
+def changed(content: Content, topic: str, nth: int, **changes: Any) -> None:
+    """Change the nth message of a topic."""
+    places = [i for i, message in enumerate(content.messages) if message.topic == topic]
+    place = places[nth]
+    content.messages[place] = replace(content.messages[place], **changes)
+
+
+def every(content: Content, topic: str, **changes: Any) -> None:
+    content.messages = [
+        replace(message, **changes) if message.topic == topic else message
+        for message in content.messages
+    ]
+
+
+def data_of(content: Content, topic: str, nth: int) -> bytearray:
+    return bytearray([m for m in content.messages if m.topic == topic][nth].data)
+
+
+def test_the_library_writes_it_as_we_do(content, written, tmp_path):
+    path = content.write(tmp_path / written.path.name)
+    check = check_archive(path)
+    assert check.keeps, check.faults
+    assert check.samples == 43
+    assert not check.repaired
+
+
+def another_position(content: Content) -> None:
+    data = data_of(content, schema.MEASURED, 5)
+    data[-8] ^= 1  # of the last effort
+    changed(content, schema.MEASURED, 5, data=bytes(data))
+
+
+def another_stamp(content: Content) -> None:
+    """In stamp and log time alike, but not cycle times period."""
+    data = data_of(content, schema.CYCLE, 7)
+    (nanoseconds,) = struct.unpack_from("<I", data, 8)
+    struct.pack_into("<I", data, 8, nanoseconds + 1)
+    time = [m for m in content.messages if m.topic == schema.CYCLE][7].log_time + 1
+    changed(content, schema.CYCLE, 7, data=bytes(data), log_time=time, publish_time=time)
+
+
+def longer(content: Content) -> None:
+    data = bytes(data_of(content, schema.COMMANDED, 3)) + bytes(8)
+    changed(content, schema.COMMANDED, 3, data=data)
+
+
+def without(topic: str) -> Callable[[Content], None]:
+    def change(content: Content) -> None:
+        content.messages = [message for message in content.messages if message.topic != topic]
+
+    return change
+
+
+def entry(key: str, value: str) -> Callable[[Content], None]:
+    return lambda content: content.metadata.update({key: value})
+
+
+def outcome(key: str, value: str) -> Callable[[Content], None]:
+    return lambda content: content.outcome.update({key: value})
+
+
+def other_text(content: Content) -> None:
+    (text,) = {m.text for m in content.messages if m.topic == schema.MEASURED}
+    every(content, schema.MEASURED, text=text.replace("rad/s", "deg/s"))
+
+
+BROKEN = {
+    "another profile": (lambda c: setattr(c, "profile", "ros1"), "container"),
+    "another library": (lambda c: setattr(c, "library", "mcap 1.6"), "container"),
+    "unknown kind": (entry("kind", "dance"), "metadata"),
+    "a kind that the name denies": (entry("kind", "excitation"), "metadata"),
+    "a joint twice": (entry("joint_names", '["a", "a"]'), "metadata"),
+    "no period": (lambda c: c.metadata.pop("period"), "metadata"),
+    "a period of zero": (entry("period", "0.0"), "metadata"),
+    "an attachment too few": (lambda c: c.attachments.pop("cell.toml"), "attachments"),
+    "another text": (other_text, "schemas"),
+    "another encoding": (lambda c: setattr(c, "encoding", "cdr2"), "channels"),
+    "another type": (lambda c: every(c, schema.CYCLE, schema="x_msgs/msg/Cycle2"), "channels"),
+    "no joint states": (without(schema.MEASURED), "channels"),
+    "no events": (without(schema.EVENTS), "channels"),
+    "lz4": (lambda c: setattr(c, "compression", CompressionType.LZ4), "chunks"),
+    "long chunks": (lambda c: setattr(c, "cycles_per_chunk", 11), "chunks"),
+    "a longer message": (longer, "sizes"),
+    "a number skipped": (lambda c: changed(c, schema.EVENTS, 2, sequence=7), "sequence"),
+    "another log time": (lambda c: changed(c, schema.MEASURED, 4, log_time=1), "times"),
+    "another publish time": (lambda c: changed(c, schema.EVENTS, 1, publish_time=1), "times"),
+    "a stamp beside the cycle": (another_stamp, "times"),
+    "a joint state beside the cycle": (another_position, "joint_states"),
+    "an unknown outcome": (outcome("outcome", "splendid"), "outcome"),
+    "a sample counted too many": (outcome("samples", "44"), "outcome"),
+    "lost packets that no gap shows": (outcome("lost_packets", "2"), "outcome"),
+    "no message index": (lambda c: setattr(c, "indexes", IndexType.CHUNK), "index"),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_rule_is_named(what, content, written, tmp_path):
+    change, aspect = BROKEN[what]
+    change(content)
+    check = check_archive(content.write(tmp_path / written.path.name))
+    assert not check.keeps
+    assert check.faults.get(aspect), check.faults
+    assert set(check.faults) <= set(ASPECTS)
+
+
+def test_every_aspect_has_a_rule_that_is_tried():
+    tried = {aspect for _, aspect in BROKEN.values()}
+    assert tried == set(ASPECTS)
+
+
+def test_only_what_is_broken_is_named(content, written, tmp_path):
+    another_position(content)
+    check = check_archive(content.write(tmp_path / written.path.name))
+    assert list(check.faults) == ["joint_states"]
+    (text,) = check.faults["joint_states"]
+    assert "/joint_states unlike its cycles" in text
+
+
+def test_imported_recordings_are_checked_by_their_own_rules(tmp_path):
+    position = np.random.default_rng(1).normal(size=(2500, 2))
+    stamp = 7 + np.arange(2500, dtype=np.int64) * 8_000_000
+    samples = Samples(stamp, position, motor_current=position)
+    path = write_samples(tmp_path / "x.mcap", samples, joint_names=("a", "b"), metadata={})
+    check = check_archive(path)
+    assert check.keeps, check.faults
+
+
+def test_a_damaged_description_is_a_fault_of_an_archive(written, tmp_path):
+    description = next(r for r in written.records if r.opcode == container.METADATA)
+    path = tmp_path / written.path.name
+    path.write_bytes(written.changed(description, -3, mask=1))
+    assert "metadata" in check_archive(path).faults
+
+
+class TestAnotherFile:
+    def test_a_foreign_mcap_file_is_named_as_such(self, tmp_path):
+        path = tmp_path / "x.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start("ros1", "some recorder")
+            writer.finish()
+        with pytest.raises(NotAnArchiveError, match=r"an MCAP file .*'ros1'.*'some recorder'"):
+            check_archive(path)
+
+    def test_anything_else_is_no_mcap_file(self, tmp_path):
+        (tmp_path / "x").write_bytes(b"hello" * 9)
+        with pytest.raises(NotAnArchiveError, match="is not an MCAP file"):
+            check_archive(tmp_path / "x")
+
+    def test_an_empty_file_is_empty(self, tmp_path):
+        (tmp_path / "x").write_bytes(b"")
+        with pytest.raises(NotAnArchiveError, match="is empty"):
+            check_archive(tmp_path / "x")

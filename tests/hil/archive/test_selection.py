@@ -1,0 +1,118 @@
+"""Parts of an archive: columns, channels and times, without decoding the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.archive import Samples, open_archive, write_samples
+from hil.errors import ArchiveError
+
+PERIOD = 0.01
+
+
+def within(stamp: np.ndarray, start: float | None, stop: float | None) -> np.ndarray:
+    """Which stamps [ns] lie in the range."""
+    begin = 0 if start is None else round(start * 1e9)
+    end = 10**18 if stop is None else round(stop * 1e9)
+    return (stamp >= begin) & (stamp < end)
+
+
+def expected(written, start: float | None, stop: float | None) -> np.ndarray:
+    """Which cycles lie in the range, by their own number."""
+    return within(written.rows["cycle"] * 10_000_000, start, stop)
+
+
+instants = st.none() | st.floats(49.5, 51.0) | st.integers(4999, 5050).map(lambda c: c * PERIOD)
+
+
+class TestTimes:
+    @given(instants, instants)
+    def test_a_range_holds_the_cycles_and_events_in_it_and_no_others(self, written, start, stop):
+        archive = open_archive(written.path, start=start, stop=stop)
+        kept = expected(written, start, stop)
+        assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][kept])
+        assert np.array_equal(archive.columns["position"], written.rows["position"][kept])
+        starts = np.array([0, 15, 30])
+        inside = starts[within((5000 + starts) * 10_000_000, start, stop)]
+        assert [event.data["start"] for event in archive.events] == inside.tolist()
+
+    @given(instants, instants)
+    def test_a_torn_file_gives_the_same_range_of_what_it_still_has(self, written, start, stop):
+        torn = written.path.with_name("torn.mcap")
+        torn.write_bytes(written.data[: written.chunks[3].offset])
+        archive = open_archive(torn, start=start, stop=stop)
+        kept = expected(written, start, stop) & (np.arange(43) < 30)
+        assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][kept])
+        assert not archive.complete
+
+    def test_what_describes_the_archive_is_there_all_the_same(self, written):
+        archive = open_archive(written.path, start=50.1, stop=50.2)
+        whole = open_archive(written.path)
+        assert archive.attachments == whole.attachments
+        assert archive.metadata == whole.metadata
+        assert archive.outcome == whole.outcome
+        assert archive.complete
+
+    def test_chunks_outside_the_range_are_not_read(self, written, tmp_path):
+        """A damage there stops a full reading, but not this one."""
+        path = tmp_path / written.path.name
+        path.write_bytes(written.changed(written.chunks[1], -5))
+        assert open_archive(path).n_samples == 10
+        archive = open_archive(path, start=50.2)
+        assert archive.complete
+        assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][20:])
+
+    def test_a_damage_inside_the_range_is_told(self, written, tmp_path):
+        path = tmp_path / written.path.name
+        path.write_bytes(written.changed(written.chunks[3], -5))
+        archive = open_archive(path, start=50.2)
+        assert not archive.complete
+        assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][20:30])
+
+    def test_stamps_that_run_backwards_are_selected_one_by_one(self, tmp_path):
+        stamp = np.array([5, 9, 1, 7, 3], np.int64) * 10**9
+        position = np.arange(5.0)[:, None]
+        path = write_samples(
+            tmp_path / "x.mcap", Samples(stamp, position), joint_names=("a",), metadata={}
+        )
+        archive = open_archive(path, start=3.0, stop=8.0)
+        assert archive.columns["position"][:, 0].tolist() == [0.0, 3.0, 4.0]
+
+
+class TestChannels:
+    def test_the_commanded_motion_can_be_read_alone(self, written):
+        archive = open_archive(written.path, topics=["/joint_states_commanded"])
+        assert set(archive.columns) == {"stamp", "position", "velocity"}
+        assert np.array_equal(archive.columns["position"], written.rows["commanded_position"])
+        assert archive.events == ()
+
+    def test_events_can_be_read_alone(self, written, tmp_path):
+        """Without the chunks that have none."""
+        path = tmp_path / written.path.name
+        path.write_bytes(written.changed(written.chunks[2], -5))
+        archive = open_archive(path, topics=["/hil/events"])
+        assert archive.complete
+        assert [event.data["start"] for event in archive.events] == [0, 15, 30]
+        assert archive.n_samples == 0
+
+    def test_a_channel_that_is_not_there_is_refused_with_those_that_are(self, written):
+        with pytest.raises(ArchiveError, match=r"/wheel: has no such channel; it has /hil/cycle,"):
+            open_archive(written.path, topics=["/wheel"])
+
+    def test_channels_with_the_same_columns_are_opened_one_at_a_time(self, written):
+        with pytest.raises(ValueError, match="have the same names"):
+            open_archive(written.path, topics=["/joint_states", "/hil/cycle"])
+
+
+def test_a_summary_that_fails_its_checksum_is_not_believed(written, tmp_path: Path) -> None:
+    path = tmp_path / written.path.name
+    at = written.records[-1].end + 40
+    path.write_bytes(written.data[:at] + bytes([written.data[at] ^ 1]) + written.data[at + 1 :])
+    archive = open_archive(path, start=50.2, stop=50.3)
+    assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][20:30])
+    assert not archive.complete

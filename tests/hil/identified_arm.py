@@ -1,0 +1,129 @@
+"""An arm of any description, moved and identified in memory: what exports are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.files import write_together
+from hil.identify.exports import Exports, exports_of
+from hil.identify.extras import consistency_of, essential_of
+from identification import Estimate, Motion
+from identification.consistency_check import ConsistencyCheck
+from identification.covariance import with_block_covariance
+from identification.essential_choice import EssentialChoice
+from identification.estimation import estimate, joint_weights
+from identification.phase_factor import PhaseFactor
+from identification.preprocessing import Samples
+
+Array = NDArray[np.float64]
+
+CELL = '[cell]\nname = "arm"\nurdf = "arm.urdf"\n[robot]\n{robot}\n'
+
+
+@dataclass(frozen=True)
+class IdentifiedArm:
+    """A cell and what was found of it.
+
+    Attributes:
+        truth: parameters (p,) that made the torques.
+        estimate: by weighted least squares.
+    """
+
+    cell: Cell
+    truth: Array
+    estimate: Estimate
+    consistency: ConsistencyCheck
+    essential: EssentialChoice
+
+
+def write_exports(folder: Path, *args: Any, **kwargs: Any) -> Exports:
+    """Write what `exports_of` makes of the arguments."""
+    exports = exports_of(*args, **kwargs)
+    write_together(folder, exports.contents)
+    return exports
+
+
+def packaged_urdf(name: str) -> str:
+    """Text of a description in the package example-robot-data, or a skip."""
+    files = metadata.files("example-robot-data") or ()
+    found = next((str(file.locate()) for file in files if file.name == name), None)
+    if found is None:
+        pytest.skip(f"the package example-robot-data, which has {name}, is not installed")
+    return Path(found).read_text(encoding="utf-8")
+
+
+def identified_arm(
+    urdf: str,
+    robot: str = "",
+    *,
+    still: tuple[int, ...] = (),
+    standard: Array | None = None,
+    noise: float = 0.01,
+) -> IdentifiedArm:
+    """Move an arm of a description and identify it.
+
+    Args:
+        urdf: text.
+        robot: lines of the cell's table [robot].
+        still: joints, from 0, that do not move.
+        standard: parameters (s,) that make the torques, by default nominal ones with rotors.
+        noise: of the torque, as a share of each joint's.
+    """
+    cell = Cell.from_texts(CELL.format(robot=robot), urdf, Path("cell.toml"))
+    model = cell.model
+    if standard is None:
+        standard = model.nominal.copy()
+        standard[model.layout.rotors] = 0.2
+    friction = [{"f0": 2.0, "f1": 1.5, "fo": 0.1}.get(t.symbol, 0.3) for t in model.friction.terms]
+    truth = np.concatenate([model.base.grouping @ standard, friction])
+    runs = [_run(cell, truth, seed, still, noise) for seed in (1, 2, 3)]
+    training, *held_out = (PhaseFactor.from_samples(model, run) for run in runs)
+    weights = joint_weights(training.total)
+    free = with_block_covariance(estimate(model, training.total, weights), training, weights)
+    unseen = sum(held_out, PhaseFactor.zero(model)).total
+    consistency = consistency_of(model, training, unseen)
+    essential = essential_of(model, training, held_out)
+    assert isinstance(consistency, ConsistencyCheck), consistency
+    assert isinstance(essential, EssentialChoice), essential
+    return IdentifiedArm(cell, truth, free, consistency, essential)
+
+
+def _run(cell: Cell, truth: Array, seed: int, still: tuple[int, ...], noise: float) -> Samples:
+    model = cell.model
+    motion = a_motion(model.n_joints, seed, still)
+    torque = model.torque(truth, *motion[1:])
+    size = np.sqrt(np.mean(torque**2, axis=0))
+    torque += noise * size * np.random.default_rng(seed).standard_normal(torque.shape)
+    return Samples(
+        motion=motion,
+        torque=torque,
+        usable=model.moving(motion.velocity),
+        segments=(slice(0, len(motion.time)),),
+        origin=0.0,
+        position_bandwidth=np.full(model.n_joints, np.inf),
+    )
+
+
+def a_motion(n: int, seed: int, still: tuple[int, ...] = ()) -> Motion:
+    """Eight seconds of three sines per joint."""
+    time = np.arange(0.0, 8.0, 0.01)
+    rng = np.random.default_rng(seed)
+    size, pulse, phase = (
+        rng.uniform(low, high, (3, n)) for low, high in ((0.2, 0.5), (1, 5), (0, 6))
+    )
+    size[:, list(still)] = 0.0
+    angle = pulse * time[:, None, None] + phase
+    return Motion(
+        time,
+        (size * np.sin(angle)).sum(axis=1),
+        (size * pulse * np.cos(angle)).sum(axis=1),
+        (-size * pulse**2 * np.sin(angle)).sum(axis=1),
+    )

@@ -1,0 +1,110 @@
+"""Motions of other people's robots with torques made by pinocchio, to be written as logs."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from identification import RobotModel
+
+Array = NDArray[np.float64]
+
+POSITION_NOISE = 2e-5  # rad
+TORQUE_NOISE = 0.02  # of a joint's own scatter
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """What a log is written from; joints in the order of the URDF, joint side.
+
+    Attributes:
+        urdf: path of the description.
+        joint_names: that move.
+        time: (m,) [s].
+        position, velocity, torque: (m, n), measured: with noise.
+        clean: the torque without noise (m, n).
+        size: of each joint (n,); friction is 0.15 of it in N·m, 0.1 in N·m·s/rad, the rotor's
+            inertia 0.02 in kg·m².
+    """
+
+    urdf: Path
+    joint_names: tuple[str, ...]
+    time: Array
+    position: Array
+    velocity: Array
+    torque: Array
+    clean: Array
+    size: Array
+
+
+def urdf_path(name: str) -> Path:
+    """A description from the package example-robot-data."""
+    for file in importlib.metadata.files("example-robot-data") or ():
+        if file.name == name:
+            return Path(str(file.locate()))
+    raise FileNotFoundError(name)
+
+
+def simulate(
+    name: str,
+    time: Array,
+    *,
+    locked: tuple[str, ...] = (),
+    seed: int = 0,
+    noise: float = 1.0,
+    pace: float = 1.0,
+    load: pin.Inertia | None = None,
+) -> Simulated:
+    """A motion of sines within the joint limits, torques by recursive Newton-Euler and friction.
+
+    The load is fixed to the last joint, in its frame; friction is that of the robot without it.
+    """
+    path = urdf_path(name)
+    model = pin.buildModelFromUrdf(str(path))
+    model = pin.buildReducedModel(model, [model.getJointId(j) for j in locked], pin.neutral(model))
+    n, rng = model.nv, np.random.default_rng(seed)
+    amplitude = rng.uniform(0.1, 0.3, (5, n)) / np.arange(1, 6)[:, None] ** 0.5
+    hertz = 0.08 + 0.13 * np.arange(5)[:, None] + rng.uniform(0.0, 0.04, (5, n))
+    rate = pace * 2.0 * np.pi * hertz
+    phase = rng.uniform(0.0, 2.0 * np.pi, (5, n))
+    lower = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)[-n:]
+    upper = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)[-n:]
+    middle = np.clip(0.5 * (lower + upper), -1.0, 1.0)
+    room = np.minimum(np.minimum(middle - lower, upper - middle), 1.5)
+    amplitude *= room / amplitude.sum(axis=0) * 0.95
+    angle = rate * (time[:, None, None] - time[0]) + phase
+    q = middle + np.einsum("kn,mkn->mn", amplitude, np.sin(angle))
+    qd = np.einsum("kn,mkn->mn", amplitude * rate, np.cos(angle))
+    qdd = np.einsum("kn,mkn->mn", -amplitude * rate**2, np.sin(angle))
+    data = model.createData()
+    rigid = np.array([pin.rnea(model, data, *row) for row in zip(q, qd, qdd, strict=True)])
+    size = rigid.std(axis=0) + 0.1
+    if load is not None:
+        model.inertias[model.njoints - 1] += load
+        data = model.createData()
+        rigid = np.array([pin.rnea(model, data, *row) for row in zip(q, qd, qdd, strict=True)])
+    clean = rigid + 0.15 * size * np.sign(qd) + 0.1 * size * qd + 0.02 * size * qdd
+    return Simulated(
+        urdf=path,
+        joint_names=tuple(name for name in model.names if name != "universe"),
+        time=time,
+        position=q + noise * POSITION_NOISE * rng.standard_normal(q.shape),
+        velocity=qd + noise * 1e-3 * rng.standard_normal(q.shape),
+        torque=clean + noise * TORQUE_NOISE * clean.std(axis=0) * rng.standard_normal(q.shape),
+        clean=clean,
+        size=size,
+    )
+
+
+def planted(robot: RobotModel, simulated: Simulated) -> Array:
+    """Parameters (p,) of a model with Coulomb, viscous and offset friction."""
+    standard = robot.nominal.copy()
+    for joint, size in enumerate(simulated.size, 1):
+        standard[robot.standard_names.index(f"I{joint}m")] = 0.02 * size
+    friction = [0.15 * simulated.size, 0.1 * simulated.size, np.zeros(robot.n_joints)]
+    return np.concatenate([robot.base.grouping @ standard, *friction])

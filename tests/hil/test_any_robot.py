@@ -1,0 +1,339 @@
+"""Robots and logs that nothing was written for: read from configuration alone, then identified."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hil.errors import ArchiveError
+from hil.identify.options import Options
+from hil.identify.prepared import Prepared, prepare_sources
+from hil.identify.sources import gather_sources
+from hil.importers import ColumnMap, Robot, Use, import_log
+from hil.progress import Silent
+from identification import Estimate, FrictionLaw, estimate, prediction_error
+from tests.hil.simulated_logs import (
+    POSITION_NOISE,
+    TORQUE_NOISE,
+    Simulated,
+    planted,
+    simulate,
+)
+
+Array = NDArray[np.float64]
+LAW = FrictionLaw(third=None, offset=True, standstill=0.02)
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+PANDA = "panda.urdf"
+UR5 = "ur5_robot.urdf"
+EPOCH_MS = 1_700_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """An identification from an archive."""
+
+    prepared: Prepared
+    fit: Estimate
+    held_out_error: float
+
+
+def identify(
+    folder: Path,
+    simulated: Simulated,
+    log: str,
+    columns: str,
+    locked: tuple[str, ...] = (),
+    options: Options = Options(torque_bandwidth=None),
+) -> Found:
+    """The way of `hil import log` and `hil identify`, up to the plain estimate."""
+    (folder / "map.toml").write_text(columns)
+    archive = import_log(
+        folder / log,
+        folder / "log.mcap",
+        robot=Robot.from_urdf(simulated.urdf, friction=LAW, locked=dict.fromkeys(locked, 0.0)),
+        columns=ColumnMap.load(folder / "map.toml"),
+    )
+    prepared = prepare_sources(gather_sources([archive], 0.7), options, Silent())
+    model = prepared.sources.cell.model
+    fit = estimate(model, prepared.fitted[0].factor(model))
+    (error,) = prediction_error(model, fit.values, prepared.held_out)
+    return Found(prepared, fit, error.overall)
+
+
+def assert_found(found: Found, simulated: Simulated) -> None:
+    """What was planted is found, and what was held out predicted down to the noise."""
+    model = found.prepared.sources.cell.model
+    truth = planted(model, simulated)
+    # Smoothing leaves a bias below a percent; chance goes beyond 5 std once in two million.
+    far = np.abs(found.fit.values - truth) > 5.0 * found.fit.std + 0.01 * np.abs(truth)
+    assert not far.any(), np.array(model.parameter_names)[far]
+    rms = np.sqrt((simulated.clean**2).mean(axis=0) @ np.ones(model.n_joints))
+    noise = TORQUE_NOISE * np.sqrt(np.sum(simulated.clean.var(axis=0)))
+    assert found.held_out_error < 1.5 * noise / rms
+
+
+def write(path: Path, header: str, table: Array, form: Callable[[float], str] = repr) -> None:
+    lines = [header] if header else []
+    lines += [",".join(form(float(cell)) for cell in row) for row in table]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_seven_axes_in_degrees_at_an_uneven_100_hz_columns_in_another_order(tmp_path: Path) -> None:
+    """Time in ms of a wall clock, a column of a gripper, stamps repeated, a second lost."""
+    rng = np.random.default_rng(2)
+    time = np.cumsum(0.01 * rng.uniform(0.6, 1.4, 4000))
+    time = time[(time < 11.0) | (time > 12.0)]
+    simulated = simulate(PANDA, time, locked=FINGERS)
+    order = [6, 2, 0, 1, 3, 4, 5]
+    degrees, torque = np.degrees(simulated.position)[:, order], simulated.torque[:, order]
+    stamp = EPOCH_MS + np.round(time * 1e3, 3)
+    table = np.column_stack([degrees, np.full(len(time), 0.04), torque, np.zeros(len(time)), stamp])
+    table = np.insert(table, 500, table[499], axis=0)  # a line written twice
+    names = [f"panda_joint{one + 1}" for one in order]
+    header = ",".join([*(f"q{k}" for k in range(1, 9)), *(f"u{k}" for k in range(1, 9)), "stamp"])
+    write(tmp_path / "log.csv", header, table)
+    columns = f"""
+        joints = {[*names, "gripper"]!r}
+        [time]
+        column = "stamp"
+        unit = "ms"
+        [position]
+        columns = "q{{}}"
+        unit = "deg"
+        [torque]
+        columns = "u{{}}"
+        """
+    found = identify(tmp_path, simulated, "log.csv", columns, FINGERS)
+    assert_found(found, simulated)
+    said = " ".join(found.prepared.notes)
+    assert "uneven" in said
+    assert "1 gaps" in said
+
+
+def test_motor_side_with_coupled_motors_in_a_transposed_npz(tmp_path: Path) -> None:
+    simulated = simulate(UR5, np.arange(0.0, 20.0, 1e-3))
+    turns = np.diag([101.0, -100.0, 80.0, 60.0, 50.0, 50.0])
+    turns[5, 4], turns[4, 3] = -50.0, 25.0
+    np.savez(
+        tmp_path / "log.npz",
+        theta=(simulated.position @ turns.T).T,
+        tau=np.linalg.solve(turns.T, simulated.torque.T),
+    )
+    rows = ", ".join(str(row) for row in turns.tolist())
+    columns = f"""
+        sample_rate = 1000.0
+        [position]
+        columns = "theta"
+        side = "motor"
+        [torque]
+        columns = "tau"
+        side = "motor"
+        [drive]
+        motor_from_joint = [{rows}]
+        """
+    found = identify(tmp_path, simulated, "log.npz", columns)
+    model = found.prepared.sources.cell.model
+    assert model.coupling is not None  # the map couples motors: the model may have them share
+    assert found.held_out_error < 1.5 * TORQUE_NOISE
+
+
+def test_text_matrices_at_5_khz_with_joints_along_rows_and_fortran_exponents(
+    tmp_path: Path,
+) -> None:
+    simulated = simulate(UR5, 3.0 + np.arange(0.0, 3.0, 2e-4), pace=2.0)
+
+    def fortran(value: float) -> str:
+        return f"{value:.9E}".replace("E", "D")
+
+    for name, values in (("q", simulated.position), ("tau", simulated.torque)):
+        lines = ["  ".join(fortran(cell) for cell in row) for row in values.T]
+        (tmp_path / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    (tmp_path / "t.txt").write_text("\n".join(fortran(t) for t in simulated.time))
+    columns = """
+        [time]
+        file = "t.txt"
+        [position]
+        [torque]
+        file = "tau.txt"
+        """
+    assert_found(identify(tmp_path, simulated, "q.txt", columns), simulated)
+
+
+def test_currents_only_get_their_scale_from_the_masses_and_say_so(tmp_path: Path) -> None:
+    """One array per joint, mA; gains, one of them negative, are found again where weight acts."""
+    simulated = simulate(UR5, np.arange(0.0, 30.0, 2e-3))
+    gains = np.array([9.0, 11.0, -10.0, 7.0, 6.0, 5.0])  # N·m/A
+    current = 1e3 * simulated.torque / gains
+    arrays = {f"i{j + 1}": current[:, j] for j in range(6)}
+    arrays |= {f"q{j + 1}": simulated.position[:, j] for j in range(6)}
+    np.savez(tmp_path / "log.npz", t=simulated.time, **arrays)
+    columns = """
+        [time]
+        column = "t"
+        [position]
+        columns = "q{}"
+        [motor_current]
+        columns = "i{}"
+        unit = "mA"
+        """
+    found = identify(tmp_path, simulated, "log.npz", columns)
+    torque = found.prepared.fitted[0].torque
+    recorded = found.prepared.sources.training[0].recording
+    assert recorded.motor_current is not None
+    made = (torque / recorded.motor_current).mean(axis=0)
+    assert made[1:5] == pytest.approx(gains[1:5], rel=0.03)
+    assert found.held_out_error < 2.0 * TORQUE_NOISE
+    doubts = " ".join(found.prepared.sources.doubts)
+    assert "only currents were recorded" in doubts
+    assert "shoulder_pan_joint" in doubts  # its axis is vertical: no weight
+
+
+def test_positions_and_currents_with_decimal_commas_and_torque_constants(tmp_path: Path) -> None:
+    """Semicolons, motor revolutions, a sensor with an offset, signs per joint."""
+    simulated = simulate(UR5, np.arange(0.0, 20.0, 4e-3))
+    ratio = np.array([100.0, 100.0, -100.0, 60.0, 60.0, -60.0])
+    constant = np.array([0.12, 0.12, 0.1, 0.06, 0.05, 0.04])
+    revolutions = simulated.position * ratio / (2.0 * np.pi)
+    current = simulated.torque / (ratio * constant) + 0.05
+    table = np.column_stack([simulated.time, revolutions, current])
+    text = "t;" + ";".join([*(f"n{j}" for j in range(1, 7)), *(f"i{j}" for j in range(1, 7))])
+    body = "\n".join(";".join(f"{cell:.8f}" for cell in row) for row in table).replace(".", ",")
+    (tmp_path / "log.csv").write_text(f"{text}\n{body}\n")
+    columns = f"""
+        [time]
+        column = "t"
+        [position]
+        columns = "n{{}}"
+        unit = "rev"
+        side = "motor"
+        [motor_current]
+        columns = "i{{}}"
+        offset = -0.05
+        [drive]
+        gear_ratio = {ratio.tolist()}
+        torque_constant = {constant.tolist()}
+        """
+    assert_found(identify(tmp_path, simulated, "log.csv", columns), simulated)
+
+
+def test_a_delay_of_the_torque_is_noticed_and_on_demand_compensated(tmp_path: Path) -> None:
+    time = np.arange(0.0, 20.0, 2e-3)
+    simulated = simulate(UR5, time, noise=0.3)
+    late = 0.009
+    shifted = np.column_stack(
+        [np.interp(time - late, time, column) for column in simulated.torque.T]
+    )
+    table = np.column_stack([time, simulated.position, shifted])[10:]
+    write(tmp_path / "log.csv", "", table)
+    columns = """
+        [time]
+        column = 0
+        [position]
+        columns = [1, 2, 3, 4, 5, 6]
+        [torque]
+        columns = [7, 8, 9, 10, 11, 12]
+        """
+    plain = Options(torque_bandwidth=None)
+    unaware = identify(tmp_path, simulated, "log.csv", columns, options=plain)
+    noticed = unaware.prepared.delays
+    assert noticed is not None
+    assert noticed.delays[noticed.determined] == pytest.approx(late, abs=1e-3)
+    assert (unaware.prepared.assumed_delay == 0.0).all()
+    (tmp_path / "log.mcap").unlink()
+    aware = identify(tmp_path, simulated, "log.csv", columns, options=replace(plain, delay="auto"))
+    delays = aware.prepared.delays
+    assert delays is not None
+    known = delays.determined
+    assert known.sum() >= 4
+    assert delays.delays[known] == pytest.approx(late, abs=1e-3)
+    assert aware.held_out_error < unaware.held_out_error
+    assert_found(aware, simulated)
+
+
+def test_a_clipped_torque_is_left_out_and_told(tmp_path: Path) -> None:
+    """A drive at its limit says nothing of the load; with its rows the mass would be too small."""
+    simulated = simulate(UR5, np.arange(0.0, 30.0, 4e-3))
+    torque, limit = simulated.torque.copy(), 0.7 * np.abs(simulated.torque[:, 1]).max()
+    clipped = np.abs(torque[:, 1]) > limit
+    assert 0.02 < clipped.mean() < 0.5
+    torque[:, 1] = np.clip(torque[:, 1], -limit, limit)
+    np.savez(tmp_path / "log.npz", q=simulated.position, tau=torque)
+    columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[torque]\ncolumns = "tau"\n'
+    found = identify(tmp_path, simulated, "log.npz", columns)
+    model = found.prepared.sources.cell.model
+    truth = planted(model, simulated)
+    far = np.abs(found.fit.values - truth) > 5.0 * found.fit.std + 0.02 * np.abs(truth)
+    assert not far.any(), np.array(model.parameter_names)[far]
+    (told,) = (
+        rows
+        for reason, rows in found.prepared.masked.items()
+        if "satur" in reason or "limit" in reason
+    )
+    assert told[1] > 0
+    assert not np.delete(told, 1).any()
+    (fitted,) = found.prepared.fitted
+    kept = fitted.usable[:, 1] & clipped[: len(fitted.usable)]
+    assert kept.sum() < 0.01 * clipped.sum(), kept.sum()  # a single sample is no flat top
+
+
+def test_currents_of_a_robot_without_masses_are_refused_with_a_remedy(tmp_path: Path) -> None:
+    simulated = simulate(UR5, np.arange(0.0, 5.0, 4e-3))
+    bare = tmp_path / "bare.urdf"
+    bare.write_text(re.sub(r"(?s)<inertial>.*?</inertial>", "", simulated.urdf.read_text()))
+    np.savez(tmp_path / "log.npz", q=simulated.position, i=simulated.torque)
+    columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[motor_current]\ncolumns = "i"\n'
+    with pytest.raises(
+        ArchiveError, match=r"no masses to compare currents with; give drive\.torque_constant"
+    ):
+        identify(tmp_path, replace(simulated, urdf=bare), "log.npz", columns)
+
+
+def test_a_standstill_gives_the_noise_and_other_recordings_are_predicted(tmp_path: Path) -> None:
+    """Three files of one robot: to be fitted, to be predicted, at rest (positions alone)."""
+    time = np.arange(0.0, 12.0, 4e-3)
+    robot = Robot.from_urdf(simulate(UR5, time[:2]).urdf, friction=LAW)
+    uses: dict[str, Use] = {"a": "excitation", "b": "validation", "c": "standstill"}
+    paths = []
+    for seed, (name, use) in enumerate(uses.items()):
+        one = simulate(UR5, time, seed=seed)
+        arrays = {"q": one.position, "tau": one.torque}
+        position = {"columns": "q"}
+        quantities = {"position": position, "torque": {"columns": "tau"}}
+        if use == "standstill":
+            noise = POSITION_NOISE * np.random.default_rng(9).standard_normal(one.position.shape)
+            arrays, quantities = {"q": one.position[0] + noise}, {"position": position}
+        np.savez(tmp_path / f"{name}.npz", **arrays)
+        paths.append(
+            import_log(
+                tmp_path / f"{name}.npz",
+                tmp_path / f"{name}.mcap",
+                robot=robot,
+                columns=ColumnMap.model_validate({"sample_rate": 250.0, **quantities}),
+                use=use,
+            )
+        )
+    sources = gather_sources(paths, 0.7)
+    assert [one.name for one in sources.training] == ["a.mcap"]
+    assert [one.name for one in sources.held_out] == ["b.mcap"]
+    assert sources.tested_on == "unseen motion"
+    assert sources.noise_variance == pytest.approx(np.full(6, POSITION_NOISE**2), rel=0.2)
+    prepared = prepare_sources(sources, Options(torque_bandwidth=None), Silent())
+    assert any("at standstill" in note for note in prepared.notes)
+
+    unread = gather_sources(paths[:1], 0.7, predict=paths[1:2])
+    assert [one.name for one in unread.held_out] == ["b.mcap"]
+
+
+@pytest.mark.parametrize("smoother", ["spline", "butterworth"])
+def test_either_smoother_finds_the_parameters(tmp_path: Path, smoother: str) -> None:
+    simulated = simulate(UR5, np.arange(0.0, 20.0, 4e-3))
+    np.savez(tmp_path / "log.npz", q=simulated.position, tau=simulated.torque)
+    columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[torque]\ncolumns = "tau"\n'
+    options = Options(torque_bandwidth=None, smoother=smoother)  # type: ignore[arg-type]
+    assert_found(identify(tmp_path, simulated, "log.npz", columns, options=options), simulated)

@@ -1,0 +1,320 @@
+"""`hil reidentify`: the numbers of `hil identify`, whoever computes them and in whatever order."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hil.batch import factors
+from hil.batch.errors import NothingToFitError
+from hil.batch.local import LocalWorkers
+from hil.batch.run import Plan, reidentify
+from hil.batch.types import ESTIMATORS, BatchEstimator, BatchResult, Choices
+from hil.campaign import Campaign
+from hil.cli import app
+from hil.errors import InputError
+from hil.identify import Options, identify_campaign
+from hil.identify.estimating import estimate_with
+from hil.identify.prepared import prepare_sources
+from hil.identify.sources import gather_sources
+from hil.progress import Silent
+
+from .batch_workers import Here
+
+EXACT = {"rtol": 1e-9, "atol": 0.0}
+
+
+def batch(
+    *places: Path, plan: Plan | None = None, workers: Here | LocalWorkers | None = None
+) -> BatchResult:
+    return reidentify([str(place) for place in places], plan or Plan(), workers or Here(), Silent())
+
+
+def archives(campaign: Campaign) -> list[Path]:
+    kinds = ("excitation", "validation", "standstill")
+    return [path for kind in kinds for path in campaign.folder.completed(kind)]
+
+
+@pytest.fixture
+def folder(campaign: Campaign, tmp_path: Path) -> Path:
+    """A copy of the campaign, to be damaged."""
+    copy = tmp_path / "campaign"
+    shutil.copytree(campaign.folder.root, copy, ignore=shutil.ignore_patterns(".hil-cache"))
+    return copy
+
+
+@pytest.fixture(scope="module")
+def found(campaign: Campaign, tmp_path_factory: pytest.TempPathFactory) -> BatchResult:
+    return batch(campaign.folder.root, plan=Plan(cache=tmp_path_factory.mktemp("cache")))
+
+
+def same_bits(first: BatchResult, second: BatchResult) -> bool:
+    def bits(result: BatchResult) -> list[bytes]:
+        levels = (*result.repetitions, *result.campaigns, *result.pooled)
+        return [one.values.tobytes() + one.std.tobytes() for one in levels]
+
+    return bits(first) == bits(second)
+
+
+# The numbers
+
+
+def test_campaign_and_repetitions_are_those_of_hil_identify(
+    campaign: Campaign, found: BatchResult
+) -> None:
+    one = identify_campaign(campaign.folder.root, Silent()).estimate
+    (level,) = found.campaigns
+    np.testing.assert_allclose(level.values, one.pooled.values, **EXACT)
+    np.testing.assert_allclose(level.covariance, one.pooled.covariance, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(level.noise_std, one.pooled.noise_std, **EXACT)
+    assert level.interval_factor == one.pooled.interval_factor
+    assert level.method == one.pooled.method
+    assert list(level.samples) == list(one.pooled.samples)
+    assert len(found.repetitions) == len(one.repetitions) == 3
+    for mine, own in zip(found.repetitions, one.repetitions, strict=True):
+        np.testing.assert_allclose(mine.values, own.values, **EXACT)
+        np.testing.assert_allclose(mine.std, own.std, **EXACT)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_gives_what_it_gives_with_samples(
+    name: BatchEstimator, campaign: Campaign, tmp_path: Path
+) -> None:
+    prepared = prepare_sources(gather_sources(archives(campaign), 0.7), Options(), Silent())
+    one = estimate_with(prepared, Options(estimator=name), Silent()).result
+    (level,) = batch(campaign.folder.root, plan=Plan(name, cache=tmp_path)).campaigns
+    # The program of the consistent estimate stops at its own tolerance.
+    close = {"rtol": 1e-4, "atol": 1e-4} if name == "consistent" else {"rtol": 1e-8, "atol": 1e-12}
+    np.testing.assert_allclose(level.values, one.pooled.values, **close)
+    np.testing.assert_allclose(level.std, one.pooled.std, rtol=1e-8)
+
+
+def test_the_error_on_unseen_motion_is_that_of_the_samples(
+    campaign: Campaign, found: BatchResult
+) -> None:
+    prepared = prepare_sources(gather_sources(archives(campaign), 0.7), Options(), Silent())
+    (level,) = found.campaigns
+    model = prepared.sources.cell.model
+    squares, rows = np.zeros(6), np.zeros(6)
+    for samples in prepared.held_out:
+        error = samples.torque - samples.predicted_torque(model, level.values)
+        squares += np.where(samples.usable, error**2, 0.0).sum(axis=0)
+        rows += samples.usable.sum(axis=0)
+    np.testing.assert_allclose(level.unseen_rms, np.sqrt(squares / rows), rtol=1e-6)
+
+
+def test_pooled_over_one_campaign_is_that_campaign(found: BatchResult) -> None:
+    assert found.pooled[0].values.tobytes() == found.campaigns[0].values.tobytes()
+    assert (found.pooled[0].level, found.pooled[0].campaign) == ("pooled", "")
+
+
+def test_campaigns_of_an_arm_are_pooled(
+    campaign: Campaign, found: BatchResult, tmp_path: Path
+) -> None:
+    """In two folders, each with the standstill: pooled they are what they were in one."""
+    for name, wanted in (("first", "excitation_000"), ("second", "excitation_00[12]")):
+        (tmp_path / name).mkdir()
+        for pattern in (wanted, "standstill"):
+            for path in campaign.folder.archives.glob(f"{pattern}*.mcap"):
+                shutil.copy(path, tmp_path / name / path.name)
+    result = batch(tmp_path, plan=Plan(keep=False))
+    assert [one.repetitions for one in result.campaigns] == [1, 2]
+    assert [one.repetitions for one in result.pooled] == [3]
+    # Other sums of the same terms: rounding, in parameters that are hardly known.
+    apart = result.pooled[0].values - found.pooled[0].values
+    assert np.abs(apart / found.pooled[0].std).max() < 1e-6
+    np.testing.assert_allclose(result.pooled[0].std, found.pooled[0].std, rtol=1e-6)
+
+
+def test_a_copy_counts_once(campaign: Campaign, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        for path in campaign.folder.completed("excitation"):
+            shutil.copy(path, tmp_path / name / path.name)
+    result = batch(tmp_path, plan=Plan(keep=False))
+    assert result.pooled[0].repetitions == 3
+    assert len([one for one in result.skipped if "holds the same" in one.reason]) == 3
+
+
+def test_workers_order_and_cache_make_no_difference_to_the_last_bit(
+    folder: Path, tmp_path: Path
+) -> None:
+    with LocalWorkers(2) as workers:
+        alone = batch(folder, plan=Plan(keep=False), workers=workers)
+    files = sorted((folder / "archives").glob("*.mcap"), reverse=True)
+    assert same_bits(alone, batch(*files, plan=Plan(keep=False)))
+    assert same_bits(alone, batch(folder, plan=Plan(keep=False), workers=Here(near=False)))
+    cached = Plan(cache=tmp_path / "cache")
+    assert same_bits(alone, batch(folder, plan=cached))
+    assert same_bits(alone, batch(folder, plan=cached))
+
+
+# What is kept
+
+
+def test_a_second_run_with_another_estimator_opens_no_archive(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    long_ago = time.time() - 100.0
+    for path in (folder / "archives").glob("*.mcap"):
+        os.utime(path, (long_ago, long_ago))
+    monkeypatch.setattr("hil.batch.discovery._SETTLED", 0)
+    first = batch(folder)
+    assert (first.read, first.cached) == (5, 0)
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("an archive was opened")
+
+    monkeypatch.setattr(factors, "open_archive", never)
+    monkeypatch.setattr("hil.batch.discovery.open_archive", never)
+    workers = Here()
+    second = batch(folder, plan=Plan("ols"), workers=workers)
+    assert (second.read, second.cached, workers.tasks) == (0, 5, [])
+    assert "ordinary" in second.campaigns[0].method
+
+
+def test_a_longer_campaign_reads_only_what_is_new(folder: Path) -> None:
+    archive = sorted((folder / "archives").glob("excitation_002*"))[0]
+    away = folder.parent / archive.name
+    archive.rename(away)
+    assert batch(folder).read == 4
+    away.rename(archive)
+    longer = batch(folder)
+    assert longer.read == 1
+    assert same_bits(longer, batch(folder, plan=Plan(keep=False)))
+
+
+def test_other_settings_are_other_factors(folder: Path) -> None:
+    batch(folder)
+    assert batch(folder, plan=Plan(choices=Choices(delay=0.002))).read == 5
+
+
+def test_damaged_entries_are_made_anew_and_never_believed(folder: Path) -> None:
+    whole = batch(folder)
+    kept = [path for path in (folder / "archives" / ".hil-cache").rglob("*") if path.is_file()]
+    random = np.random.default_rng(1)
+    for path in kept:
+        data = bytearray(path.read_bytes())
+        data[random.integers(len(data))] ^= 1 << random.integers(8)
+        path.write_bytes(data)
+    again = batch(folder)
+    assert again.read == 5
+    assert same_bits(whole, again)
+    for path in kept:
+        if path.exists():
+            path.write_bytes(path.read_bytes()[:-1])
+    assert same_bits(whole, batch(folder))
+
+
+def test_a_read_only_folder_is_kept_elsewhere(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert batch(folder).read == 5
+    assert batch(folder).read == 0
+    assert not (folder / "archives" / ".hil-cache").exists()
+    assert list((tmp_path / "xdg" / "hil").iterdir())
+
+
+def test_nothing_is_left_behind_without_a_cache(folder: Path) -> None:
+    before = sorted(folder.rglob("*"))
+    batch(folder, plan=Plan(keep=False))
+    assert sorted(folder.rglob("*")) == before
+
+
+# What is broken
+
+
+def test_broken_archives_are_listed_and_cost_only_themselves(folder: Path) -> None:
+    whole = batch(folder, plan=Plan(keep=False))
+    names = [path.name for path in sorted((folder / "archives").glob("excitation*"))]
+    loose = folder / "loose"
+    loose.mkdir()
+    for path in (folder / "archives").glob("*.mcap"):
+        shutil.copy(path, loose / path.name)
+    shutil.rmtree(folder / "archives")
+    (folder / "manifest.json").unlink()
+    torn = loose / names[1]
+    torn.write_bytes(torn.read_bytes()[:-5000])
+    (loose / "nothing.mcap").write_bytes(b"")
+    (loose / "other.mcap").write_bytes(b"not an archive at all")
+    flipped = bytearray((loose / names[2]).read_bytes())
+    middle = len(flipped) // 2
+    flipped[middle : middle + 2000] = bytes(2000)
+    (loose / names[2]).write_bytes(flipped)
+    for plan in (Plan(), Plan(), Plan(keep=False)):
+        result = batch(folder, plan=plan)
+        reasons = {Path(one.path).name: one.reason for one in result.broken}
+        assert set(reasons) == {names[1], names[2], "nothing.mcap", "other.mcap"}
+        assert "repair" in reasons[names[1]]
+        assert len(result.repetitions) == 1
+    np.testing.assert_allclose(result.repetitions[0].values, whole.repetitions[0].values, **EXACT)
+
+
+def test_a_file_that_is_not_what_was_recorded_is_not_used(folder: Path) -> None:
+    victim, other = sorted((folder / "archives").glob("excitation*"))[:2]
+    shutil.copy(other, victim)
+    result = batch(folder, plan=Plan(keep=False))
+    assert [Path(one.path).name for one in result.broken] == [victim.name]
+    assert "manifest" in result.broken[0].reason
+
+
+@pytest.mark.parametrize("near", [True, False])
+def test_an_archive_that_ends_its_process_costs_itself(
+    near: bool, folder: Path, tmp_path: Path
+) -> None:
+    names = [path.name for path in sorted((folder / "archives").glob("excitation*"))]
+    result = batch(folder, plan=Plan(cache=tmp_path / "cache"), workers=Here(names[1], near=near))
+    assert [Path(one.path).name for one in result.broken] == [names[1]]
+    assert [Path(one.archive).name for one in result.repetitions] == [names[0], names[2]]
+    left = [path for path in (folder / "archives").glob("*.mcap") if path.name != names[1]]
+    assert same_bits(result, batch(*left, plan=Plan(keep=False)))
+
+
+def test_a_standstill_that_ends_its_process_costs_itself(folder: Path, tmp_path: Path) -> None:
+    (name,) = [path.name for path in (folder / "archives").glob("standstill*")]
+    result = batch(folder, plan=Plan(cache=tmp_path), workers=Here(name))
+    assert name in [Path(one.path).name for one in result.broken]
+    assert len(result.repetitions) == 3
+
+
+def test_nothing_to_fit_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(NothingToFitError, match="no archive"):
+        batch(tmp_path)
+    (tmp_path / "bad.mcap").write_bytes(b"")
+    with pytest.raises(NothingToFitError, match=r"bad\.mcap"):
+        batch(tmp_path)
+
+
+# The command
+
+
+def test_the_command_lists_what_is_broken_and_says_so_in_its_status(
+    folder: Path, tmp_path: Path
+) -> None:
+    command = ["reidentify", str(folder), "--workers", "1", "-o", str(tmp_path / "out")]
+    ran = CliRunner().invoke(app, command)
+    assert ran.exit_code == 0, ran.output
+    assert "3 repetitions in 1 campaigns of 1 arms; 5 archives read" in ran.output
+    (folder / "archives" / "bad.mcap").write_bytes(b"")
+    ran = CliRunner().invoke(app, [*command, "--json"])
+    assert ran.exit_code == 5, ran.output
+    told = json.loads(ran.stdout)
+    assert [Path(one["path"]).name for one in told["broken"]] == ["bad.mcap"]
+    assert (told["read"], told["cached"]) == (0, 5)
+    assert all(Path(path).is_file() for path in told["written"])
+
+
+def test_the_command_needs_a_place_with_archives(tmp_path: Path) -> None:
+    for place in (tmp_path, tmp_path / "missing"):
+        ran = CliRunner().invoke(app, ["reidentify", str(place)])
+        assert isinstance(ran.exception, InputError)
+        assert ran.exception.exit_code == 2

@@ -1,0 +1,108 @@
+"""Archives behind an address: found, fetched, and refused in one sentence where that fails."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from hil.batch import remote_files
+from hil.batch.remote_files import is_url, listed, local_copy
+from hil.errors import InputError
+from tests.hil.web_folder import served
+
+CONTENT = {"a/first.mcap": b"one" * 1_000_000, "b/c/second.mcap": b"", "b/notes.txt": b"no archive"}
+ARCHIVES = ["a/first.mcap", "b/c/second.mcap"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("store")
+    for name, content in CONTENT.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(content)
+    return root
+
+
+@pytest.fixture(scope="module")
+def web(folder: Path) -> Iterator[str]:
+    with served(folder) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def memory() -> str:
+    store = fsspec.filesystem("memory")
+    for name, content in CONTENT.items():
+        store.pipe(f"/store/{name}", content)
+    return "memory://store"
+
+
+@pytest.fixture(params=["web", "memory", "file"])
+def root(request: pytest.FixtureRequest, folder: Path) -> str:
+    """The same files in three kinds of store."""
+    if request.param == "file":
+        return folder.as_uri()
+    return str(request.getfixturevalue(request.param))
+
+
+def test_every_archive_below_an_address_is_found_in_order(root: str) -> None:
+    found = [file.url for file in listed(root)]
+    assert len(found) == len(ARCHIVES)
+    for url, name in zip(found, ARCHIVES, strict=True):
+        assert is_url(url)
+        assert url.endswith(f"/{name}")
+
+
+def test_an_archive_is_found_by_its_own_address(root: str) -> None:
+    (found,) = listed(f"{root}/{ARCHIVES[0]}")
+    assert found.url.endswith(ARCHIVES[0])
+    assert found.size in (None, len(CONTENT[ARCHIVES[0]]))
+
+
+def test_what_is_found_is_fetched_to_the_byte_and_removed(root: str) -> None:
+    for file, name in zip(listed(root), ARCHIVES, strict=True):
+        with local_copy(file.url) as path:
+            assert path.name == Path(name).name
+            assert path.read_bytes() == CONTENT[name]
+        assert not path.parent.exists()
+
+
+def test_a_version_is_that_of_the_content_or_none(
+    memory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = f"{memory}/{ARCHIVES[0]}"
+    assert listed(address)[0].version == ""
+    store = fsspec.get_filesystem_class("memory")
+    plain = store.info
+    monkeypatch.setattr(store, "info", lambda *path: plain(*path) | {"ETag": '"5f3"'})
+    assert listed(address)[0].version == '"5f3"'
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("memory://store/absent.mcap", "is not there"),
+        ("http://127.0.0.1:9/x.mcap", "(Cannot connect|its server does not answer)"),
+        ("nosuch://store/x.mcap", "Protocol not known: nosuch"),
+    ],
+)
+def test_what_cannot_be_read_is_one_sentence_with_the_address(address: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"{address}.*{message}"):
+        listed(address)
+    with pytest.raises(InputError, match=f"{address}.*{message}"), local_copy(address):
+        pass
+
+
+def test_without_fsspec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote_files, "find_spec", lambda _: None)
+    with pytest.raises(InputError, match=r"pip install 'hil\[cluster\]'"):
+        listed("memory://store")
+
+
+def test_a_path_is_no_address() -> None:
+    assert is_url("s3://bucket/campaign")
+    assert not is_url("/data/campaign")
+    assert not is_url("C:/data")

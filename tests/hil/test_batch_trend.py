@@ -1,0 +1,392 @@
+"""What the trend says of arms that changed, and how rarely of arms that did not."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import kendalltau
+
+from hil.batch import payload_change
+from hil.batch.axis_figures import friction_of, friction_weights
+from hil.batch.chart import FEWEST, chart, drift, limits, qn_scale
+from hil.batch.trend import FALSE_ALARMS, ArmTrend, Trends, arm_trend
+from hil.batch.trend_words import findings, summary
+from hil.batch.types import Broken
+from hil.report.trend import render_trend_report, write_trend_report
+
+from .arm_histories import FRICTION, Condition, Load, history, model, motion, steady, trend_of
+
+# --- the chart ---------------------------------------------------------------------------------
+
+
+def judged(values: list[float], std: float = 0.0, **options: float) -> tuple[bool, ...]:
+    return chart(np.array(values), np.full(len(values), std), 0.01, **options)[1]
+
+
+@pytest.mark.parametrize("count", [5, 6, 8, 12, 25])
+@pytest.mark.parametrize("share", [0.01, 0.001])
+def test_of_values_that_do_not_change_no_more_than_the_share_are_said_to(
+    count: int, share: float
+) -> None:
+    random = np.random.default_rng(count)
+    runs = 40_000 if count < 20 else 10_000
+    first, second = np.triu_indices(count, 1)
+    values = random.standard_normal((runs, count))
+    half = count // 2 + 1
+    # Qn of many histories at once, against `qn_scale` of some of them.
+    distance = np.sort(np.abs(values[:, first] - values[:, second]), axis=1)
+    raw = distance[:, half * (half - 1) // 2 - 1]
+    factor = qn_scale(values[0]) / raw[0]
+    assert qn_scale(values[1]) == pytest.approx(factor * raw[1])
+    one = limits(values[0], np.zeros(count), 0.0, share)
+    assert one is not None
+    reach = (one.high - one.centre) / qn_scale(values[0])
+    new = random.standard_normal(runs)
+    outside = np.mean(np.abs(new - np.median(values, axis=1)) > reach * factor * raw)
+    allowed = 3.0 * math.sqrt(share / runs)
+    assert outside <= share + allowed
+    assert outside >= 0.1 * share - allowed
+
+
+def test_qn_is_a_standard_deviation_that_half_the_values_cannot_spoil() -> None:
+    values = np.random.default_rng(0).standard_normal(400)
+    assert qn_scale(values) == pytest.approx(1.0, abs=0.1)
+    spoilt = values.copy()
+    spoilt[:120] += 1e6
+    assert qn_scale(spoilt) < 3.0
+
+
+@given(st.floats(-5.0, 5.0), st.floats(0.1, 10.0))
+def test_limits_move_and_stretch_with_the_values(shift: float, stretch: float) -> None:
+    values = np.array([0.3, -0.2, 0.9, 0.1, -1.1, 0.4, 0.0])
+    plain = limits(values, np.zeros(7), 0.0, 0.01)
+    moved = limits(shift + stretch * values, np.zeros(7), 0.0, 0.01)
+    assert plain is not None
+    assert moved is not None
+    assert moved.low == pytest.approx(shift + stretch * plain.low, abs=1e-9)
+    assert moved.high == pytest.approx(shift + stretch * plain.high, abs=1e-9)
+
+
+def test_nothing_is_judged_by_too_short_a_history() -> None:
+    assert limits(np.zeros(FEWEST - 1), np.zeros(FEWEST - 1), 0.0, 0.01) is None
+    assert judged([1.0] * FEWEST + [99.0]) == (False,) * FEWEST + (True,)
+
+
+def test_a_history_that_agrees_by_chance_is_no_narrower_than_its_values_are_known() -> None:
+    assert judged([1.0] * 8 + [1.5])[-1]
+    assert not judged([1.0] * 8 + [1.5], std=0.5)[-1]
+
+
+def test_a_value_that_departed_is_no_history() -> None:
+    values = [1.0, 1.1, 0.9, 1.05, 0.95, 1.02, 1.0] + [3.0] * 12
+    assert judged(values) == (False,) * 7 + (True,) * 12
+
+
+def test_a_value_that_is_not_known_neither_departs_nor_counts() -> None:
+    assert judged([1.0, 1.1, 0.9, math.nan, 1.0, 1.05, math.nan, 5.0]) == (False,) * 7 + (True,)
+
+
+def test_a_drift_is_a_rank_correlation_and_the_median_of_all_slopes() -> None:
+    time = np.array([0.0, 1.0, 2.0, 4.0, 7.0, 11.0])
+    values = 2.0 + 0.5 * time + np.array([0.1, -0.1, 0.0, 0.2, -0.2, 0.0])
+    found = drift(time, values)
+    assert found is not None
+    pairs = [(i, j) for i in range(6) for j in range(i)]
+    slopes = [(values[i] - values[j]) / (time[i] - time[j]) for i, j in pairs]
+    assert found.slope == pytest.approx(np.median(slopes))
+    assert found.low <= 0.5 <= found.high
+    assert found.p_value == pytest.approx(kendalltau(time, values).pvalue)
+
+
+# --- what is watched ---------------------------------------------------------------------------
+
+
+def test_friction_of_an_axis_is_the_mean_of_both_directions() -> None:
+    arm = model()
+    speed = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
+    values = np.random.default_rng(1).uniform(0.1, 2.0, arm.n_parameters)
+    values[: arm.base.rank] = 0.0
+    still = np.zeros((1, 6))
+    forwards, backwards = (
+        arm.torque(values, still, sign * speed[None], still)[0] for sign in (1.0, -1.0)
+    )
+    found, _ = friction_of(values, np.eye(arm.n_parameters), friction_weights(arm, speed))
+    np.testing.assert_allclose(found, 0.5 * (forwards - backwards), rtol=1e-12)
+
+
+def test_friction_with_an_undetermined_coefficient_is_not_known() -> None:
+    arm = model()
+    variances = np.ones(arm.n_parameters)
+    variances[arm.parameter_names.index("f1_2")] = np.inf
+    weights = friction_weights(arm, np.ones(6))
+    value, std = friction_of(np.ones(arm.n_parameters), np.diag(variances), weights)
+    assert np.isnan(value).tolist() == [False, True, False, False, False, False]
+    assert std[0] == pytest.approx(math.sqrt(3.0))
+
+
+def test_the_speed_is_that_of_the_motion() -> None:
+    speed = np.array([axis.speed for axis in quiet().axes])
+    moved = motion().velocity
+    usable = model().moving(moved)
+    expected = [math.sqrt(np.mean(moved[usable[:, j], j] ** 2)) for j in range(6)]
+    np.testing.assert_allclose(speed, expected, rtol=1e-9)
+
+
+# --- histories ---------------------------------------------------------------------------------
+
+
+@cache
+def quiet() -> ArmTrend:
+    return trend_of(steady, 12, seed=21)
+
+
+def troubled(k: int, random: np.random.Generator) -> Condition:
+    """Axis 2 wears, axis 3 is damaged at last, axis 5 is noisy once; a gripper from the eighth."""
+    now = steady(k, random)
+    friction = now.friction.copy()
+    friction[:, 1] *= 1.0 + 0.05 * k
+    friction[:, 2] *= 1.4 if k >= 10 else 1.0
+    louder = np.ones(6)
+    louder[4] = 1.8 if k == 11 else 1.0
+    return Condition(friction, Load(3.0 if k >= 7 else 0.0), louder)
+
+
+@cache
+def changed() -> ArmTrend:
+    return trend_of(troubled, 12)
+
+
+def test_an_arm_that_does_not_change_is_said_not_to() -> None:
+    arm = quiet()
+    assert [one.level for one in findings(arm)] == ["quiet"]
+    assert summary(arm) == "as before"
+
+
+def test_wear_is_a_drift_of_that_axis_alone() -> None:
+    arm = changed()
+    assert [axis.joint for axis in arm.axes if axis.drifts] == ["joint_2"]
+    slope = arm.axes[1].drift
+    assert slope is not None
+    speed = np.array([1.0, arm.axes[1].speed, arm.axes[1].speed ** 2])
+    truth = 0.05 * 11 * float(FRICTION[:, 1] @ speed) / arm.time[-1]
+    assert slope.low <= truth <= slope.high
+
+
+def test_a_damaged_axis_departs_from_then_on_and_no_other_does() -> None:
+    arm = changed()
+    which = {axis.joint: np.flatnonzero(axis.friction.departs).tolist() for axis in arm.axes}
+    assert which["joint_3"] == [10, 11]
+    assert all(not campaigns for joint, campaigns in which.items() if joint != "joint_3")
+
+
+def test_a_larger_torque_error_is_told_and_a_smaller_one_is_not() -> None:
+    arm = changed()
+    departing = {axis.joint: np.flatnonzero(axis.error.departs).tolist() for axis in arm.axes}
+    assert departing["joint_5"] == [11]
+    campaigns = history(steady, 7, seed=5)
+    quieter = replace(campaigns[-1], noise_std=0.3 * campaigns[-1].noise_std)
+    better = arm_trend("arm", model(), [*campaigns[:-1], quieter])
+    assert not any(axis.error.departs[-1] for axis in better.axes)
+
+
+def test_what_is_put_on_is_found_and_weighed() -> None:
+    payload = changed().payload
+    assert np.flatnonzero(payload.changed).tolist() == [7]
+    assert not any(payload.other)
+    change = payload.changes[7]
+    assert change is not None
+    assert abs(change.mass - 3.0) < 3.0 * change.mass_std < 0.5
+    np.testing.assert_array_less(
+        np.abs(change.moment - 3.0 * np.array(Load().centre)), 4.0 * change.moment_std
+    )
+    assert np.abs(payload.mass[:7]).max() < 0.4
+    np.testing.assert_allclose(payload.mass[7:], 3.0, atol=0.4)
+
+
+def test_half_a_kilogram_taken_off_is_found_between_two_campaigns() -> None:
+    arm = trend_of(lambda k, random: replace(steady(k, random), load=Load(1.0 - 0.5 * k)), 2)
+    assert arm.payload.changed == (False, True)
+    change = arm.payload.changes[1]
+    assert change is not None
+    assert abs(change.mass + 0.5) < 4.0 * change.mass_std
+    assert "taken off" in findings(arm)[0].words
+
+
+def test_inertia_of_another_link_is_no_payload() -> None:
+    arm = model()
+    before, after = history(steady, 2, seed=2)
+    # The second link gets heavier: a cable guide, not a tool.
+    standard = np.zeros(len(arm.standard_names))
+    standard[arm.standard_names.index("mc2x")] = 8.0
+    moved = after.values.copy()
+    moved[: arm.base.rank] += arm.base.grouping @ standard
+    found = arm_trend("arm", arm, [before, replace(after, values=moved)])
+    assert found.payload.changed == (False, False)
+    assert found.payload.other == (False, True)
+    assert "not as by something put on" in findings(found)[0].words
+
+
+def test_the_body_is_read_back_from_the_parameters_it_changes() -> None:
+    arm = model()
+    onto = payload_change.projection(
+        arm, np.ones(arm.n_parameters, bool), history(steady, 1, seed=1)[0].information, 1000
+    )
+    assert onto is not None
+    body = np.array([0.03, 0.01, -0.02, 0.05, 0.004, 0.02, 0.1, -0.2, 0.3, 1.7])
+    standard = np.zeros(len(arm.standard_names))
+    standard[arm.layout.links[-1]] = body
+    seen = np.isfinite(onto.body).all(axis=1)
+    read = onto.body @ onto.reader @ (arm.base.grouping @ standard)[onto.places]
+    np.testing.assert_allclose(read[seen], body[seen], atol=1e-9)
+    assert seen[-1]
+    assert seen[6:9].all()
+
+
+def test_of_unchanged_arms_the_joint_test_finds_a_change_as_rarely_as_it_says() -> None:
+    """Parameters drawn from their own covariance: T² must be F distributed, or smaller."""
+    one = history(steady, 1, seed=1)[0]
+    onto = payload_change.projection(
+        model(), np.isfinite(one.std), one.information, int(one.samples.sum())
+    )
+    assert onto is not None
+    assert one.covariance is not None
+    random = np.random.default_rng(8)
+    blocks = 40
+    root = np.linalg.cholesky(one.covariance + 1e-12 * np.diag(np.diag(one.covariance)))
+    p_values = []
+    for _ in range(1500):
+        states = []
+        for _ in range(2):
+            # Each campaign estimates its covariance from as many blocks.
+            scores = random.standard_normal((blocks, len(root))) @ root.T
+            values = root @ random.standard_normal(len(root))
+            covariance = scores.T @ scores / blocks
+            states.append(payload_change.state(onto, values, covariance, blocks))
+        change = payload_change.compare(onto, *states)
+        assert change is not None
+        p_values.append(change.p_value)
+    assert np.mean(np.array(p_values) < 0.01) <= 0.01 + 3.0 * math.sqrt(0.01 / 1500)
+    assert np.mean(np.array(p_values) < 0.5) > 0.3
+
+
+def test_campaigns_that_scatter_more_than_they_say_raise_no_alarm() -> None:
+    """A hose that pulls differently every time: the arm's own changes are the measure."""
+    arm = model()
+    campaigns = history(steady, 9, seed=3)
+    assert campaigns[0].covariance is not None
+    random = np.random.default_rng(4)
+    restless = [
+        replace(one, values=one.values + 5.0 * one.std * random.standard_normal(len(one.std)))
+        for one in campaigns
+    ]
+    assert not any(arm_trend("arm", arm, restless).payload.changed)
+
+
+def test_without_times_campaigns_keep_their_order_and_are_numbered() -> None:
+    campaigns = [replace(one, when="") for one in history(steady, 2, seed=2)]
+    arm = arm_trend("arm", model(), campaigns)
+    assert not arm.dated
+    assert arm.time.tolist() == [1.0, 2.0]
+
+
+def test_axes_of_which_nothing_is_known_are_left_out_of_the_figures_and_judged_no_further() -> None:
+    campaigns = []
+    for one in history(steady, 2, seed=2):
+        std, noise = one.std.copy(), one.noise_std.copy()
+        std[[name in ("f0_1", "mc2x") for name in one.names]] = np.inf
+        noise[0] = np.nan
+        covariance = np.asarray(one.covariance).copy()
+        np.fill_diagonal(covariance, std**2)
+        campaigns.append(
+            replace(one, std=std, noise_std=noise, covariance=covariance, speed_rms=None)
+        )
+    arm = arm_trend("arm", model(), [*campaigns, *campaigns * 3])
+    assert np.isnan(arm.axes[0].friction.values).all()
+    assert not any(any(axis.friction.departs) for axis in arm.axes)
+    text = render_trend_report(Trends((arm,), (), "wls", 16))
+    assert text.count('<span class="title">joint_1</span>') == 0
+    assert text.count('<span class="title">joint_2</span>') == 2
+    assert "mc2x [" not in text
+
+
+def test_campaigns_are_put_in_order_of_time() -> None:
+    campaigns = history(steady, 3, seed=2)
+    arm = arm_trend("arm", model(), campaigns[::-1])
+    assert arm.campaigns == ("line/c00", "line/c01", "line/c02")
+    assert arm.time.tolist() == [0.0, 14.0, 31.0]
+
+
+def test_without_information_it_is_said_that_payload_was_not_tested() -> None:
+    campaigns = [replace(one, information=None) for one in history(steady, 2, seed=2)]
+    arm = arm_trend("arm", model(), campaigns)
+    assert "not tested" in findings(arm)[0].words
+
+
+# --- the page ----------------------------------------------------------------------------------
+
+BROKEN = Broken("/data/<b>torn</b>.mcap", "its footer is missing")
+
+
+@cache
+def page() -> str:
+    return render_trend_report(Trends((changed(), quiet()), (BROKEN,), "wls", 48))
+
+
+def test_the_page_says_first_in_words_what_was_found() -> None:
+    head = page().split("<main>")[0]
+    for one in findings(changed()):
+        assert one.words.replace("'", "&#39;") in head
+    assert head.index("joint_3 departs") < head.index("What the arm carries has changed")
+    assert "Earlier: What the arm carries" in head
+
+
+def test_the_page_needs_nothing_but_itself() -> None:
+    addresses = re.findall(r"(?:href|src)=\"([^\"#][^\"]*)\"|url\((?!#)([^)]*)\)", page())
+    assert not addresses
+    assert "<script" not in page()
+
+
+def test_what_could_not_be_used_is_listed_and_cannot_inject() -> None:
+    assert "its footer is missing" in page()
+    assert "&lt;b&gt;torn" in page()
+    assert "<b>torn" not in page()
+
+
+def test_ids_are_unique_and_every_link_has_its_goal() -> None:
+    ids = re.findall(r'\bid="([^"]+)"', page())
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'href="#([^"]+)"', page())) <= set(ids)
+
+
+def test_every_parameter_and_axis_has_a_panel() -> None:
+    assert page().count("<svg") >= 2 * (model().n_parameters + 12)
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+    trends = Trends((arm_trend("arm", model(), history(steady, 2, seed=2)),), (), "wls", 4)
+    for name in ("one", "two"):
+        write_trend_report(tmp_path / name, trends)
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+@pytest.mark.slow
+def test_arms_that_do_not_change_are_rarely_said_to() -> None:
+    """Any rule, over whole histories: at most the stated share of campaigns."""
+    alarms = campaigns = drifts = 0
+    for seed in range(60):
+        arm = trend_of(steady, 12, seed=1000 + seed)
+        for k in range(1, 12):
+            axes = any(axis.friction.departs[k] or axis.error.departs[k] for axis in arm.axes)
+            alarms += axes or arm.payload.changed[k] or arm.payload.other[k]
+            campaigns += 1
+        drifts += any(axis.drifts for axis in arm.axes)
+    assert alarms <= FALSE_ALARMS * campaigns + 3.0 * math.sqrt(FALSE_ALARMS * campaigns)
+    assert drifts <= 60 * FALSE_ALARMS + 3.0 * math.sqrt(60 * FALSE_ALARMS)

@@ -1,0 +1,294 @@
+"""The identified model in a user's tools: what is written can be relied on, or is not written."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from hil.identify.exports import FILES, Exports, provenance_of
+from hil.results import VerdictResult
+from identification.kinematics import chain_from_urdf
+from identification.urdf_write import not_in_urdf
+
+from .identified_arm import IdentifiedArm, a_motion, identified_arm, packaged_urdf, write_exports
+from .test_report import make_results
+
+Array = NDArray[np.float64]
+
+TWO_LINK = (Path(__file__).parents[1] / "identification" / "two_link.urdf").read_text()
+SLIDER = """<robot name="slider"><link name="base"/>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="cart"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<link name="cart"><inertial><origin xyz="0.02 0 0.1"/><mass value="4"/>
+<inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="swing" type="continuous"><parent link="cart"/><child link="arm"/><axis xyz="0 1 0"/>
+<dynamics damping="0.7" friction="0.3"/></joint>
+<link name="arm"><inertial><origin xyz="0 0.01 -0.3"/><mass value="1.5"/>
+<inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
+"""
+ALL = {
+    "parameters.json",
+    "parameters.csv",
+    "standard.csv",
+    "friction.txt",
+    "friction.py",
+    "identified.urdf",
+}
+PROVENANCE = {"robot": "arm", "archives": "run_1.mcap sha256 0a1b", "verdict": "good: 1.1%"}
+BARE = "import json, runpy, sys; f = runpy.run_path(sys.argv[1]); " + (
+    "print(json.dumps([f['torques'](v) for v in json.load(sys.stdin)]))"
+)
+
+
+@pytest.fixture(scope="module")
+def arm() -> IdentifiedArm:
+    return identified_arm(TWO_LINK)
+
+
+def exported(arm: IdentifiedArm, folder: Path) -> Exports:
+    names = arm.essential.elimination.estimate.names
+    return write_exports(
+        folder,
+        arm.cell,
+        arm.estimate,
+        arm.consistency.consistent,
+        essential=names,
+        provenance=PROVENANCE,
+    )
+
+
+def test_six_files_are_written_and_named(arm: IdentifiedArm, tmp_path: Path) -> None:
+    found = exported(arm, tmp_path)
+    assert set(found.written) == ALL == set(FILES) == {path.name for path in tmp_path.iterdir()}
+    assert not found.withheld
+    assert set(found.result.written) == ALL
+
+
+def robots() -> Iterator[tuple[str, str, str]]:
+    yield "two_link", "", ""
+    yield "slider", "", '[robot.friction]\nthird = "cubic"'
+    yield "ur10_robot.urdf", "", "[robot.friction]\noffset = true"
+    yield "panda.urdf", "locked = {panda_finger_joint1 = 0.02, panda_finger_joint2 = 0.01}", ""
+    coupling = np.eye(6)
+    coupling[5, 4] = 0.4
+    yield (
+        "ur5_robot.urdf",
+        'payload = {mass = 2.0, centre = [0.0, 0.0, 0.1], frame = "tool0"}',
+        f"[robot.coupling]\nmotor_from_joint = {coupling.tolist()}\n"
+        "[robot.friction]\nstribeck = 0.1\nasymmetric = true",
+    )
+
+
+@pytest.fixture(scope="module", params=robots(), ids=lambda case: case[0])
+def any_arm(request: pytest.FixtureRequest) -> IdentifiedArm:
+    name, robot, tables = request.param
+    own = {"two_link": TWO_LINK, "slider": SLIDER}
+    urdf = own[name] if name in own else packaged_urdf(name)
+    return identified_arm(urdf, f"{robot}\n{tables}")
+
+
+def test_urdf_rotors_and_friction_together_give_the_torque_of_the_model(
+    any_arm: IdentifiedArm, tmp_path: Path
+) -> None:
+    """By files alone: pinocchio on the URDF, numbers of the JSON, friction of a bare process."""
+    exported(any_arm, tmp_path)
+    model, consistent = any_arm.cell.model, any_arm.consistency.consistent
+    motion = a_motion(model.n_joints, seed=5)
+    every = slice(None, None, 40)
+    q, qd, qdd = (array[every] for array in motion[1:])
+    moving = np.all(np.abs(qd) > 0.02, axis=1)
+    q, qd, qdd = q[moving], qd[moving], qdd[moving]
+    parameters = json.loads((tmp_path / "parameters.json").read_text())
+    rigid = rigid_torque(tmp_path / "identified.urdf", parameters, q, qd, qdd)
+    rotors = qdd @ np.array(parameters["standard"]["rotor_matrix"])
+    total = rigid + rotors + bare_friction(tmp_path / "friction.py", qd)
+    expected = model.torque(consistent.estimate.values, q, qd, qdd)
+    np.testing.assert_allclose(total, expected, atol=1e-7 * np.abs(expected).max())
+
+
+def rigid_torque(urdf: Path, parameters: dict, q: Array, qd: Array, qdd: Array) -> Array:  # type: ignore[type-arg]
+    """Inverse dynamics by pinocchio, joints by name, locked ones held."""
+    model = pin.buildModelFromUrdf(str(urdf))
+    held = pin.neutral(model)
+    for name, position in parameters["locked_joints"].items():
+        held[model.joints[model.getJointId(name)].idx_q] = position
+    locked = [model.getJointId(name) for name in parameters["locked_joints"]]
+    model = pin.buildReducedModel(model, locked, held)
+    model.gravity.linear = np.array(parameters["gravity"])
+    data, still = model.createData(), pin.neutral(model)
+    order = [model.joints[model.getJointId(name)].idx_v for name in parameters["joints"]]
+    torque = np.empty_like(q)
+    for k in range(len(q)):
+        p, v, a = (np.empty(model.nv) for _ in range(3))
+        p[order], v[order], a[order] = q[k], qd[k], qdd[k]
+        torque[k] = pin.rnea(model, data, pin.integrate(model, still, p), v, a)[order]
+    return torque
+
+
+def bare_friction(source: Path, speeds: Array) -> Array:
+    """Friction torques by an interpreter that sees no package at all."""
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", BARE, str(source)],
+        input=json.dumps(speeds.tolist()),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return np.array(json.loads(done.stdout))
+
+
+def test_the_urdf_is_still_the_users(any_arm: IdentifiedArm, tmp_path: Path) -> None:
+    """Apart from inertia, friction and comments not a character has changed."""
+    exported(any_arm, tmp_path)
+    written = (tmp_path / "identified.urdf").read_text()
+    changed = r"<!--.*?-->|<inertial>.*?</inertial>|<inertial\s*/>|<dynamics[^>]*?>|</dynamics>"
+
+    def rest(text: str) -> str:
+        return "".join(re.sub(changed, "", text, flags=re.S).split())
+
+    assert rest(written).replace("></joint>", ">") == rest(any_arm.cell.urdf).replace(
+        "></joint>", ">"
+    )
+    if any_arm.cell.model.payload is not None:
+        carried = chain_from_urdf(written).inertial[:, 9].sum()
+        assert carried == pytest.approx(
+            any_arm.consistency.consistent.standard[any_arm.cell.model.layout.links[:, 9]].sum()
+        )
+
+
+def test_the_json_says_what_a_urdf_cannot_hold(any_arm: IdentifiedArm, tmp_path: Path) -> None:
+    exported(any_arm, tmp_path)
+    parameters = json.loads((tmp_path / "parameters.json").read_text())
+    model = any_arm.cell.model
+    assert parameters["standard"]["not_in_urdf"] == list(not_in_urdf(model))
+    assert parameters["joints"] == list(model.joint_names)
+    assert parameters["locked_joints"] == dict(model.locked)
+    assert (parameters["payload"] or {}).get("mass") == (model.payload and model.payload.mass)
+    standard = any_arm.consistency.consistent.standard
+    np.testing.assert_array_equal(
+        parameters["standard"]["rotor_matrix"], model.layout.rotor_matrix(standard)
+    )
+
+
+def test_tables_give_the_same_numbers(any_arm: IdentifiedArm, tmp_path: Path) -> None:
+    exported(any_arm, tmp_path)
+    model, consistent = any_arm.cell.model, any_arm.consistency.consistent
+    rows = table(tmp_path / "parameters.csv")
+    assert [float(row["value"]) for row in rows] == any_arm.estimate.values.tolist()
+    assert [row["unit"] for row in rows] == list(model.units)
+    links = table(tmp_path / "standard.csv")
+    masses = [float(link["m"]) for link in links]
+    assert masses == consistent.standard[model.layout.links[:, 9]].tolist()
+    remarks = [
+        line for line in (tmp_path / "standard.csv").read_text().splitlines() if line[:1] == "#"
+    ]
+    for k in model.layout.couplings:
+        assert any(line.startswith(f"# {model.layout.names[k]}: ") for line in remarks)
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    lines = path.read_text().splitlines()
+    return list(csv.DictReader(line for line in lines if not line.startswith("#")))
+
+
+def test_every_file_says_where_it_comes_from(arm: IdentifiedArm, tmp_path: Path) -> None:
+    exported(arm, tmp_path)
+    assert json.loads((tmp_path / "parameters.json").read_text())["provenance"] == PROVENANCE
+    for name in ALL - {"parameters.json"}:
+        assert "sha256 0a1b" in (tmp_path / name).read_text(), name
+
+
+def test_without_consistent_parameters_there_is_no_urdf_and_an_old_one_goes(
+    arm: IdentifiedArm, tmp_path: Path
+) -> None:
+    exported(arm, tmp_path)
+    (tmp_path / "mine.urdf").write_text("kept")
+    found = write_exports(tmp_path, arm.cell, arm.estimate, "the solver gave up")
+    assert set(found.withheld) == {"identified.urdf", "standard.csv"}
+    assert "the solver gave up" in found.withheld["identified.urdf"]
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == (ALL - set(found.withheld)) | {"mine.urdf"}
+    free = arm.estimate.values[arm.cell.model.base.rank :]
+    taken = bare_friction(tmp_path / "friction.py", np.array([[1.0, 1.0]]))[0]
+    np.testing.assert_allclose(taken, free.reshape(-1, 2).sum(axis=0), rtol=1e-12)
+
+
+def test_impossible_parameters_are_not_written_as_a_urdf(
+    arm: IdentifiedArm, tmp_path: Path
+) -> None:
+    broken = arm.consistency.consistent.standard.copy()
+    broken[arm.cell.model.layout.links[1, 9]] = -1.0
+    found = write_exports(
+        tmp_path, arm.cell, arm.estimate, replace(arm.consistency.consistent, standard=broken)
+    )
+    assert "no possible body" in found.withheld["identified.urdf"]
+    assert not (tmp_path / "identified.urdf").exists()
+
+
+def test_names_of_archives_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
+    evil = {"archives": 'a --> ---> <robot> """ \x00\x1b[2J\nimport os\udc80 b', "robot": "€"}
+    write_exports(tmp_path, arm.cell, arm.estimate, arm.consistency.consistent, provenance=evil)
+    model = arm.cell.model
+    assert chain_from_urdf((tmp_path / "identified.urdf").read_text()).n_joints == model.n_joints
+    assert bare_friction(tmp_path / "friction.py", np.ones((1, 2))).shape == (1, 2)
+    assert len(table(tmp_path / "parameters.csv")) == model.n_parameters
+    assert "€" in (tmp_path / "friction.txt").read_text(encoding="utf-8")
+
+
+def test_names_in_a_urdf_cannot_break_a_file(tmp_path: Path) -> None:
+    evil = "a---&gt;'&quot;&quot;&quot;&#10;&lt;script&gt;alert(1)&lt;/script&gt;#"
+    urdf = TWO_LINK.replace("shoulder", evil).replace('"upper"', f'"{evil}"')
+    arm = identified_arm(urdf)
+    found = exported(arm, tmp_path)
+    assert not found.withheld
+    chain = chain_from_urdf((tmp_path / "identified.urdf").read_text())
+    assert chain.joint_names == arm.cell.joint_names
+    assert bare_friction(tmp_path / "friction.py", np.ones((1, 2))).shape == (1, 2)
+    assert len(table(tmp_path / "standard.csv")) == 2
+
+
+@pytest.mark.parametrize(("good", "word"), [(True, "good"), (False, "NOT GOOD")])
+def test_provenance_has_digests_and_the_verdict(tmp_path: Path, good: bool, word: str) -> None:
+    verdict = VerdictResult(good=good, line="why", reasons=[], doubts=[])
+    results = make_results(verdict=verdict.model_dump())
+    (tmp_path / "a.mcap").write_bytes(b"abc")
+    found = provenance_of(results, [tmp_path / "a.mcap"])
+    assert found["verdict"] == f"{word}: why"
+    assert found["archives"] == f"a.mcap sha256 {hashlib.sha256(b'abc').hexdigest()}"
+    assert found["robot"] == results.cell
+
+
+def test_a_joint_that_never_moved_keeps_what_its_description_says(tmp_path: Path) -> None:
+    arm = identified_arm(SLIDER, still=(1,))
+    assert {"f0_2", "f1_2"} <= set(arm.estimate.undetermined)
+    exported(arm, tmp_path)
+    text = (tmp_path / "identified.urdf").read_text()
+    assert '<dynamics damping="0.7" friction="0.3"/>' in text
+    assert "Not determined by the data" in text
+    source = (tmp_path / "friction.py").read_text()
+    assert "NOT DETERMINED" in source.splitlines()[1]
+    assert "f0_2" in source.splitlines()[1]
+    rows = {row["name"]: row for row in table(tmp_path / "parameters.csv")}
+    assert float(rows["f0_2"]["std"]) == np.inf
+    listed = json.loads((tmp_path / "parameters.json").read_text())["parameters"]
+    assert {p["name"] for p in listed if not p["determined"]} == set(arm.estimate.undetermined)
+
+
+def test_a_joint_that_never_moved_does_not_disturb_the_others() -> None:
+    arm = identified_arm(TWO_LINK, still=(1,))
+    consistent = arm.consistency.consistent
+    known = np.isfinite(arm.estimate.std)
+    assert np.all(np.abs(consistent.shift[known]) < 1.0)
+    assert np.abs(consistent.standard).max() < 100.0

@@ -1,0 +1,77 @@
+"""Robot descriptions and bodies for tests of the model."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from identification.pseudo_inertia import Body, inertial_parameters
+
+Array = NDArray[np.float64]
+
+
+def robot_text(path: str) -> str:
+    try:
+        package = distribution("example-robot-data")
+    except PackageNotFoundError:
+        pytest.skip("the example-robot-data package is not installed")
+    root = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
+    return (root / path).read_text(encoding="utf-8")
+
+
+def random_urdf(seed: int, n_joints: int = 7) -> str:
+    """A random tree: any axis, any placement, all four kinds of joint that are allowed."""
+    random = np.random.default_rng(seed)
+    parts = ['<robot name="random"><link name="l0"/>']
+
+    def numbers(*values: float) -> str:
+        return " ".join(f"{value:.6f}" for value in values)
+
+    for i in range(1, n_joints + 1):
+        kind = random.choice(
+            ["revolute", "prismatic", "continuous", "fixed"], p=[0.4, 0.3, 0.2, 0.1]
+        )
+        if i == 1:
+            kind = "revolute"
+        parent = int(random.integers(max(0, i - 3), i))  # branches now and then
+        half = random.normal(size=(3, 3))
+        inertia = half @ half.T + np.eye(3)
+        axis = np.eye(3)[random.integers(3)] if random.random() < 0.5 else random.normal(size=3)
+        parts.append(
+            f'<link name="l{i}"><inertial><origin xyz="{numbers(*random.normal(size=3))}"/>'
+            f'<mass value="{random.uniform(1, 5):.6f}"/><inertia ixx="{inertia[0, 0]}" '
+            f'ixy="{inertia[0, 1]}" ixz="{inertia[0, 2]}" iyy="{inertia[1, 1]}" '
+            f'iyz="{inertia[1, 2]}" izz="{inertia[2, 2]}"/></inertial></link>'
+            f'<joint name="j{i}" type="{kind}"><parent link="l{parent}"/><child link="l{i}"/>'
+            f'<origin xyz="{numbers(*random.normal(size=3))}" '
+            f'rpy="{numbers(*random.normal(size=3))}"/>'
+            f'<axis xyz="{numbers(*axis)}"/>'
+            '<limit lower="-9" upper="9" effort="9" velocity="9"/></joint>'
+        )
+    return "".join(parts) + "</robot>"
+
+
+def one_joint(kind: str, axis: str = "0 0 1") -> str:
+    return (
+        '<robot name="r"><link name="a"/><link name="b"><inertial><mass value="2"/>'
+        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+        f'<joint name="strange" type="{kind}"><parent link="a"/><child link="b"/>'
+        f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+
+
+def some_bodies(n: int, seed: int = 0) -> Array:
+    """Possible standard parameters that have nothing to do with the robot, rotors last."""
+    rng = np.random.default_rng(seed)
+    standard = np.empty((n, 11))
+    for row in standard:
+        points, mass = rng.normal(scale=0.1, size=(9, 3)), rng.uniform(0.5, 20.0)
+        spread = np.cov(points.T) * mass
+        tensor = np.trace(spread) * np.eye(3) - spread
+        row[:10] = inertial_parameters(Body(mass, rng.normal(scale=0.2, size=3), tensor))
+        row[10] = rng.uniform(0.0, 1.0)
+    return standard.reshape(-1)

@@ -1,0 +1,105 @@
+"""A wrong torque constant shows beside the nominal inertias, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from identification import RobotModel
+from identification.friction import FrictionLaw
+from identification.nominal_scale import nominal_scale
+from identification.preprocessing import Samples
+from tests.hil.identified_arm import a_motion, packaged_urdf
+
+Array = NDArray[np.float64]
+AXES = range(1, 4)  # of the UR5, whose weight and inertia stand out of their friction
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return RobotModel.from_urdf(packaged_urdf("ur5_robot.urdf"), friction=FrictionLaw(offset=True))
+
+
+def standard(model: RobotModel, wrong: float, seed: int) -> Array:
+    """Nominal parameters with every link off by its own share, and rotors."""
+    values = model.nominal.copy()
+    rng = np.random.default_rng(seed)
+    for link in range(model.n_joints):
+        rows = model.layout.links[link]
+        values[rows] *= 1.0 + wrong * rng.uniform(-1.0, 1.0)
+    values[model.layout.rotors] = 0.2
+    return values
+
+
+def runs(model: RobotModel, values: Array, seed: int) -> list[Samples]:
+    friction = [{"f0": 3.0, "f1": 2.0, "fo": 0.2}.get(t.symbol, 0.3) for t in model.friction.terms]
+    truth = np.concatenate([model.base.grouping @ values, friction])
+    found = []
+    for number in range(2):
+        motion = a_motion(model.n_joints, 10 * seed + number)
+        torque = model.torque(truth, *motion[1:])
+        torque += (
+            0.02 * torque.std(axis=0) * np.random.default_rng(seed).standard_normal(torque.shape)
+        )
+        found.append(
+            Samples(
+                motion=motion,
+                torque=torque,
+                usable=model.moving(motion.velocity),
+                segments=(slice(0, len(motion.time)),),
+                origin=0.0,
+                position_bandwidth=np.full(model.n_joints, np.inf),
+            )
+        )
+    return found
+
+
+def nominal(model: RobotModel) -> Array:
+    friction = np.zeros(model.n_parameters - model.base.rank)
+    return np.concatenate([model.base.grouping @ model.nominal, friction])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_links_that_are_off_by_a_tenth_raise_no_doubt(model: RobotModel, seed: int) -> None:
+    found = nominal_scale(model, nominal(model), runs(model, standard(model, 0.1, seed), seed))
+    assert np.isfinite(found.scale[2])
+    assert found.findings() == []
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("factor", [0.6, 1.5])
+def test_a_wrong_torque_constant_is_told_by_axis_and_factor(
+    model: RobotModel, axis: int, factor: float
+) -> None:
+    scaled = []
+    for run in runs(model, standard(model, 0.05, axis), axis):
+        torque = run.torque.copy()
+        torque[:, axis] *= factor
+        scaled.append(replace(run, torque=torque))
+    found = nominal_scale(model, nominal(model), scaled)
+    assert found.off.tolist() == [axis]
+    assert found.scale[axis] == pytest.approx(factor, rel=0.1)
+    (finding,) = found.findings()
+    name = model.joint_names[axis]
+    assert finding.level == "doubtful" and name in finding.words and name in finding.next_step
+
+
+def test_of_a_urdf_without_masses_nothing_is_said(model: RobotModel) -> None:
+    zero = np.zeros(model.n_parameters)
+    found = nominal_scale(model, zero, runs(model, standard(model, 0.0, 1), 1))
+    assert np.isnan(found.scale).all() and found.findings() == []
+
+
+@pytest.mark.parametrize("factor", [0.01, 1000.0])
+def test_torques_of_another_unit_or_of_the_motors_leave_no_model_to_rely_on(
+    model: RobotModel, factor: float
+) -> None:
+    scaled = [
+        replace(run, torque=factor * run.torque) for run in runs(model, standard(model, 0.05, 1), 1)
+    ]
+    (finding,) = nominal_scale(model, nominal(model), scaled).findings()
+    assert finding.level == "wrong"
+    assert "unit" in finding.next_step and "side" in finding.next_step

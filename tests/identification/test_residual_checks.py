@@ -1,0 +1,240 @@
+"""Checks of the residual speak up for what was planted, and keep still for coloured noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from identification.autocorrelation import autocorrelation
+from identification.errors import IdentificationError
+from identification.friction import FrictionLaw
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.preprocessing import Samples
+from identification.residual_blocks import FEWEST_BLOCKS, BlockSums
+from identification.residual_checks import ResidualChecks, check_residuals
+from identification.ripple import HARMONICS
+
+Array = NDArray[np.float64]
+Disturbance = Callable[[Motion, int], Array]
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+STEP = 4e-3
+GEAR = np.diag([100.0, -80.0])
+NOISE = 0.5
+MEMORY = 0.05  # s, of the coloured noise
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
+
+
+def values_of(model: RobotModel) -> Array:
+    return np.concatenate([model.base.grouping @ model.nominal, [4.0, 2.0, 1.5, 0.8]])
+
+
+def coloured(rng: np.random.Generator, shape: tuple[int, ...], memory: float = MEMORY) -> Array:
+    """First-order noise of unit variance that is correlated over `memory` seconds."""
+    decay = np.exp(-STEP / memory)
+    white = np.sqrt(1.0 - decay**2) * rng.standard_normal(shape)
+    return np.asarray(lfilter([1.0], [1.0, -decay], white, axis=0))
+
+
+def a_run(
+    model: RobotModel,
+    seed: int,
+    disturbance: Disturbance | None = None,
+    *,
+    duration: float = 12.0,
+    noise: float = NOISE,
+) -> Samples:
+    time = np.arange(round(duration / STEP)) * STEP
+    rng = np.random.default_rng(seed)
+    amplitude, rate = rng.uniform(0.3, 0.9, (3, 2)), rng.uniform(0.7, 3.0, (3, 2))
+    angle = rate * time[:, None, None] + rng.uniform(0.0, 6.0, (3, 2))
+    motion = Motion(
+        time,
+        (amplitude * np.sin(angle)).sum(axis=1),
+        (amplitude * rate * np.cos(angle)).sum(axis=1),
+        (-amplitude * rate**2 * np.sin(angle)).sum(axis=1),
+    )
+    torque = model.torque(values_of(model), *motion[1:])
+    torque = torque + noise * coloured(rng, torque.shape)
+    if disturbance is not None:
+        torque = torque + disturbance(motion, seed)
+    return Samples(
+        motion=motion,
+        torque=torque,
+        usable=model.moving(motion.velocity),
+        segments=(slice(0, len(time)),),
+        origin=0.0,
+        position_bandwidth=np.full(2, np.inf),
+    )
+
+
+def checked(
+    model: RobotModel,
+    disturbance: Disturbance | None = None,
+    *,
+    first_seed: int = 0,
+    noise: float = NOISE,
+) -> ResidualChecks:
+    runs = [a_run(model, first_seed + k, disturbance, noise=noise) for k in range(6)]
+    return check_residuals(model, values_of(model), runs[:5], runs[5:], motor_from_joint=GEAR)
+
+
+def test_coloured_noise_alone_raises_no_alarm(model: RobotModel) -> None:
+    alarms = np.zeros(4)
+    campaigns = 25
+    for campaign in range(campaigns):
+        checks = checked(model, first_seed=100 * campaign)
+        assert checks.ripple is not None and checks.drift is not None
+        for k, check in enumerate((checks.speed, checks.position, checks.ripple, checks.drift)):
+            alarms[k] += np.count_nonzero(check.significant)
+    # 50 joints at a chance of 0.001 each; two alarms would have a chance of 0.1 %.
+    assert (alarms <= 1).all(), alarms
+
+
+def test_friction_of_another_form_shows_over_speed_of_its_joint_only(
+    model: RobotModel,
+) -> None:
+    def stribeck(motion: Motion, _: int) -> Array:
+        extra = 1.0 * np.sign(motion.velocity) * np.exp(-((motion.velocity / 0.5) ** 2))
+        return np.asarray(extra * np.array([0.0, 1.0]))
+
+    checks = checked(model, stribeck)
+    assert checks.speed.significant.tolist() == [False, True]
+    at, size = checks.speed.worst(1)
+    assert abs(at) < 0.6 and np.sign(size) == np.sign(at)
+
+
+def test_a_pull_that_depends_on_posture_shows_over_position(model: RobotModel) -> None:
+    checks = checked(model, lambda motion, _: 0.6 * np.cos(3.0 * motion.position) * [1.0, 0.0])
+    assert checks.position.significant.tolist() == [True, False]
+    # RMS of the planted wave, to within what binning and its own noise take off.
+    assert checks.position.rms[0] == pytest.approx(0.6 / np.sqrt(2.0), rel=0.25)
+
+
+@pytest.mark.parametrize("harmonic", HARMONICS)
+def test_ripple_is_found_with_its_harmonic_and_amplitude(model: RobotModel, harmonic: int) -> None:
+    planted = np.array([0.0, 0.4])
+
+    def ripple(motion: Motion, _: int) -> Array:
+        return np.asarray(planted * np.sin(harmonic * motion.position @ GEAR.T + 0.7))
+
+    found = checked(model, ripple).ripple
+    assert found is not None
+    assert found.significant.tolist() == [False, True]
+    assert found.strongest(1) == harmonic
+    amplitude = found.amplitude[1, HARMONICS.index(harmonic)]
+    assert amplitude == pytest.approx(0.4, abs=0.05)
+    assert found.rms[1] == pytest.approx(0.4 / np.sqrt(2.0), abs=0.05)
+
+
+def test_without_a_gear_ratio_there_is_no_ripple_to_look_for(model: RobotModel) -> None:
+    assert check_residuals(model, values_of(model), [a_run(model, 1)]).ripple is None
+
+
+def test_friction_that_falls_from_run_to_run_is_found_with_its_size(
+    model: RobotModel,
+) -> None:
+    friction = np.where(model.friction_columns, values_of(model), 0.0)
+
+    def cooling(motion: Motion, seed: int) -> Array:
+        # Five fitted recordings, seeds 0 to 4: from +4 % to -4 % of the second joint's friction.
+        change = 0.04 - 0.02 * seed
+        return np.asarray(change * model.torque(friction, *motion[1:]) * np.array([0.0, 1.0]))
+
+    drift = checked(model, cooling, noise=0.1).drift
+    assert drift is not None and drift.pieces == 15
+    assert drift.significant.tolist() == [False, True]
+    assert drift.change[1] == pytest.approx(-0.08, abs=4.0 * drift.change_std[1])
+    assert drift.change_std[1] < 0.02
+
+
+def test_one_recording_is_cut_so_that_drift_can_be_seen(model: RobotModel) -> None:
+    drift = check_residuals(model, values_of(model), [a_run(model, 1, duration=30.0)]).drift
+    assert drift is not None and drift.pieces >= 4
+
+
+def test_no_recording_is_an_error(model: RobotModel) -> None:
+    with pytest.raises(IdentificationError, match="no recording"):
+        check_residuals(model, values_of(model), [])
+
+
+def test_samples_of_white_noise_are_worth_what_they_are() -> None:
+    rng = np.random.default_rng(1)
+    residual = rng.standard_normal((20000, 3))
+    found = autocorrelation([(residual, np.ones(residual.shape, dtype=bool))], STEP)
+    np.testing.assert_allclose(found.effective_rows, 20000, rtol=0.1)
+
+
+@pytest.mark.parametrize("memory", [0.01, 0.05])
+def test_the_memory_of_coloured_noise_is_that_of_theory(memory: float) -> None:
+    rng = np.random.default_rng(2)
+    residual = coloured(rng, (200_000, 2), memory)
+    found = autocorrelation([(residual, np.ones(residual.shape, dtype=bool))], STEP)
+    decay = np.exp(-STEP / memory)
+    expected = 0.5 * STEP * (1.0 + decay) / (1.0 - decay)
+    np.testing.assert_allclose(found.time, expected, rtol=0.15)
+
+
+@given(st.integers(20, 60), st.integers(0, 2**32 - 1), st.integers(1, 3))
+@settings(max_examples=25, deadline=None)
+def test_the_autocorrelation_is_that_of_counting_pairs(rows: int, seed: int, runs: int) -> None:
+    rng = np.random.default_rng(seed)
+    parts = [(rng.standard_normal((rows, 2)), rng.random((rows, 2)) > 0.3) for _ in range(runs)]
+    found = autocorrelation(parts, STEP, longest=10 * STEP)
+    for joint in range(2):
+        covariance = []
+        for lag in range(11):
+            products = [
+                residual[t, joint] * residual[t + lag, joint]
+                for residual, usable in parts
+                for t in range(rows - lag)
+                if usable[t, joint] and usable[t + lag, joint]
+            ]
+            covariance.append(np.sum(products) / max(len(products), 1))
+        if covariance[0] > 0.0:
+            expected = np.array(covariance) / covariance[0]
+            np.testing.assert_allclose(found.correlation[:, joint], expected, atol=1e-9)
+
+
+def test_block_means_cover_the_truth_where_samples_taken_as_independent_do_not() -> None:
+    blocks, per_block, seeds = 60, 125, 400
+    inside, naive = 0, 0
+    for seed in range(seeds):
+        noise = coloured(np.random.default_rng(seed), (blocks * per_block,))
+        sums = BlockSums(
+            noise.reshape(blocks, per_block).sum(axis=1, keepdims=True),
+            np.full((blocks, 1), float(per_block)),
+        )
+        found = sums.mean()
+        inside += abs(found.mean[0]) < 1.96 * found.std[0]
+        naive += abs(noise.mean()) < 1.96 * noise.std() / np.sqrt(len(noise))
+    assert 0.90 < inside / seeds < 0.98
+    assert naive / seeds < 0.6
+
+
+def test_repetitions_of_one_motion_do_not_make_its_errors_more_certain() -> None:
+    rng = np.random.default_rng(3)
+    repeated = BlockSums(rng.standard_normal((40, 1)), np.ones((40, 1)))
+    once = repeated.mean()
+    thrice = repeated.plus(repeated, same_motion=True).plus(repeated, same_motion=True).mean()
+    other = repeated.plus(repeated, same_motion=False).plus(repeated, same_motion=False).mean()
+    assert thrice.mean[0] == pytest.approx(once.mean[0])
+    assert thrice.std[0] == pytest.approx(once.std[0])
+    assert other.std[0] == pytest.approx(once.std[0] / np.sqrt(3.0), rel=0.02)
+
+
+def test_too_few_blocks_give_no_mean() -> None:
+    few = BlockSums(np.ones((FEWEST_BLOCKS - 1, 1)), np.ones((FEWEST_BLOCKS - 1, 1)))
+    assert np.isnan(few.mean().mean).all()

@@ -1,0 +1,68 @@
+"""A planted arm of two links, a motion of it, and recordings with noise whose truth is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from identification.friction import FrictionLaw
+from identification.model import RobotModel
+from identification.motion import Motion
+from identification.preprocessing import Samples
+
+Array = NDArray[np.float64]
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
+P = MODEL.n_parameters
+NOISE = np.array([3.0, 0.2])
+"""Standard deviation of the torque noise of each joint [N·m]."""
+
+
+def truth() -> Array:
+    """The planted parameters (p,)."""
+    standard = MODEL.nominal.copy()
+    standard[[10, 21]] = 0.4, 0.1  # rotors
+    return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
+
+
+def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
+    """Four sines for each joint."""
+    time = np.arange(0.0, duration, step)
+    rng = np.random.default_rng(12)
+    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
+    angle = w * time[:, None, None] + phase
+    return Motion(
+        time,
+        (a * np.sin(angle)).sum(axis=1),
+        (a * w * np.cos(angle)).sum(axis=1),
+        (-a * w**2 * np.sin(angle)).sum(axis=1),
+    )
+
+
+def recording(error: Array, motion: Motion) -> Samples:
+    """What the planted arm's torques were in a motion, with an error (m, 2) [N·m]."""
+    return Samples(
+        motion=motion,
+        torque=MODEL.torque(truth(), *motion[1:]) + error,
+        usable=MODEL.moving(motion.velocity),
+        segments=(slice(0, len(motion.time)),),
+        origin=float(motion.time[0]),
+        position_bandwidth=np.full(2, np.inf),
+    )
+
+
+def gaussian(rng: np.random.Generator, motion: Motion) -> Array:
+    """White noise of standard deviation NOISE."""
+    return NOISE * rng.standard_normal((len(motion.time), 2))
+
+
+def coloured(rng: np.random.Generator, length: int, step: float, correlation: float) -> Array:
+    """First-order noise of standard deviation NOISE, correlated over a time [s]; 0 for white."""
+    r = np.exp(-step / correlation) if correlation else 0.0
+    start = rng.standard_normal((1, 2)) * r
+    white = np.sqrt(1.0 - r**2) * rng.standard_normal((length, 2))
+    return NOISE * lfilter([1.0], [1.0, -r], white, axis=0, zi=start)[0]
