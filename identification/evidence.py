@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from identification.carried_load import CarriedLoad, find_load
 from identification.delay import DelayEstimate
-from identification.directions import MOST_RECORDINGS
 from identification.errors import IdentificationError
 from identification.estimation import Estimate, total
 from identification.excitation.criteria import (
@@ -31,7 +30,7 @@ from identification.repeatability import Repeatability, repeatability
 from identification.repetitions import RepeatedEstimate
 from identification.residual_checks import ResidualChecks, check_residuals
 from identification.standard_gram import StandardGram, gravity_loads
-from identification.turned_axes import Turned, compare_turned
+from identification.turned_axes import MOST_RECORDINGS, Turned, compare_turned
 from identification.validation import (
     PredictionError,
     over_all,

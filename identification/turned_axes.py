@@ -1,6 +1,11 @@
 """Whether turning an axis of a recording round makes it fit better, beyond chance.
 
-See :mod:`identification.directions` for why that is tried. A single ratio of errors can fall below
+A gear ratio with the wrong sign turns an axis' measured position and torque at once. Its own
+friction and inertia keep their signs, and only what couples it to the other axes is wrong: too
+little to stand out for the first axis of an arm, which is nearly its own mirror image. But the
+right hypothesis then fits better than the wrong one, and that can be tried.
+
+A single ratio of errors can fall below
 any threshold on a weak motion; here it is taken block by block of time, which gives it a standard
 error.
 """
@@ -8,26 +13,40 @@ error.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.directions import MOST_RECORDINGS, turned
 from identification.estimation import estimate, joint_weights, total
 from identification.model import RobotModel
+from identification.motion import Motion
 from identification.preprocessing import Samples
 from identification.residual_blocks import block_index
 from identification.validation import residual
 
 Array = NDArray[np.float64]
 
+# A few recordings of each kind decide as well as all.
+MOST_RECORDINGS: Final = 3
 # Standard errors that make a difference between two hypotheses one.
 SIGMAS: Final = 3.0
 # Blocks of time that a comparison needs, and samples of a joint that a block needs.
 _FEWEST_BLOCKS: Final = 6
 _FEWEST_ROWS: Final = 10
+
+
+def turned(samples: Samples, joint: int) -> Samples:
+    """Return samples as they would be if one joint counted the other way round."""
+    sign = np.ones(samples.torque.shape[1])
+    sign[joint] = -1.0
+    motion = samples.motion
+    return replace(
+        samples,
+        motion=Motion(motion.time, *(part * sign for part in motion[1:])),
+        torque=samples.torque * sign,
+    )
 
 
 @dataclass(frozen=True, eq=False)

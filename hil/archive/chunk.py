@@ -205,10 +205,6 @@ def _bounds(chunk: bytes, at: int, offset: int) -> tuple[int, int]:
     return opcode, end
 
 
-def _word(head: bytes, at: int) -> int:
-    return int.from_bytes(head[at : at + _WORD.itemsize], "little")
-
-
 def _append(
     found: dict[int, Messages], channel: int, data: Bytes, sequence: NDArray[np.uint32]
 ) -> None:

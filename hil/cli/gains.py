@@ -77,7 +77,7 @@ def gains(
     """Find the torque constant of every motor, from recordings with and without a known payload.
 
     Prints TOML to paste into a cell or a column map, with 95 % intervals. A motor whose constant
-    the data cannot determine is named, and gets no number: exit status 5.
+    the data cannot determine is named, and gets "nan", which neither accepts: exit status 5.
     """
     methods: dict[str, GainMethod] = {"weighted": "weighted", "total": "total"}
     if method not in methods:
@@ -154,7 +154,8 @@ def _as_toml(found: GainsFound) -> str:
             half = gains.interval_factor * gains.std[motor]
             lines.append(f"    {gains.values[motor]:.6g},  # {name} ± {half:.2g}")
         else:
-            lines.append(f"    # {name}: not determined; {reason}")
+            # Keeps its place in the list; a cell or map that it is pasted into refuses it by name.
+            lines.append(f"    nan,  # {name}: not determined; {reason}")
     return "\n".join([*lines, "]"])
 
 

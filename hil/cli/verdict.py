@@ -9,8 +9,7 @@ from typing import Final
 
 import typer
 
-from hil.judgement import JointJudgement
-from hil.results import Results
+from hil.results import JointJudgement, Results
 
 NOT_GOOD = 5
 """Exit status of a command whose model is not good."""

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.extras_results import ExportResult
-from hil.results import Results
+from hil.results import ExportResult, Results
 from identification import Estimate, IdentificationError, RobotModel
 from identification.consistent import ConsistentEstimate
 from identification.friction_text import friction_in_words, friction_source

@@ -23,6 +23,7 @@ from identification.recording import Recording, RecordingError
 from identification.resampling import without_repeats
 
 from .currents import motor_from_joint
+from .prepared import current_limit
 from .sources import cell_of, useful_part
 
 Array = NDArray[np.float64]
@@ -86,7 +87,15 @@ def find_gains(
             if first is None:
                 first = cell, replace(cell.model, payload=None), turns
             _refuse_stranger(archive, cell, turns, first)
-            factor = _factor(archive, first[1], recording, payload, turns, _delay(cell, delay))
+            factor = _factor(
+                archive,
+                first[1],
+                recording,
+                payload,
+                turns,
+                delay=_delay(cell, delay),
+                limit=current_limit(cell),
+            )
             total = factor if total is None else total + factor
             loads[path.name] = payload
             task.advance(1, path.name)
@@ -139,7 +148,9 @@ def _factor(
     recording: Recording,
     payload: Payload | None,
     turns: Array,
+    *,
     delay: float,
+    limit: Array | None,
 ) -> GainFactor:
     current = recording.motor_current
     assert current is not None
@@ -147,7 +158,9 @@ def _factor(
     bare = replace(recording, torque=np.zeros_like(current))
     try:
         single = without_repeats(bare)
-        samples = prepare(single, model, options=Preprocessing(torque_delay=delay))
+        samples = prepare(
+            single, model, options=Preprocessing(torque_delay=delay), current_limit=limit
+        )
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
     assert single.motor_current is not None

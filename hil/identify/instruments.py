@@ -15,9 +15,9 @@ from identification.estimation import Estimate
 from identification.instrument_factor import InstrumentFactor
 from identification.instrument_motion import planned_motion, same_plan
 from identification.instrumental import InstrumentalEstimate, estimate_instrumental
-from identification.preprocessing import Samples, prepare
+from identification.preprocessing import Samples
 
-from .prepared import Prepared
+from .prepared import Prepared, samples_of
 
 # Hz. A narrower smoother takes part of the motion out of the regressor, which instruments cannot
 # mend. On simulated NS 16 logs with a hundred to a thousand times the encoders' noise, instrumental
@@ -55,17 +55,11 @@ class InstrumentalFit:
 def widely_smoothed(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...]:
     """What is fitted, smoothed no narrower than `NARROWEST`, however noisy the positions are."""
     how = replace(prepared.preprocessing, rigid_bandwidth=NARROWEST)
+    noiseless = replace(prepared.sources, noise_variance=np.zeros(model.n_joints))
     return tuple(
         samples
         if float(samples.position_bandwidth.min()) >= NARROWEST
-        else prepare(
-            source.recording,
-            model,
-            noise_variance=np.zeros(model.n_joints),
-            torque_variance=prepared.sources.torque_variance,
-            options=how,
-            origin=source.origin,
-        )
+        else samples_of(source, noiseless, how)
         for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True)
     )
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.judgement import FindingResult, JointJudgement, JudgementResult, ProfileResult
+from hil.results import FindingResult, JointJudgement, JudgementResult, ProfileResult
 from identification.errors import IdentificationError
 from identification.evidence import Evidence
 from identification.residual_profile import Profile

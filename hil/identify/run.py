@@ -24,8 +24,9 @@ from identification.repetitions import RepeatedEstimate
 from identification.validation import for_figure
 from identification.verdict import Verdict, judge
 
+from .consistency import consistency_doubts, consistency_of, consistency_reasons
+from .essential import essential_doubts, essential_of
 from .estimating import Estimation, estimate_with
-from .extras import consistency_of, essential_of, extras_doubts, extras_reasons
 from .judging import judgement_result
 from .options import Options
 from .prepared import Prepared, prepare_sources
@@ -152,7 +153,7 @@ def _judged(
             essential = essential_of(cell.model, result.phase, estimation.held_out)
         task.advance(1, "verdict")
         sources = prepared.sources
-        for doubt in extras_doubts(essential, consistency):
+        for doubt in (*consistency_doubts(consistency), *essential_doubts(essential)):
             sources = sources.with_doubt(doubt)
         nominal = nominal_of(cell)
         evidence = gather(
@@ -165,7 +166,7 @@ def _judged(
             surroundings=surroundings_of(paths, prepared, result.pooled),
             in_sample=sources.in_sample,
         )
-        impossible = (*evidence.implausible.impossible, *extras_reasons(consistency))
+        impossible = (*evidence.implausible.impossible, *consistency_reasons(consistency))
         evidence = replace(
             evidence, implausible=evidence.implausible._replace(impossible=impossible)
         )

@@ -44,9 +44,10 @@ from identification.verdict import Verdict
 from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, urdf_text
 
+from .consistency import consistency_result
+from .essential import essential_result
 from .estimating import Estimation
 from .estimation_summary import endogeneity_result, estimator_result, uncertainty_result
-from .extras import consistency_result, essential_result
 from .prepared import Prepared
 from .sources import Source, Sources
 

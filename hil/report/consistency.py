@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from hil.extras_results import ConsistencyResult
 from hil.report import numbers
 from hil.report.figures.consistency import shift_panels
-from hil.results import Results
+from hil.results import ConsistencyResult, Results
 
 _AT_EDGE: Final = 0.01
 

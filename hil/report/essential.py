@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final
 
-from hil.extras_results import BlindResult, EssentialResult
 from hil.report import numbers
 from hil.report.figures.elimination import elimination_panels
-from hil.results import ParameterResult, Results
+from hil.results import BlindResult, EssentialResult, ParameterResult, Results
 
 _WELL: Final = 0.1
 _ROUGHLY: Final = 0.5

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hil.judgement import JointJudgement, JudgementResult
 from hil.report import numbers
 from hil.report.figures.residuals import (
     autocorrelation_panels,
@@ -14,7 +13,7 @@ from hil.report.figures.residuals import (
     position_panels,
     speed_panels,
 )
-from hil.results import Results
+from hil.results import JointJudgement, JudgementResult, Results
 
 _ORDER = ("wrong", "doubtful", "information", "good")
 

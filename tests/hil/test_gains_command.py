@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from hil.cli import app
 from hil.errors import InputError
 from hil.importers import ColumnMap, Robot, import_log
+from hil.importers.column_map import Drive
 from identification import FrictionLaw
 from tests.hil.simulated_logs import Simulated, simulate
 
@@ -98,9 +100,12 @@ def test_an_axis_parallel_to_gravity_is_named_and_gets_no_number(tmp_path: Path)
         archive(tmp_path, name, replace(slow, torque=slow.torque + noise))
     status, text = run(tmp_path, "empty.mcap", *BOTH, "-q")
     assert status == 5
-    assert "# shoulder_pan_joint: not determined; " in text
+    assert "nan,  # shoulder_pan_joint: not determined; " in text
     assert "shoulder_lift_joint ±" in text
-    assert len(tomllib.loads(text)["torque_constant"]) < len(CONSTANTS)
+    pasted = tomllib.loads(text)["torque_constant"]
+    assert len(pasted) == len(CONSTANTS)
+    with pytest.raises(ValidationError, match="torque_constant"):
+        Drive(torque_constant=pasted)
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,9 @@ from hil.identify.controller_model import controller_error
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.surroundings import torque_limits
-from hil.judgement import JudgementResult
 from hil.progress import Silent
 from hil.report.verdict import verdict_context
+from hil.results import JudgementResult
 
 TWO_LINK = Path(__file__).parents[1] / "identification" / "two_link.urdf"
 _REST = ("explains", "nominal", "controller")

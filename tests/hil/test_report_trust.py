@@ -8,17 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.extras_results import BlindResult, ConsistencyResult, EssentialResult
-from hil.identify.extras import (
-    consistency_result,
-    essential_result,
-    extras_doubts,
-    extras_reasons,
-)
+from hil.identify.consistency import consistency_doubts, consistency_reasons, consistency_result
+from hil.identify.essential import essential_doubts, essential_result
 from hil.report import consistency, essential
 from hil.report.figures.elimination import elimination_panels
 from hil.report.page import _environment, _Numbering
-from hil.results import ParameterResult
+from hil.results import BlindResult, ConsistencyResult, EssentialResult, ParameterResult
 
 from .identified_arm import IdentifiedArm, identified_arm
 from .test_exports import TWO_LINK
@@ -198,8 +193,8 @@ def test_names_of_joints_are_text_and_nothing_else(arm: IdentifiedArm) -> None:
 
 
 def test_a_machine_is_no_reason_and_no_doubt(arm: IdentifiedArm) -> None:
-    assert extras_reasons(arm.consistency) == ()
-    assert extras_doubts(arm.essential, arm.consistency) == ()
-    doubts = extras_doubts("no motion", "the solver gave up")
+    assert consistency_reasons(arm.consistency) == ()
+    assert (*essential_doubts(arm.essential), *consistency_doubts(arm.consistency)) == ()
+    doubts = (*consistency_doubts("the solver gave up"), *essential_doubts("no motion"))
     assert len(doubts) == 2
     assert "the solver gave up" in doubts[0]

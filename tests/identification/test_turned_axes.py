@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.directions import turned
 from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from identification.motion import Motion
 from identification.preprocessing import Samples
-from identification.turned_axes import compare_turned
+from identification.turned_axes import compare_turned, turned
 
 Array = NDArray[np.float64]
 
@@ -71,3 +70,19 @@ def test_noise_that_drowns_the_torque_makes_no_joint_seem_turned(
             a_run(model, seed + 50, noise=500.0),
         )
         assert (compare_turned(model, [training], [held_out], 10.0).highest > 0.7).all()
+
+
+def test_turning_twice_changes_nothing(model: RobotModel) -> None:
+    run = a_run(model, 1)
+    back = turned(turned(run, 0), 0)
+    np.testing.assert_array_equal(back.torque, run.torque)
+    np.testing.assert_array_equal(back.motion.position, run.motion.position)
+
+
+def test_turning_leaves_power_and_the_other_joint_as_they_are(model: RobotModel) -> None:
+    run = a_run(model, 1)
+    other = turned(run, 0)
+    np.testing.assert_array_equal(other.torque[:, 1], run.torque[:, 1])
+    np.testing.assert_array_equal(
+        other.torque * other.motion.velocity, run.torque * run.motion.velocity
+    )

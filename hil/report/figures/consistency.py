@@ -6,13 +6,12 @@ import math
 
 from matplotlib.axes import Axes
 
-from hil.extras_results import ConsistencyResult
 from hil.report import numbers
 from hil.report.figures.canvas import TICK_SIZE, footed
 from hil.report.figures.palette import BAND, FIRST, INK, MUTED, OUTSIDE_3
 from hil.report.figures.parameters import groups, parameter_rows
 from hil.report.figures.svg import Panel, drawing, to_panel
-from hil.results import Results
+from hil.results import ConsistencyResult, Results
 
 _SMALLEST_REACH, _LARGEST_REACH = 4.0, 12.0
 _MOVED = 3.0

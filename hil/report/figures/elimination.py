@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from hil.extras_results import EliminationStepResult, EssentialResult
 from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, place, ruled
 from hil.report.figures.palette import FIRST, GRID, INK, MUTED, PAPER, SECOND
 from hil.report.figures.svg import Panel, drawing, to_panel
+from hil.results import EliminationStepResult, EssentialResult
 
 _WIDTH, _HEIGHT = 370.0, 250.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 12.0, 22.0, 42.0

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hil.judgement import JudgementResult, ProfileResult
 from hil.report import numbers
 from hil.report.figures.canvas import blank, footed, headed, place, ruled
 from hil.report.figures.palette import BAND, FIRST, MUTED, SECOND
 from hil.report.figures.svg import Panel, drawing, to_panel
+from hil.results import JudgementResult, ProfileResult
 
 _WIDTH, _HEIGHT = 370.0, 170.0
 _LEFT, _TOP, _RIGHT, _BOTTOM = 46.0, 20.0, 10.0, 40.0

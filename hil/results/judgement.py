@@ -7,14 +7,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from hil.results.frozen import Frozen
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
-
-
-class FindingResult(_Frozen):
+class FindingResult(Frozen):
     """One check and its outcome."""
 
     check: str
@@ -24,7 +20,7 @@ class FindingResult(_Frozen):
     """What to do about it; empty where nothing needs doing."""
 
 
-class JointJudgement(_Frozen):
+class JointJudgement(Frozen):
     """One joint on unseen motion; on that of the fit where `JudgementResult.in_sample`."""
 
     joint: str
@@ -54,7 +50,7 @@ class JointJudgement(_Frozen):
     """Standard deviation of that ratio over the postures."""
 
 
-class ProfileResult(_Frozen):
+class ProfileResult(Frozen):
     """Mean residual of one joint over bins of its speed or position, all recordings."""
 
     centre: list[float]
@@ -63,7 +59,7 @@ class ProfileResult(_Frozen):
     """Standard error that allows for the residual's correlation in time."""
 
 
-class JudgementResult(_Frozen):
+class JudgementResult(Frozen):
     """Every check, the figures per joint, and what the residual follows."""
 
     in_sample: bool = False

@@ -11,21 +11,20 @@ import json
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from hil.errors import InputError
-from hil.extras_results import ConsistencyResult, EssentialResult, ExportResult
 from hil.files import write_atomically
-from hil.judgement import JudgementResult
+from hil.results.consistency import ConsistencyResult
+from hil.results.essential import EssentialResult
+from hil.results.exports import ExportResult
+from hil.results.frozen import Frozen
+from hil.results.judgement import JudgementResult
 
 SCHEMA_VERSION = 2
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
-
-
-class CriteriaResult(_Frozen):
+class CriteriaResult(Frozen):
     """Excitation criteria of one trajectory (paper eqs. 5, 7, 9); log det in SI units."""
 
     log10_det: float
@@ -37,7 +36,7 @@ class CriteriaResult(_Frozen):
     scaled_condition: float | None
 
 
-class ExcitationResult(_Frozen):
+class ExcitationResult(Frozen):
     """The excitation: as planned, and as it was really executed (from the archives)."""
 
     method: str | None = None
@@ -51,7 +50,7 @@ class ExcitationResult(_Frozen):
     executed: CriteriaResult
 
 
-class ParameterResult(_Frozen):
+class ParameterResult(Frozen):
     """One parameter: pooled estimate, its standard deviation, and what it is compared with."""
 
     name: str
@@ -76,7 +75,7 @@ class ParameterResult(_Frozen):
     """Whether at least three quarters of what is known of it come from the data."""
 
 
-class ValidationResult(_Frozen):
+class ValidationResult(Frozen):
     """Torque prediction on one motion that was never used for fitting; lists are per joint."""
 
     archive: str
@@ -91,7 +90,7 @@ class ValidationResult(_Frozen):
     """The same over every row, standstill and the first and last rows included."""
 
 
-class FittedResult(_Frozen):
+class FittedResult(Frozen):
     """Torque error on the motion that was fitted, all recordings; lists are per joint."""
 
     relative_error: list[float]
@@ -117,7 +116,7 @@ class FittedResult(_Frozen):
         return text
 
 
-class DelaysResult(_Frozen):
+class DelaysResult(Frozen):
     """Delay of the torque behind the position; lists are per joint, s."""
 
     found: list[float | None]
@@ -128,7 +127,7 @@ class DelaysResult(_Frozen):
     """What the fit took it to be."""
 
 
-class CoverageResult(_Frozen):
+class CoverageResult(Frozen):
     """How many parameters lie within 2 and 3 standard deviations of the planted truth."""
 
     within_2: int
@@ -136,7 +135,7 @@ class CoverageResult(_Frozen):
     total: int
 
 
-class VerdictResult(_Frozen):
+class VerdictResult(Frozen):
     """Is the model good? One sentence, and the reasons."""
 
     good: bool
@@ -147,7 +146,7 @@ class VerdictResult(_Frozen):
     """What is not as it should be, but too small or too uncertain to say no."""
 
 
-class EstimatorResult(_Frozen):
+class EstimatorResult(Frozen):
     """How the parameters were estimated."""
 
     name: str
@@ -161,7 +160,7 @@ class EstimatorResult(_Frozen):
     """Why there are as many base parameters, in words."""
 
 
-class EndogeneityResult(_Frozen):
+class EndogeneityResult(Frozen):
     """Durbin-Wu-Hausman test: was least squares biased by noise in the regressor?"""
 
     sentence: str
@@ -177,7 +176,7 @@ class EndogeneityResult(_Frozen):
     """Least squares less instrumental variables, per parameter."""
 
 
-class UncertaintyResult(_Frozen):
+class UncertaintyResult(Frozen):
     """Standard deviation of each parameter by several routes."""
 
     reported: Literal[
@@ -199,7 +198,7 @@ class UncertaintyResult(_Frozen):
     posterior: list[float] | None = None
 
 
-class Results(_Frozen):
+class Results(Frozen):
     """One identification, whole."""
 
     schema_version: int = SCHEMA_VERSION

@@ -1,37 +1,17 @@
-"""Essential parameters and physical consistency of an estimate, as they go into a result."""
+"""The physical consistency of an estimate, as it goes into a result."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from hil.extras_results import (
-    BlindResult,
-    ConsistencyResult,
-    EliminationStepResult,
-    EssentialParameter,
-    EssentialResult,
-    LinkResult,
-)
+from hil.results import ConsistencyResult, LinkResult
 from identification import Factor, IdentificationError, RobotModel, estimate
 from identification.consistency_check import ConsistencyCheck, check_consistency
 from identification.consistent import Consistency
 from identification.consistent_program import link_parameters
 from identification.covariance import with_block_covariance
-from identification.essential_choice import EssentialChoice, choose_essential
 from identification.estimation import joint_weights
 from identification.phase_factor import PhaseFactor
-
-
-def essential_of(
-    model: RobotModel, training: PhaseFactor, held_out: Sequence[PhaseFactor]
-) -> EssentialChoice | str:
-    """The essential parameters; in words why there are none."""
-    try:
-        return choose_essential(model, training, held_out)
-    except IdentificationError as error:
-        return str(error)
 
 
 def consistency_of(
@@ -53,7 +33,7 @@ def consistency_of(
         return str(error)
 
 
-def extras_reasons(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
+def consistency_reasons(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
     """Why a model must not be relied on: no machine predicts what it predicts."""
     if isinstance(consistency, str) or not consistency.impossible:
         return ()
@@ -63,57 +43,12 @@ def extras_reasons(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
     )
 
 
-def extras_doubts(
-    essential: EssentialChoice | str, consistency: ConsistencyCheck | str
-) -> tuple[str, ...]:
-    """What a reader of the verdict must know of both."""
-    doubts = []
+def consistency_doubts(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
+    """What a reader of the verdict must know of it."""
     if isinstance(consistency, str):
-        doubts.append(f"no physically consistent parameters were found: {consistency}")
-    elif consistency.costly and not consistency.impossible:
-        doubts.append(consistency.sentence)
-    if isinstance(essential, str):
-        doubts.append(f"essential parameters were not looked for: {essential}")
-    return tuple(doubts)
-
-
-def essential_result(choice: EssentialChoice | str) -> EssentialResult | None:
-    """As it goes into `results.json`."""
-    if isinstance(choice, str):
-        return None
-    elimination, blind = choice.elimination, choice.blind
-    kept = elimination.estimate
-    return EssentialResult(
-        reason=elimination.reason,
-        cut=elimination.cut,
-        steps=[
-            EliminationStepResult(
-                removed=step.removed,
-                left=step.left,
-                spread=step.spread,
-                in_sample=step.in_sample,
-                held_out=step.held_out,
-                largest_relative_std=step.largest_relative_std,
-            )
-            for step in elimination.steps
-        ],
-        refused=list(elimination.refused),
-        parameters=[
-            EssentialParameter(name=name, unit=unit, estimate=value, std=std)
-            for name, unit, value, std in zip(
-                kept.names,
-                kept.units,
-                kept.values.tolist(),
-                kept.std.tolist(),
-                strict=True,
-            )
-        ],
-        by_spread_left=choice.by_spread.left,
-        by_spread_held_out=choice.by_spread.held_out,
-        blind=None
-        if blind is None
-        else BlindResult(left=blind.left, essential=blind.essential, full=blind.full),
-    )
+        return (f"no physically consistent parameters were found: {consistency}",)
+    costly = consistency.costly and not consistency.impossible
+    return (consistency.sentence,) if costly else ()
 
 
 def consistency_result(

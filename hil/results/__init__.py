@@ -1,0 +1,48 @@
+"""What an identification leaves behind, as plain numbers: `results.json`."""
+
+from .consistency import ConsistencyResult, LinkResult
+from .essential import BlindResult, EliminationStepResult, EssentialParameter, EssentialResult
+from .exports import ExportResult
+from .judgement import FindingResult, JointJudgement, JudgementResult, ProfileResult
+from .results import (
+    SCHEMA_VERSION,
+    CoverageResult,
+    CriteriaResult,
+    DelaysResult,
+    EndogeneityResult,
+    EstimatorResult,
+    ExcitationResult,
+    FittedResult,
+    ParameterResult,
+    Results,
+    UncertaintyResult,
+    ValidationResult,
+    VerdictResult,
+)
+
+__all__ = [
+    "BlindResult",
+    "ConsistencyResult",
+    "CoverageResult",
+    "CriteriaResult",
+    "DelaysResult",
+    "EliminationStepResult",
+    "EndogeneityResult",
+    "EssentialParameter",
+    "EssentialResult",
+    "EstimatorResult",
+    "ExcitationResult",
+    "ExportResult",
+    "FindingResult",
+    "FittedResult",
+    "JointJudgement",
+    "JudgementResult",
+    "LinkResult",
+    "ParameterResult",
+    "ProfileResult",
+    "Results",
+    "SCHEMA_VERSION",
+    "UncertaintyResult",
+    "ValidationResult",
+    "VerdictResult",
+]
