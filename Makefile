@@ -34,6 +34,7 @@ test-slow: $(STAMP)  ## the tests that take minutes
 
 bench: $(STAMP)  ## every benchmark that needs no data beside the project
 	$(BIN)/python -m benchmarks.regressor
+	$(BIN)/python -m benchmarks.identification
 	$(BIN)/python -m benchmarks.session
 	$(BIN)/python -m benchmarks.planner
 	$(BIN)/python -m benchmarks.design
