@@ -103,7 +103,8 @@ class Work:
         for one in failed:
             self._drop(one, self._unreadable(consulted(one.refs)))
         self._settle([one for one in failed if one.refs])
-        self.broken += [Broken(one.key.campaign, one.reason) for one in failed if one.reason]
+        self._settle_by_the_next(waiting)
+        self.broken += [Broken(one.key.campaign, one.reason) for one in waiting if one.reason]
         return [one for one in campaigns if one.settings is not None]
 
     def reduce(self, campaigns: Sequence[Campaign]) -> None:
@@ -143,6 +144,22 @@ class Work:
         if not self._workers.near:
             return self._far(one, next(self._far_sums))
         return Collected(self._bundle(one, refs) for refs in one.bundles)
+
+    def _settle_by_the_next(self, campaigns: Sequence[Campaign]) -> None:
+        """Where those consulted were broken and nothing is settled, ask the archives left."""
+        while True:
+            left = {
+                id(one): len(one.refs)
+                for one in campaigns
+                if one.settings is None and not one.reason and one.refs
+            }
+            if not left:
+                return
+            asked = [one for one in campaigns if id(one) in left]
+            self._settle(asked)
+            for one in asked:
+                if one.settings is None and len(one.refs) == left[id(one)]:
+                    one.reason = one.reason or "none of its archives says how it is to be read"
 
     def _settle(self, campaigns: Sequence[Campaign]) -> None:
         tasks = [

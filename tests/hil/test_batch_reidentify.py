@@ -259,6 +259,20 @@ def test_broken_archives_are_listed_and_cost_only_themselves(folder: Path) -> No
     np.testing.assert_allclose(result.repetitions[0].values, whole.repetitions[0].values, **EXACT)
 
 
+def test_a_broken_first_excitation_costs_only_itself(folder: Path) -> None:
+    (folder / "manifest.json").unlink()
+    first, *others = sorted((folder / "archives").glob("excitation*"))
+    damaged = bytearray(first.read_bytes())
+    middle = len(damaged) // 2
+    damaged[middle : middle + 2000] = bytes(2000)
+    first.write_bytes(damaged)
+
+    result = batch(folder, plan=Plan(keep=False))
+
+    assert [Path(one.path).name for one in result.broken] == [first.name]
+    assert len(result.repetitions) == len(others)
+
+
 def test_a_file_that_is_not_what_was_recorded_is_not_used(folder: Path) -> None:
     victim, other = sorted((folder / "archives").glob("excitation*"))[:2]
     shutil.copy(other, victim)
