@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import file_digest
 from pathlib import Path
@@ -28,7 +29,7 @@ _ARCHIVES: Final = "archives"  # folder of a campaign's archives
 _SETTLED: Final = 2_000_000_000
 """ns that a file must have been left alone before its time stamps are believed to tell of the next
 change: file systems count in steps, some of them of two seconds."""
-_NOTES: Final = 1
+_NOTES: Final = 2
 """Version of the notes on archives."""
 
 
@@ -55,6 +56,7 @@ class _Found(NamedTuple):
     number: int
     attempt: int
     outcome: str
+    record: str
     arm: str
     cell: str
     motion: str
@@ -95,6 +97,8 @@ def discover(
             raise
         except HilError as error:
             return Broken(place.location, str(error))
+        except Exception as error:  # whatever a stranger's file does costs that file alone
+            return Broken(place.location, f"cannot be read ({type(error).__name__}: {error})")
 
     found = []
     with (
@@ -195,7 +199,7 @@ def _inspected(place: _Place, path: Path, store: Store) -> _Found:
     if archive.damage is not None:
         raise TornError(place.location, str(archive.damage))
     kind = archive.kind
-    name = ArchiveName.parse(place.name)
+    index, attempt = _interval(archive.metadata, place.name)
     use = archive.metadata.get("use", "excitation") if kind == "imported" else kind
     arm = cell = ""
     if use in USES:
@@ -209,14 +213,24 @@ def _inspected(place: _Place, path: Path, store: Store) -> _Found:
         sha256=sha256,
         kind=kind,
         use=use,
-        number=0 if name is None else name.index,
-        attempt=0 if name is None else name.attempt,
+        number=index,
+        attempt=attempt,
         outcome=(archive.outcome or {}).get("outcome", "completed"),
+        record=text_digest(json.dumps(dict(archive.metadata), sort_keys=True)),
         arm=arm,
         cell=cell,
         motion="" if plan is None else text_digest(plan),
         when=archive.metadata.get("recorded_at", ""),
     )
+
+
+def _interval(metadata: Mapping[str, str], name: str) -> tuple[int, int]:
+    """Index and attempt: as the archive says, whatever its file is called now; else by its name."""
+    said = metadata.get("index", ""), metadata.get("attempt", "")
+    if all(text.isdecimal() for text in said):
+        return int(said[0]), int(said[1])
+    parsed = ArchiveName.parse(name)
+    return (0, 0) if parsed is None else (parsed.index, parsed.attempt)
 
 
 def _sorted_out(places: Sequence[_Place], found: Sequence[_Examined | Broken]) -> Discovery:
@@ -265,6 +279,10 @@ def _beside_the_point(
         return f"attempt {last} took its place"
     if found.sha256 in seen and found.use != "standstill":
         return f"holds the same as {seen[found.sha256]}"
+    if found.attempt:
+        first = seen.setdefault(f"{place.folder} {found.record}", place.name)
+        if first != place.name:
+            return f"is a copy of {first}, or was repaired from it"
     return ""
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hil.archive.repair import repair, repaired_name
 from hil.batch import factors
 from hil.batch.errors import NothingToFitError
 from hil.batch.local import LocalWorkers
@@ -271,6 +272,25 @@ def test_a_broken_first_excitation_costs_only_itself(folder: Path) -> None:
 
     assert [Path(one.path).name for one in result.broken] == [first.name]
     assert len(result.repetitions) == len(others)
+
+
+def test_a_repaired_copy_is_not_fitted_beside_its_original(folder: Path) -> None:
+    """One wrong bit in an index, which we do not need, makes the two files differ."""
+    (folder / "manifest.json").unlink()
+    whole = sorted((folder / "archives").glob("excitation*"))
+    data = bytearray(whole[0].read_bytes())
+    at = 8
+    while data[at] != 0x07:  # MessageIndex
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    data[at + 20] ^= 1
+    whole[0].write_bytes(data)
+    repair(whole[0])
+    assert repaired_name(whole[0]).read_bytes() != bytes(data)
+
+    result = batch(folder, plan=Plan(keep=False))
+
+    assert not result.broken
+    assert len(result.repetitions) == len(whole)
 
 
 def test_a_file_that_is_not_what_was_recorded_is_not_used(folder: Path) -> None:
