@@ -22,22 +22,22 @@ import json
 import resource
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hil.batch.local import LocalWorkers, Workers
+from hil.batch.local import LocalWorkers
 from hil.batch.on_workers import ArchiveTask, Summed, run_task
 from hil.batch.run import Plan, reidentify
-from hil.batch.tree import sum_tree
-from hil.batch.types import BatchResult, Broken
+from hil.batch.types import BatchResult
+from hil.batch.workers import Workers, summed
 from hil.progress import Silent
 
 T = TypeVar("T")
 S = TypeVar("S")
 
 
-class InThisProcess:
+class InThisProcess(Workers):
     """One core and no child: what the work itself takes."""
 
     near = True
@@ -49,26 +49,9 @@ class InThisProcess:
         *,
         done: Callable[[int], None] | None = None,
     ) -> list[Summed[T, S]]:
-        """See `hil.batch.local.Workers`."""
+        """See `hil.batch.workers.Workers`."""
         del done
-        found = []
-        for group in groups:
-            parts = [run_task(task) for task in group]
-            totals = [None if isinstance(part, Broken) else part.total for part in parts]
-            notes = tuple(part if isinstance(part, Broken) else part.note for part in parts)
-            found.append(Summed(sum_tree(totals, add), notes))
-        return found
-
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Callable[[int], None] | None = None,
-    ) -> Iterator[Summed[T, S]]:
-        """See `hil.batch.local.Workers`."""
-        for group in groups:
-            yield from self.sums([group], add, done=done)
+        return [summed([run_task(task) for task in group], add) for group in groups]
 
 
 def archives_to_estimate(paths: Sequence[Path]) -> float:

@@ -27,6 +27,7 @@ from hil.batch.on_workers import (
 )
 from hil.batch.tree import FAN_IN
 from hil.batch.types import Broken
+from hil.batch.workers import Workers
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -39,7 +40,7 @@ _AHEAD: Final = 4
 """Tasks given out per thread of the cluster: enough that none waits, few enough to keep in mind."""
 
 
-class DaskWorkers:
+class DaskWorkers(Workers):
     """The workers of a Dask cluster.
 
     Args:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Any, Final, Protocol, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from planner.children import map_in_children
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.isolation import PlanningChild
 
 from .on_workers import ArchiveTask, Part, Summed, run_task
-from .tree import sum_tree
 from .types import Broken
+from .workers import Workers, summed
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -22,38 +22,7 @@ TIMEOUT: Final = 300.0
 """Longest time for one task [s]."""
 
 
-class Workers(Protocol):
-    """Who does the work on archives.
-
-    Attributes:
-        near: whether files they write can be read here under the same names.
-    """
-
-    near: bool
-
-    def sums(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Callable[[int], None] | None = None,
-    ) -> list[Summed[T, S]]:
-        """Do the tasks, and add up what comes of those of each group, in `tree.sum_tree`'s order.
-
-        A task that ends its process or takes too long has a `Broken` in place of its note.
-        """
-
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Callable[[int], None] | None = None,
-    ) -> Iterator[Summed[T, S]]:
-        """The same, group by group as soon as each is there, while later ones are worked on."""
-
-
-class LocalWorkers:
+class LocalWorkers(Workers):
     """Child processes of this one; they are started when there is something to do.
 
     Args:
@@ -101,18 +70,7 @@ class LocalWorkers:
         while len(self._children) < min(self.count, len(tasks)):
             self._children.append(PlanningChild(timeout=self._timeout))
         found = iter(self._done(tasks, done))
-        return [_summed([next(found) for _ in group], add) for group in groups]
-
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Callable[[int], None] | None = None,
-    ) -> Iterator[Summed[T, S]]:
-        """See :class:`Workers`."""
-        for group in groups:
-            yield from self.sums([group], add, done=done)
+        return [summed([next(found) for _ in group], add) for group in groups]
 
     def _done(
         self, tasks: Sequence[ArchiveTask[Any, Any]], done: Callable[[int], None] | None
@@ -142,10 +100,3 @@ class LocalWorkers:
 def run_tasks(tasks: Sequence[ArchiveTask[T, S]]) -> list[Part[T, S] | Broken]:
     """In a child: what comes of each task, or what it met."""
     return [run_task(task) for task in tasks]
-
-
-def _summed(parts: Sequence[Part[T, S] | Broken], add: Callable[[T, T], T]) -> Summed[T, S]:
-    return Summed(
-        sum_tree([None if isinstance(part, Broken) else part.total for part in parts], add),
-        tuple(part if isinstance(part, Broken) else part.note for part in parts),
-    )

@@ -20,7 +20,6 @@ from .errors import NothingToFitError
 from .estimates import Estimator, Unseen, repetition_level, sum_level
 from .factors import cell_from, cell_in, opened
 from .keys import code_digest, settings_digest
-from .local import Workers
 from .tree_sum import TreeSum
 from .types import (
     ArchiveRef,
@@ -33,6 +32,7 @@ from .types import (
     LevelEstimate,
 )
 from .work import Campaign, Work
+from .workers import Workers
 
 
 @dataclass(frozen=True)

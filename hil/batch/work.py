@@ -13,12 +13,12 @@ from identification.phase_factor import PhaseFactor
 from .cache import Where
 from .errors import CacheError
 from .keeping import bundles, is_kept, kept_bundle
-from .local import Workers
 from .on_workers import ArchiveTask, Summed
 from .settling import Settled, consulted, known_settings
 from .tasks import Done, bundle_kept, bundle_sent, campaign_settled, opened_once
 from .tree_sum import TreeSum
 from .types import ArchiveRef, Broken, Bundle, Choices, GroupKey, Settings
+from .workers import Workers
 
 _ROUNDS: Final = 3
 """How often a campaign is added up far away before what still ends its process is left out."""

@@ -14,11 +14,12 @@ import typer
 
 from hil.batch import run
 from hil.batch.keys import code_digest
-from hil.batch.local import TIMEOUT, LocalWorkers, Workers
+from hil.batch.local import TIMEOUT, LocalWorkers
 from hil.batch.table import write_tables
 from hil.batch.trend import trends, write_trend
 from hil.batch.trend_words import summary
 from hil.batch.types import BatchEstimator, BatchResult, Broken, Choices, LevelEstimate
+from hil.batch.workers import Workers
 from hil.cli.identify import LONGEST_DELAY, bandwidth_from
 from hil.files import make_folder
 from hil.progress import Reporter

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from hil.batch.on_workers import ArchiveTask, Part, Summed, run_task
-from hil.batch.tree import sum_tree
 from hil.batch.types import ArchiveRef, Broken
+from hil.batch.workers import Workers, summed
 
 
-class Here:
+class Here(Workers):
     """This process; `deadly` archives, by name, end it, or would if it were another."""
 
     def __init__(self, *deadly: str, near: bool = True) -> None:
@@ -24,23 +24,7 @@ class Here:
         *,
         done: Callable[[int], None] | None = None,
     ) -> list[Summed[Any, Any]]:
-        found = []
-        for group in groups:
-            parts = [self._part(task) for task in group]
-            totals = [part.total if isinstance(part, Part) else None for part in parts]
-            notes = tuple(part.note if isinstance(part, Part) else part for part in parts)
-            found.append(Summed(sum_tree(totals, add), notes))
-        return found
-
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[Any, Any]]],
-        add: Callable[[Any, Any], Any],
-        *,
-        done: Callable[[int], None] | None = None,
-    ) -> Iterator[Summed[Any, Any]]:
-        for group in groups:
-            yield from self.sums([group], add, done=done)
+        return [summed([self._part(task) for task in group], add) for group in groups]
 
     def _part(self, task: ArchiveTask[Any, Any]) -> Part[Any, Any] | Broken:
         self.tasks.append(task)
