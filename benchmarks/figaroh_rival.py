@@ -67,7 +67,7 @@ class Identification(BaseIdentification):  # type: ignore[misc]
         self.identif_config = settings
 
     def load_trajectory_data(self, data_source: Any = None) -> Any:
-        """figaroh asks every class for a loader; here the samples are handed over."""
+        """A loader, which figaroh asks of every class; here the samples are handed over."""
         raise RuntimeError(f"samples are handed over, none are loaded from {data_source!r}")
 
     def weighted(self, base: Any, torque: Any, values: Any) -> tuple[Any, Any]:
