@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test test-slow check bench clean
+.PHONY: help setup demo docs test test-slow check bench clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -21,6 +21,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)  ## the whole way on the simulated NS 16; leaves runs/demo/report.html
 	$(BIN)/hil demo --output runs/demo --force
+
+docs: $(STAMP)  ## build the documentation; leaves build/docs/index.html, which opens offline
+	$(BIN)/sphinx-build --quiet --fail-on-warning --jobs auto docs build/docs
 
 test: $(STAMP)  ## lint, types, floors and the fast tests
 	$(BIN)/ruff check .

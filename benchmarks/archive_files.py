@@ -32,14 +32,24 @@ _BATCH = 100
 _FIRST = 3000  # cycle in which an excitation of a campaign begins, about
 
 
-def repetitions(folder: Path, count: int) -> list[Path]:
-    """Archives of `count` repetitions of one excitation in `folder`; those there are kept."""
+def repetitions(
+    folder: Path, count: int, *, first: int = 0, cycles: int = CYCLES, recorded_at: str = ""
+) -> list[Path]:
+    """Archives of `count` repetitions of one excitation in `folder`; those there are kept.
+
+    Args:
+        folder: of the archives.
+        count: of them.
+        first: number of the first among all repetitions, no two of which have the same noise.
+        cycles: of each that are kept.
+        recorded_at: time of recording, ISO 8601.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for index in range(count):
         name = ArchiveName("excitation", index)
         if not (folder / name).exists():
-            _write(folder, name, records(index))
+            _write(folder, name, records(first + index)[:cycles], recorded_at)
         paths.append(folder / name)
     return paths
 
@@ -99,7 +109,7 @@ def _wire(values: object) -> Array:
     return np.asarray(values, np.float32).astype(np.float64)
 
 
-def _write(folder: Path, name: ArchiveName, rows: NDArray[np.void]) -> None:
+def _write(folder: Path, name: ArchiveName, rows: NDArray[np.void], recorded_at: str) -> None:
     cell = Cell.load(CELL_PATH)
     drive = drive_train()
     attachments = {"cell.toml": cell.text.encode(), "robot.urdf": cell.urdf.encode()}
@@ -109,7 +119,7 @@ def _write(folder: Path, name: ArchiveName, rows: NDArray[np.void]) -> None:
         partial,
         joint_names=cell.joint_names,
         period=PERIOD,
-        metadata=name.metadata(),
+        metadata=name.metadata() | ({"recorded_at": recorded_at} if recorded_at else {}),
         attachments=attachments,
         durable=False,
     ) as archive:

@@ -1,7 +1,11 @@
 """Time, memory and disk of a batch: from archives to estimates, and from what was kept of them.
 
-Run with ``python -m benchmarks.batch FOLDER [--workers N] [--json]`` on a folder of archives. Those
-of `benchmarks.archive --folder FOLDER` are 30 repetitions of 16 s at 1 kHz with 6 joints.
+Run with ``python -m benchmarks.batch FOLDER... [--workers N] [--json]`` on folders of archives, or
+with ``python -m benchmarks.batch --archives 1000 [--seconds 12] [--json]`` on archives made for it:
+campaigns of 25 repetitions at 1 kHz with 6 joints, each with a noise of its own, so that no two
+hold the same. They lie in a temporary folder (0.45 MB per second of motion) and are deleted, unless
+``--folder`` names one to keep them in. A hundred, four hundred and all of them are run, each in a
+process of its own, whose memory is then that of so many.
 
 The first run keeps nothing beforehand, the second one estimates otherwise from what the first has
 kept. Wall times are those of the machine as it is; the processor time, of this process and its
@@ -20,12 +24,16 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import argparse
 import json
 import resource
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 
+from benchmarks.archive_files import PERIOD, repetitions
 from hil.batch.local import LocalWorkers
 from hil.batch.on_workers import ArchiveTask, Summed, run_task
 from hil.batch.run import Plan, reidentify
@@ -35,6 +43,8 @@ from hil.progress import Silent
 
 T = TypeVar("T")
 S = TypeVar("S")
+
+_CAMPAIGN = 25  # repetitions
 
 
 class InThisProcess(Workers):
@@ -69,31 +79,106 @@ def archives_to_estimate(paths: Sequence[Path]) -> float:
     return end - start
 
 
-def measure(folder: Path, workers: int | None) -> dict[str, Any]:
-    """A first and a second run on a folder."""
+def measure(places: Sequence[str], workers: int | None) -> dict[str, Any]:
+    """A first and a second run on some folders."""
     with tempfile.TemporaryDirectory() as cache, LocalWorkers(workers) as hands:
-        first, first_wall, first_cpu = _timed([str(folder)], Path(cache), "wls", hands)
+        first, first_wall, first_own = _timed(places, Path(cache), "wls", hands)
         hands.close()
-        first_cpu += _children()
-        second, second_wall, second_cpu = _timed([str(folder)], Path(cache), "ols", hands)
+        first_cpu = first_own + _children()
+        second, second_wall, second_own = _timed(places, Path(cache), "ols", hands)
+        hands.close()
+        second_cpu = first_own + second_own + _children() - first_cpu
         kept = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
     count = first.read
-    if not count or second.read:
-        raise SystemExit(f"read {first.read} archives, and then {second.read} again")
+    if not count or second.read or first.broken:
+        raise SystemExit(
+            f"read {first.read} archives, then {second.read} again; broken: {first.broken[:3]}"
+        )
     return {
         "archives": count,
+        "campaigns": len(first.campaigns),
         "workers": hands.count,
+        "first_wall_s": round(first_wall, 2),
         "first_wall_ms_per_archive": round(first_wall / count * 1e3, 2),
         "first_processor_ms_per_archive": round(first_cpu / count * 1e3, 2),
+        "first_parent_ms_per_archive": round(first_own / count * 1e3, 3),
+        "second_wall_s": round(second_wall, 2),
         "second_wall_ms_per_archive": round(second_wall / count * 1e3, 3),
         "second_processor_ms_per_archive": round(second_cpu / count * 1e3, 3),
         "cached_ratio_wall": round(first_wall / second_wall, 1),
         "cached_ratio_processor": round(first_cpu / second_cpu, 1),
         "kept_kB_per_archive": round(kept / count / 1e3, 1),
-        "largest_parent_MB": round(_largest(resource.RUSAGE_SELF), 1),
+        "largest_parent_MB": round(_largest_own(), 1),
         "largest_child_MB": round(_largest(resource.RUSAGE_CHILDREN), 1),
         "load": round(os.getloadavg()[0], 1),
     }
+
+
+def measure_made(
+    archives: int, seconds: float, workers: int | None, folder: Path | None
+) -> dict[str, Any]:
+    """Make archives, and measure on a hundred, four hundred and all of them."""
+    with tempfile.TemporaryDirectory(prefix="hil-benchmark-") as temporary:
+        root = folder or Path(temporary)
+        campaigns = _make(root, archives, seconds)
+        size = sum(path.stat().st_size for one in campaigns for path in one.glob("*.mcap"))
+        counts = sorted({count for count in (100, 400, archives) if count <= archives})
+        steps = [_measured(campaigns[: -(-count // _CAMPAIGN)], workers) for count in counts]
+    return steps[-1] | {
+        "seconds_per_archive": seconds,
+        "archive_MB": round(size / archives / 1e6, 2),
+        "parent_MB": {str(one["archives"]): one["largest_parent_MB"] for one in steps},
+        "million_on_100_machines": million_on_100_machines(steps[0], steps[-1]),
+        "steps": steps,
+    }
+
+
+def million_on_100_machines(small: dict[str, Any], large: dict[str, Any]) -> dict[str, float]:
+    """A calculation on paper: 10^6 such archives on 100 machines like this one.
+
+    Archives are shared out evenly; what the one process that gives them out does for each comes on
+    top, as if nothing of it happened meanwhile. From a small run and a large one follows what one
+    more archive takes there.
+    """
+    archives, machines = 1e6, 100.0
+    more = max(1, large["archives"] - small["archives"])
+    far = large["first_processor_ms_per_archive"] - large["first_parent_ms_per_archive"]
+    near = _parent_ms(large) - _parent_ms(small)
+    held = large["largest_parent_MB"] - small["largest_parent_MB"]
+    return {
+        "factors_min": round(far * archives / machines / large["workers"] / 6e4, 1),
+        "client_min": round(near / more * archives / 6e4, 1),
+        "client_GB": round(held / more * archives / 1e3, 1),
+    }
+
+
+def _parent_ms(step: dict[str, Any]) -> float:
+    return float(step["first_parent_ms_per_archive"] * step["archives"])
+
+
+def _make(root: Path, archives: int, seconds: float) -> list[Path]:
+    """Folders of campaigns, a week apart."""
+    begin = datetime(2026, 1, 5, 8, tzinfo=UTC)
+    folders = []
+    for number, first in enumerate(range(0, archives, _CAMPAIGN)):
+        folders.append(root / f"campaign_{number:03d}" / "archives")
+        repetitions(
+            folders[-1],
+            min(_CAMPAIGN, archives - first),
+            first=first,
+            cycles=round(seconds / PERIOD),
+            recorded_at=(begin + number * timedelta(weeks=1)).isoformat(),
+        )
+    return folders
+
+
+def _measured(campaigns: Sequence[Path], workers: int | None) -> dict[str, Any]:
+    """`measure` in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.batch", "--json", *map(str, campaigns)]
+    command += [] if workers is None else ["--workers", str(workers)]
+    ran = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    found: dict[str, Any] = json.loads(ran.stdout)
+    return found
 
 
 def _run(places: Sequence[str], cache: Path, estimator: Any, workers: Workers) -> BatchResult:
@@ -118,16 +203,34 @@ def _largest(who: int) -> float:
     return resource.getrusage(who).ru_maxrss / 1024
 
 
+def _largest_own() -> float:
+    """Largest memory of this process [MB]; `getrusage` would count that of its parent as well."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
 def main() -> None:
     """Measure, and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("folder", type=Path, help="with archives anywhere below")
+    parser.add_argument("places", nargs="*", help="folders with archives anywhere below")
+    parser.add_argument("--archives", type=int, default=0, help="make so many instead")
+    parser.add_argument("--seconds", type=float, default=12.0, help="duration of each, at most 16")
+    parser.add_argument("--folder", type=Path, default=None, help="to keep those made")
     parser.add_argument("--workers", type=int, default=None, help="child processes")
     parser.add_argument("--json", action="store_true", help="print one line of JSON only")
     arguments = parser.parse_args()
-    result = measure(arguments.folder, arguments.workers)
+    if bool(arguments.places) == bool(arguments.archives):
+        parser.error("name folders, or give --archives")
+    if arguments.archives:
+        result = measure_made(
+            arguments.archives, arguments.seconds, arguments.workers, arguments.folder
+        )
+    else:
+        result = measure(arguments.places, arguments.workers)
     if not arguments.json:
         for name, value in result.items():
+            if name == "steps":
+                continue
             print(f"  {name:32} {value}")
     print(json.dumps(result))
 

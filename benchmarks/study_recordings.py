@@ -169,7 +169,7 @@ def _run(
         campaign = Campaign.create(scratch / "campaign", seeded, plan)
         link = simulated_link(seeded, effects=effects)
         provenance = simulated_provenance(seeded, effects)
-        campaign.run(link, Stop(), Silent(), provenance=provenance, durable=False)
+        campaign.run(link, Stop(), Silent(), provenance=provenance, durable=False, unrehearsed=True)
         kinds = ("standstill", "excitation", "validation")
         archives = [path for kind in kinds for path in campaign.folder.completed(kind)]
         # All of a single excitation is wanted: nothing is held out of it.

@@ -92,6 +92,22 @@ class MotionStarted:
 
 
 @dataclass(frozen=True)
+class OverrideChanged:
+    """From `cycle` on the requested motion was to go on at this fraction of its planned speed."""
+
+    fraction: float
+    cycle: int
+
+
+@dataclass(frozen=True)
+class HoldChanged:
+    """In `cycle` the requested motion was told to rest on its path, or (not `held`) to go on."""
+
+    held: bool
+    cycle: int
+
+
+@dataclass(frozen=True)
 class MotionEnded:
     """The end of a requested motion.
 
@@ -149,6 +165,8 @@ Event = (
     | GapSeen
     | AnswersLost
     | MotionStarted
+    | OverrideChanged
+    | HoldChanged
     | MotionEnded
     | PacketRejected
     | Refused

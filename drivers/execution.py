@@ -47,6 +47,8 @@ class Execution(ABC):
 
     Attributes:
         started: the first set-point was taken.
+        fraction: of the planned speed, asked for last; None before.
+        held: whether a hold stands.
         leaving: the motion came to rest and open mode is being left.
         finished: the source said so.
         outcome: what it will be called when open mode has been left.
@@ -71,6 +73,8 @@ class Execution(ABC):
         self._resting = 0
         self.finished = False
         self.started = False
+        self.fraction: float | None = None
+        self.held = False
         self.leaving = False
         self.outcome: Outcome = "completed"
         self.reason = "the motion came to its end"
@@ -103,6 +107,7 @@ class Execution(ABC):
             return
         self.outcome = "stopped"
         self.reason = reason
+        self.held = False
         self._grant("stop")
         try:
             self._source.stop()
@@ -123,21 +128,27 @@ class Execution(ABC):
         except BaseException as error:
             return f"the motion source refused it: {in_words(error)}"
         self._grant("override")
+        self.fraction = float(fraction)
         return None
 
     def hold(self) -> str | None:
-        """Come to rest on the path until `resume`; says why that cannot be, or None."""
+        """Come to rest on the path until `resume`; says why that cannot be, or None.
+
+        Before the beginning it is kept: the motion begins at rest, and stays there.
+        """
         if self.outcome == "stopped" or self.finished:
             return None
         source: object = self._source
         try:
             if not is_holdable(source):
                 return "held, which this motion cannot: it was stopped instead"
-            self._grant("stop")
-            source.hold()
+            if self.started:  # what a source is told before, it may forget when it begins
+                self._grant("stop")
+                source.hold()
         except BaseException as error:
             return f"the motion source failed to hold: {in_words(error)}"
-        if self._holding is None:
+        self.held = True
+        if self._holding is None and self.started:
             self._holding = 0
         return None
 
@@ -153,11 +164,22 @@ class Execution(ABC):
                 return "this motion cannot be held"
             if self.outcome == "stopped":
                 return "the motion was told to stop"
-            source.resume()
+            if self.started:
+                source.resume()
         except BaseException as error:
             return f"the motion source refused it: {in_words(error)}"
-        self._holding = None
+        self._holding, self.held = None, False
         return None
+
+    def _started(self, cycle: int) -> None:
+        """The source has begun; it is held at once if that was asked for before.
+
+        Raises:
+            SourceFailed: it does not hold.
+        """
+        self.started = True
+        if self.held and (reason := self.hold()) is not None:
+            raise SourceFailed(f"{reason}, before it began", cycle)
 
     def _grant(self, bounds: BoundsName) -> None:
         if bounds not in self._granted:
@@ -220,7 +242,7 @@ class MotionExecution(Execution):
             self.finished = bool(self._source.finished)
         except BaseException as error:
             raise _failed("cannot begin", error, cycle) from error
-        self.started = True
+        self._started(cycle)
 
     def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
         """The next set-point (n,) rad, rad/s, and the bounds it keeps; the end is held.
@@ -301,7 +323,7 @@ class CorrectionExecution(Execution):
             self.finished = bool(self._source.finished)
         except BaseException as error:
             raise _failed("cannot begin", error, cycle) from error
-        self.started = True
+        self._started(cycle)
 
     def advance(self, cycle: int) -> tuple[Array, Array]:
         """The next correction: motion (n,), see `CorrectionSource`, and motor current (n,) A.

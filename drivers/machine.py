@@ -13,9 +13,11 @@ from drivers.events import (
     Counters,
     Event,
     GapSeen,
+    HoldChanged,
     MotionEnded,
     MotionStarted,
     Outcome,
+    OverrideChanged,
     StateChanged,
 )
 from drivers.execution import Execution
@@ -37,6 +39,8 @@ _LOSS: Final = {
     Input.SILENCE: "nothing was heard from the controller",
 }
 
+
+_NONE: Final = "no motion was requested"
 
 LOSS_WINDOW: Final = 100
 """Cycles over which lost answers are added up."""
@@ -103,22 +107,52 @@ class Machine:
         if self.state in (State.OPENING, State.OPEN):
             self.stop_reason = self.stop_reason or reason
 
+    def override(self, fraction: float) -> None:
+        """Run the requested motion at this fraction of its speed.
+
+        Raises:
+            RequestError: there is none, or it cannot.
+        """
+        execution = self.execution
+        before = None if execution is None else execution.fraction
+        reason = _NONE if execution is None else execution.override(fraction)
+        if reason is not None:
+            raise RequestError(self.state.name.lower(), reason, "change of override")
+        if fraction != before:
+            self.events.append(OverrideChanged(float(fraction), self.cycle))
+
     def hold(self) -> None:
         """Come to rest on the path and wait there; a stop where the source cannot.
 
-        A motion not begun is dropped, as by a stop.
+        A motion not begun begins at rest.
 
         Raises:
             RequestError: there is none. Nothing is kept for one to come.
         """
         execution = self.execution
         if execution is None:
-            raise RequestError(self.state.name.lower(), "no motion was requested", "hold")
+            raise RequestError(self.state.name.lower(), _NONE, "hold")
         if self.stop_reason is not None:
             return
-        reason = execution.hold() if execution.started else "held before it began"
+        before, reason = execution.held, execution.hold()
         if reason is not None:
             self.stop(reason)
+        elif execution.held is not before:
+            self.events.append(HoldChanged(True, self.cycle))
+
+    def resume(self) -> None:
+        """Go on after a hold.
+
+        Raises:
+            RequestError: there is no motion, or it cannot.
+        """
+        execution = self.execution
+        before = execution is not None and execution.held
+        reason = _NONE if execution is None else execution.resume()
+        if reason is not None:
+            raise RequestError(self.state.name.lower(), reason, "resumption")
+        if before:
+            self.events.append(HoldChanged(False, self.cycle))
 
     def note_answers(self, lost: int, max_gap: int) -> None:
         """So many of our last answers did not reach the controller, or it did not take them.

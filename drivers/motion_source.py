@@ -12,6 +12,7 @@ open mode    who generates the targets                                   source
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final, Literal, Protocol, TypeGuard
 
@@ -156,6 +157,21 @@ def is_correction(source: object) -> TypeGuard[CorrectionSource]:
 def is_holdable(source: object) -> TypeGuard[HoldableSource]:
     """Whether it has what a `HoldableSource` is asked for."""
     return _has(source, ("hold", "resume"))
+
+
+def progress_of(source: object) -> tuple[float, float]:
+    """Motion time, s, and how fast it runs (1 as planned); NaN where a source does not tell.
+
+    Nothing in the cycle depends on them, so whatever a source raises counts as not telling.
+    """
+    return _told(source, "motion_time"), _told(source, "rate")
+
+
+def _told(source: object, name: str) -> float:
+    try:
+        return float(getattr(source, name))
+    except BaseException:
+        return math.nan
 
 
 def _has(source: object, names: Sequence[str]) -> bool:

@@ -220,13 +220,12 @@ class Session:
         Raises:
             RequestError: there is none, it is being stopped, or it knows no override.
         """
-        execution = self._machine.execution
-        reason = "no motion was requested" if execution is None else execution.override(fraction)
-        if reason is not None:
-            raise RequestError(self.state.name.lower(), reason, "change of override")
+        self._machine.override(fraction)
 
     def hold(self) -> None:
-        """Rest on the path until `resume`; a motion that cannot, or has not begun, is stopped.
+        """Rest on the path until `resume`; a motion that cannot is stopped.
+
+        One that has not begun begins at rest, where the arm stands, and waits there.
 
         Raises:
             RequestError: there is no motion.
@@ -239,10 +238,7 @@ class Session:
         Raises:
             RequestError: there is no motion, it is being stopped, or it cannot hold and resume.
         """
-        execution = self._machine.execution
-        reason = "no motion was requested" if execution is None else execution.resume()
-        if reason is not None:
-            raise RequestError(self.state.name.lower(), reason, "resumption")
+        self._machine.resume()
 
     def discarded(self, kind: str, count: int) -> None:
         """The link dropped `count` packets before the session saw them: counted and told."""

@@ -16,6 +16,7 @@ from typing import IO
 
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
+from hil.archive.live_view import LiveView
 from hil.campaign.live_link import LiveLink
 from hil.cell import Cell
 from hil.cell.schema import CanTable
@@ -80,7 +81,11 @@ class SimulatorProcess:
 
 @contextmanager
 def loopback_link(
-    cell: Cell, *, simulated_by: Path | None = None, options: tuple[str, ...] = ()
+    cell: Cell,
+    *,
+    simulated_by: Path | None = None,
+    options: tuple[str, ...] = (),
+    live: LiveView | None = None,
 ) -> Iterator[LiveLink]:
     """A `LiveLink` to a simulated controller of `cell` that runs beside this program.
 
@@ -91,6 +96,7 @@ def loopback_link(
         cell: with transport "udp" or "can".
         simulated_by: cell file for the controller, if not the cell's own.
         options: further options of `hil simulate`.
+        live: lets viewers look at what is recorded.
     """
     spec: TransportSpec
     if cell.controller.can is not None and cell.controller.transport == "can":
@@ -103,7 +109,7 @@ def loopback_link(
         far = ("--udp", f"{LOOPBACK}:{port}")
     simulator = SimulatorProcess.start(simulated_by or cell.path, *far, *options)
     try:
-        with LiveLink.open(cell, transport=spec, finish=simulator.finish) as link:
+        with LiveLink.open(cell, transport=spec, finish=simulator.finish, live=live) as link:
             yield link
     except ControllerFault as fault:
         if (failure := simulator.failure()) is not None:

@@ -5,9 +5,11 @@ HilError                   exit status 1
 ├── UnsafeError            3: a motion was refused before anything was sent
 │   ├── MotionRefusedError      limits, current, collision, or too long
 │   ├── NoExcitationError       every motion of a design would be refused
-│   └── NotRehearsedError       the controller may be a real one
+│   ├── NotRehearsedError       the plan did not pass its rehearsal
+│   └── DryRunError             nobody has accepted the plan's slow dry run
 ├── ControllerFault        4: the controller, the link or the guard ended a motion
 │   └── MotionFailedError       and what was recorded of it is archived
+├── RepetitionsRejectedError   5: a motion failed its quality check again and again
 ├── OperatorStopError         130: a person stopped the work
 ├── OutputError            1: what was found cannot be written: disk full, no permission
 └── InputError             2: something the user gave cannot be used: file, field, problem, remedy

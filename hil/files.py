@@ -41,6 +41,19 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     _sync_folder(path.parent)
 
 
+def write_or_tell(path: Path, content: str | bytes) -> None:
+    """As `write_atomically`, with an error of ours.
+
+    Raises:
+        OutputError: the disk refuses.
+    """
+    try:
+        write_atomically(path, content)
+    except OSError as error:
+        problem = f"{path.name} cannot be written ({error.strerror or error})"
+        raise OutputError(path.parent, problem) from error
+
+
 def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
     """Replace several files of a folder, or none of them.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
@@ -26,6 +26,10 @@ LONGEST: Final = 600.0
 interval that fails has to be repeated whole."""
 MOST_SINES: Final = 20
 """For each joint, as a design may have at most."""
+PLANNED_CURRENT: Final = 0.8
+"""Share of a motor's current limit that a motion is planned with, and that its rehearsal allows.
+The rest is for what no plan knows: noise, and what the servo spends on following. Before a motion
+is sent, the whole limit counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +139,11 @@ def current_model(cell: Cell) -> CurrentModel:
         uncertainty=cell.nominal.uncertainty,
         torque_limit=cell.torque_limit,
     )
+
+
+def planned(currents: CurrentModel) -> CurrentModel:
+    """The same currents with the share of their limits that a motion is planned with."""
+    return replace(currents, usable=PLANNED_CURRENT)
 
 
 def _unwieldy(trajectory: PiecewiseCubic | FourierSeries) -> str | None:

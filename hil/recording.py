@@ -54,8 +54,8 @@ def record(
         metadata={
             "motion": CONTROLLERS_OWN,
             "cell": cell.name,
-            **_kind(path, kind),
-            **_origin(cell),
+            **kind_entry(path, kind),
+            **origin_of(cell),
         },
         attachments={
             "cell.toml": cell.text.encode(),
@@ -90,13 +90,19 @@ def archive_path(output: Path, kind: str) -> Path:
     return output / ArchiveName(kind, index)
 
 
-def _kind(path: Path, kind: str) -> dict[str, str]:
+def kind_entry(path: Path, kind: str) -> dict[str, str]:
+    """The kind as metadata, where the file's name does not say it."""
     return {} if ArchiveName.parse(path) is not None else {"kind": kind}
 
 
-def _origin(cell: Cell) -> dict[str, str]:
-    """Where and with what it was recorded; a time of day only where a real arm may have moved."""
+def origin_of(cell: Cell, *, only_simulated: bool | None = None) -> dict[str, str]:
+    """As metadata: where and with what it was recorded; a time of day only for a real arm.
+
+    Args:
+        cell: its own link says whether only a simulated arm can move, where that is left out.
+        only_simulated: of the link that is really used.
+    """
     versions = {f"software.{name}": version for name, version in software().items()}
-    if cell.only_simulated:
+    if cell.only_simulated if only_simulated is None else only_simulated:
         return {"simulated": "yes", **versions}
     return {"recorded_at": datetime.now(UTC).isoformat(timespec="seconds"), **versions}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from dataclasses import replace
 from os import PathLike
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import AnswersLost
-from hil.archive import CONTROLLERS_OWN, Archive, open_archive
+from hil.archive import CONTROLLERS_OWN, Archive, foreign_json, open_archive
 from hil.errors import ArchiveError
 from identification.recording import Recording
 
@@ -80,9 +79,11 @@ def recording_of(archive: Archive) -> Recording:
     recording has a fixed rate), not in times of arrival.
 
     Raises:
-        ArchiveError: the archive holds no sample.
+        ArchiveError: the archive holds no sample, or its metadata hold what they must not.
     """
     columns = archive.columns
+    _names(archive, "effects")
+    _check_motors(archive)
     if not archive.n_samples or "position" not in columns:
         raise ArchiveError(
             archive.path,
@@ -98,7 +99,7 @@ def recording_of(archive: Archive) -> Recording:
         motor_current=current,
         commanded_position=_commanded(archive),
         gap_before=_gaps(archive),
-        held_joints=tuple(json.loads(archive.metadata.get("held_joints", "[]"))),
+        held_joints=_names(archive, "held_joints"),
         provenance=_provenance(archive),
     )
 
@@ -135,6 +136,32 @@ def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
         cycles = np.rint(np.array(untaken) / archive.period)
         gaps |= np.isin(archive.columns["cycle"], cycles)
     return gaps
+
+
+def _names(archive: Archive, field: str) -> tuple[str, ...]:
+    """An entry of the metadata that lists names; none where there is no such entry."""
+    found = foreign_json.names(archive.metadata.get(field, "[]"))
+    if found is None:
+        raise _unfit(archive, field, "is no JSON list of names")
+    return found
+
+
+def _check_motors(archive: Archive) -> None:
+    """Check the motors' angles per joint angle, where the metadata state them."""
+    field = "motor_from_joint"
+    stated, n = foreign_json.loads(archive.metadata.get(field, "null")), len(archive.joint_names)
+    if field not in archive.metadata:
+        return
+    try:
+        matrix = np.array(stated, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.zeros(0)
+    if matrix.shape != (n, n) or not np.isfinite(matrix).all():
+        raise _unfit(archive, field, f"is no JSON matrix of {n} by {n} numbers")
+
+
+def _unfit(archive: Archive, field: str, problem: str) -> ArchiveError:
+    return ArchiveError(archive.path, problem, field=field, remedy="import it again")
 
 
 def _known(torque: Array | None) -> Array | None:

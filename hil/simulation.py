@@ -140,8 +140,14 @@ def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
 
 
 def simulated_drive(cell: Cell) -> SimulatedDrive:
-    """The cell's drive train as the simulated robot has it, by its own formulas."""
-    table = cell.drive_table
+    """The drive train as the simulated robot has it, by its own formulas.
+
+    What `[simulation.drive_train]` names is taken from there: a mistake in `[drive_train]` then
+    shows, as it would on the robot.
+    """
+    simulation = cell.file.simulation
+    known = {} if simulation is None else simulation.drive_train.model_dump(exclude_none=True)
+    table = cell.drive_table.model_copy(update=known)
     return SimulatedDrive(
         gear_ratio=tuple(table.gear_ratio),
         calibration=tuple(table.calibration),

@@ -1,6 +1,6 @@
 r"""Cluster-robust covariance of any estimate that solves sum W' psi(e) = 0, from the samples.
 
-.. math:: D^{-1} \Big(\sum_b s_b s_b^T\Big) D^{-1}, \quad
+.. math:: D^{-1} \left(\sum_b s_b s_b^T\right) D^{-1}, \quad
           D = \sum w\,\psi'(e/\sigma)\,W^T W, \quad s_b = \sum_{t \in b} w\,u(e/\sigma)\,W^T e
 
 as in :mod:`identification.covariance` (blocks of time, repetitions at equal times of the motion

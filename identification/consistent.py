@@ -4,7 +4,7 @@ Over the standard parameters :math:`\pi_s` and the friction f, one semidefinite 
 torque objective itself (never a projection of an estimate, link by link):
 
 .. math:: \min\; \|R\,[G\pi_s;\, f] - z\|^2
-          + w \Big( \sum_i D(J_i \,\|\, J_i^0) + \ldots \Big)
+          + w \left( \sum_i D(J_i \,\|\, J_i^0) + \ldots \right)
           \quad\text{s.t.}\quad J_i \succ 0,\; I_{im} \ge 0,\; f_0, f_1 \ge 0
 
 R is the square root of the weighted normal equations, G the grouping of the base parameters, J

@@ -49,7 +49,7 @@ def ordinary_least_squares(model: RobotModel, factor: Factor | QRFactor) -> Esti
     The covariance is the sandwich for white residuals whose variance differs by joint
     (White 1980), with :math:`A = \sum_j G_j`:
 
-    .. math:: A^{-1} \Big(\sum_j \sigma_j^2\, G_j\Big) A^{-1}
+    .. math:: A^{-1} \left(\sum_j \sigma_j^2\, G_j\right) A^{-1}
 
     Raises:
         IdentificationError: the factor holds no rows.

@@ -108,6 +108,7 @@ class TrajectoryPlayer:
         reach = self._table.position
         self._lower = reach.min(axis=0) if extrema is None else extrema.lower
         self._upper = reach.max(axis=0) if extrema is None else extrema.upper
+        self._duration = trajectory.duration
         # The end of the motion, but for a last period that is no more than rounding.
         self._end = trajectory.duration - _ROUNDING * period
         self._path = PathReader(trajectory)
@@ -132,6 +133,11 @@ class TrajectoryPlayer:
     def start(self) -> Array:
         """Position (n,) [rad] where the trajectory begins."""
         return self._start
+
+    @property
+    def duration(self) -> float:
+        """Duration [s] of the trajectory at full rate."""
+        return self._duration
 
     @property
     def finished(self) -> bool:

@@ -11,6 +11,7 @@ order otherwise, at the price of one evaluation.
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from operator import mul
 
 import numpy as np
@@ -30,7 +31,7 @@ def build_model(urdf: str, gravity: ArrayLike, armature: ArrayLike) -> pin.Model
     Raises:
         SettingError: the joints are not as many as the armatures, or not simple revolute ones.
     """
-    model = pin.buildModelFromXML(urdf)
+    model = pin.buildModelFromXML(_with_one_angle_each(urdf))
     inertias = np.asarray(armature, dtype=np.float64)
     if not model.nq == model.nv == inertias.size:
         raise SettingError(
@@ -39,6 +40,21 @@ def build_model(urdf: str, gravity: ArrayLike, armature: ArrayLike) -> pin.Model
     model.gravity.linear = np.asarray(gravity, dtype=np.float64)
     model.armature = inertias
     return model
+
+
+def _with_one_angle_each(urdf: str) -> str:
+    """Continuous joints as revolute ones: pinocchio describes the former by sine and cosine."""
+    root = ET.fromstring(urdf)
+    continuous = root.findall("joint[@type='continuous']")
+    if not continuous:
+        return urdf
+    for joint in continuous:
+        joint.set("type", "revolute")
+        limit = joint.find("limit")
+        if limit is None:
+            limit = ET.SubElement(joint, "limit", effort="0", velocity="0")
+        limit.attrib |= {"lower": "-1e9", "upper": "1e9"}
+    return ET.tostring(root, encoding="unicode")
 
 
 def joint_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:

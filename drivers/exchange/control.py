@@ -10,10 +10,12 @@ from enum import IntEnum
 from typing import Final, overload
 
 from drivers.exchange import memory
+from drivers.exchange.latency import BINS
 
 STALE: Final = 0.5
 """s after which a heartbeat is taken for that of a dead process."""
-_WORDS: Final = 64
+_WORDS: Final = 128
+_LATENCIES: Final = 64
 
 
 class ArchiveState(IntEnum):
@@ -77,6 +79,7 @@ class ControlBlock:
     """The fields, for whoever reads or writes them. Those of different writers lie apart.
 
     Attributes:
+        latencies: (`latency.BINS`,) answers by how long they took, counted by the exchange.
         supervisor_heartbeat: s.
         stop_count: raised by one for each stop asked for.
         override: fraction of the speed asked for.
@@ -114,6 +117,8 @@ class ControlBlock:
         worst_turnaround_us: microseconds from a packet's arrival (in the kernel, where the link
             can say) to the departure of its answer.
         finished: 1 when the exchange has ended properly.
+        motion_time: s of the motion taken last that were gone through; NaN if it does not tell.
+        rate: how fast its motion time runs, 1 as planned; NaN likewise.
     """
 
     supervisor_heartbeat = _Real(0)
@@ -151,6 +156,8 @@ class ControlBlock:
     unanswered = _Whole(36)
     ended_outcome = _Whole(37)
     ended_interval = _Whole(38)
+    motion_time = _Real(39)
+    rate = _Real(40)
 
     def __init__(self, fd: int) -> None:
         whole = memoryview(memory.attach(fd)).cast("B")
@@ -158,3 +165,4 @@ class ControlBlock:
             raise ValueError("this memory is not a control block")
         self.wholes = whole.cast("q")
         self.reals = whole.cast("d")
+        self.latencies = self.wholes[_LATENCIES : _LATENCIES + BINS]

@@ -62,6 +62,9 @@ class ExchangeStatus:
     unanswered: int
     refused: int
     worst_turnaround_us: float
+    motion_time: float
+    rate: float
+    latencies: tuple[int, ...]
     finished: bool
 
 
@@ -181,7 +184,7 @@ class ExchangeProcess:
     def hold(self) -> None:
         """Ask the motion going on to rest on its path until `resume`; one that cannot is stopped.
 
-        A motion that has not begun is dropped; where there is none, `HoldRefused` is among the
+        One that has not begun begins at rest; where there is none, `HoldRefused` is among the
         events, and one handed over later begins as usual.
         """
         self._hold(1)
@@ -210,6 +213,7 @@ class ExchangeProcess:
             ended_outcome=control.Ended(block.ended_outcome).name.lower(),
             heartbeat_age=time.monotonic() - block.exchange_heartbeat,
             finished=bool(block.finished),
+            latencies=tuple(block.latencies),
             **{name: getattr(block, name) for name in _COPIED},
         )
 
@@ -279,7 +283,7 @@ class ExchangeProcess:
 _COPIED: Final = tuple(
     name
     for name in ExchangeStatus.__dataclass_fields__
-    if name not in ("state", "ended_outcome", "heartbeat_age", "finished")
+    if name not in ("state", "ended_outcome", "heartbeat_age", "finished", "latencies")
 )
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

@@ -16,6 +16,7 @@ from drivers.exchange.control import STALE, ArchiveState, ControlBlock, Ended
 from drivers.exchange.digest import Digest
 from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import Inbox
+from drivers.exchange.latency import bin_of
 from drivers.exchange.notices import (
     ExchangeEvent,
     HoldRefused,
@@ -24,6 +25,7 @@ from drivers.exchange.notices import (
     ResumeRefused,
 )
 from drivers.exchange.shared_ring import SharedCycleRing
+from drivers.motion_source import progress_of
 from drivers.record import MEASURED
 from drivers.session import Session
 from drivers.states import State
@@ -98,6 +100,7 @@ class Serving:
         self._arm = ring.measured[0, _POSITION].copy()
         self._arm_moved_at = -math.inf
         self._digest = Digest()
+        self._source: object = None
 
     def __call__(self) -> bool:
         """Whether the exchange is to end."""
@@ -118,7 +121,9 @@ class Serving:
             return
         self._rows = rows
         arrival = float(self._ring.arrival[(rows - 1) % self._ring.capacity])
-        self._worst = max(self._worst, self._transport.now - arrival)
+        took = self._transport.now - arrival
+        self._worst = max(self._worst, took)
+        self._control.latencies[bin_of(took)] += 1
 
     def _orders(self, now: float) -> None:
         control, session = self._control, self._session
@@ -185,29 +190,31 @@ class Serving:
 
     def _take_program(self, now: float) -> None:
         """Read the program that was handed over, request it, and say what became of it."""
-        name = self._session.state.name.lower()
+        control, name = self._control, self._session.state.name.lower()
         refusal = None
         try:
             handed_over = self._inbox.take()
             if handed_over is None:
                 return  # withdrawn before, or its descriptor is still on the way
             source = handed_over.unpacked()
-            if handed_over.identity != self._control.program_id:
+            if handed_over.identity != control.program_id:
                 raise RequestError(name, "it was withdrawn")
             if self.reason:
                 raise RequestError(name, self.reason)
             if self._needs_archive and (trouble := self._archive_trouble(now)):
                 raise RequestError(name, trouble)
             self._session.request(source)
+            self._source = source
+            control.motion_time, control.rate = progress_of(source)
         except RequestError as error:
             refusal = error
         except Exception as error:  # whatever the classes of a foreign program raise
             refusal = RequestError(name, f"the program cannot be read: {error!r}")
         if refusal is None:
-            self._control.program_accepted = self._inbox.taken
+            control.program_accepted = self._inbox.taken
         else:
-            self._control.program_refused = self._inbox.taken
-        self._control.pickup_us = 1e6 * (time.monotonic() - now)
+            control.program_refused = self._inbox.taken
+        control.pickup_us = 1e6 * (time.monotonic() - now)
         self._inbox.answer(refusal)
 
     def _report(self, now: float) -> None:
@@ -262,6 +269,7 @@ class Serving:
         control.unanswered = counters.unanswered
         control.refused = counters.refused
         control.worst_turnaround_us = 1e6 * self._worst
+        control.motion_time, control.rate = progress_of(self._source)
 
     def _over(self, now: float) -> bool:
         """Whether nobody needs answers any more, once there is a reason to end.

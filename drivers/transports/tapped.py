@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.packet_records import PacketSink
 from drivers.transports.base import Stamped, Transport
+
+MOST_WAITING: Final = 256
+"""Packets that wait for their cycle; a flood is handed on in parts, with the cycle known then."""
 
 
 class _Passed(NamedTuple):
@@ -25,7 +28,8 @@ class TappedTransport:
 
     A packet reaches the sink when its answer is out, before the next one is waited for: nothing
     but its place in a list is taken note of between the two. Its cycle is known by then; packets
-    that had piled up and were left out have that of the one answered.
+    that had piled up and were left out have that of the one answered, but for those of a pile of
+    more than `MOST_WAITING`: they are not kept waiting, and have that of the one answered before.
 
     Args:
         transport: the link.
@@ -56,7 +60,7 @@ class TappedTransport:
 
     def receive(self, timeout: float) -> bytes | None:
         """See `Transport.receive`."""
-        if self._passed and timeout > 0.0:
+        if self._passed and (timeout > 0.0 or len(self._passed) >= MOST_WAITING):
             self.settle()
         packet = self._transport.receive(timeout)
         if packet is not None:

@@ -11,8 +11,8 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
-from functools import cache, cached_property
-from typing import Any
+from functools import cached_property, lru_cache
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,12 @@ _PRIMITIVES = {
     "float32": "<f4",
     "float64": "<f8",
 }
+_LONGEST_COUNT = 9  # digits
 _FIELD = re.compile(r"(?P<type>[\w/]+)(\[(?P<count>\d+)\])?\s+(?P<name>\w+)")
+
+
+LARGEST_MESSAGE: Final = 1 << 20
+"""Bytes; the longest of ours has some ten thousand. A layout takes memory in proportion."""
 
 
 class LayoutError(ValueError):
@@ -81,7 +86,7 @@ class MessageLayout:
 
 
 class LayoutBuilder:
-    """Lays out a message field by field."""
+    """Lays out a message field by field; what becomes too long is a `LayoutError`."""
 
     def __init__(self) -> None:
         self._template = bytearray(ENCAPSULATION)
@@ -103,9 +108,14 @@ class LayoutBuilder:
         self._template += data
         self._constant += [constant] * len(data)
 
+    def _check_room(self, size: int) -> None:
+        if self.size + size > LARGEST_MESSAGE:
+            raise LayoutError(f"its messages are longer than {LARGEST_MESSAGE} bytes")
+
     def variable(self, name: str, primitive: str, count: int | None = None) -> None:
         """Place a number, or an array of `count` numbers, that changes with each message."""
         item = np.dtype(_PRIMITIVES[primitive])
+        self._check_room(item.itemsize * (count or 1))
         self._align(item.itemsize)
         self._names.append(name)
         self._formats.append(item if count is None else (item, (count,)))
@@ -120,6 +130,7 @@ class LayoutBuilder:
     def string(self, value: str) -> None:
         """Place a constant string."""
         data = value.encode() + b"\0"
+        self._check_room(len(data))
         self.count(len(data))
         self._extend(data, constant=True)
 
@@ -136,7 +147,13 @@ class LayoutBuilder:
         self.string(frame)
 
     def build(self) -> MessageLayout:
-        """The layout of the fields placed so far."""
+        """The layout of the fields placed so far.
+
+        Raises:
+            LayoutError: two fields have one name.
+        """
+        if len(set(self._names)) != len(self._names):
+            raise LayoutError("two of its fields have one name")
         dtype = np.dtype(
             {
                 "names": self._names,
@@ -148,12 +165,12 @@ class LayoutBuilder:
         return MessageLayout(dtype, bytes(self._template), np.array(self._constant))
 
 
-@cache
+@lru_cache(maxsize=64)
 def fixed_layout(definition: str) -> MessageLayout:
     """Lay out a ros2msg definition of numbers and fixed arrays, with or without a header.
 
     Raises:
-        LayoutError: a field of other type, whose size depends on the message.
+        LayoutError: a field of other type, whose size depends on the message, or too many.
     """
     builder = LayoutBuilder()
     for line in definition.partition("=" * 80)[0].splitlines():
@@ -166,9 +183,10 @@ def fixed_layout(definition: str) -> MessageLayout:
         if match["type"] == "std_msgs/Header":
             builder.header()
         elif match["type"] in _PRIMITIVES:
-            builder.variable(
-                match["name"], match["type"], int(match["count"]) if match["count"] else None
-            )
+            count = match["count"]
+            if count is not None and len(count) > _LONGEST_COUNT:
+                raise LayoutError(f"{match['name']} has too many elements")
+            builder.variable(match["name"], match["type"], None if count is None else int(count))
         else:
             raise LayoutError(f"{match['type']!r} is not a type of constant size")
     return builder.build()

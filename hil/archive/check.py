@@ -6,16 +6,14 @@ is of the file alone: whether the motion in it is any good is not asked.
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
-from hil.archive import schema
+from hil.archive import description, schema
 from hil.archive.check_messages import message_faults
+from hil.archive.description import DescriptionError
 from hil.archive.names import KINDS, ArchiveName
 from hil.archive.survey import Survey, survey
 from hil.errors import NotAnArchiveError
@@ -79,13 +77,13 @@ def check_archive(path: str | PathLike[str]) -> Check:
     if found.metadata is None:
         if not any(repr(schema.METADATA) in text for text in faults.get("metadata", ())):
             raise _another_kind(found)
-        description = ["without the record hil the rest cannot be checked"]
+        described = ["without the record hil the rest cannot be checked"]
     else:
-        description = _description_faults(path, found.metadata)
-    faults.setdefault("metadata", []).extend(description)
+        described = _description_faults(path, found.metadata)
+    faults.setdefault("metadata", []).extend(described)
     if found.outcome is not None:
         faults.setdefault("outcome", []).extend(_outcome_faults(found.outcome))
-    if not description and found.pieces:
+    if not described and found.pieces:
         for aspect, text in message_faults(found):
             faults.setdefault(aspect, []).append(text)
     return Check(
@@ -125,21 +123,13 @@ def _description_faults(path: Path, metadata: Mapping[str, str]) -> list[str]:
     kind = metadata.get("kind")
     if kind not in KINDS:
         faults.append(f"kind is {kind!r}, not one of {', '.join(KINDS)}")
-    joints = parsed(metadata, "joint_names")
-    if (
-        not isinstance(joints, list)
-        or not joints
-        or not all(isinstance(name, str) for name in joints)
-        or len(set(joints)) != len(joints)
-    ):
-        faults.append("joint_names is no JSON list of different names")
-    attachments = parsed(metadata, "attachments")
-    if not isinstance(attachments, list):
-        faults.append("attachments is no JSON list")
-    if "period" in metadata or kind != "imported":
-        period = parsed(metadata, "period")
-        if not isinstance(period, int | float) or not math.isfinite(period) or period <= 0.0:
-            faults.append(f"period is {metadata.get('period')!r}, not a time in seconds")
+    for read in (description.joint_names, description.attachment_names, description.period):
+        try:
+            read(metadata)
+        except DescriptionError as error:
+            faults.append(str(error))
+    if "period" not in metadata and kind != "imported":
+        faults.append("period is missing")
     name = ArchiveName.parse(path)
     for key, value in (name.metadata() if name else {}).items():
         if metadata.get(key) != value:
@@ -153,11 +143,3 @@ def _outcome_faults(outcome: Mapping[str, str]) -> list[str]:
     if word not in OUTCOMES:
         return [f"outcome is {word!r}, not one of {', '.join(OUTCOMES)}"]
     return []
-
-
-def parsed(metadata: Mapping[str, str], key: str) -> Any:
-    """An entry that is JSON; None where it is not."""
-    try:
-        return json.loads(metadata.get(key, "null"))
-    except ValueError:
-        return None

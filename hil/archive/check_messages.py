@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from typing import Any, BinaryIO
 
@@ -14,7 +13,8 @@ from drivers.packet_records import LONGEST_PACKET
 from hil.archive import container, definitions, index, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
 from hil.archive.chunk import ChunkParser, Messages
-from hil.archive.container import ChannelRecord, Record
+from hil.archive.container import ChannelRecord, Damage, Record
+from hil.archive.description import Description
 from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
 from hil.archive.survey import Survey
 
@@ -54,9 +54,9 @@ class _Checker:
         assert found.metadata is not None
         self._found = found
         self._imported = found.metadata["kind"] == "imported"
-        self._joints = tuple(json.loads(found.metadata["joint_names"]))
-        period = found.metadata.get("period")
-        self._period_ns = None if period is None else float(period) * 1e9
+        description = Description.of(found.metadata)
+        self._joints = description.joint_names
+        self._period_ns = None if description.period is None else description.period * 1e9
         self._parser = ChunkParser()
         self._layouts: dict[str, MessageLayout | None] = {}
         self._last_cycle: int | None = None
@@ -70,7 +70,10 @@ class _Checker:
         for piece in self._found.pieces:
             record = container.record_at(stream, piece.offset, piece.length)
             if piece.opcode == container.CHUNK:
-                yield from self._chunk(record)
+                try:
+                    yield from self._chunk(record)
+                except Damage as damage:
+                    yield "chunks", f"the record at byte {damage.offset} {damage}"
             elif piece.opcode in (container.SCHEMA, container.CHANNEL):
                 self._parser.announce(record.opcode, record.body, record.offset)
         if self._parser.channels:
@@ -142,7 +145,9 @@ class _Checker:
             if topic not in _STATES:
                 channels = self._parser.channels.values()
                 identity = next(c.schema_id for c in channels if c.topic == topic)
-                return fixed_layout(self._parser.schemas[identity].definition)
+                layout = fixed_layout(self._parser.schemas[identity].definition)
+                schema.check_fields(topic, layout, len(self._joints))
+                return layout
             names, layout = joint_state_of(messages.first())
         except (LayoutError, KeyError):
             return None
@@ -179,10 +184,12 @@ class _Checker:
         if self._period_ns is not None:
             if not np.array_equal(stamp, np.rint(number * self._period_ns)):
                 yield "times", f"{place} has cycles whose stamp is not cycle times period"
-            if (number[-1] - number[0]) * self._period_ns >= max(_CHUNK_NS, self._period_ns):
+            if (int(number[-1]) - int(number[0])) * self._period_ns >= max(
+                _CHUNK_NS, self._period_ns
+            ):
                 yield "chunks", f"{place} spans more than 100 ms"
-        before = number[0] - 1 if self._last_cycle is None else self._last_cycle
-        if (np.diff(number, prepend=before) <= 0).any():
+        behind = () if self._last_cycle is None else (number[0] <= self._last_cycle,)
+        if any(behind) or (number[1:] <= number[:-1]).any():
             yield "times", f"{place} has cycles that do not grow"
         self._last_cycle = int(number[-1])
         self._gaps += int(cycles["gap"].sum())

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.drive_train import DriveTrain
+from hil.archive.live_view import LiveView
 from hil.archive.recorder import ArchiveSpec
 
 
@@ -35,6 +36,25 @@ class Open:
     until_ended: bool
 
 
+@dataclass(frozen=True, eq=False)
+class Serve:
+    """Let viewers look from now on, whether or not an archive is open.
+
+    Attributes:
+        job: for the answer, `Serving` or `Failed`.
+        view: where.
+        joint_names: of the link's joints.
+        period: of the controller, s.
+        drive_train: in force until an archive says otherwise.
+    """
+
+    job: int
+    view: LiveView
+    joint_names: tuple[str, ...]
+    period: float
+    drive_train: DriveTrain
+
+
 @dataclass(frozen=True)
 class Close:
     """Complete archive `job`, if it is open, with this outcome."""
@@ -54,6 +74,14 @@ class Opened:
     """Archive `job` is open: the motion may begin."""
 
     job: int
+
+
+@dataclass(frozen=True)
+class Serving:
+    """Viewers can look, at this TCP port."""
+
+    job: int
+    port: int
 
 
 @dataclass(frozen=True)
@@ -93,8 +121,8 @@ class Failed:
     remedy: str
 
 
-Command = Open | Close | End
-Answer = Opened | Closed | Failed
+Command = Open | Close | Serve | End
+Answer = Opened | Closed | Serving | Failed
 
 
 class Channel:

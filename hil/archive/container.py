@@ -19,7 +19,9 @@ import zstandard
 from isal.isal_zlib import crc32  # ten times as fast as that of zlib
 
 MAGIC = b"\x89MCAP0\r\n"
-LARGEST_CHUNK = 1 << 26  # bytes; ours have a tenth of a megabyte, a greater size is a corrupt one
+LARGEST_CHUNK = 1 << 24  # bytes; ours have a tenth of a megabyte
+LARGEST_RECORD = 1 << 28  # bytes; neither attachments nor summaries come near
+MOST_INFLATION = 1000  # times what is compressed; an arm at rest reaches a tenth
 
 HEADER = 0x01
 FOOTER = 0x02
@@ -42,6 +44,7 @@ FOOTER_SIZE = RECORD.size + 20
 _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
 _NO_CRC = 0
+_FARTHEST = 1 << 62  # bytes, less than the end of any file
 
 
 class Damage(Exception):  # noqa: N818 - handed on as a finding, too
@@ -155,9 +158,11 @@ def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
     Raises:
         Damage: it is not there.
     """
+    if not RECORD.size <= length <= LARGEST_RECORD or offset > _FARTHEST:
+        raise Damage(offset, "is not of the length that the index says")
     stream.seek(offset)
     data = stream.read(length)
-    if len(data) != length or length < RECORD.size:
+    if len(data) != length:
         raise Damage(offset, "is cut off")
     opcode, body_length = RECORD.unpack_from(data)
     if body_length != length - RECORD.size:
@@ -192,6 +197,8 @@ def records(
         opcode, length = RECORD.unpack(head)
         if length > size - offset - RECORD.size:
             raise Damage(offset, "is cut off, or its length is corrupt")
+        if length > LARGEST_RECORD and opcode not in skip:
+            raise Damage(offset, f"claims {length} bytes of content")
         if opcode in skip:
             seek(length, os.SEEK_CUR)
             yield Record(offset, opcode, b"", length)
@@ -200,7 +207,7 @@ def records(
         offset += RECORD.size + length
         if opcode == DATA_END:
             if check_end:
-                _check_end(read(), offset)
+                _check_end(read(min(size - offset, LARGEST_RECORD)), offset)
             return
 
 
@@ -242,6 +249,8 @@ def schema(body: bytes, offset: int) -> SchemaRecord:
     fields = Fields(body, offset)
     identity, name, encoding = fields.number("H"), fields.text(), fields.text()
     definition = fields.data("I").decode(errors="replace")
+    if not identity:
+        raise Damage(offset, "(schema) has the number 0, which says that there is none")
     return SchemaRecord(identity, name, encoding, definition)
 
 
@@ -270,7 +279,7 @@ def chunk(record: Record) -> Chunk:
 def chunk_data(record: Record, *, decompressor: zstandard.ZstdDecompressor) -> bytes:
     """Decompress the records of a chunk and verify their checksum."""
     head = chunk(record)
-    if head.size > LARGEST_CHUNK:
+    if head.size > min(LARGEST_CHUNK, MOST_INFLATION * len(head.data)):
         raise Damage(record.offset, f"(chunk) claims {head.size} bytes of content")
     data = _decompressed(head, record.offset, decompressor)
     if len(data) != head.size:

@@ -7,7 +7,6 @@ the end by the counts in the outcome.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
@@ -20,11 +19,13 @@ from hil.archive.cdr import LayoutError, MessageLayout, fixed_layout
 from hil.archive.chunk import Bytes, ChunkParser, Messages
 from hil.archive.columns import Columns
 from hil.archive.container import Damage, Record
+from hil.archive.description import Description, DescriptionError
 from hil.archive.events import ArchivedEvent
-from hil.archive.messages import decode_log, joint_state_of
+from hil.archive.messages import check_joints, decode_log, joint_state_of
 from hil.archive.selection import Selection
 
 _NEEDED = ("kind", "joint_names", "attachments")
+_MOST_EXPECTED = 1 << 20  # samples that room is made for on the word of one chunk
 _MARGIN = 1.3  # room for chunks that are smaller than the one the count is guessed from
 _BATCH = 1 << 20  # bytes of chunks decoded at once: few calls per chunk, and all in the cache
 _COLUMN_OF = {"effort": "torque"}  # where a message has another word for it than we
@@ -48,6 +49,7 @@ class Content:
 
     def __init__(self, selection: Selection, *, gapless: bool = True) -> None:
         self.metadata: dict[str, str] | None = None
+        self.description: Description | None = None
         self.outcome: dict[str, str] | None = None
         self.attachments: dict[str, bytes] = {}
         self.events: list[ArchivedEvent] = []
@@ -111,6 +113,8 @@ class Content:
         if name == schema.OUTCOME:
             self.outcome = entries
             return
+        if self.metadata is not None:
+            raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
         if entries.get("format_version") != str(schema.FORMAT_VERSION):
             self.metadata = entries
             raise Damage(record.offset, "is of another version")
@@ -118,9 +122,13 @@ class Content:
         if absent:
             raise Damage(record.offset, f"(metadata {name!r}) has no entry {absent[0]!r}")
         self.metadata = entries
+        try:
+            self.description = Description.of(entries)
+        except DescriptionError as error:
+            raise Damage(record.offset, f"(metadata {name!r}) cannot be used: {error}") from error
 
     def _take_chunk(self, record: Record) -> None:
-        if self.metadata is None:
+        if self.description is None:
             return  # some other MCAP file, which will be refused as such
         data = container.chunk_data(record, decompressor=self._decompressor)
         if not self.parser.repeats(data):
@@ -165,7 +173,8 @@ class Content:
         events = self._decoded_events(logs, offset)
         for channel, messages in decoded:
             share = self._size / compressed if compressed else 0.0
-            channel.append(messages, expected=int(_MARGIN * len(messages) * share))
+            expected = min(_MOST_EXPECTED, int(_MARGIN * len(messages) * share))
+            channel.append(messages, expected)
         self._n_events += len(events)
         start, stop = self._selection.times
         self.events += [event for stamp, event in events if start <= stamp < stop]
@@ -181,13 +190,19 @@ class Content:
         return self._channels[topic]
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout:
+        assert self.description is not None
+        joints = self.description.joint_names
         if topic in (schema.MEASURED, schema.COMMANDED):
-            return joint_state_of(messages.first())[1]
+            names, layout = joint_state_of(messages.first())
+            check_joints(names, layout, joints)
+            return layout
         channels = self.parser.channels.values()
         identity = next(channel.schema_id for channel in channels if channel.topic == topic)
         if identity not in self.parser.schemas:
             raise LayoutError("their schema is missing")
-        return fixed_layout(self.parser.schemas[identity].definition)
+        layout = fixed_layout(self.parser.schemas[identity].definition)
+        schema.check_fields(topic, layout, len(joints))
+        return layout
 
     def _decoded_events(
         self, messages: Messages | None, offset: int
@@ -204,10 +219,9 @@ class Content:
 
     def _check_counts(self, size: int) -> None:
         """Compare what was read with what the writer says it wrote."""
-        if self.metadata is None:
+        if self.description is None:
             return
-        announced = set(json.loads(self.metadata["attachments"]))
-        absent = sorted(announced - set(self.attachments))
+        absent = sorted(set(self.description.attachments) - set(self.attachments))
         if absent:
             raise Damage(size, f"(attachment {absent[0]!r}) is missing")
         if self.outcome is None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.archive import foreign_json
 from hil.archive.messages import LogMessage
 
 
@@ -55,10 +56,7 @@ class ArchivedEvent:
         text, _, second = message.text.partition("\n")
         data: Any = None
         if second:
-            try:
-                data = json.loads(second)
-            except ValueError:
-                data = None
+            data = foreign_json.loads(second)
         if not isinstance(data, dict):
             text, data = message.text, {}
         level = max((known for known in Level if known <= message.level), default=Level.DEBUG)

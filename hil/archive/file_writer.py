@@ -93,7 +93,7 @@ class ArchiveFile:
         with self._guarded():
             self._start(metadata, attachments)
             if durable:  # only now: the file is empty for as short a time as possible
-                _sync_folder(path.parent)
+                sync_folder(path.parent)
             self._channels = [self._register(channel) for channel in channels]
             self._event_channel = self._register(EVENT_CHANNEL)
             self._packet_channel = None if packets is None else self._register(packets)
@@ -229,7 +229,7 @@ def _create(path: Path) -> int:
         raise ArchiveWriteError(path, f"cannot be created: {error.strerror}") from error
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Make the name of a new file survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:

@@ -82,6 +82,17 @@ def messages(chunk: bytes, offset: int) -> Iterator[MessageHead | Record]:
         at = end
 
 
+def split(records: bytes) -> list[bytes]:
+    """Whole records one by one, each with its head."""
+    found, at = [], 0
+    while at < len(records):
+        _, length = RECORD.unpack_from(records, at)
+        end = at + RECORD.size + length
+        found.append(records[at:end])
+        at = end
+    return found
+
+
 def record(opcode: int, body: bytes) -> bytes:
     """A record with its head."""
     return RECORD.pack(opcode, len(body)) + body
@@ -237,7 +248,7 @@ class Summary:
 
     @classmethod
     def read(cls, stream: BinaryIO, size: int) -> Summary | None:
-        """Read it; None where there is none, or where it fails its checksum."""
+        """Read it; None where there is none, or where it is not whole or lists nonsense."""
         tail = container.FOOTER_SIZE + len(container.MAGIC)
         if size < tail:
             return None
@@ -249,14 +260,26 @@ class Summary:
             return None
         if not len(container.MAGIC) <= start <= size - tail or not crc:
             return None
+        if size - start > container.LARGEST_RECORD:
+            return None
         stream.seek(start)
         body = stream.read(size - tail - start)
         if crc32(body + footer[: _FOOTER_HEAD.size]) != crc:
             return None
         try:
-            return cls._parsed(body, start)
+            found = cls._parsed(body, start)
         except Damage:
             return None
+        return found if found._is_within(start) else None
+
+    def _is_within(self, end: int) -> bool:
+        """Whether what it lists lies before `end`, and nothing twice."""
+        at = len(container.MAGIC)
+        for offset, length in sorted([*((c.offset, c.length) for c in self.chunks), *self.others]):
+            if offset < at:
+                return False
+            at = offset + length
+        return at <= end
 
     @classmethod
     def of(cls, tail: bytes) -> Summary:

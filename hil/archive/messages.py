@@ -8,10 +8,17 @@ messages differ in length and are encoded one by one.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from hil.archive.cdr import ENCAPSULATION, LayoutBuilder, LayoutError, MessageLayout
+from hil.archive.cdr import (
+    ENCAPSULATION,
+    LARGEST_MESSAGE,
+    LayoutBuilder,
+    LayoutError,
+    MessageLayout,
+)
 
 
 def joint_state_layout(
@@ -74,6 +81,8 @@ def joint_state_of(message: bytes) -> tuple[tuple[str, ...], MessageLayout]:
     Raises:
         LayoutError: the bytes are not such a message.
     """
+    if len(message) > LARGEST_MESSAGE:
+        raise LayoutError(f"the message has {len(message)} bytes")
     cursor = _Cursor(message)
     cursor.number("i", 4)
     cursor.number("I", 4)
@@ -86,6 +95,20 @@ def joint_state_of(message: bytes) -> tuple[tuple[str, ...], MessageLayout]:
     if layout.size != len(message):
         raise LayoutError(f"the message has {len(message)} bytes, its fields {layout.size}")
     return names, layout
+
+
+def check_joints(names: Sequence[str], layout: MessageLayout, joints: Sequence[str]) -> None:
+    """Check that messages are of all these joints, and have each quantity of all or of none.
+
+    Raises:
+        LayoutError: they are not.
+    """
+    if tuple(names) != tuple(joints):
+        raise LayoutError("they are of other joints than joint_names says")
+    lengths: Mapping[str, Any] = layout.dtype.fields or {}
+    for name in ("position", "velocity", "effort"):
+        if name in lengths and lengths[name][0].shape != (len(joints),):
+            raise LayoutError(f"their {name} is not that of {len(joints)} joints")
 
 
 @dataclass(frozen=True)

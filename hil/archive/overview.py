@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from hil.archive import container
+from hil.archive import container, foreign_json
 from hil.archive.reader import Archive, open_archive
 from hil.archive.survey import survey
 
@@ -125,7 +124,7 @@ def _lost(outcome: Mapping[str, str]) -> str:
         if outcome.get(key, "0") != "0"
     ]
     if "repaired.losses" in outcome:
-        words += json.loads(outcome["repaired.losses"])
+        words += foreign_json.names(outcome["repaired.losses"]) or ()
     return "; ".join(words)
 
 

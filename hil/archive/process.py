@@ -22,21 +22,32 @@ from types import FrameType
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.events import InitReceived, Outcome
+from drivers.events import Outcome
 from drivers.exchange import (
     ArchiveState,
     ControlBlock,
     Ended,
     EventReader,
-    ExchangeEvent,
     PacketReader,
     RingReader,
 )
-from drivers.packet_records import PACKET_DTYPE
-from hil.archive.commands import Answer, Channel, Close, Closed, End, Failed, Open, Opened
+from hil.archive.commands import (
+    Answer,
+    Channel,
+    Close,
+    Closed,
+    End,
+    Failed,
+    Open,
+    Opened,
+    Serve,
+    Serving,
+)
+from hil.archive.live import LivePublisher
 from hil.archive.pulse import Pulse
+from hil.archive.recent import Recent
 from hil.archive.recorder import Recorder
-from hil.errors import ArchiveError
+from hil.errors import ArchiveError, InputError
 
 Records = NDArray[np.void]
 
@@ -58,8 +69,6 @@ EXCHANGE_QUIET = 1.0
 """s without a heartbeat of the exchange process after which the archive says so."""
 ORPHAN_QUIET = 60.0
 """s after which one that lives, but gives no sign of it, is not waited for by us alone."""
-RECENT = 5000
-"""Records kept while no archive is open, for one that is to begin with what came before."""
 
 
 @dataclass
@@ -119,9 +128,8 @@ class ArchiveProcess:
         self._exchange = exchange
         self._pulse = Pulse(lambda: control.exchange_heartbeat)
         self._packets = packets
-        self._recent: list[Records] = []
-        self._recent_packets: list[Records] = []
-        self._recent_events: list[ExchangeEvent] = []
+        self._live: LivePublisher | None = None
+        self._recent = Recent()
 
     def run(self) -> None:
         """Work until told to end, or left alone with nothing to do."""
@@ -133,6 +141,11 @@ class ArchiveProcess:
             if self._commands is None and self._job is None and self._exchange_gone():
                 return
             self._look_after_exchange()
+
+    def end_view(self) -> None:
+        """Nobody can look any more."""
+        if self._live is not None:
+            self._live.close()
 
     def leave(self, _signum: int, _frame: FrameType | None) -> None:
         """SIGTERM: complete the archive that is open, then end."""
@@ -163,6 +176,8 @@ class ArchiveProcess:
             if self._job is not None and self._job.number == command.job:
                 self._take()
                 self._close(command.outcome, command.reason)
+        elif isinstance(command, Serve):
+            self._serve(command)
         elif isinstance(command, End):
             self._leaving = True
             if self._job is not None and not self._job.until_ended:
@@ -174,20 +189,27 @@ class ArchiveProcess:
             return DRAIN_PERIOD
         return min(DRAIN_PERIOD, self._job.recorder.writer.chunk_ends_in + PUNCTUAL)
 
+    def _serve(self, command: Serve) -> None:
+        try:
+            self._live = LivePublisher(command)
+        except InputError as error:
+            self._answer(Failed(command.job, "", error.problem, error.remedy))
+        else:
+            self._answer(Serving(command.job, self._live.port))
+
     def _open(self, command: Open) -> None:
         if self._job is not None:
             self._take()
             self._close("interrupted", "another archive was begun")
         self._idle()
-        records, events, packets = self._recent, self._recent_events, self._recent_packets
-        self._recent, self._recent_events, self._recent_packets = [], [], []
+        recent = self._recent.taken()
         overflow, control = self._ring.overflow, self._control
         accepted, ended_count = control.program_accepted, control.ended_count
         try:
             recorder = Recorder(command.spec.open(), command.drive_train)
             if not command.from_now:
-                recorder.take_packets(_packets_of_the_last_session(packets))
-                recorder.take(*_of_the_last_session(records, events))
+                recorder.take_packets(recent.packets)
+                recorder.take(recent.records, recent.events)
         except Exception as error:
             self._fail(command.job, error)
             return
@@ -201,6 +223,8 @@ class ArchiveProcess:
             ended_count,
             heard=time.monotonic(),
         )
+        if self._live is not None:
+            self._live.drive_train = command.drive_train
         control.archive_state = ArchiveState.READY
         self._answer(Opened(command.job))
 
@@ -213,14 +237,12 @@ class ArchiveProcess:
         # Looked at first, so that what it left behind is taken.
         gone, ended_count = self._exchange_gone(), self._control.ended_count
         events, records = self._events.drain(), self._ring.drain()
-        packets = None if self._packets is None else self._packets.drain()
         lost, job.overflow = self._ring.overflow - job.overflow, self._ring.overflow
+        if self._live is not None:
+            self._live.publish(records, events)
         now = time.monotonic()
         try:
-            if self._packets is not None and packets is not None:
-                lost_packets = self._packets.overflow - job.packets_overflow
-                job.packets_overflow = self._packets.overflow
-                job.recorder.take_packets(packets, lost_packets)
+            self._take_packets(job)
             job.recorder.take(records, events, lost)
             if ended_count != job.ended_count and job.recorder.ended is None:
                 self._believe_the_count(job.recorder)
@@ -233,6 +255,14 @@ class ArchiveProcess:
             self._fail(job.number, error)
             return
         self._complete(job, now, gone=gone)
+
+    def _take_packets(self, job: Job) -> None:
+        """Move the raw packets that have come into the archive, and count those overwritten."""
+        if self._packets is None:
+            return
+        packets, before = self._packets.drain(), job.packets_overflow
+        job.packets_overflow = self._packets.overflow
+        job.recorder.take_packets(packets, job.packets_overflow - before)
 
     def _complete(self, job: Job, now: float, *, gone: bool) -> None:
         """Close the archive if the interval is over."""
@@ -274,16 +304,11 @@ class ArchiveProcess:
 
     def _idle(self) -> None:
         """Keep the newest of what comes while no archive is open."""
-        records = self._ring.drain()
-        if len(records):
-            self._recent.append(records)
-        self._recent_events = [*self._recent_events, *self._events.drain()][-RECENT:]
-        while len(self._recent) > 1 and sum(map(len, self._recent[1:])) > RECENT:
-            self._recent.pop(0)
-        if self._packets is not None and len(packets := self._packets.drain()):
-            self._recent_packets.append(packets)
-        while len(self._recent_packets) > 1 and sum(map(len, self._recent_packets)) > 2 * RECENT:
-            self._recent_packets.pop(0)
+        records, events = self._ring.drain(), self._events.drain()
+        if self._live is not None:
+            self._live.publish(records, events)
+        packets = None if self._packets is None else self._packets.drain()
+        self._recent.keep(records, events, packets)
 
     def _close(self, outcome: str, reason: str) -> None:
         job, self._job = self._job, None
@@ -294,7 +319,7 @@ class ArchiveProcess:
         try:
             if self._packets is not None and recorder.newest_packet < recorder.newest:
                 time.sleep(BEHIND)
-                recorder.take_packets(self._packets.drain())
+                self._take_packets(job)
             recorder.close(outcome, reason)
         except Exception as error:
             self._fail(job.number, error)
@@ -348,27 +373,6 @@ _OUTCOMES: dict[Ended, Outcome] = {
 }
 
 
-def _of_the_last_session(
-    parts: list[Records], events: list[ExchangeEvent]
-) -> tuple[Records, list[ExchangeEvent]]:
-    """What belongs to the session that began last; its init packet is not news any more."""
-    records = np.concatenate(parts) if parts else np.zeros(0, np.void(0).dtype)
-    if len(records):
-        restarts = np.flatnonzero(np.diff(records["cycle"]) <= 0)
-        records = records[int(restarts[-1]) + 1 :] if restarts.size else records
-    inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
-    return records, events[inits[-1] + 1 :] if inits else events
-
-
-def _packets_of_the_last_session(parts: list[Records]) -> Records:
-    """Packets from the init packet on of the session that began last."""
-    if not parts:
-        return np.zeros(0, PACKET_DTYPE)
-    packets = np.concatenate(parts)
-    restarts = np.flatnonzero(np.diff(packets["cycle"]) < 0)
-    return packets[int(restarts[-1]) + 1 :] if restarts.size else packets
-
-
 def main() -> None:
     """Attach what the command line names, and work."""
     ring, events, control, commands, exchange, n_joints, *packets = map(int, sys.argv[1:])
@@ -383,7 +387,10 @@ def main() -> None:
         PacketReader(packets[0]) if packets else None,
     )
     signal.signal(signal.SIGTERM, process.leave)
-    process.run()
+    try:
+        process.run()
+    finally:
+        process.end_view()
 
 
 if __name__ == "__main__":

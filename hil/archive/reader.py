@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -17,15 +16,12 @@ from hil.archive import container
 from hil.archive.cdr import Rows
 from hil.archive.container import Damage
 from hil.archive.content import Content
+from hil.archive.description import Description, DescriptionError
 from hil.archive.events import ArchivedEvent
 from hil.archive.index import Summary
-from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, METADATA
+from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, LATER_FIELDS, METADATA
 from hil.archive.selection import Selection
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
-
-_LATER_FIELDS = frozenset(("age",))
-"""Fields of a cycle that older archives do not have; zero is what they would have held."""
-
 
 _UNREAD = frozenset((container.MESSAGE_INDEX,))
 """Records that only other programs need."""
@@ -111,6 +107,28 @@ class Archive:
         """Number of samples."""
         return len(self.columns["stamp"])
 
+    def text(self, name: str) -> str:
+        """An attachment that is text.
+
+        Raises:
+            ArchiveError: it is not there, or not UTF-8.
+        """
+        if name not in self.attachments:
+            raise ArchiveError(
+                self.path,
+                f"carries no {name}",
+                remedy="import the recording again with a URDF or a cell file",
+            )
+        try:
+            return self.attachments[name].decode()
+        except UnicodeDecodeError as error:
+            raise ArchiveError(
+                self.path,
+                f"is no text in UTF-8 ({error.reason} at byte {error.start})",
+                field=name,
+                remedy="import the recording again with a URDF or a cell file in UTF-8",
+            ) from error
+
     def cycles(self) -> Rows:
         """The cycle records as the session wrote them, structure of `drivers.cycle_dtype`.
 
@@ -119,7 +137,7 @@ class Archive:
         """
         dtype = cycle_dtype(len(self.joint_names))
         names = dtype.names or ()
-        absent = [name for name in names if name not in self.columns and name not in _LATER_FIELDS]
+        absent = [name for name in names if name not in self.columns and name not in LATER_FIELDS]
         if absent:
             raise ArchiveError(self.path, f"has no column {absent[0]}", field=CYCLE)
         rows = np.zeros(self.n_samples, dtype)
@@ -170,6 +188,10 @@ def open_archive(
                 damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+    except MemoryError as error:
+        raise ArchiveError(
+            path, "does not fit into memory", remedy="read a part of its time, or fewer columns"
+        ) from error
     metadata = _checked_metadata(path, size, content, damage)
     if damage is None:
         _check_topics(path, content, selection)
@@ -179,7 +201,7 @@ def open_archive(
         metadata=metadata,
         outcome=content.outcome,
         attachments=content.attachments,
-        joint_names=tuple(json.loads(metadata["joint_names"])),
+        joint_names=_described(path, metadata).joint_names,
         columns=columns,
         events=tuple(content.events),
         damage=None if damage is None else _damage(damage, size, content, columns["stamp"]),
@@ -192,8 +214,11 @@ def _by_index(stream: BinaryIO, size: int, selection: Selection) -> Content | No
     if summary is None:
         return None
     content = Content(selection, gapless=False)
-    for record in summary.announced:
-        content.parser.announce(record.opcode, record.body, record.offset)
+    try:
+        for record in summary.announced:
+            content.parser.announce(record.opcode, record.body, record.offset)
+    except Damage:
+        return None
     channels = content.parser.channels.values()
     topics = {*selection.numbers({channel.topic for channel in channels})}
     if selection.events:
@@ -244,6 +269,19 @@ def _checked_metadata(
     else:
         problem = f"is torn before its first data: the record at byte {damage.offset} {damage}"
     raise NotAnArchiveError(path, problem, remedy=remedy)
+
+
+def _described(path: Path, metadata: Mapping[str, str]) -> Description:
+    try:
+        return Description.of(metadata)
+    except DescriptionError as error:
+        raise ArchiveError(
+            path,
+            error.problem,
+            field=error.field,
+            remedy=f"what wrote this archive does not keep the profile: its record {METADATA!r} "
+            "must be mended there",
+        ) from error
 
 
 def _damage(damage: Damage, size: int, content: Content, stamp: NDArray[np.int64]) -> ArchiveDamage:

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from drivers.drive_train import DriveTrain
 from drivers.events import (
     AnswersLost,
+    HoldChanged,
     InitReceived,
     LinkLost,
     MotionEnded,
     Outcome,
+    OverrideChanged,
     PacketRejected,
 )
 from drivers.exchange import EventsLost, ExchangeEvent
@@ -187,7 +189,7 @@ class Recorder:
             type(event).__name__,
             describe(event),
             level=level_of(event),
-            data={"count": event.count} if isinstance(event, AnswersLost) else None,
+            data=_data(event),
         )
 
     def _count(self, event: ExchangeEvent) -> None:
@@ -257,6 +259,18 @@ class Recorder:
         self.records += len(records)
         self.missed += int(records["gap"].sum())
         self._newest = int(records["cycle"][-1])
+
+
+def _data(event: ExchangeEvent) -> dict[str, float | bool] | None:
+    """What a program may want to know of an event beside its cycle."""
+    match event:
+        case AnswersLost():
+            return {"count": event.count}
+        case OverrideChanged():
+            return {"fraction": event.fraction}
+        case HoldChanged():
+            return {"held": event.held}
+    return None
 
 
 def _at_rest(ended: MotionEnded) -> bool:

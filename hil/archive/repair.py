@@ -6,25 +6,28 @@ says what is lost. Nothing is invented: what cannot be verified is left out.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
+import shutil
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 import zstandard
 
-from hil.archive import container, index, schema
+from hil.archive import container, foreign_json, index, schema
 from hil.archive.container import Record
+from hil.archive.description import Description, DescriptionError
 from hil.archive.index import IndexBuilder, MessageHead
 from hil.archive.reader import open_archive
 from hil.archive.survey import HEADER, Piece, Survey, announced_attachments, survey
-from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
+from hil.archive.written_anew import write_anew
+from hil.errors import ArchiveWriteError, NotAnArchiveError
 
+_DIGITS = 18  # of a count
 _SEQUENCE_AT = container.RECORD.size + 2  # in a message record
 
 
@@ -78,13 +81,11 @@ def repair(
     """
     path = Path(path)
     found = survey(path)
-    if found.metadata is None:
-        open_archive(path)  # says why it is none
+    if not _is_described(found):
+        open_archive(path, fields=())  # says why it is none
         raise NotAnArchiveError(path, "is not an archive")
-    if found.metadata.get("format_version") != str(schema.FORMAT_VERSION):
-        open_archive(path)
-    target = path if in_place else Path(output) if output else repaired_name(path)
-    if not in_place and target.exists():
+    target = path.resolve() if in_place else Path(output) if output else repaired_name(path)
+    if not in_place and os.path.lexists(target):
         raise ArchiveWriteError(target, "exists already", remedy="choose another name with -o")
     whole = not found.faults
     written = None
@@ -96,45 +97,45 @@ def repair(
     )
 
 
+def _is_described(found: Survey) -> bool:
+    """Whether the file says what is in it, in words that we know."""
+    if found.metadata is None:
+        return False
+    try:
+        Description.of(found.metadata)
+    except DescriptionError:
+        return False
+    return found.metadata.get("format_version") == str(schema.FORMAT_VERSION)
+
+
 def _samples_lost(found: Survey) -> int | None:
     if not found.losses:
         return 0
-    if found.outcome is None or not found.outcome.get("samples", "").isdecimal():
-        return None
-    return max(0, int(found.outcome["samples"]) - found.samples)
+    stated = None if found.outcome is None else _count(found.outcome.get("samples", ""))
+    return None if stated is None else max(0, stated - found.samples)
+
+
+def _count(text: str) -> int | None:
+    """A number of samples; None where the text is none that a file could hold."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= _DIGITS else None
 
 
 def _write(found: Survey, target: Path) -> None:
-    """Write the repaired archive beside its name, read it back, and give it the name."""
-    partial = target.with_name(f".{target.name}.part")
-    try:
-        with found.path.open("rb") as stream, partial.open("wb") as output:
-            if found.faults:
-                _Writer(stream, output).write(found)
-            else:
-                _copy(stream, output)
-            output.flush()
-            os.fsync(output.fileno())
-        back = open_archive(partial, fields=())
-        if not back.complete:
-            raise ArchiveError(found.path, f"cannot be repaired: {back.damage}")
-        partial.replace(target)
-    except OSError as error:
-        raise ArchiveWriteError(target, f"cannot be written: {error.strerror}") from error
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            partial.unlink()
+    """Write the repaired archive; one that is whole is copied to the byte."""
+
+    def fill(stream: BinaryIO, output: IO[bytes]) -> None:
+        if found.faults:
+            ArchiveCopy(stream, output).write(found)
+        else:
+            shutil.copyfileobj(stream, output)
+
+    write_anew(found.path, target, fill)
 
 
-def _copy(stream: BinaryIO, output: BinaryIO) -> None:
-    while block := stream.read(1 << 20):
-        output.write(block)
+class ArchiveCopy:
+    """Copies what stands of a survey into a new file, with the outcome of the survey."""
 
-
-class _Writer:
-    """Copies what stands into a new file."""
-
-    def __init__(self, stream: BinaryIO, output: BinaryIO) -> None:
+    def __init__(self, stream: BinaryIO, output: IO[bytes]) -> None:
         self._stream = stream
         self._output = output
         self._offset = 0
@@ -226,15 +227,15 @@ def _outcome(found: Survey) -> dict[str, str]:
     if not found.losses and found.outcome is not None:
         return found.outcome
     before = found.outcome or {"outcome": "unknown", "reason": "the outcome is lost"}
-    lost, lost_before = _samples_lost(found), before.get("repaired.samples_lost", "0")
-    known = lost is not None and lost_before.isdecimal()
-    earlier = json.loads(before.get("repaired.losses", "[]"))
+    lost, lost_before = _samples_lost(found), _count(before.get("repaired.samples_lost", "0"))
+    known = lost is not None and lost_before is not None
+    earlier = foreign_json.names(before.get("repaired.losses", "[]")) or ()
     return {
         **before,
         "samples": str(found.samples),
         "events": str(found.events),
         **({"packets": str(found.counts.get(schema.PACKETS, 0))} if "packets" in before else {}),
         "repaired": "yes",
-        "repaired.samples_lost": str((lost or 0) + int(lost_before)) if known else "unknown",
+        "repaired.samples_lost": str((lost or 0) + (lost_before or 0)) if known else "unknown",
         "repaired.losses": json.dumps([*earlier, *found.losses]),
     }

@@ -9,14 +9,14 @@ import json
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.packet_records import LONGEST_PACKET
 from hil.archive import definitions
-from hil.archive.cdr import MessageLayout, Rows, fixed_layout
+from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
 from hil.archive.messages import joint_state_layout
 
 Array = NDArray[np.float64]
@@ -35,7 +35,11 @@ MOTOR_CURRENT = "/motor_currents"
 PACKETS = "/hil/packets"
 EVENTS = "/hil/events"
 
+LATER_FIELDS = frozenset(("age",))
+"""Fields of a cycle that older archives do not have; zero is what they would have held."""
+
 _STAMP = ("sec", "nanosec")
+_STAMP_TYPES = {"sec": (np.dtype("<i4"),), "nanosec": (np.dtype("<u4"),)}
 
 
 @dataclass(frozen=True)
@@ -166,6 +170,34 @@ class SampleEncoder:
         current = _stamped(self._current, stamp)
         current["motor_current"] = motor_current
         return Batch(stamp, (state, current))
+
+
+def profile_layout(topic: str, n_joints: int) -> MessageLayout | None:
+    """How the messages of a topic of numbers are laid out; None where it is not the profile's."""
+    definition = {
+        CYCLE: definitions.cycle(n_joints),
+        MOTOR_CURRENT: definitions.motor_current(n_joints),
+        PACKETS: definitions.packet(LONGEST_PACKET),
+    }.get(topic)
+    return None if definition is None else fixed_layout(definition)
+
+
+def check_fields(topic: str, layout: MessageLayout, n_joints: int) -> None:
+    """Check that the numbers in messages are those of the profile, of so many joints.
+
+    Raises:
+        LayoutError: one is missing, or of another type or length.
+    """
+    found: Mapping[str, Any] = layout.dtype.fields or {}
+    profile = profile_layout(topic, n_joints)
+    expected: Mapping[str, Any] = _STAMP_TYPES
+    if profile is not None:
+        expected = profile.dtype.fields or {}
+    for name, (kind, *_) in expected.items():
+        if name not in found and name not in LATER_FIELDS:
+            raise LayoutError(f"they have no {name}")
+        if name in found and found[name][0] != kind:
+            raise LayoutError(f"their {name} is not that of {n_joints} joints")
 
 
 def checksum(entries: Mapping[str, str]) -> str:

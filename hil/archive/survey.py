@@ -6,7 +6,6 @@ keeps has passed the same checks: checksums, and numbers of messages that count 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from os import PathLike
@@ -15,7 +14,7 @@ from typing import BinaryIO, NamedTuple
 
 import zstandard
 
-from hil.archive import container, index, schema
+from hil.archive import container, foreign_json, index, schema
 from hil.archive.container import Damage, Record
 from hil.archive.index import IndexBuilder, MessageHead, Summary
 from hil.errors import ArchiveError
@@ -266,16 +265,21 @@ class _Surveyor:
                 stamps.append(item.log_time)
             else:
                 announced.append(item)
-        for item in announced:
-            if item.opcode in (container.SCHEMA, container.CHANNEL):
-                self._announce(item.opcode, item.body, record.offset)
-        shift = self._continued(numbered, record.offset)
+        known = dict(self._channels), dict(self._types)
+        try:
+            for item in announced:
+                if item.opcode in (container.SCHEMA, container.CHANNEL):
+                    self._announce(item.opcode, item.body, record.offset)
+            shift = self._continued(numbered, record.offset)
+        except Damage:
+            self._channels, self._types = known  # what it announces goes with it
+            raise
         times = min(stamps, default=0), max(stamps, default=0)
         head = container.chunk(record)
         if (head.start_time, head.end_time) != times:
             self._fault("index", Damage(record.offset, "(chunk) states other times"), loss=False)
         indexes = self._index.add_chunk(record.offset, record.end - record.offset, head, data)
-        self._indexes = _split(indexes)
+        self._indexes = index.split(indexes)
         moved = shift if any(shift.values()) else None
         self._keep(record, moved)
         self.survey.pieces[-1] = self.survey.pieces[-1]._replace(times=times)
@@ -380,21 +384,6 @@ _ASPECTS = {
 }
 
 
-def _split(indexes: bytes) -> list[bytes]:
-    """The records one by one."""
-    found, at = [], 0
-    while at < len(indexes):
-        _, length = container.RECORD.unpack_from(indexes, at)
-        end = at + container.RECORD.size + length
-        found.append(indexes[at:end])
-        at = end
-    return found
-
-
 def announced_attachments(metadata: dict[str, str]) -> list[str]:
     """Names of the attachments that must be there."""
-    try:
-        names = json.loads(metadata.get("attachments", "[]"))
-    except ValueError:
-        return []
-    return [str(name) for name in names] if isinstance(names, list) else []
+    return list(foreign_json.names(metadata.get("attachments", "[]")) or ())

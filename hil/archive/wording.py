@@ -5,10 +5,12 @@ from __future__ import annotations
 from drivers.events import (
     AnswersLost,
     GapSeen,
+    HoldChanged,
     InitReceived,
     LinkLost,
     MotionEnded,
     MotionStarted,
+    OverrideChanged,
     PacketRejected,
     Refused,
     StateChanged,
@@ -40,6 +42,10 @@ def describe(event: ExchangeEvent) -> str:
             )
         case MotionStarted():
             return f"first set-point in cycle {event.cycle}"
+        case OverrideChanged():
+            return f"override {100.0 * event.fraction:.4g} % in cycle {event.cycle}"
+        case HoldChanged():
+            return f"{'held' if event.held else 'gone on with'} in cycle {event.cycle}"
         case MotionEnded():
             return f"{event.outcome} in cycle {event.cycle}: {event.reason}"
         case PacketRejected(kind="answered late"):

@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -68,7 +69,7 @@ class Where:
             if os.access(beside if beside.is_dir() else folder, os.W_OK | os.X_OK):
                 return Store(beside)
         root = Path(self.root) if self.root is not None else _users_own()
-        name = folder if "://" in location else str(Path(folder).resolve())
+        name = folder if "://" in location else _resolved(folder)
         return Store(root / text_digest(name)[:16])
 
 
@@ -174,6 +175,11 @@ def decoded(data: bytes, key: str) -> Entry | None:
         arrays[name] = np.frombuffer(body, dtype, count, at).reshape(shape)
         at += count * dtype.itemsize
     return Entry(content["header"], arrays)
+
+
+@lru_cache(maxsize=1024)
+def _resolved(folder: str) -> str:
+    return str(Path(folder).resolve())
 
 
 def _users_own() -> Path:

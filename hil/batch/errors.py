@@ -19,6 +19,10 @@ class ChangedError(ArchiveError):
         super().__init__(location, "was changed while it was read", remedy="run the batch again")
 
 
+class UnavailableError(InputError):
+    """An address that cannot be read now, for reasons that are not those of its content."""
+
+
 class NothingToFitError(InputError):
     """A batch without one archive that can be fitted."""
 

@@ -19,6 +19,7 @@ from identification.estimation import Estimate, estimate, nothing_usable
 from identification.factor import Factor
 from identification.least_squares import Weighting, weights_of
 from identification.model import RobotModel
+from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
 from identification.prior import GaussianPrior, with_prior
 from identification.qr_factor import QR_CONDITION
@@ -204,6 +205,7 @@ def repetition_level(estimator: Estimator, summary: Summary, settings: str) -> L
         unseen_torque_rms=nothing,
         settings=settings,
         doubts=(*summary.doubts, *doubts),
+        setup=ref.setup,
     )
 
 
@@ -214,6 +216,8 @@ def sum_level(
     phase: PhaseFactor,
     unseen: Unseen,
     settings: str,
+    doubts: Sequence[str] = (),
+    payload: Payload | None = None,
 ) -> LevelEstimate:
     """The estimate of a campaign, or of all campaigns of an arm.
 
@@ -224,12 +228,14 @@ def sum_level(
         phase: the sum of their factors.
         unseen: what is predicted.
         settings: digest, "" where campaigns have different ones.
+        doubts: about the archives.
+        payload: that the campaign's cell states.
 
     Raises:
         IdentificationError: there is no estimate.
     """
-    found, doubts = estimator.of_sum(phase)
-    total = phase.total
+    found, own = estimator.of_sum(phase)
+    total, setups = phase.total, {ref.setup for ref in refs}
     left, torque = unseen.errors(found.values, phase.n_joints)
     return LevelEstimate(
         level=level,
@@ -245,7 +251,10 @@ def sum_level(
         unseen_rms=left,
         unseen_torque_rms=torque,
         settings=settings,
-        doubts=doubts,
+        doubts=(*own, *doubts),
         speed_rms=speed_rms(estimator.model, total),
         information=total.weighted(estimator.weights(total)).A,
+        setup=setups.pop() if len(setups) == 1 else "",
+        payload=payload,
+        unseen=None if unseen.total is None else unseen.total.total,
     )

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
+from hashlib import file_digest
 from pathlib import Path
 from typing import Final
 
@@ -17,8 +18,10 @@ import numpy as np
 
 from hil.archive import CONTROLLERS_OWN, Archive, open_archive
 from hil.cell import Cell
+from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
-from hil.identify.sources import Source, source_of
+from hil.identify.sources import Source, known_doubts, source_of
+from hil.importers import Findings
 from identification import IdentificationError
 from identification.covariance import block_covariance
 from identification.estimation import Estimate
@@ -80,7 +83,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> ArchiveFactor:
         total=phase.merged(max(1, len(phase))),
         fits=_fits(model, samples, phase) if ref.use == "excitation" else {},
         duration=float(recording.time[-1] - recording.time[0]),
-        doubts=_doubts(archive, source),
+        doubts=_doubts(archive, cell, source),
     )
     return ArchiveFactor(summary, phase)
 
@@ -110,7 +113,7 @@ def reduce_bundle(
             one = archive_factor(ref, settings)
         except (HilError, IdentificationError) as error:
             broken.append(Broken(ref.location, str(error)))
-            lasting &= not (isinstance(error, ChangedError) or isinstance(error.__cause__, OSError))
+            lasting &= _of_the_bytes(error)
             continue
         except Exception as error:  # a fault of ours: it costs this archive, not the batch
             broken.append(Broken(ref.location, f"{type(error).__name__}: {error}"))
@@ -120,6 +123,13 @@ def reduce_bundle(
         if ref.use == "excitation":
             phase = one.phase if phase is None else phase + one.phase
     return Bundle(tuple(refs), tuple(summaries), phase, tuple(broken), lasting)
+
+
+def _of_the_bytes(error: HilError | IdentificationError) -> bool:
+    """Whether an error will be met again as long as the bytes of the archive are the same."""
+    if isinstance(error, ChangedError) or isinstance(error.__cause__, OSError):
+        return False
+    return isinstance(error, ArchiveError | CellError | IdentificationError)
 
 
 @contextmanager
@@ -132,14 +142,24 @@ def opened(ref: ArchiveRef) -> Iterator[Archive]:
         ArchiveError: it cannot be read.
     """
     with local_file(ref.location) as path:
-        if ref.stamp is not None and stamp_of(path) != ref.stamp:
-            raise ChangedError(ref.location)
-        archive = open_archive(path, fields=_FIELDS)
-        if archive.metadata.get("motion") == CONTROLLERS_OWN:
-            archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
+        _require_same(path, ref)
+        try:
+            archive = open_archive(path, fields=_FIELDS)
+            if archive.metadata.get("motion") == CONTROLLERS_OWN:
+                archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
+        finally:
+            if ref.stamp is not None:  # what was written meanwhile is no fault of the archive
+                _require_same(path, ref)
         if archive.damage is not None:
             raise TornError(ref.location, str(archive.damage))
         yield archive
+
+
+def _require_same(path: Path, ref: ArchiveRef) -> None:
+    """Of a fetched copy only the bytes tell whether it is what was found."""
+    same = digest_of(path) == ref.sha256 if ref.stamp is None else stamp_of(path) == ref.stamp
+    if not same:
+        raise ChangedError(ref.location)
 
 
 @contextmanager
@@ -152,6 +172,19 @@ def local_file(location: str) -> Iterator[Path]:
 
     with local_copy(location) as path:
         yield path
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of all bytes of a file.
+
+    Raises:
+        ArchiveError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
 
 
 def stamp_of(path: Path) -> FileStamp:
@@ -171,19 +204,10 @@ def cell_in(archive: Archive) -> Cell:
     """The cell that travels in an archive; those of one campaign share theirs.
 
     Raises:
-        ArchiveError: the archive carries no cell or no URDF.
+        ArchiveError: the archive carries no cell or no URDF, or one that is no text.
         CellError: the cell is not right.
     """
-    absent = [name for name in ("cell.toml", "robot.urdf") if name not in archive.attachments]
-    if absent:
-        raise ArchiveError(
-            archive.path,
-            f"carries no {absent[0]}",
-            remedy="import the recording again with a URDF or a cell file",
-        )
-    return cell_from(
-        archive.attachments["cell.toml"].decode(), archive.attachments["robot.urdf"].decode()
-    )
+    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"))
 
 
 @lru_cache(maxsize=8)
@@ -219,8 +243,8 @@ def design_effect(estimate: Estimate, phase: PhaseFactor, weighting: Weighting) 
     return float(np.einsum("ij,ji->", information, estimate.covariance)) / phase.n_parameters
 
 
-def _doubts(archive: Archive, source: Source) -> tuple[str, ...]:
-    doubts = []
+def _doubts(archive: Archive, cell: Cell, source: Source) -> tuple[str, ...]:
+    doubts = [*known_doubts(cell, archive), *Findings.of(archive.metadata).doubts]
     if source.merged:
         doubts.append(
             f"{source.merged} samples had the time stamp of the one before and were averaged "

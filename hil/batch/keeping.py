@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import lru_cache
+from sys import intern
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from identification.estimation import Estimate
 from identification.phase_factor import PhaseFactor
 
-from .cache import Entry, Store, Where
+from .cache import Entry, Where
 from .factors import BUNDLE, reduce_bundle
 from .keys import settings_digest, sum_key, summary_key
 from .types import ArchiveRef, Broken, Bundle, Fit, Settings, Summary
@@ -69,7 +71,7 @@ class _Shelf:
 
     def __init__(self, refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> None:
         self._refs, self._settings = tuple(refs), settings_digest(settings)
-        self._where = where
+        self._store = where.store(refs[0].location)
 
     def has(self) -> bool:
         """Whether there are files for all of it."""
@@ -115,10 +117,6 @@ class _Shelf:
         """The sum over the first `count` is part of a longer one now."""
         self._store.forget(sum_key(self._refs[:count], self._settings))
 
-    @property
-    def _store(self) -> Store:
-        return self._where.store(self._refs[0].location)
-
 
 def phase_entry(phase: PhaseFactor | None, prefix: str) -> tuple[dict[str, Any], Arrays]:
     """A factor as header and arrays, the names of which begin with the prefix."""
@@ -126,7 +124,7 @@ def phase_entry(phase: PhaseFactor | None, prefix: str) -> tuple[dict[str, Any],
         return {f"{prefix}joints": None}, {}
     arrays: Arrays = {f"{prefix}samples": phase.samples}
     for joint, (gram, columns) in enumerate(zip(phase.gram, phase.columns, strict=True)):
-        row, column = np.tril_indices(gram.shape[1])
+        row, column = _triangle(gram.shape[1])
         arrays[f"{prefix}gram{joint}"] = gram[:, row, column]
         arrays[f"{prefix}columns{joint}"] = columns
     header = {f"{prefix}joints": phase.n_joints, f"{prefix}names": list(phase.parameter_names)}
@@ -143,7 +141,7 @@ def phase_from(entry: Entry, prefix: str) -> PhaseFactor | None:
         used = entry.arrays[f"{prefix}columns{joint}"]
         triangle = entry.arrays[f"{prefix}gram{joint}"]
         width = len(used) + 1
-        row, column = np.tril_indices(width)
+        row, column = _triangle(width)
         gram = np.empty((len(triangle), width, width))
         gram[:, row, column] = triangle
         gram[:, column, row] = triangle
@@ -159,7 +157,7 @@ def summary_entry(summary: Summary) -> tuple[dict[str, Any], Arrays]:
     header |= {"duration": summary.duration, "doubts": list(summary.doubts), "fits": {}}
     for name, fit in summary.fits.items():
         one = fit.estimate
-        row, column = np.tril_indices(len(one.values))
+        row, column = _triangle(len(one.values))
         arrays |= {
             f"{name}.values": one.values,
             f"{name}.covariance": one.covariance[row, column],
@@ -177,12 +175,15 @@ def summary_from(entry: Entry, ref: ArchiveRef) -> Summary:
     total = phase_from(entry, "total.")
     assert total is not None
     fits = {name: _fit(entry, name, told) for name, told in entry.header["fits"].items()}
-    return Summary(ref, total, fits, entry.header["duration"], tuple(entry.header["doubts"]))
+    return Summary(
+        ref, total, fits, entry.header["duration"], tuple(map(intern, entry.header["doubts"]))
+    )
 
 
 def _fit(entry: Entry, name: str, told: Mapping[str, Any]) -> Fit:
+    """Words that most archives share are held once."""
     values = entry.arrays[f"{name}.values"]
-    row, column = np.tril_indices(len(values))
+    row, column = _triangle(len(values))
     covariance = np.empty((len(values), len(values)))
     covariance[row, column] = covariance[column, row] = entry.arrays[f"{name}.covariance"]
     estimate = Estimate(
@@ -192,9 +193,9 @@ def _fit(entry: Entry, name: str, told: Mapping[str, Any]) -> Fit:
         covariance=covariance,
         noise_std=entry.arrays[f"{name}.noise_std"],
         samples=entry.arrays[f"{name}.samples"],
-        method=told["method"],
+        method=intern(told["method"]),
         condition=told["condition"],
-        undetermined=tuple(told["undetermined"]),
+        undetermined=tuple(map(intern, told["undetermined"])),
         interval_factor=told["interval_factor"],
     )
     return Fit(estimate, told["design_effect"])
@@ -210,3 +211,10 @@ def settings_from(header: Mapping[str, Any]) -> Settings:
     noise = header["noise_variance"]
     known = dict(header) | {"noise_variance": None if noise is None else tuple(noise)}
     return Settings(**known)
+
+
+@lru_cache(maxsize=64)
+def _triangle(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the lower triangle of a square."""
+    row, column = np.tril_indices(width)
+    return row, column

@@ -19,19 +19,21 @@ from hil.cell import Cell
 
 from .types import ArchiveRef, Choices, Settings
 
-# What stands between the bytes of an archive and its factor.
+# What stands between the bytes of an archive and all that is kept of it.
 _PROGRAMS: Final = (
     (drivers, ("*.py",)),
     (identification, ("*.py",)),
     (hil, ("recordings.py", "archive/*.py", "cell/*.py", "identify/sources.py")),
-    (hil, ("batch/factors.py", "batch/settling.py", "batch/keeping.py")),
+    (hil, ("importers/findings.py",)),
+    (hil, ("batch/examining.py", "batch/factors.py", "batch/settling.py", "batch/keeping.py")),
+    (hil, ("batch/keys.py", "batch/setup.py")),
 )
 _LIBRARIES: Final = ("numpy", "scipy", "pin")
 
 
 @cache
 def code_digest() -> str:
-    """Digest of the programs that make a factor and of the libraries they compute with.
+    """Digest of the programs that examine and reduce archives, and of the libraries they use.
 
     The programs' own text is read, so that a change counts even where nobody has raised a version.
     """
@@ -46,24 +48,33 @@ def code_digest() -> str:
     return found.hexdigest()
 
 
-def arm_digest(cell: Cell, drive_train: bytes | None) -> str:
+def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:
     """Digest of what makes a robot the same one: links, joints, friction law, drives.
 
-    Not of a payload: an arm that carries something else is the same arm.
+    Not of a payload or a delay (see :mod:`hil.batch.setup`): an arm that carries something else is
+    the same arm.
 
     Args:
         cell: as it travels in the archive.
         drive_train: the drive train in force, if the archive has one.
+        simulated: whether it is no arm, but a model of one.
     """
     drives = cell.file.drive_train
     return _digest(
         {
             "urdf": hashlib.sha256(cell.urdf.encode()).hexdigest(),
+            "simulated": simulated,
             "robot": cell.file.robot.model_dump(mode="json", exclude={"payload"}),
             "drives": drives.model_dump(mode="json") if drives is not None else None,
             "in force": None if drive_train is None else hashlib.sha256(drive_train).hexdigest(),
         }
     )
+
+
+def belief_digest(cell: Cell) -> str:
+    """Digest of what the maker's figures are, "" without any; the URDF counts to the arm."""
+    nominal = cell.file.nominal
+    return "" if nominal is None else _digest(nominal.model_dump(mode="json"))
 
 
 def settings_digest(settings: Settings) -> str:

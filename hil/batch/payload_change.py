@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -37,7 +36,6 @@ _MOMENT_PLACES: Final = [LINK_SYMBOLS.index(f"mc{axis}") for axis in "xyz"]
 PAYLOAD_LIKE: Final = 0.5
 """Share of a change of the inertial parameters that a payload has to explain to be one."""
 
-# Directions in which a body changes less than this share of the strongest are not seen.
 # Directions in which a body changes less than this share of the strongest are not seen.
 _SEEN: Final = 1e-4
 _BLIND: Final = 1e-3
@@ -120,6 +118,11 @@ class Change:
     mass_std: float
     moment: Array
     moment_std: Array
+
+    @property
+    def like_a_payload(self) -> bool:
+        """Whether a body on the last link explains enough of the change to be the cause."""
+        return self.share >= PAYLOAD_LIKE
 
 
 def projection(
@@ -206,18 +209,18 @@ def compare(onto: Projection, before: State, after: State, scatter: float = 1.0)
     )
 
 
-def own_scatter(onto: Projection, states: Sequence[State]) -> float:
+def own_scatter(onto: Projection, pairs: Sequence[tuple[State, State]]) -> float:
     """How much more campaigns of this arm differ than their covariances say, at least 1.
 
-    The median over successive campaigns, so that a payload put on once is no part of it.
+    The median over successive campaigns that state the same payload, so that a payload put on once
+    is no part of it.
     """
-    changes = [compare(onto, one, other) for one, other in pairwise(states)]
-    ratios = [
-        change.statistic
-        / float(fisher.median(onto.rank, min(one.freedom, other.freedom) - onto.rank + 1))
-        for change, (one, other) in zip(changes, pairwise(states), strict=True)
-        if change is not None
-    ]
+    ratios = []
+    for one, other in pairs:
+        change = compare(onto, one, other)
+        if change is not None:
+            spare = min(one.freedom, other.freedom) - onto.rank + 1
+            ratios.append(change.statistic / float(fisher.median(onto.rank, spare)))
     return max(1.0, float(np.median(ratios))) if len(ratios) >= _FEWEST_CHANGES else 1.0
 
 

@@ -2,12 +2,13 @@
 
 Any address fsspec knows is good (``s3://``, ``gs://``, ``http://``, ``file://``, ``memory://``...);
 some need a package of their own, which the error names. fsspec is imported when such an address is
-given, and not before.
+given, and not before. What a busy store or network refuses is asked for again, a few times.
 """
 
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -16,11 +17,19 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from hil.errors import InputError
 
+from .errors import UnavailableError
+
 T = TypeVar("T")
 
 _SUFFIX: Final = ".mcap"
 _VERSIONS: Final = ("ETag", "etag", "md5Hash", "content_md5", "Content-MD5")
 """What stores say of the content of an object, by the names they have for it."""
+
+_PAUSES: Final = (0.5, 2.0)
+"""s before a store that failed is asked again: once after each."""
+
+_TRY_LATER: Final = (408, 425, 429)
+"""Of HTTP's 4xx those that ask for patience."""
 
 
 class RemoteFile(NamedTuple):
@@ -50,7 +59,8 @@ def listed(url: str) -> list[RemoteFile]:
         url: of an archive, or of a folder (of a web server: one that lists its folders as links).
 
     Raises:
-        InputError: the address cannot be read, or a package for it is missing.
+        InputError: a package for the address is missing.
+        UnavailableError: it cannot be read.
     """
     return _asked(url, lambda: _listed(url))
 
@@ -62,7 +72,8 @@ def local_copy(url: str) -> Iterator[Path]:
     It lies in the folder for temporary files (``TMPDIR``); nothing of it is held in memory.
 
     Raises:
-        InputError: the address cannot be read, or a package for it is missing.
+        InputError: a package for the address is missing.
+        UnavailableError: it cannot be read.
     """
     with tempfile.TemporaryDirectory(prefix="hil-") as folder:
         path = Path(folder) / url.rstrip("/").rsplit("/", 1)[-1]
@@ -99,7 +110,7 @@ def _version(info: dict[str, Any]) -> str:
 
 
 def _asked(url: str, question: Callable[[], T]) -> T:
-    """Ask a store; whatever it has against that is one sentence."""
+    """Ask a store, and again if it is only indisposed; what it has against that is one sentence."""
     if find_spec("fsspec") is None:
         raise InputError(
             None,
@@ -107,12 +118,33 @@ def _asked(url: str, question: Callable[[], T]) -> T:
             field=url,
             remedy="install it with: pip install 'hil[cluster]'",
         )
+    for pause in _PAUSES:
+        try:
+            return question()
+        except Exception as error:  # each store has errors of its own
+            if _is_final(error):
+                raise _refusal(url, error) from error
+            time.sleep(pause)
     try:
         return question()
-    except ImportError as error:  # fsspec says which package the protocol needs
-        raise InputError(None, f"needs another package: {error}", field=url) from error
-    except FileNotFoundError as error:
-        raise InputError(None, "is not there, or its server does not answer", field=url) from error
-    except Exception as error:  # each store has errors of its own
-        reason = str(error) or type(error).__name__
-        raise InputError(None, f"cannot be read: {reason}", field=url) from error
+    except Exception as error:
+        raise _refusal(url, error) from error
+
+
+def _is_final(error: Exception) -> bool:
+    """Whether a store would say the same another time: what it does not have, or does not give."""
+    status = getattr(error.__cause__ or error, "status", None)  # of HTTP
+    if isinstance(status, int):
+        return 400 <= status < 500 and status not in _TRY_LATER
+    if isinstance(error, FileNotFoundError):
+        return error.__cause__ is None
+    return isinstance(error, ImportError | ValueError | PermissionError | NotImplementedError)
+
+
+def _refusal(url: str, error: Exception) -> InputError:
+    if isinstance(error, ImportError):  # fsspec says which package the protocol needs
+        return InputError(None, f"needs another package: {error}", field=url)
+    if isinstance(error, FileNotFoundError):
+        return UnavailableError(None, "is not there, or its server does not answer", field=url)
+    reason = str(error) or type(error).__name__
+    return UnavailableError(None, f"cannot be read: {reason}", field=url)

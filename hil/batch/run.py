@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
 from hil.cell import Cell
-from hil.progress import Reporter, Task
+from hil.errors import InputError
+from hil.progress import Reporter
 from identification import IdentificationError
+from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
 
 from .cache import Where
 from .discovery import discover
+from .doubts import Doubts
 from .errors import NothingToFitError
 from .estimates import Estimator, Unseen, repetition_level, sum_level
 from .factors import cell_from, cell_in, opened
@@ -28,6 +32,7 @@ from .types import (
     BatchResult,
     Broken,
     Choices,
+    GroupKey,
     Level,
     LevelEstimate,
 )
@@ -53,19 +58,18 @@ class Plan:
 
 
 def reidentify(
-    roots: Sequence[str], plan: Plan, workers: Workers, reporter: Reporter, *, threads: int = 1
+    roots: Sequence[str], plan: Plan, workers: Workers, reporter: Reporter
 ) -> BatchResult:
     """Identify every arm from all its archives: repetition by repetition, campaign, and pooled.
 
-    The numbers are those of `hil identify` on the archives of a campaign. They do not depend on
-    the order in which archives are found, nor on who computes what.
+    The numbers are those of `hil identify` on the archives of a campaign with the same held out.
+    They do not depend on the order in which archives are found, nor on who computes what.
 
     Args:
         roots: folders, archives, or URLs of either.
         plan: how.
         workers: who does the work on archives.
         reporter: of progress.
-        threads: that hash archives.
 
     Raises:
         NothingToFitError: there is not one archive that can be fitted.
@@ -73,7 +77,7 @@ def reidentify(
         CacheError: nothing can be kept where it should be.
     """
     with _kept(plan) as where:
-        found = discover(roots, where, threads=threads, reporter=reporter)
+        found = discover(roots, where, workers, reporter)
         work = Work(workers, plan.choices, where, reporter)
         work.broken += found.broken
         campaigns = [
@@ -81,7 +85,7 @@ def reidentify(
         ]
         campaigns = work.settle(campaigns)
         work.reduce(campaigns)
-        return _Estimates(plan, work, where).result(campaigns, found.skipped, reporter)
+        return _Estimates(plan, work, where).result(campaigns, found.skipped)
 
 
 @contextmanager
@@ -104,13 +108,11 @@ class _Estimates:
         self._campaigns: list[LevelEstimate] = []
         self._pooled: list[LevelEstimate] = []
 
-    def result(
-        self, campaigns: Sequence[Campaign], skipped: tuple[Broken, ...], reporter: Reporter
-    ) -> BatchResult:
+    def result(self, campaigns: Sequence[Campaign], skipped: tuple[Broken, ...]) -> BatchResult:
         """Estimate everything."""
-        with reporter.task("estimating", len(campaigns)) as task:
+        with self._work.collecting(campaigns):
             for digest, members in groupby(campaigns, lambda one: one.key.arm):
-                self._arm(digest, list(members), task)
+                self._arm(digest, list(members))
         if not self._repetitions:
             raise self._nothing()
         return BatchResult(
@@ -119,57 +121,68 @@ class _Estimates:
             repetitions=tuple(self._repetitions),
             campaigns=tuple(self._campaigns),
             pooled=tuple(self._pooled),
-            broken=tuple(dict.fromkeys(self._work.broken)),
+            broken=tuple(dict.fromkeys(map(_once, self._work.broken))),
             skipped=skipped,
             read=self._work.read,
             cached=sum(len(refs) for one in campaigns for refs in one.bundles) - self._work.read,
             code=code_digest(),
         )
 
-    def _arm(self, digest: str, members: Sequence[Campaign], task: Task) -> None:
+    def _arm(self, digest: str, members: Sequence[Campaign]) -> None:
         """Campaigns of one arm, and all of them together."""
         self._arms[digest] = Arm(digest, self._cell(members[0].refs[0]))
+        if self._plan.estimator == "prior":
+            _require_one_belief(members)
         estimator = Estimator(self._plan.estimator, self._arms[digest].cell)
         everything: list[ArchiveRef] = []
         sums, unseen, settings, levels = TreeSum[PhaseFactor](), Unseen(), set(), []
+        doubts = Doubts()
         for one in members:
-            refs, phase, own = self._campaign(one, estimator)
-            task.advance(1, one.key.campaign)
+            refs, phase, own, about = self._campaign(one, estimator)
             if phase is None:
                 continue
             used = settings_digest(one.ready)
-            levels += self._level("campaign", estimator, refs, phase, own, used)
+            payload = _carried(self._cell(refs[0]))
+            levels += self._level(
+                "campaign", estimator, refs, phase, own, used, about.lines(), payload
+            )
             sums.add(phase)
             settings.add(used)
             everything += refs
             unseen += own
+            doubts.add(about)
         whole = sums.result()
         self._campaigns += levels
         if whole is None:
             return
-        if len({ref.campaign for ref in everything}) == 1:
-            self._pooled += [replace(one, level="pooled", campaign="") for one in levels]
+        keys = {ref.key for ref in everything}
+        if len(keys) == 1:
+            self._pooled += [
+                replace(one, level="pooled", campaign="", payload=None) for one in levels
+            ]
             return
         used = settings.pop() if len(settings) == 1 else ""
-        self._pooled += self._level("pooled", estimator, everything, whole, unseen, used)
+        told = (*_setups(keys), *doubts.lines())
+        self._pooled += self._level("pooled", estimator, everything, whole, unseen, used, told)
 
     def _campaign(
         self, one: Campaign, estimator: Estimator
-    ) -> tuple[list[ArchiveRef], PhaseFactor | None, Unseen]:
-        """Archives of one campaign that are fitted, their sum, and what is predicted."""
+    ) -> tuple[list[ArchiveRef], PhaseFactor | None, Unseen, Doubts]:
+        """Archives of one campaign that are fitted, their sum, what is predicted, and doubts."""
         used = settings_digest(one.ready)
         refs: list[ArchiveRef] = []
-        unseen = Unseen()
+        unseen, doubts = Unseen(), Doubts()
         collected = self._work.collected(one)
         for bundle in collected:
             self._work.broken += bundle.broken
             for summary in bundle.summaries:
+                doubts.note(summary)
                 if summary.ref.use == "excitation":
                     refs.append(summary.ref)
                     self._repetitions.append(repetition_level(estimator, summary, used))
                 else:
                     unseen += Unseen(summary.total)
-        return refs, collected.total, unseen
+        return refs, collected.total, unseen, doubts
 
     def _level(
         self,
@@ -179,10 +192,12 @@ class _Estimates:
         phase: PhaseFactor,
         unseen: Unseen,
         settings: str,
+        doubts: Sequence[str],
+        payload: Payload | None = None,
     ) -> list[LevelEstimate]:
         """The estimate from a sum; none, and the reason among what is broken, if it fails."""
         try:
-            return [sum_level(level, estimator, refs, phase, unseen, settings)]
+            return [sum_level(level, estimator, refs, phase, unseen, settings, doubts, payload)]
         except IdentificationError as error:
             name = refs[0].campaign if level == "campaign" else f"arm {refs[0].arm[:8]}"
             self._work.broken.append(Broken(name, str(error)))
@@ -203,3 +218,41 @@ class _Estimates:
             problem += f"; {len(broken)} archives are broken, such as {broken[0].path}"
             problem += f" ({broken[0].reason})"
         return NothingToFitError(None, problem)
+
+
+def _once(one: Broken) -> Broken:
+    """Without the path in the reason, where it stands already."""
+    return Broken(one.path, one.reason.removeprefix(f"{one.path}: "))
+
+
+def _carried(cell: Cell) -> Payload | None:
+    """The payload that a cell states; None for one of no weight and inertia."""
+    payload = cell.model.payload
+    return payload if payload is not None and payload.parameters.any() else None
+
+
+def _setups(keys: Collection[GroupKey]) -> list[str]:
+    """What is to be known of campaigns whose cells state different things."""
+    counts = Counter(key.setup for key in keys)
+    if len(counts) < 2:
+        return []
+    stated = "; ".join(
+        f"{setup or 'nothing'} ({count} {'campaign' if count == 1 else 'campaigns'})"
+        for setup, count in sorted(counts.items())
+    )
+    return [
+        f"pooled over campaigns whose cells state different things, known and taken off: {stated}"
+    ]
+
+
+def _require_one_belief(members: Sequence[Campaign]) -> None:
+    """One prior serves all campaigns of an arm, so their cells must state the same one."""
+    first, *others = (ref for one in members for ref in one.refs)
+    for ref in others:
+        if ref.belief != first.belief:
+            raise InputError(
+                ref.location,
+                f"its cell states another [nominal] than that of {first.location}, of the same arm",
+                field="--estimator prior",
+                remedy="name their folders apart, or use --estimator wls",
+            )

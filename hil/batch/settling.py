@@ -20,6 +20,7 @@ from .cache import Where
 from .factors import cell_in, opened, preprocessing
 from .keeping import settings_from, settings_header
 from .keys import choices_digest, code_digest
+from .setup import stated_delay
 from .types import ArchiveRef, Broken, Choices, Settings
 
 COMPARED: Final = 32
@@ -125,8 +126,7 @@ def _same_motion(refs: Sequence[ArchiveRef]) -> bool:
 def _delay(cell: Cell, choices: Choices) -> float:
     if choices.delay is not None:
         return choices.delay
-    controller = cell.file.controller
-    return controller.current_delay_cycles * cell.period if controller else 0.0
+    return stated_delay(cell)
 
 
 def _bandwidth(cell: Cell, first: Source, settings: Settings, choices: Choices) -> float | None:

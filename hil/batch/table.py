@@ -58,6 +58,7 @@ _ESTIMATE_COLUMNS: Final[Mapping[str, Kind]] = {
     "arm": "text",
     "arm_digest": "text",
     "campaign": "text",
+    "setup": "text",
     "archive": "text",
     "archive_sha256": "text",
     "when": "time",
@@ -101,6 +102,7 @@ def _estimate_columns(arm: Arm, level: LevelEstimate) -> Row:
         "arm": arm.name,
         "arm_digest": level.arm,
         "campaign": level.campaign,
+        "setup": level.setup,
         "archive": level.archive,
         "archive_sha256": level.sha256,
         "when": _instant(level.when),
@@ -116,8 +118,8 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
             "archives": level.repetitions,
             "samples": int(level.samples.sum()),
             "condition": level.condition,
-            "relative_error": _relative(level.noise_std, level.torque_rms, level.samples),
-            "unseen_relative_error": _relative(level.unseen_rms, level.unseen_torque_rms),
+            "relative_error": relative_error(level.noise_std, level.torque_rms, level.samples),
+            "unseen_relative_error": relative_error(level.unseen_rms, level.unseen_torque_rms),
             "method": level.method,
             "doubts": "; ".join(level.doubts),
             "estimator": result.estimator,
@@ -215,12 +217,18 @@ TABLES: Final = (
 )
 
 
-def _relative(
+def relative_error(
     error: np.ndarray[Any, np.dtype[np.float64]],
     torque: np.ndarray[Any, np.dtype[np.float64]],
     rows: np.ndarray[Any, np.dtype[np.intp]] | None = None,
 ) -> float:
-    """Error over torque, root of the sums of squares over all joints; NaN where unknown."""
+    """Error over torque, root of the sums of squares over all joints; NaN where unknown.
+
+    Args:
+        error: RMS or standard deviation per joint (n,).
+        torque: RMS per joint (n,).
+        rows: of each joint (n,); equally many if left out.
+    """
     count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
     known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
     if not known.any():

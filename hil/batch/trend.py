@@ -6,21 +6,19 @@ is said of an arm that has not changed, is in `docs/batch.md`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.stats import t as student
 
-from hil.batch import payload_change
 from hil.batch.axis_figures import friction_of, friction_weights
 from hil.batch.chart import Drift, Limits, chart, drift
-from hil.batch.payload_change import PAYLOAD_LIKE, Change, Projection
+from hil.batch.payload_trend import LEAST_EFFECT, PayloadTrend, payload_trend
 from hil.batch.types import BatchResult, Broken, LevelEstimate
 from identification import RobotModel
 
@@ -35,14 +33,10 @@ LEAST_FRICTION: Final = 0.05
 """A change of friction by less than this share is not told, however certain."""
 LEAST_ERROR: Final = 0.10
 """The same of the torque error."""
-LEAST_EFFECT: Final = 0.10
-"""A change of payload is told if its RMS torque is at least this share of the torque residual."""
-
 FILE_NAME: Final = "trend.html"
 
 _RULES = 3
 _DAY = 86400.0
-_NORMAL = float(student.ppf(0.975, 1e6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +48,20 @@ class Watched:
         stds: (c,); zero where only the scatter of the history is known.
         limits: of each campaign by those before, None while these are too few.
         departs: which campaigns are outside, and by enough to matter.
+        levels: see :class:`hil.batch.chart.Chart`.
     """
 
     values: Array
     stds: Array
     limits: tuple[Limits | None, ...]
     departs: tuple[bool, ...]
+    levels: tuple[int, ...]
+
+    @property
+    def settled(self) -> NDArray[np.bool_]:
+        """Campaigns at the level that was reached last (c,)."""
+        known = [level for level in self.levels if level >= 0]
+        return np.asarray(np.array(self.levels) == (known[-1] if known else 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,8 @@ class AxisTrend:
         speed_unit: its unit.
         friction: mean of both directions.
         error: standard deviation of what the model leaves of the torque.
-        drift: of the friction [unit per day, or per campaign]; None if it cannot be told.
+        drift: of the friction at the level reached last [unit per day, or per campaign]; None if
+            it cannot be told.
         drifts: whether that is more than chance, and enough to matter.
     """
 
@@ -104,27 +107,6 @@ class ParameterTrend:
 
 
 @dataclass(frozen=True, eq=False)
-class PayloadTrend:
-    """What the last link carries beside what it carried in the first campaign.
-
-    Attributes:
-        changes: of each campaign against those before it since the last change; None of the first.
-        changed: which campaigns differ in what the last link carries.
-        other: which differ in their inertial parameters, but not as a payload would.
-        mass: on top of the first campaign's [kg] (c,); NaN where it cannot be seen.
-        mass_std: (c,).
-        untested: why there is no test; "" if there is.
-    """
-
-    changes: tuple[Change | None, ...]
-    changed: tuple[bool, ...]
-    other: tuple[bool, ...]
-    mass: Array
-    mass_std: Array
-    untested: str = ""
-
-
-@dataclass(frozen=True, eq=False)
 class ArmTrend:
     """An arm over c campaigns.
 
@@ -132,8 +114,11 @@ class ArmTrend:
         name: of the arm.
         campaigns: folders, in order of time.
         when: of each, ISO 8601, "" where unknown.
-        time: (c,) [days since the first]; number of the campaign where not all times are known.
-        dated: whether all times are known.
+        time: (c,) [days since the first]; number of the campaign where no time is known.
+        dated: whether times are known. If not, campaigns are in the order of their names.
+        setups: what the cells state that campaigns of one arm may differ in, in words.
+        undated: folders of further campaigns, without a time, that are no part of the history.
+        doubts: what a reader must know of the archives.
     """
 
     name: str
@@ -144,25 +129,37 @@ class ArmTrend:
     axes: tuple[AxisTrend, ...]
     parameters: tuple[ParameterTrend, ...]
     payload: PayloadTrend
+    setups: tuple[str, ...] = ()
+    undated: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Trends:
-    """All arms of a batch, and what could not be read for it."""
+    """All arms of a batch, and what was not used for it.
+
+    Attributes:
+        arms: by name.
+        broken: what could not be used.
+        estimator: by name.
+        archives: that were fitted.
+        skipped: what is not meant to be used.
+    """
 
     arms: tuple[ArmTrend, ...]
     broken: tuple[Broken, ...]
     estimator: str
     archives: int
+    skipped: tuple[Broken, ...] = ()
 
 
-def write_trend(folder: Path, result: BatchResult) -> Path:
+def write_trend(folder: Path, found: Trends) -> Path:
     """Write the trend report of a batch into a folder, and return its path."""
     # Figures need matplotlib, which is slow to import.
     from hil.report.trend import write_trend_report
 
     path = folder / FILE_NAME
-    write_trend_report(path, trends(result))
+    write_trend_report(path, found)
     return path
 
 
@@ -172,13 +169,22 @@ def trends(result: BatchResult) -> Trends:
     for digest, arm in sorted(result.arms.items(), key=lambda item: item[1].name):
         campaigns = [one for one in result.campaigns if one.arm == digest]
         if campaigns:
-            found.append(arm_trend(arm.name, arm.cell.model, campaigns))
-    return Trends(tuple(found), result.broken, result.estimator, len(result.repetitions))
+            doubts = [text for one in result.pooled if one.arm == digest for text in one.doubts]
+            trend = arm_trend(arm.name, arm.cell.model, campaigns)
+            found.append(replace(trend, doubts=tuple(dict.fromkeys(doubts))))
+    return Trends(
+        tuple(found), result.broken, result.estimator, len(result.repetitions), result.skipped
+    )
 
 
 def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) -> ArmTrend:
-    """Find what changed on one arm from campaign to campaign, in any order."""
+    """Find what changed on one arm from campaign to campaign, in any order.
+
+    Campaigns without a time of recording are left out if others have one, since nobody knows where
+    they belong. If none has, all are taken in the order of their folders' names.
+    """
     ordered, time, dated = _in_time(campaigns)
+    within = {id(one) for one in ordered}
     return ArmTrend(
         name=name,
         campaigns=tuple(one.campaign for one in ordered),
@@ -196,21 +202,29 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
             )
             for k in range(model.n_parameters)
         ),
-        payload=_payload(model, ordered),
+        payload=payload_trend(model, ordered, FALSE_ALARMS / _RULES),
+        setups=tuple(one.setup for one in ordered),
+        undated=tuple(one.campaign for one in campaigns if id(one) not in within),
     )
 
 
 def _in_time(
     campaigns: Sequence[LevelEstimate],
 ) -> tuple[list[LevelEstimate], Array, bool]:
-    """Campaigns by time if every one has it, else as they come, with days or numbers."""
-    instants = [_instant(one.when) for one in campaigns]
-    known = [at for at in instants if at is not None]
-    if len(known) < len(instants):
-        return list(campaigns), np.arange(1.0, len(campaigns) + 1.0), False
-    order = sorted(range(len(known)), key=lambda k: (known[k], campaigns[k].campaign))
-    time = np.array([known[k] for k in order])
-    return [campaigns[k] for k in order], (time - time[:1]) / _DAY, True
+    """Campaigns with a time, and their days; if none has one, all by name, and their numbers."""
+    known = [(at, one) for one in campaigns if (at := _instant(one.when)) is not None]
+    if not known:
+        named = sorted(campaigns, key=lambda one: _natural(one.campaign))
+        return named, np.arange(1.0, len(named) + 1.0), False
+    known.sort(key=lambda pair: (pair[0], pair[1].campaign))
+    time = np.array([at for at, _ in known])
+    return [one for _, one in known], (time - time[:1]) / _DAY, True
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Names in the order that people count in: the ninth before the tenth."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
 
 
 def _instant(when: str) -> float | None:
@@ -246,7 +260,7 @@ def _axes(
                 friction=friction_watch,
                 error=_error(error[:, j], share),
                 drift=slope,
-                drifts=_matters(slope, time, friction[:, j], FALSE_ALARMS / model.n_joints),
+                drifts=_matters(slope, friction[:, j], FALSE_ALARMS / model.n_joints),
             )
         )
     return tuple(found)
@@ -270,7 +284,8 @@ def _reference_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> A
 
 def _friction(values: Array, stds: Array, share: float) -> Watched:
     least = LEAST_FRICTION * _size(values)
-    return Watched(values, stds, *chart(values, stds, share, least=least))
+    judged = chart(values, stds, share, least=least)
+    return Watched(values, stds, judged.limits, judged.departs, judged.levels)
 
 
 def _error(values: Array, share: float) -> Watched:
@@ -281,99 +296,30 @@ def _error(values: Array, share: float) -> Watched:
     with np.errstate(divide="ignore"):
         logarithm = np.where(values > 0.0, np.log(values), np.nan)
     nothing = np.zeros(len(values))
-    bands, departs = chart(
-        logarithm, nothing, share, least=float(np.log1p(LEAST_ERROR)), rise_only=True
-    )
+    judged = chart(logarithm, nothing, share, least=float(np.log1p(LEAST_ERROR)), rise_only=True)
     limits = tuple(
         None
         if band is None
         else Limits(float(np.exp(band.centre)), 0.0, float(np.exp(band.high)), band.history)
-        for band in bands
+        for band in judged.limits
     )
-    return Watched(values, nothing, limits, departs)
+    return Watched(values, nothing, limits, judged.departs, judged.levels)
 
 
 def _drift(time: Array, friction: Watched) -> Drift | None:
-    """Slope without the campaigns that departed: a step is no drift."""
-    return drift(time, np.where(friction.departs, np.nan, friction.values))
+    """Slope at one level: a step is no drift."""
+    return drift(time, np.where(friction.settled, friction.values, np.nan))
 
 
-def _matters(slope: Drift | None, time: Array, values: Array, share: float) -> bool:
+def _matters(slope: Drift | None, values: Array, share: float) -> bool:
     if slope is None or not slope.p_value < share:
         return False
-    return bool(abs(slope.slope) * np.ptp(time) >= LEAST_FRICTION * _size(values))
+    return bool(abs(slope.slope) * slope.span >= LEAST_FRICTION * _size(values))
 
 
 def _size(values: Array) -> float:
     known = np.abs(values[np.isfinite(values)])
     return float(np.median(known)) if len(known) else 0.0
-
-
-def _payload(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> PayloadTrend:
-    onto = _projection(model, campaigns)
-    if isinstance(onto, str):
-        return _no_payload(len(campaigns), onto)
-    states = [
-        payload_change.state(onto, one.values, _finite(one.covariance), _freedom(one))
-        for one in campaigns
-    ]
-    scatter = payload_change.own_scatter(onto, states)
-    changes: list[Change | None] = [None]
-    changed, other = [False], [False]
-    since = [states[0]]
-    for state in states[1:]:
-        change = payload_change.compare(onto, payload_change.pooled(since), state, scatter)
-        different = (
-            change is not None
-            and change.p_value < FALSE_ALARMS / _RULES
-            and change.effect >= LEAST_EFFECT
-        )
-        like = change is not None and change.share >= PAYLOAD_LIKE
-        since = [state] if different else [*since, state]
-        changes.append(change)
-        changed.append(different and like)
-        other.append(different and not like)
-    if len(changes) > 1 and not any(changes):
-        return _no_payload(len(campaigns), "the campaigns are too short to be compared jointly")
-    beside = [payload_change.compare(onto, states[0], state, scatter) for state in states[1:]]
-    return PayloadTrend(
-        changes=tuple(changes),
-        changed=tuple(changed),
-        other=tuple(other),
-        mass=np.array([0.0, *(np.nan if one is None else one.mass for one in beside)]),
-        mass_std=np.array([0.0, *(np.nan if one is None else one.mass_std for one in beside)]),
-    )
-
-
-def _projection(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Projection | str:
-    """The projection onto a payload, or why there is none."""
-    if len(campaigns) < 2:
-        return "there is one campaign and nothing to compare it with"
-    information = [one.information for one in campaigns if one.information is not None]
-    if len(information) < len(campaigns) or any(one.covariance is None for one in campaigns):
-        return "the estimator gives no information matrix to compare with"
-    known = np.all([np.isfinite(one.std) for one in campaigns], axis=0)
-    rows = sum(int(one.samples.sum()) for one in campaigns)
-    onto = payload_change.projection(model, known, np.sum(information, axis=0), rows)
-    return "nothing that is known of this arm depends on what it carries" if onto is None else onto
-
-
-def _no_payload(count: int, why: str) -> PayloadTrend:
-    no, unknown = (False,) * count, np.full(count, np.nan)
-    return PayloadTrend((None,) * count, no, no, unknown, unknown, why)
-
-
-def _finite(covariance: Array | None) -> Array:
-    assert covariance is not None
-    return np.where(np.isfinite(covariance), covariance, 0.0)
-
-
-def _freedom(level: LevelEstimate) -> float:
-    """Degrees of freedom of the covariance, from the Student factor of its intervals."""
-    factor = level.interval_factor
-    if factor <= _NORMAL:
-        return 1e6
-    return float(brentq(lambda freedom: student.ppf(0.975, freedom) - factor, 0.5, 1.1e6))
 
 
 __all__ = [

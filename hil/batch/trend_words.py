@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 
 from hil.batch.chart import FEWEST
 from hil.batch.payload_change import Change
+from hil.batch.payload_trend import Statement
+from hil.batch.shifts import Shift, shifts
 from hil.batch.trend import ArmTrend, AxisTrend, Watched
+from identification.payload import Payload
 
 Level = Literal["alarm", "past", "quiet"]
+_ORDER: Final[tuple[Level, ...]] = get_args(Level)
 
 _MONTH = 365.25 / 12.0
 _YEAR = 365.25
 _CERTAIN = 2.0
 _MILLIMETRE = 1e-3
+# Told one by one; what is more is counted.
+_SHIFTS = 2
+_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -37,20 +45,25 @@ class Finding:
 
 def findings(arm: ArmTrend) -> tuple[Finding, ...]:
     """What was found of an arm, what concerns its last campaign first; never empty."""
-    found = [*_payload_findings(arm)]
+    found = [*payload_findings(arm)]
     for axis in arm.axes:
         found += _axis_findings(arm, axis)
-    found.sort(key=lambda one: one.level != "alarm")
-    return tuple(found) if found else (_nothing(arm),)
+    if all(one.level == "quiet" for one in found):
+        found.insert(0, _nothing(arm))
+    found.sort(key=lambda one: _ORDER.index(one.level))
+    return (*found, *_order_findings(arm))
 
 
 def summary(arm: ArmTrend) -> str:
     """One line: what the last campaign says of the arm."""
-    alarms = sum(one.level == "alarm" for one in findings(arm))
+    levels = [one.level for one in findings(arm)]
+    alarms, past = levels.count("alarm"), levels.count("past")
     if alarms:
         return f"{alarms} {'thing' if alarms == 1 else 'things'} to look into"
     if len(arm.campaigns) < 2:
         return "one campaign, nothing to compare it with"
+    if past:
+        return f"no new change; {past} earlier {'one' if past == 1 else 'ones'}"
     if len(arm.campaigns) <= FEWEST:
         return "no change found, but too few campaigns to judge the axes"
     return "as before"
@@ -58,8 +71,49 @@ def summary(arm: ArmTrend) -> str:
 
 def campaign_name(arm: ArmTrend, k: int) -> str:
     """A campaign as the page calls it: the last part of its folder, and its day."""
-    name = arm.campaigns[k].rstrip("/").rsplit("/", 1)[-1] or f"campaign {k + 1}"
+    name = campaign_folder(arm, k)
     return f"{name} ({arm.when[k][:10]})" if arm.dated else name
+
+
+def campaign_folder(arm: ArmTrend, k: int) -> str:
+    """The last part of its folder, and what its cell states where a folder holds several."""
+    name = _last_part(arm.campaigns[k]) or f"campaign {k + 1}"
+    if arm.campaigns.count(arm.campaigns[k]) == 1:
+        return name
+    return f"{name}, {arm.setups[k] or 'nothing stated'}"
+
+
+def _last_part(folder: str) -> str:
+    return folder.rstrip("/").rsplit("/", 1)[-1]
+
+
+def _order_findings(arm: ArmTrend) -> list[Finding]:
+    """What a reader must know of the order of campaigns."""
+    if arm.undated:
+        names = ", ".join(_last_part(one) for one in arm.undated[:_NAMED])
+        more = len(arm.undated) - _NAMED
+        return [
+            Finding(
+                "quiet",
+                f"{len(arm.undated)} further {_campaigns(len(arm.undated))} ({names}"
+                f"{f' and {more} more' if more > 0 else ''}) without a time of recording:"
+                " left out here, since nobody knows where they belong.",
+            )
+        ]
+    if arm.dated or len(arm.campaigns) < 2:
+        return []
+    return [
+        Finding(
+            "quiet",
+            "No campaign has a time of recording: they are taken in the order of their folders'"
+            f" names, from {campaign_name(arm, 0)} to {campaign_name(arm, len(arm.campaigns) - 1)}."
+            " If that is not the order of time, before and after mean nothing here.",
+        )
+    ]
+
+
+def _campaigns(count: int) -> str:
+    return "campaign" if count == 1 else "campaigns"
 
 
 def _nothing(arm: ArmTrend) -> Finding:
@@ -85,58 +139,100 @@ def _nothing(arm: ArmTrend) -> Finding:
 
 
 def _axis_findings(arm: ArmTrend, axis: AxisTrend) -> list[Finding]:
-    found = []
-    if any(axis.friction.departs):
-        found.append(_friction_departs(arm, axis))
-    if any(axis.error.departs):
-        found.append(_error_departs(arm, axis))
+    found = _shift_findings(arm, axis, axis.friction, _friction_words)
+    found += _shift_findings(arm, axis, axis.error, _error_words)
     if axis.drifts:
         found.append(_drifts(arm, axis))
     return found
 
 
-def _friction_departs(arm: ArmTrend, axis: AxisTrend) -> Finding:
-    k, centre = _latest(axis.friction)
-    value = float(axis.friction.values[k])
-    change = _relative_change(value, centre)
+def _shift_findings(
+    arm: ArmTrend,
+    axis: AxisTrend,
+    watched: Watched,
+    words: Callable[[ArmTrend, AxisTrend, Shift], tuple[str, str]],
+) -> list[Finding]:
+    """The last shifts of a figure: each with its own sentence, and how many there were before."""
+    every = shifts(watched)
+    found = []
+    for shift in every[-_SHIFTS:]:
+        # What has risen stays a thing to look into until it returns, however long ago it was.
+        alarming = shift.kind == "departs" and (shift.value > shift.before or not shift.settled)
+        level: Level = "alarm" if shift.lasts and alarming else "past"
+        found.append(Finding(level, *words(arm, axis, shift)))
+    if len(every) > _SHIFTS:
+        count = len(every) - _SHIFTS
+        text = f"{axis.joint} had {count} earlier {'change' if count == 1 else 'changes'} of this"
+        found.append(Finding("past", f"{text} kind: see the figures."))
+    return found
+
+
+def _friction_words(arm: ArmTrend, axis: AxisTrend, shift: Shift) -> tuple[str, str]:
+    value, unit = shift.value, axis.unit
+    change = _relative_change(value, shift.before)
     at = f" at {axis.speed:.2g} {axis.speed_unit}" if math.isfinite(axis.speed) else ""
+    if shift.kind == "returns":
+        return (
+            f"{axis.joint} has returned to an earlier level of friction{at}: {value:.3g} after"
+            f" {shift.before:.3g} {unit}{_when(arm, shift)}.",
+            "Repaired, greased, or equally warm again?",
+        )
     words = (
         f"{axis.joint} departs from its history: friction{at} is {100.0 * abs(change):.0f} %"
         f" {'above' if change > 0 else 'below'} what it was, {value:.3g} against"
-        f" {centre:.3g} {axis.unit}{_since(arm, axis.friction)}."
+        f" {shift.before:.3g} {unit}{_when(arm, shift)}.{_settled(shift)}"
     )
-    step = (
-        "Check this axis' gear, brake and lubrication; was it colder than in the other campaigns?"
-        if change > 0
-        else "Was it warmer than in the other campaigns, or has gear or lubricant been changed?"
-    )
-    return _finding(arm, axis.friction, words, step)
+    if change > 0:
+        step = "Check this axis' gear, brake and lubrication; was it colder than before?"
+    else:
+        step = "Was it warmer than before, or has gear or lubricant been changed?"
+    return words, step
 
 
-def _error_departs(arm: ArmTrend, axis: AxisTrend) -> Finding:
-    k, centre = _latest(axis.error)
-    value = float(axis.error.values[k])
-    words = (
-        f"{axis.joint} departs from its history: the model leaves {value:.3g} {axis.unit} of its"
-        f" torque unexplained, {100.0 * _relative_change(value, centre):.0f} % more than before"
-        f" ({centre:.3g} {axis.unit}){_since(arm, axis.error)}."
+def _error_words(arm: ArmTrend, axis: AxisTrend, shift: Shift) -> tuple[str, str]:
+    value, unit = shift.value, axis.unit
+    if shift.kind == "returns":
+        return (
+            f"{axis.joint} has returned to an earlier level of torque error: {value:.3g} after"
+            f" {shift.before:.3g} {unit}{_when(arm, shift)}.",
+            "",
+        )
+    return (
+        f"{axis.joint} departs from its history: the model leaves {value:.3g} {unit} of its"
+        f" torque unexplained, {100.0 * _relative_change(value, shift.before):.0f} % more than"
+        f" before ({shift.before:.3g} {unit}){_when(arm, shift)}.{_settled(shift)}",
+        "Look at the residual of this axis in hil identify on that campaign: backlash, a rubbing"
+        " hose or another motion make it.",
     )
-    step = "Look at the residual of this axis in hil identify on that campaign: backlash, a"
-    return _finding(arm, axis.error, words, f"{step} rubbing hose or another motion make it.")
+
+
+def _settled(shift: Shift) -> str:
+    if shift.settled and shift.lasts:
+        return " It has stayed there: later campaigns are judged by this level."
+    return ""
+
+
+def _when(arm: ArmTrend, shift: Shift) -> str:
+    """In which campaigns."""
+    if shift.first == shift.last:
+        return f" in {campaign_name(arm, shift.first)}"
+    if shift.lasts:
+        return f", since {campaign_name(arm, shift.first)}"
+    return f", from {campaign_name(arm, shift.first)} to {campaign_name(arm, shift.last)}"
 
 
 def _drifts(arm: ArmTrend, axis: AxisTrend) -> Finding:
-    assert axis.drift is not None
+    slope = axis.drift
+    assert slope is not None
     size = abs(float(np.nanmedian(axis.friction.values))) or math.inf
-    span = float(np.ptp(arm.time))
-    unit, scale = _per(arm, span)
-    slope, low, high = (
-        100.0 * one * scale / size for one in (axis.drift.slope, axis.drift.low, axis.drift.high)
-    )
-    total = axis.drift.slope * span / size
+    unit, scale = _per(arm, slope.span)
+    per, low, high = (100.0 * one * scale / size for one in (slope.slope, slope.low, slope.high))
+    total = 100.0 * slope.slope * slope.span / size
+    first = int(np.flatnonzero(axis.friction.settled)[0])
+    over = f"since {campaign_name(arm, first)}" if first else "over all campaigns"
     words = (
-        f"Friction of {axis.joint} {'rises' if slope > 0 else 'falls'} steadily: {slope:+.2g} %"
-        f" {unit} (95 %: {low:+.2g} to {high:+.2g}), {100.0 * total:+.0f} % over all campaigns."
+        f"Friction of {axis.joint} {'rises' if per > 0 else 'falls'} steadily: {per:+.2g} %"
+        f" {unit} (95 %: {low:+.2g} to {high:+.2g}), {total:+.0f} % {over}."
     )
     return Finding("alarm", words, "Wear, lubricant that ages, or campaigns run ever warmer.")
 
@@ -150,16 +246,21 @@ def _per(arm: ArmTrend, span: float) -> tuple[str, float]:
     return ("per month", _MONTH) if span < 2.0 * _YEAR else ("per year", _YEAR)
 
 
-def _payload_findings(arm: ArmTrend) -> list[Finding]:
+def payload_findings(arm: ArmTrend) -> list[Finding]:
+    """What was found of what an arm carries, campaign by campaign."""
     payload = arm.payload
     found = []
     for k, change in enumerate(payload.changes):
+        statement = payload.statements[k]
+        if statement is not None:
+            found.append(_statement_finding(arm, k, statement))
         if change is None or not (payload.changed[k] or payload.other[k]):
             continue
         level: Level = "alarm" if k == len(payload.changes) - 1 else "past"
         where = f"between {campaign_name(arm, k - 1)} and {campaign_name(arm, k)}"
         if payload.changed[k]:
-            words = f"What the arm carries has changed {where}: {_what(change)}."
+            beside = "" if statement is None else ", beside what is stated,"
+            words = f"What the arm carries{beside} has changed {where}: {_what(change)}."
             step = "State the payload in the cell file, or check the tool and its fastening."
         else:
             words = (
@@ -169,6 +270,39 @@ def _payload_findings(arm: ArmTrend) -> list[Finding]:
             step = "Check the torque constants and the calibration, and what links before it carry."
         found.append(Finding(level, words, step))
     return found
+
+
+def _statement_finding(arm: ArmTrend, k: int, statement: Statement) -> Finding:
+    """A payload that a cell states is no discovery; whether the torques agree is."""
+    told = (
+        f"From {campaign_name(arm, k)} on the cell states {_load(statement.after)} instead of"
+        f" {_load(statement.before)}"
+    )
+    match statement.verdict:
+        case "agrees":
+            return Finding("quiet", f"{told}; the torques agree.")
+        case "statement only":
+            return Finding(
+                "quiet", f"{told}; by its torques it carries the same as before: only that is new."
+            )
+        case "either":
+            return Finding(
+                "quiet", f"{told}; whether it was carried before as well, the torques do not say."
+            )
+        case "differs":
+            return Finding(
+                "alarm" if k == len(arm.campaigns) - 1 else "past",
+                f"{told}; the torques do not agree.",
+                "Weigh the payload and measure its centre, then correct the cell file.",
+            )
+        case "untested":
+            return Finding("quiet", f"{told}; whether the torques agree was not tested.")
+
+
+def _load(payload: Payload | None) -> str:
+    if payload is None or payload.mass == 0.0:
+        return "nothing"
+    return f"a payload of {payload.mass:g} kg"
 
 
 def _what(change: Change) -> str:
@@ -193,26 +327,3 @@ def _what(change: Change) -> str:
 
 def _relative_change(value: float, centre: float) -> float:
     return (value - centre) / (abs(centre) or math.inf)
-
-
-def _latest(watched: Watched) -> tuple[int, float]:
-    """The last campaign that departs, and the centre of those before it."""
-    k = max(k for k, departs in enumerate(watched.departs) if departs)
-    limits = watched.limits[k]
-    assert limits is not None
-    return k, limits.centre
-
-
-def _since(arm: ArmTrend, watched: Watched) -> str:
-    """In which campaigns."""
-    which = [k for k, departs in enumerate(watched.departs) if departs]
-    first, last = which[0], which[-1]
-    if first == last:
-        return f" in {campaign_name(arm, last)}"
-    if len(which) == last - first + 1 and last == len(watched.departs) - 1:
-        return f", since {campaign_name(arm, first)}"
-    return f", in {len(which)} campaigns, last in {campaign_name(arm, last)}"
-
-
-def _finding(arm: ArmTrend, watched: Watched, words: str, step: str) -> Finding:
-    return Finding("alarm" if watched.departs[len(arm.campaigns) - 1] else "past", words, step)

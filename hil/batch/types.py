@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from identification.estimation import Estimate
+from identification.factor import Factor
+from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Smoother
 
@@ -30,10 +32,12 @@ class GroupKey(NamedTuple):
     Attributes:
         arm: digest of URDF, model, friction law and drive train.
         campaign: the folder the archives were recorded into.
+        setup: delay and payload that their cells state, in words; "" for neither.
     """
 
     arm: str
     campaign: str
+    setup: str = ""
 
 
 class FileStamp(NamedTuple):
@@ -45,7 +49,7 @@ class FileStamp(NamedTuple):
     inode: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ArchiveRef:
     """One archive: where it lies, and what it is, without its samples.
 
@@ -59,6 +63,8 @@ class ArchiveRef:
         cell: digest of the texts of cell file and URDF.
         motion: digest of the planned motion, "" where none is known.
         when: time of recording, ISO 8601; "" in simulation.
+        setup: see :class:`GroupKey`.
+        belief: digest of what the cell's `[nominal]` says of the arm.
         stamp: of the file when it was hashed; None of a remote one.
     """
 
@@ -71,6 +77,8 @@ class ArchiveRef:
     cell: str
     motion: str
     when: str = ""
+    setup: str = ""
+    belief: str = ""
     stamp: FileStamp | None = None
 
     @property
@@ -81,12 +89,12 @@ class ArchiveRef:
     @property
     def key(self) -> GroupKey:
         """The group it belongs to."""
-        return GroupKey(self.arm, self.campaign)
+        return GroupKey(self.arm, self.campaign, self.setup)
 
     @property
-    def order(self) -> tuple[str, str, int, str, str]:
+    def order(self) -> tuple[str, str, str, int, str, str]:
         """Sums go in this order, whatever order archives were found in."""
-        return self.arm, self.campaign, self.index, self.name, self.sha256
+        return *self.key, self.index, self.name, self.sha256
 
 
 class Broken(NamedTuple):
@@ -222,7 +230,7 @@ class Arm:
         return f"{self.cell.name}-{self.digest[:8]}"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class LevelEstimate:
     """Parameters from one repetition, one campaign, or all campaigns of an arm.
 
@@ -252,6 +260,10 @@ class LevelEstimate:
         doubts: what a reader must know.
         speed_rms: per axis (n,), see :mod:`hil.batch.axis_figures`; None for a repetition.
         information: weighted Gram matrix (p, p) of the fitted rows; None for a repetition.
+        setup: what the cell states that archives of one arm may differ in, in words; "" if
+            nothing, or if campaigns with different ones are pooled.
+        payload: that the cell states; None for none, or if pooled.
+        unseen: sum of the factors of the validation runs; None if there are none.
     """
 
     level: Level
@@ -279,6 +291,9 @@ class LevelEstimate:
     doubts: tuple[str, ...] = ()
     speed_rms: Array | None = None
     information: Array | None = None
+    setup: str = ""
+    payload: Payload | None = None
+    unseen: Factor | None = None
 
 
 @dataclass(frozen=True, eq=False)

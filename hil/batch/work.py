@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from hil.progress import Reporter
+from hil.progress import Reporter, Task
 from identification.phase_factor import PhaseFactor
 
 from .cache import Where
@@ -52,14 +53,17 @@ class Campaign:
 class Collected:
     """Bundles of a campaign, one in memory at a time, and their sum when all have been seen."""
 
-    def __init__(self, found: Iterator[Bundle], total: PhaseFactor | None = None) -> None:
-        self._found, self._total = found, total
+    def __init__(
+        self, found: Iterator[Bundle], ended: Callable[[], None], total: PhaseFactor | None = None
+    ) -> None:
+        self._found, self._ended, self._total = found, ended, total
         self._sums = TreeSum[PhaseFactor]()
 
     def __iter__(self) -> Iterator[Bundle]:
         for bundle in self._found:
             self._sums.add(bundle.phase)
             yield bundle
+        self._ended()
 
     @property
     def total(self) -> PhaseFactor | None:
@@ -90,6 +94,7 @@ class Work:
         self._where, self._reporter = where, reporter
         self._loose: dict[tuple[ArchiveRef, ...], Bundle] = {}
         self._far_sums: Iterator[Summed[PhaseFactor, Done]] = iter(())
+        self._task: Task | None = None
 
     def settle(self, campaigns: Sequence[Campaign]) -> list[Campaign]:
         """Give each campaign its settings; returns those that have some."""
@@ -116,9 +121,10 @@ class Work:
         for one in campaigns:
             one.bundles = bundles([ref for ref in one.refs if ref.use != "standstill"])
         if not self._workers.near:
+            tasks = [[self._reduction(one, refs) for refs in one.bundles] for one in campaigns]
+            share = _archives(campaigns) / max(1, sum(map(len, tasks)))
             self._far_sums = self._workers.sums_in_turn(
-                [[self._task(one, refs) for refs in one.bundles] for one in campaigns],
-                operator.add,
+                tasks, operator.add, done=lambda count: self._advance(share * count)
             )
             return
         missing = []
@@ -129,7 +135,7 @@ class Work:
                 if not is_kept(refs, one.ready, self._where)
             ]
         notes = self._ask(
-            [self._task(one, one.bundles[k]) for one, k in missing],
+            [self._reduction(one, one.bundles[k]) for one, k in missing],
             "reading archives",
             sum(len(one.bundles[k]) for one, k in missing),
         )
@@ -139,11 +145,24 @@ class Work:
             else:
                 one.bundles[k] = self._one_by_one(one, one.bundles[k])
 
+    @contextmanager
+    def collecting(self, campaigns: Sequence[Campaign]) -> Iterator[None]:
+        """Report how far all of them are collected; where work is far away, how far it is."""
+        near = self._workers.near
+        title = "estimating" if near else "reading archives and estimating"
+        total = len(campaigns) if near else _archives(campaigns)
+        with self._reporter.task(title, total) as self._task:
+            try:
+                yield
+            finally:
+                self._task = None
+
     def collected(self, one: Campaign) -> Collected:
         """The bundles of a campaign, once it is settled and reduced."""
         if not self._workers.near:
             return self._far(one, next(self._far_sums))
-        return Collected(self._bundle(one, refs) for refs in one.bundles)
+        found = (self._bundle(one, refs) for refs in one.bundles)
+        return Collected(found, lambda: self._advance(1, one.key.campaign))
 
     def _settle_by_the_next(self, campaigns: Sequence[Campaign]) -> None:
         """Where those consulted were broken and nothing is settled, ask the archives left."""
@@ -183,7 +202,7 @@ class Work:
         good: tuple[ArchiveRef, ...] = ()
         for ref in refs:
             longer = (*good, ref)
-            (note,) = self._ask([self._task(one, longer)], f"reading {ref.name} by itself")
+            (note,) = self._ask([self._reduction(one, longer)], f"reading {ref.name} by itself")
             if isinstance(note, Done):
                 self._loose.pop(good, None)
                 self._take(longer, note)
@@ -199,7 +218,7 @@ class Work:
         found = self._loose.pop(refs, None) or kept_bundle(refs, one.ready, self._where)
         if found is not None:
             return found
-        (note,) = self._ask([self._task(one, refs)], f"reading {refs[0].name} again")
+        (note,) = self._ask([self._reduction(one, refs)], f"reading {refs[0].name} again")
         if isinstance(note, Done):
             self._take(refs, note)
         else:
@@ -224,14 +243,14 @@ class Work:
                     one.bundles[k] = self._one_by_one(one, one.bundles[k])
             one.bundles = [refs for refs in one.bundles if refs]
             if attempt < _ROUNDS - 1:
-                tasks = [self._task(one, refs) for refs in one.bundles]
+                tasks = [self._reduction(one, refs) for refs in one.bundles]
                 (found,) = self._workers.sums([tasks], operator.add)
         notes = [note for note in found.notes if isinstance(note, Done)]
         self.read += sum(note.read for note in notes)
         without_sums = (note.bundle for note in notes if note.bundle is not None)
-        return Collected(without_sums, found.total)
+        return Collected(without_sums, lambda: self._advance(0, one.key.campaign), found.total)
 
-    def _task(self, one: Campaign, refs: tuple[ArchiveRef, ...]) -> ArchiveTask[Any, Done]:
+    def _reduction(self, one: Campaign, refs: tuple[ArchiveRef, ...]) -> ArchiveTask[Any, Done]:
         function = bundle_kept if self._workers.near else bundle_sent
         return ArchiveTask(refs[0].location, function, (refs, one.ready, self._where))
 
@@ -258,11 +277,22 @@ class Work:
         """The notes of tasks, each by itself."""
         if not tasks:
             return []
+        groups = [[one] for one in tasks]
+        if self._task is not None:  # one bar at a time
+            self._advance(0, title)
+            return [one.notes[0] for one in self._workers.sums(groups, operator.add)]
         share = (total or len(tasks)) / len(tasks)
         with self._reporter.task(title, total or len(tasks)) as progress:
-            done = self._workers.sums(
-                [[one] for one in tasks],
-                operator.add,
-                done=lambda count: progress.advance(share * count),
+            found = self._workers.sums(
+                groups, operator.add, done=lambda count: progress.advance(share * count)
             )
-        return [one.notes[0] for one in done]
+        return [one.notes[0] for one in found]
+
+    def _advance(self, units: float, note: str = "") -> None:
+        if self._task is not None:
+            self._task.advance(units, note)
+
+
+def _archives(campaigns: Sequence[Campaign]) -> int:
+    """How many archives of them are reduced."""
+    return sum(len(refs) for one in campaigns for refs in one.bundles)

@@ -2,34 +2,36 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from hil.archive import ArchiveSpec
+from hil.archive.live_view import LiveView
 from hil.cell import Cell
-from hil.files import make_folder
+from hil.design.folder import DESIGN_FILES
+from hil.errors import InputError
+from hil.files import make_folder, write_atomically
 from hil.motion_checks import MotionChecks
-from hil.progress import Reporter
-from hil.version import software
-from planner import TrajectoryPlayer
+from hil.progress import Reporter, Silent
+from identification.excitation import Excitation
 
-from .errors import CampaignFolderError, MotionFailedError, NotRehearsedError
+from .errors import CampaignFolderError
+from .execution_result import RunResult
 from .folder import CampaignFolder
-from .intervals import (
-    START_TOLERANCE,
-    Interval,
-    require_joined,
-    require_runnable,
-    require_sound,
-    wanted,
-    with_ways,
-)
+from .intervals import require_runnable
 from .motion_link import MotionLink
-from .plan import CampaignPlan, moves_to_dict
+from .operator import Operator
+from .plan import CampaignPlan
+from .quick_design import plan_around
+from .rehearsal import Rehearsal
+from .status import CampaignStatus, status_of
 from .stop import Stop
+
+if TYPE_CHECKING:
+    from hil.identify import Identification, Options
+    from sim_fixtures import SimulatedDrive
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,31 +44,46 @@ class Campaign:
 
     @classmethod
     def create(
-        cls, root: Path, cell: Cell, plan: CampaignPlan, checks: MotionChecks | None = None
+        cls,
+        root: Path,
+        cell: Cell,
+        plan: CampaignPlan | Excitation,
+        checks: MotionChecks | None = None,
     ) -> Campaign:
         """A new campaign folder with its own copies of cell, URDF and plan.
 
         Args:
-            root: the folder to make.
+            root: the folder to make; it may hold the design that the plan comes from.
             cell: the cell.
-            plan: excitation and validation motions.
+            plan: excitation and validation motions, or an excitation, around which validation
+                motions are then drawn as `[campaign]` says.
             checks: those of the cell, where they are at hand.
 
         Raises:
             CampaignFolderError: the folder holds something already.
             MotionRefusedError: the plan can never run on the cell; no folder was made.
+            NoExcitationError: no validation motion keeps the constraints of the cell.
         """
+        if isinstance(plan, Excitation):
+            checks = checks or MotionChecks.of(cell)
+            plan = plan_around(cell, plan, checks)
         require_runnable(cell, plan, checks)
         make_folder(root)
-        if any(root.iterdir()):
+        if any(path.name not in DESIGN_FILES for path in root.iterdir()):
             raise CampaignFolderError(root, "is not empty", "name a new folder")
         folder = CampaignFolder(root)
-        make_folder(folder.archives)
         own = cell.with_urdf(folder.cell, folder.urdf.name)
-        folder.urdf.write_text(own.urdf, encoding="utf-8")
-        folder.cell.write_text(own.text, encoding="utf-8")
-        plan.save(folder.plan)
-        folder.seal()
+        files = {folder.urdf: own.urdf, folder.cell: own.text, folder.plan: plan.to_text()}
+        try:
+            make_folder(folder.archives)
+            for path, text in files.items():
+                write_atomically(path, text)
+            folder.seal()
+        except OSError:
+            for path in files:
+                path.unlink(missing_ok=True)
+            folder.archives.rmdir()
+            raise
         return cls(folder, own, plan)
 
     @classmethod
@@ -84,120 +101,146 @@ class Campaign:
             )
         return cls(folder, Cell.load(folder.cell), CampaignPlan.load(folder.plan))
 
-    def run(
-        self,
-        link: MotionLink,
-        stop: Stop,
-        reporter: Reporter,
-        *,
-        provenance: Mapping[str, str],
-        durable: bool = True,
-    ) -> None:
-        """Run what is still missing, in order, and return to where the arm was.
+    def status(self) -> CampaignStatus:
+        """What is done, what is next, and what to type for it."""
+        return status_of(self)
 
-        Every motion is checked before the first one is sent.
+    def rehearse(
+        self,
+        *,
+        reporter: Reporter | None = None,
+        seed: int | None = None,
+        stop: Stop | None = None,
+        again: bool = False,
+        drive: SimulatedDrive | None = None,
+    ) -> Rehearsal:
+        """Run exactly this plan on a simulated twin of the cell, and judge it.
+
+        The result is in `rehearsal.json` and holds as long as cell, URDF and plan stay what they
+        are. A rehearsal that passed is not repeated, one that was stopped goes on.
 
         Args:
-            link: to the controller.
-            stop: set from outside to bring the arm to rest on its path.
             reporter: told of the progress.
-            provenance: goes into the metadata of every archive, e.g. whether it is simulated.
-            durable: wait at each flush until the disk has the data.
+            seed: of what is planted in the twin, its noise and its link's faults.
+            stop: ends it early.
+            again: rehearse once more even if it passed.
+            drive: the simulated arm's gears and motors, where they shall not be those of the cell
+                file; the result is then returned only, and opens no gate.
 
         Raises:
+            MotionRefusedError: a motion breaks a limit of the cell.
+            OperatorStopError: it was stopped; what was recorded is kept.
+            CampaignFolderError: the folder was changed, or a run is at work on it.
+        """
+        from .rehearsal_run import SEED, rehearse  # which runs campaigns
+
+        return rehearse(
+            self,
+            reporter or Silent(),
+            seed=SEED if seed is None else seed,
+            stop=stop,
+            again=again,
+            drive=drive,
+        )
+
+    def identify(
+        self, options: Options | None = None, *, reporter: Reporter | None = None
+    ) -> Identification:
+        """Estimate from the archives, judge, and write results, exports and report to the folder.
+
+        Raises:
+            InputError: there is no whole excitation yet, or the archives cannot be used.
+            OutputError: the folder cannot be written to.
+        """
+        from hil.identify import Options, identify_campaign  # which knows campaign folders
+        from hil.outcome import write_outcome
+
+        reporter = reporter or Silent()
+        found = identify_campaign(self.folder.root, reporter, options or Options())
+        return replace(found, results=write_outcome(self.folder.root, found, reporter))
+
+    def report(self, *, reporter: Reporter | None = None) -> Path:
+        """The report, made anew from the results; from the archives where these know more.
+
+        Raises:
+            InputError: nothing can be identified yet.
+            OutputError: the folder cannot be written to.
+        """
+        from hil.outcome import rewrite_report  # which knows identifications
+
+        steps = {step.name: step.state for step in self.status().steps}
+        if steps["identify"] == "done":
+            with suppress(InputError):  # of an older version: identified again
+                rewrite_report(self.folder.root)
+                return self.folder.report
+        self.identify(reporter=reporter)
+        return self.folder.report
+
+    def run(
+        self,
+        link: MotionLink | None = None,
+        stop: Stop | None = None,
+        reporter: Reporter | None = None,
+        *,
+        operator: Operator | None = None,
+        provenance: Mapping[str, str] | None = None,
+        durable: bool | None = None,
+        unrehearsed: bool = False,
+        dry_run_only: bool = False,
+        accept_dry_run: bool = False,
+        accept_torque: Sequence[str] = (),
+        live: LiveView | None = None,
+    ) -> RunResult:
+        """Run what is still missing, in order, and return to where the arm was.
+
+        A plan is run after it passed its rehearsal on the simulated twin, and at full speed only
+        after a person has accepted its slow dry run. Every motion is checked before the first one
+        is sent. A motion that fails its quality check is archived as rejected, with the reason,
+        and run again.
+
+        Args:
+            link: to the controller; the cell's own if left out. A cell with the transport
+                "simulated" has a simulated controller in virtual time.
+            stop: set from outside to bring the arm to rest on its path.
+            reporter: told of the progress.
+            operator: sees each motion, may slow or hold it, and is asked to accept the dry run;
+                nobody if left out.
+            provenance: goes into the metadata of every archive, e.g. whether it is simulated.
+            durable: wait at each flush until the disk has the data; left out, in real time only.
+            unrehearsed: without rehearsal and dry run; only a simulated arm allows that.
+            dry_run_only: end after the dry run.
+            accept_dry_run: the caller accepts the dry run that was done before; on a simulated
+                link also the one that this run does.
+            accept_torque: joints whose torque ran against the model's gravity in the dry run that
+                was done before (`DryRun.against_gravity`), accepted by name.
+            live: of the cell's own link: lets viewers look at what is recorded.
+
+        Raises:
+            NotRehearsedError: the plan did not pass its rehearsal.
+            DryRunError: nobody has accepted the dry run of the plan.
             MotionRefusedError: a motion failed its check; nothing was sent.
             MotionFailedError: a motion ended otherwise than planned; it is archived.
+            RepetitionsRejectedError: a motion failed its quality check again and again.
             ControllerFault: the controller did not come up.
+            OperatorStopError: a stop was asked for instead of an answer to the dry run.
             CampaignFolderError: the folder was changed, or another run is at work on it.
-            NotRehearsedError: the link may lead to a real controller.
+            OutputError: what came of it cannot be written down.
         """
-        if not link.only_simulated:
-            raise NotRehearsedError
-        with self.folder.locked():
-            self.folder.require_unchanged()
-            intervals = self._missing()
-            checks = MotionChecks.of(self.cell)
-            if checks.not_checked is not None:
-                reporter.say(checks.not_checked)
-            # What is wrong with a motion itself is told before anything is connected.
-            require_sound(intervals, checks)
-            where = link.connect(stop)
-            if intervals:
-                intervals = with_ways(self.cell, intervals, where)
-                require_sound([way for way in intervals if way.kind == "move"], checks)
-                require_joined(intervals)
-            total = sum(interval.trajectory.duration for interval in intervals)
-            with reporter.task("running the campaign (s of motion)", total) as task:
-                for interval in intervals:
-                    if stop.requested:
-                        raise MotionFailedError(str(interval), "stopped", "it had not begun")
-                    self._run_one(interval, link, stop, provenance, durable=durable)
-                    task.advance(interval.trajectory.duration, str(interval))
-            link.close()
+        from .execution import Choices, run_campaign  # which knows campaigns
 
-    def _missing(self) -> list[Interval]:
-        """What is still to be run."""
-        return [
-            interval
-            for interval in wanted(self.cell, self.plan)
-            if self.folder.whole(interval.kind, interval.index) is None
-        ]
-
-    def _run_one(
-        self,
-        interval: Interval,
-        link: MotionLink,
-        stop: Stop,
-        provenance: Mapping[str, str],
-        *,
-        durable: bool,
-    ) -> None:
-        cell, bounds = self.cell, self.cell.file.bounds
-        player = TrajectoryPlayer(
-            interval.trajectory,
-            cell.period,
-            cell.joint_limits,
-            override_acceleration=bounds.override.acceleration,
-            override_jerk=bounds.override.jerk,
-            stop_acceleration=bounds.stop.acceleration,
-            stop_jerk=bounds.stop.jerk,
-            start_tolerance=START_TOLERANCE,
+        return run_campaign(
+            self,
+            link,
+            stop,
+            reporter,
+            operator=operator,
+            provenance=provenance,
+            choices=Choices(
+                unrehearsed=unrehearsed,
+                dry_run_only=dry_run_only,
+                accept_dry_run=accept_dry_run,
+                accept_torque=tuple(accept_torque),
+                durable=durable,
+                live=live,
+            ),
         )
-        name = self.folder.next_name(interval.kind, interval.index)
-        spec = ArchiveSpec(
-            self.folder.archives / name.filename,
-            joint_names=cell.joint_names,
-            period=cell.period,
-            metadata=self._metadata() | dict(provenance),
-            attachments=self._attachments(interval),
-            durable=durable,
-        )
-        ended = link.run(player, spec, stop)
-        self.folder.add(name.filename, ended.outcome)
-        if ended.outcome != "completed":
-            refused = link.connection.refused if ended.outcome == "refused" else None
-            recorder = None if refused is None else refused.flight_recorder
-            raise MotionFailedError(str(interval), ended.outcome, ended.reason, recorder)
-
-    def _attachments(self, interval: Interval) -> dict[str, bytes]:
-        cell = self.cell
-        return {
-            "cell.toml": cell.text.encode(),
-            "robot.urdf": cell.urdf.encode(),
-            "drive_train.json": cell.drive_table.model_dump_json().encode(),
-            "plan.json": json.dumps(self._plan_of(interval)).encode(),
-        }
-
-    def _plan_of(self, interval: Interval) -> dict[str, Any]:
-        """The trajectory of an interval, its moves, and how an excitation was found."""
-        moves = moves_to_dict(interval.moves)
-        if interval.kind == "excitation":
-            return {"excitation": self.plan.excitation.to_dict(), **moves}
-        return {"trajectory": interval.trajectory.to_dict(), **moves}
-
-    def _metadata(self) -> dict[str, str]:
-        return {
-            "campaign": self.folder.root.resolve().name,
-            "cell": self.cell.name,
-            **{f"software.{name}": version for name, version in software().items()},
-        }

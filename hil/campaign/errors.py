@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive.commands import Failed
-from hil.errors import ArchiveWriteError, ControllerFault, InputError, UnsafeError
+from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError, UnsafeError
 
 
 class CampaignFolderError(InputError):
@@ -53,12 +55,53 @@ class MotionFailedError(ControllerFault):
 
 
 class NotRehearsedError(UnsafeError):
-    """A campaign that was never rehearsed is not run on a controller that may be real."""
+    """A plan that did not pass its rehearsal is not run."""
 
-    def __init__(self) -> None:
+    def __init__(self, campaign: Path, problem: str, remedy: str) -> None:
+        super().__init__(f"{campaign} {problem}; {remedy}.")
+
+
+class DryRunError(UnsafeError):
+    """A plan is not run at full speed before a person has accepted its slow dry run."""
+
+    def __init__(self, campaign: Path, problem: str, remedy: str) -> None:
+        super().__init__(f"{campaign}: its slow dry run {problem}; {remedy}.")
+
+
+class AgainstGravityError(DryRunError):
+    """A dry run whose torques contradict the model is accepted joint by joint, or not at all.
+
+    Attributes:
+        joints: whose torque runs against the model's gravity.
+    """
+
+    def __init__(self, campaign: Path, joints: Sequence[str], why: str) -> None:
+        self.joints = tuple(joints)
+        names = " ".join(f"--accept-torque {joint}" for joint in joints)
         super().__init__(
-            "this campaign was not rehearsed, and its link leads out of this computer; "
-            "only a simulated controller on this computer (127.0.0.1) is driven without a rehearsal"
+            campaign,
+            f"was done, but is not accepted ({', '.join(joints)}: {why})",
+            "correct the cell file and rehearse again, or, if you know that the arm is right and "
+            f"the model is not, run `hil run {campaign} --accept-dry-run {names}`",
+        )
+
+
+class RepetitionsRejectedError(HilError):
+    """A motion failed its quality check as often as it may be repeated.
+
+    Attributes:
+        motion: which one.
+        reasons: of each attempt.
+    """
+
+    exit_code: ClassVar[int] = 5
+
+    def __init__(self, motion: str, reasons: Sequence[str]) -> None:
+        self.motion, self.reasons = motion, tuple(reasons)
+        super().__init__(
+            f"{motion} was of no use {len(self.reasons)} times, at last because "
+            f"{self.reasons[-1]}; all attempts are archived with their reasons: find the cause, "
+            "then run the campaign again to continue."
         )
 
 

@@ -10,6 +10,7 @@ from drivers.exchange import (
     ControlBlock,
     EventsLost,
     ExchangeEnded,
+    ExchangeEvent,
     ExchangeFailed,
     ExchangeProcess,
     ExchangeStatus,
@@ -63,9 +64,10 @@ class ExchangeView:
         control = ControlBlock(self.exchange.control_fd)
         self._pulse = Pulse(lambda: control.exchange_heartbeat)
 
-    def look(self) -> None:
-        """Take in what the exchange says."""
-        for event in self.exchange.events():
+    def look(self) -> list[ExchangeEvent]:
+        """Take in what the exchange says, and return it."""
+        events = self.exchange.events()
+        for event in events:
             self.connection.note(event)
             if isinstance(event, InitReceived):
                 self.inits += 1
@@ -81,6 +83,7 @@ class ExchangeView:
                 self._said = event.trace.strip().splitlines()[-1]
             elif isinstance(event, Leaving | ExchangeEnded) and not self._said:
                 self._said = event.reason
+        return events
 
     def forget_motion(self) -> None:
         """Another motion is about to be asked for."""

@@ -12,27 +12,45 @@ import fcntl
 import hashlib
 import json
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hil.archive import ArchiveName
+from hil.archive.amend import REJECTED
 from hil.files import write_atomically
 
 from .errors import CampaignFolderError
+from .sealed import MESH, MISSING, as_text, checksums, combined
+
+if TYPE_CHECKING:
+    from hil.cell import Cell
+
+    from .plan import CampaignPlan
 
 LOCK = "campaign.lock"
+LOCK_PATIENCE = 0.5
+"""s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One closed archive."""
+    """One closed archive.
+
+    Attributes:
+        name: of the file.
+        outcome: how its motion ended; "rejected" for one that ended well and is of no use.
+        sha256: checksum of the file.
+        reason: why it was rejected, in words; "" for every other.
+    """
 
     name: str
     outcome: str
     sha256: str
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,8 +90,61 @@ class CampaignFolder:
         return self.root / "report.html"
 
     @property
+    def rehearsal(self) -> Path:
+        """How the rehearsal of the plan went."""
+        return self.root / "rehearsal.json"
+
+    @property
+    def rehearsed(self) -> Path:
+        """Folder of the rehearsal's own campaigns: its archives and reports."""
+        return self.root / "rehearsal"
+
+    @property
+    def dry_run(self) -> Path:
+        """Who accepted the slow dry run."""
+        return self.root / "dry_run.json"
+
+    @property
+    def warmup(self) -> Path:
+        """How the friction fell while the arm warmed up."""
+        return self.root / "warmup.json"
+
+    @property
+    def plan_hash(self) -> str:
+        """SHA-256 over cell, URDF, plan and collision meshes as they lie there."""
+        return combined(self._inputs())
+
+    def hash_of(self, cell: Cell, plan: CampaignPlan) -> str:
+        """The hash of a cell and a plan in memory, which must be those that lie in the folder.
+
+        What is judged, run and stamped is then one and the same, whatever is edited meanwhile.
+
+        Raises:
+            CampaignFolderError: one of them was changed since it was read.
+        """
+        contents = self._contents()
+        same = {
+            self.cell.name: as_text(contents.get(self.cell.name, b"")) == cell.text,
+            self.urdf.name: as_text(contents.get(self.urdf.name, b"")) == cell.urdf,
+            self.plan.name: plan.is_of(as_text(contents.get(self.plan.name, b""))),
+        }
+        for name, unchanged in same.items():
+            if not unchanged:
+                raise CampaignFolderError(
+                    self.root,
+                    f"{name} was changed after it was read",
+                    "open the campaign anew, and begin this step again",
+                )
+        return combined(self._checksums(contents))
+
+    @property
     def _manifest(self) -> Path:
         return self.root / "manifest.json"
+
+    @property
+    def sealed(self) -> bool:
+        """Whether there is a manifest."""
+        return self._manifest.exists()
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -88,21 +159,42 @@ class CampaignFolder:
             raise CampaignFolderError(
                 self.root, f"{LOCK} cannot be written ({error.strerror})", "make it writable"
             ) from error
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        if not _taken(lock, fcntl.LOCK_EX, LOCK_PATIENCE):
             os.close(lock)
             raise CampaignFolderError(
                 self.root, "another run is at work on it", "wait for its end, or stop it"
-            ) from error
+            )
         try:
             yield
+        finally:
+            os.close(lock)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a run is at work on the folder at this moment."""
+        try:
+            lock = os.open(self.root / LOCK, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError:  # nobody ever was, or it is not ours to look
+            return False
+        try:
+            return not _taken(lock, fcntl.LOCK_SH, 0.0)
         finally:
             os.close(lock)
 
     def seal(self) -> None:
         """Begin the manifest with the checksums of what the campaign is about."""
         self._save({"inputs": self._inputs(), "archives": []})
+
+    def accept_changes(self) -> None:
+        """Take cell, URDF and plan as they are, if nothing has been recorded with them yet.
+
+        Raises:
+            CampaignFolderError: something was recorded, and one of them changed since.
+        """
+        if self._content()["archives"]:
+            self.require_unchanged()
+        elif self._content()["inputs"] != self._inputs():
+            self.seal()
 
     def require_unchanged(self) -> None:
         """Refuse to go on if cell, URDF or plan are not those the campaign began with.
@@ -112,11 +204,15 @@ class CampaignFolder:
         """
         sealed, now = self._content()["inputs"], self._inputs()
         for name in sorted(sealed.keys() | now.keys()):
+            if name.startswith(MESH) and name not in sealed:
+                continue  # sealed by a version that did not look at meshes
             if sealed.get(name) != now.get(name):
                 raise CampaignFolderError(
                     self.root,
                     f"{name} is not the one this campaign began with",
-                    "restore it, or begin a new campaign",
+                    "restore it, or begin a new campaign"
+                    if self._content()["archives"]
+                    else f"restore it, or rehearse again (`hil rehearse {self.root}`)",
                 )
 
     def manifest(self) -> list[Entry]:
@@ -133,15 +229,31 @@ class CampaignFolder:
         except (KeyError, TypeError) as error:
             raise self._damaged(error) from error
 
-    def add(self, name: str, outcome: str) -> None:
+    def add(self, name: str, outcome: str, reason: str = "") -> None:
         """Enter a closed archive into the manifest.
+
+        Args:
+            name: of the file.
+            outcome: how its motion ended, or "rejected".
+            reason: why it was rejected.
 
         Raises:
             CampaignFolderError: the disk refuses.
         """
         content = self._content()
-        entry = Entry(name, outcome, _sha256(self.archives / name))
+        entry = Entry(name, outcome, _sha256(self.archives / name), reason)
         self._save(content | {"archives": [*content["archives"], asdict(entry)]})
+
+    def reject(self, name: str, reason: str) -> None:
+        """Enter an archive that was found good before as rejected; it says so itself by now.
+
+        Raises:
+            CampaignFolderError: the disk refuses.
+        """
+        content = self._content()
+        now = asdict(Entry(name, REJECTED, _sha256(self.archives / name), reason))
+        entries = [now if one["name"] == name else one for one in content["archives"]]
+        self._save(content | {"archives": entries})
 
     def whole(self, kind: str, index: int) -> str | None:
         """Name of the whole archive of this interval, if there is one with outcome `completed`."""
@@ -178,9 +290,16 @@ class CampaignFolder:
         ]
 
     def next_name(self, kind: str, index: int) -> ArchiveName:
-        """Name of the next attempt at an interval; never that of an existing file."""
+        """Name of the next attempt at an interval; never one that lies there or ever did.
+
+        Raises:
+            CampaignFolderError: the manifest cannot be read.
+        """
+        taken = {entry.name for entry in self.manifest()}
         attempt = 1
-        while (self.archives / ArchiveName(kind, index, attempt).filename).exists():
+        while (name := ArchiveName(kind, index, attempt).filename) in taken or (
+            self.archives / name
+        ).exists():
             attempt += 1
         return ArchiveName(kind, index, attempt)
 
@@ -188,10 +307,24 @@ class CampaignFolder:
         path = self.archives / entry.name
         return path.is_file() and _sha256(path) == entry.sha256
 
-    def _inputs(self) -> dict[str, str]:
-        """Checksums of cell, plan and URDF by file name."""
+    def _contents(self) -> dict[str, bytes]:
+        """Cell, plan and URDF by file name, each read once."""
         files = [self.cell, self.plan, self.urdf]
-        return {file.name: _sha256(file) for file in files if file.exists()}
+        return {file.name: file.read_bytes() for file in files if file.exists()}
+
+    def _inputs(self) -> dict[str, str]:
+        """Checksums of cell, plan, URDF and meshes by name."""
+        return self._checksums(self._contents())
+
+    def _checksums(self, contents: dict[str, bytes]) -> dict[str, str]:
+        """Checksums of these; a mesh that is not on this computer counts as it was sealed."""
+        sums = checksums(contents, self.root)
+        if MISSING in sums.values():
+            sealed = self._content()["inputs"]
+            sums |= {
+                name: sealed[name] for name in sums if sums[name] == MISSING and name in sealed
+            }
+        return sums
 
     def _content(self) -> dict[str, Any]:
         if not self._manifest.exists():
@@ -214,6 +347,19 @@ class CampaignFolder:
         return CampaignFolderError(
             self.root, f"manifest.json is damaged ({error})", "restore it or start a new folder"
         )
+
+
+def _taken(lock: int, kind: int, patience: float) -> bool:
+    """Whether a lock on an open file could be had within some time [s]."""
+    deadline = time.monotonic() + patience
+    while True:
+        try:
+            fcntl.flock(lock, kind | fcntl.LOCK_NB)
+            return True
+        except OSError:
+            if time.monotonic() >= deadline:
+                return False
+            time.sleep(0.02)
 
 
 def _sha256(path: Path) -> str:

@@ -63,7 +63,8 @@ def wanted(cell: Cell, plan: CampaignPlan) -> list[Interval]:
 def with_ways(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[Interval]:
     """Put moves between: from `where` (n,) to home, from home to an excitation, and back.
 
-    An excitation may begin and end elsewhere than at home; whatever else does is not met.
+    An excitation, and sines of any kind, may begin and end elsewhere than at home; whatever else
+    does is not met.
     """
     home, at = cell.home, where
     joined: list[Interval] = []
@@ -75,13 +76,14 @@ def with_ways(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[I
         if np.max(np.abs(target - at)) > AT_REST_TOLERANCE:
             key = at.tobytes() + target.tobytes()
             if key not in ways:
-                ways[key] = _way(cell, at, target)
+                ways[key] = way(cell, at, target)
             index = sum(interval.kind == "move" for interval in joined)
             joined.append(replace(ways[key], index=index, from_arm=from_arm))
         at = target
 
     for interval in intervals:
-        start, end = ends(interval) if interval.kind == "excitation" else (home, home)
+        elsewhere = interval.kind == "excitation" or isinstance(interval.trajectory, FourierSeries)
+        start, end = ends(interval) if elsewhere else (home, home)
         go(start)
         joined.append(interval)
         at = end
@@ -146,7 +148,7 @@ def hold(position: Array, duration: float) -> PiecewiseCubic:
     )
 
 
-def _way(cell: Cell, start: Array, end: Array) -> Interval:
+def way(cell: Cell, start: Array, end: Array) -> Interval:
     """The straight way between two postures; planned where a crash does not end us."""
     move = Move(end, speed=cell.campaign.approach_speed)
     motion = in_child(plan_moves, start, (move,), cell.joint_limits)

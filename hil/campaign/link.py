@@ -7,6 +7,7 @@ waits for the PC, and only there: on a real link a slow disk must not delay a re
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import inf
@@ -18,7 +19,7 @@ from drivers.errors import RequestError
 from drivers.events import Event, MotionEnded
 from drivers.exchange import exchange
 from drivers.guard import Guard
-from drivers.motion_source import MotionSource
+from drivers.motion_source import MotionSource, progress_of
 from drivers.packet_records import PacketRing
 from drivers.record import CycleRing
 from drivers.session import Session
@@ -30,6 +31,9 @@ from hil.cell import Cell
 from hil.errors import ControllerFault, OperatorStopError
 
 from .motion_link import Connection, Progress, Recorded, Watch, described, unwatched
+from .motion_watch import MotionWatch, unwatched_motion
+from .sight import Counted, Sight, duration_of
+from .steering import ASKED_EVERY, NOT_BEGUN, Polite, Steering
 from .stop import Stop
 
 Array = NDArray[np.float64]
@@ -47,18 +51,22 @@ class Link:
         transport: moves bytes and time, virtual time (see above).
         session: answers every packet.
         ring: the session's records, drained here.
+        guard: the session's; has the limits in force.
         finish: asks the far end to end the session.
         cycles: records archived so far.
         packets: the raw packets, where archives keep them.
+        cell: whose controller is at the far end, where it is known.
     """
 
     transport: Transport
     session: Session
     ring: CycleRing
+    guard: Guard
     finish: Callable[[], None] = field(default=lambda: None)
     cycles: int = 0
     connection: Connection = field(default_factory=Connection)
     packets: PacketRing | None = None
+    cell: Cell | None = None
 
     @classmethod
     def over(
@@ -80,17 +88,18 @@ class Link:
                 "must not share a thread with the archive"
             )
         ring = CycleRing(len(cell.joint_names), capacity=10 * DRAIN_CYCLES)
+        guard = Guard(cell.guard_limits, cell.period)
         session = Session(
             cell.drive_train,
-            Guard(cell.guard_limits, cell.period),
+            guard,
             ring,
             **cell.session_settings(accept_init=accept_init),
         )
         if not cell.controller.packets:
-            return cls(transport, session, ring, finish)
+            return cls(transport, session, ring, guard, finish, cell=cell)
         packets = PacketRing(20 * DRAIN_CYCLES)
         tap = tapped(transport, packets, lambda: session.cycle)
-        return cls(tap, session, ring, finish, packets=packets)
+        return cls(tap, session, ring, guard, finish, packets=packets, cell=cell)
 
     @property
     def only_simulated(self) -> bool:
@@ -122,18 +131,33 @@ class Link:
             )
         return last
 
-    def run(self, source: MotionSource, spec: ArchiveSpec, stop: Stop) -> MotionEnded:
-        """See `MotionLink.run`."""
+    def run(
+        self,
+        source: MotionSource,
+        spec: ArchiveSpec,
+        stop: Stop,
+        *,
+        override: float = 1.0,
+        watch: MotionWatch = unwatched_motion,
+    ) -> MotionEnded:
+        """See `MotionLink.run`; while a hold stands, the simulated controller waits too."""
+        steering = Steering(watch, override)
+        steering.begin(source, stop)  # so that no archive is kept open while a hold stands
         with self._open(spec) as writer:
             taking = _Taking(self, Recorder(writer, self.session.drive_train))
+            watching = _Watching(self, source, watch, steering)
+            taking.sight = watching.sight
             self.ring.drain()
             self.drain_packets()
             self._events()
+            if not steering.begin(source, stop):
+                taking.recorder.close("stopped", NOT_BEGUN)
+                return MotionEnded("stopped", NOT_BEGUN, -1, -1)
             try:
                 self.session.request(source)
             except RequestError as error:
                 raise ControllerFault(str(error)) from error
-            until_drain, patience = DRAIN_CYCLES, AFTERMATH_CYCLES
+            until_drain, patience = 1, AFTERMATH_CYCLES  # a wish counts from the first cycle
 
             def over() -> bool:
                 nonlocal until_drain, patience
@@ -143,6 +167,7 @@ class Link:
                 if until_drain == 0 or not (self.session.requested or taking.recorder.ended):
                     until_drain = DRAIN_CYCLES
                     taking.take()
+                    watching.look(stop)
                 patience -= taking.recorder.ended is not None
                 return taking.recorder.over or patience < 0
 
@@ -273,6 +298,7 @@ class _Taking:
     def __init__(self, link: Link, recorder: Recorder) -> None:
         self.recorder = recorder
         self.failure: Exception | None = None
+        self.sight: Sight | None = None
         self._link = link
         self._overflow = link.ring.overflow
         self._packets_overflow = link.packets_overflow
@@ -285,6 +311,9 @@ class _Taking:
         lost, self._overflow = link.ring.overflow - self._overflow, link.ring.overflow
         lost_packets = link.packets_overflow - self._packets_overflow
         self._packets_overflow = link.packets_overflow
+        if self.sight is not None:
+            self.sight.note(events)
+            self.sight.take(records)
         if self.failure is not None:
             recorder.note(events)
             return
@@ -296,3 +325,35 @@ class _Taking:
             self.failure = error
             link.session.stop("the archive cannot be written")
         link.cycles += recorder.records - before
+
+
+class _Watching:
+    """Shows a motion to its watch and does what that wishes."""
+
+    def __init__(
+        self, link: Link, source: MotionSource, watch: MotionWatch, steering: Steering
+    ) -> None:
+        self._link, self._source, self._watch, self._steering = link, source, watch, steering
+        drives, duration = link.session.drive_train, duration_of(source)
+        self.sight = Sight(drives, link.guard, steering, duration, self._counted())
+
+    def look(self, stop: Stop) -> None:
+        """Show it if that is due, and pass wishes on; returns when no hold stands any more.
+
+        A simulated controller waits for its answer, so that a hold costs no simulated time.
+        """
+        while True:
+            if self.sight.due:
+                state, progress = self._link.session.state, progress_of(self._source)
+                self.sight.show(self._watch, state, self._counted(), *progress)
+            motion = Polite(self._link.session, self.sight.told)
+            self._steering.follow(motion)
+            rests = progress_of(self._source)[1] == 0.0
+            if not (self._steering.held and rests) or stop.requested:
+                return
+            time.sleep(ASKED_EVERY)
+
+    def _counted(self) -> Counted:
+        counters = self._link.session.counters
+        late = counters.discarded.get("late", 0) + counters.discarded.get("answered late", 0)
+        return Counted(counters.answered, counters.missed, late, counters.unanswered)

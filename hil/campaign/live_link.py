@@ -13,28 +13,32 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from types import TracebackType
-from typing import Self, get_args
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DriverError, RequestError
-from drivers.events import MotionEnded, Outcome
+from drivers.errors import DriverError
+from drivers.events import MotionEnded
 from drivers.exchange import ExchangeProcess, ExchangeSettings, RealTimeSettings, RingReader
 from drivers.motion_source import MotionSource
 from drivers.packet_records import CAPACITY
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec
-from hil.archive.commands import Close, Closed, Failed, Open, Opened
+from hil.archive.commands import Close, Closed, Failed, Open, Opened, Serve, Serving
+from hil.archive.live_view import LiveView, LiveViewError
 from hil.archive.supervised import ArchiveProcessHandle
 from hil.cell import Cell
+from hil.cell.link import stays_here
 from hil.errors import ControllerFault
 
 from .errors import write_error
 from .exchange_view import ExchangeView
+from .live_motion import LiveMotion
 from .live_recording import LiveRecording
 from .motion_link import Connection, Recorded, Watch, described, drives_in_force, unwatched
+from .motion_watch import MotionWatch, unwatched_motion
 from .stop import Stop
 
 Array = NDArray[np.float64]
@@ -48,8 +52,6 @@ BEAT = 0.05
 """s between two heartbeats; the exchange stops the arm after 0.5 s without one."""
 OPEN_TIMEOUT = 10.0
 """s within which a file must have been created."""
-REST_TIMEOUT = 30.0
-"""s for an arm that was told to stop to rest, and for the archive of a motion that has ended."""
 END_TIMEOUT = 30.0
 """s within which the exchange must have ended after it was told to."""
 
@@ -70,6 +72,11 @@ class LiveLink:
         cycles: records archived so far.
         late: answers so far that were late or left out for a newer one's.
         untaken: answers so far that the controller did not take.
+        job: number of the archive opened last.
+        open_path: of the archive that is open; "" if none is.
+        live: where viewers may look, None if nowhere.
+        only_simulated: whether the transport really opened ends on this computer, so that nothing
+            but a simulated controller can be at the far end.
     """
 
     cell: Cell
@@ -79,9 +86,11 @@ class LiveLink:
     cycles: int = 0
     late: int = 0
     untaken: int = 0
+    live: LiveView | None = None
+    only_simulated: bool = False
     view: ExchangeView = field(init=False)
-    _job: int = 0
-    _open_path: str = ""
+    job: int = 0
+    open_path: str = ""
     _closed: bool = False
 
     def __post_init__(self) -> None:
@@ -96,16 +105,27 @@ class LiveLink:
         accept_init: bool = False,
         realtime: RealTimeSettings | None = None,
         finish: Callable[[], None] = lambda: None,
+        live: LiveView | None = None,
     ) -> LiveLink:
         """Start both processes on the cell's link, or on another `transport` to it.
 
+        Args:
+            cell: the cell.
+            transport: in place of the cell's own.
+            accept_init: use the controller's figures where they differ from the cell's.
+            realtime: what the exchange asks of the system.
+            finish: asks the far end to end the session.
+            live: lets viewers look at what is recorded.
+
         Raises:
+            LiveViewError: the live view cannot be served as asked for.
             CellError: the cell names no real link.
             ControllerFault: the link cannot be opened (port taken, not permitted, no adapter), or
                 the system refuses a process.
         """
+        spec = transport if transport is not None else cell.transport_spec()
         settings = ExchangeSettings(
-            transport=transport if transport is not None else cell.transport_spec(),
+            transport=spec,
             drive_train=cell.drive_train,
             guard_limits=cell.guard_limits,
             period=cell.period,
@@ -130,19 +150,20 @@ class LiveLink:
             if isinstance(error, OSError):
                 raise ControllerFault(f"the archive process cannot be started: {error}") from error
             raise
-        link = cls(cell, exchange, archive, finish)
+        link = cls(cell, exchange, archive, finish, only_simulated=stays_here(spec))
         threading.Thread(target=link._beat, daemon=True).start()
+        if live is not None:
+            try:
+                link._serve(live)
+            except BaseException:
+                link._shut()
+                raise
         return link
 
     @property
     def connection(self) -> Connection:
         """What is known of the controller."""
         return self.view.connection
-
-    @property
-    def only_simulated(self) -> bool:
-        """Whether nothing but a simulated controller can be at the far end."""
-        return self.cell.only_simulated
 
     def notes(self) -> tuple[str, ...]:
         """What the system refused to the exchange, in sentences; none of it is needed."""
@@ -171,41 +192,17 @@ class LiveLink:
             f"(state {self.view.state.name}); switch the drive on and try again"
         )
 
-    def run(self, source: MotionSource, spec: ArchiveSpec, stop: Stop) -> MotionEnded:
+    def run(
+        self,
+        source: MotionSource,
+        spec: ArchiveSpec,
+        stop: Stop,
+        *,
+        override: float = 1.0,
+        watch: MotionWatch = unwatched_motion,
+    ) -> MotionEnded:
         """See `MotionLink.run`."""
-        self.view.forget_motion()
-        self.open_archive(spec, from_now=True, until_ended=True)
-        try:
-            self.exchange.submit(source)
-        except RequestError as error:
-            self.complete("refused", str(error))
-            raise ControllerFault(f"{error}; {spec.path} says so") from error
-        except DriverError as error:
-            self._raise_failure()
-            self.exchange.stop()
-            closed = self.complete("void", str(error))
-            raise ControllerFault(f"{error}; {spec.path} is {closed.outcome}") from error
-        asked, due = False, float("inf")
-        while True:
-            self.view.look()
-            if stop.requested and not asked:
-                self.exchange.stop()
-                asked = True
-            if (idle := self.view.not_begun()) is not None:
-                return self._give_up(idle)
-            answer = self.archive.answer(POLL, self._job)
-            if isinstance(answer, Closed):
-                return self._ending(answer)
-            if isinstance(answer, Failed):
-                self._open_path = ""
-                self._come_to_rest()
-                raise write_error(answer)
-            self._raise_failure()
-            if self.view.motion_ended or self.view.failure() is not None:
-                due = min(due, time.monotonic() + REST_TIMEOUT)
-            if time.monotonic() > due:
-                what = f"{spec.path} was not completed within {REST_TIMEOUT:g} s"
-                raise ControllerFault(f"the motion is over, but {what}")
+        return LiveMotion(self, stop, watch, override).run(source, spec)
 
     def record(
         self,
@@ -260,20 +257,20 @@ class LiveLink:
         drives = drives_in_force(self.cell, self.connection)
         spec = described(spec, self.connection, drives)
         spec = replace(spec, packets=self.cell.controller.packets)
-        self._job += 1
-        self._open_path = str(spec.path)
+        self.job += 1
+        self.open_path = str(spec.path)
         self.view.lost = None
-        self.archive.send(Open(self._job, spec, drives, from_now, until_ended))
-        answer = self.archive.answer(OPEN_TIMEOUT, self._job)
+        self.archive.send(Open(self.job, spec, drives, from_now, until_ended))
+        answer = self.archive.answer(OPEN_TIMEOUT, self.job)
         if isinstance(answer, Opened):
             return
-        self._open_path = ""
+        self.open_path = ""
         if isinstance(answer, Failed):
             raise write_error(answer)
         if (failure := self.archive.failure()) is not None:
             raise ControllerFault(f"{failure}; nothing was sent, and {spec.path} is not recorded")
         # Should it come to it after all, it is to be closed at once.
-        self.archive.send(Close(self._job, "void", "nothing was sent: it was opened too late"))
+        self.archive.send(Close(self.job, "void", "nothing was sent: it was opened too late"))
         late = f"did not open {spec.path} within {OPEN_TIMEOUT:g} s"
         raise ControllerFault(f"the archive process {late}; nothing was sent")
 
@@ -284,16 +281,16 @@ class LiveLink:
             ArchiveWriteError: the disk refuses.
             ControllerFault: the archive process does not answer.
         """
-        path = self._open_path
-        self.archive.send(Close(self._job, outcome, reason))
+        path = self.open_path
+        self.archive.send(Close(self.job, outcome, reason))
         deadline = time.monotonic() + OPEN_TIMEOUT
         while time.monotonic() < deadline:
-            answer = self.archive.answer(POLL, self._job)
+            answer = self.archive.answer(POLL, self.job)
             if isinstance(answer, Closed):
                 self.count(answer)
                 return answer
             if isinstance(answer, Failed):
-                self._open_path = ""
+                self.open_path = ""
                 raise write_error(answer)
             if (failure := self.archive_failure()) is not None:
                 raise ControllerFault(f"{failure}; {path} is not complete ({outcome}: {reason})")
@@ -304,69 +301,40 @@ class LiveLink:
 
         Waits `POLL` s for it.
         """
-        answer = self.archive.answer(POLL, self._job)
+        answer = self.archive.answer(POLL, self.job)
         return answer if isinstance(answer, Failed) else None
 
     def archive_failure(self) -> str | None:
         """What is wrong with the archive process; whoever asks tells what becomes of the file."""
         failure = self.archive.failure()
         if failure is not None:
-            self._open_path = ""
+            self.open_path = ""
         return failure
 
     def count(self, closed: Closed) -> None:
         """Add up what an archive holds."""
-        self._open_path = ""
+        self.open_path = ""
         self.cycles += closed.records
         self.late += closed.late
         self.untaken += closed.untaken
+
+    def _serve(self, view: LiveView) -> None:
+        """Have the archive process let viewers look."""
+        cell = self.cell
+        self.job += 1
+        self.archive.send(Serve(self.job, view, cell.joint_names, cell.period, cell.drive_train))
+        answer = self.archive.answer(OPEN_TIMEOUT, self.job)
+        if isinstance(answer, Failed):
+            raise LiveViewError(None, answer.problem, remedy=answer.remedy)
+        if not isinstance(answer, Serving):
+            failure = self.archive.failure() or "the archive process does not answer"
+            raise ControllerFault(f"{failure}; nothing was sent")
+        self.live = replace(view, port=answer.port)
 
     def _beat(self) -> None:
         while not self._closed and self.exchange.alive:
             self.exchange.beat()
             time.sleep(BEAT)
-
-    def _ending(self, closed: Closed) -> MotionEnded:
-        self.count(closed)
-        self.view.look()
-        if self.view.ended is not None:
-            return self.view.ended
-        if closed.outcome in get_args(Outcome) and self.view.motion_ended:
-            outcome: Outcome = closed.outcome  # type: ignore[assignment]
-            return MotionEnded(outcome, closed.reason, closed.interval, -1)
-        failure = self.view.failure() or closed.reason
-        alone = "the controller gets no answers and acts by its own watch"
-        raise ControllerFault(f"{failure}; {alone}; the archive ({closed.outcome}) is whole so far")
-
-    def _give_up(self, why: str) -> MotionEnded:
-        """A motion that has not begun is dropped; without an archive it cannot begin any more."""
-        path, refused = self._open_path, self.view.refused
-        outcome = "void" if refused is None else "refused"
-        self.complete(outcome, why if refused is None else str(refused.error))
-        self.exchange.stop()
-        if refused is None:
-            raise ControllerFault(f"{why}; nothing was sent ({path})")
-        return MotionEnded("refused", str(refused.error), -1, -1)
-
-    def _raise_failure(self) -> None:
-        """Raise ControllerFault if the archive process is gone or hangs; the arm rests first."""
-        path = self._open_path
-        if (failure := self.archive_failure()) is not None:
-            rests = "the arm was brought to rest"
-            if not self._come_to_rest():
-                rests = f"the arm was told to stop, but not seen to rest ({self.view.state.name})"
-            raise ControllerFault(f"{failure}; {rests}, and {path} is readable up to its last part")
-
-    def _come_to_rest(self) -> bool:
-        """Whether the motion has ended; the exchange stops it by itself, but is told to again."""
-        self.exchange.stop()
-        deadline = time.monotonic() + REST_TIMEOUT
-        while not self.view.motion_ended and time.monotonic() < deadline:
-            if self.view.failure() is not None:
-                return False
-            self.view.look()
-            time.sleep(POLL)
-        return self.view.motion_ended
 
     def _shut(self) -> str | None:
         """End both processes; what was wrong with them, None if nothing was."""
@@ -389,7 +357,7 @@ class LiveLink:
                 )
         finally:
             failure = self.archive.end()
-            if failure is not None and self._open_path:
-                trouble = f"{failure}; {self._open_path} is not complete"
+            if failure is not None and self.open_path:
+                trouble = f"{failure}; {self.open_path} is not complete"
             self.exchange.close()
         return trouble

@@ -21,6 +21,7 @@ from hil.archive import ArchiveSpec
 from hil.cell import Cell
 from hil.errors import ControllerFault
 
+from .motion_watch import MotionWatch, unwatched_motion
 from .stop import Stop
 
 Array = NDArray[np.float64]
@@ -120,7 +121,8 @@ class Connection:
         remedy = ""
         if self.differences and not self.adopted:
             remedy = (
-                "; correct the cell file, or pass --accept-init to use the controller's figures"
+                "; correct the cell file; only `hil record` and `hil move` can use the "
+                "controller's figures instead (--accept-init)"
             )
         raise ControllerFault(f"the controller cannot be used: {self.unusable}{remedy}")
 
@@ -152,13 +154,31 @@ class MotionLink(Protocol):
         """
         ...
 
-    def run(self, source: MotionSource, spec: ArchiveSpec, stop: Stop) -> MotionEnded:
+    def run(
+        self,
+        source: MotionSource,
+        spec: ArchiveSpec,
+        stop: Stop,
+        *,
+        override: float = 1.0,
+        watch: MotionWatch = unwatched_motion,
+    ) -> MotionEnded:
         """Run one motion, archive every cycle of it, and say how it ended.
 
         Should archiving fail, the arm is brought to rest on its path before the error is raised.
 
+        Args:
+            source: the motion.
+            spec: its archive.
+            stop: asks for a stop on the path.
+            override: the largest fraction of the planned speed. The motion runs at the smaller of
+                this and the wish's, from its very first cycle.
+            watch: sees the motion, and may slow, hold and release it. Nothing begins while its
+                wish is a hold.
+
         Raises:
-            ControllerFault: the motion was not accepted (nothing moved), or the link broke.
+            ControllerFault: the motion was not accepted (nothing moved), or the link broke; or it
+                is to be slower and knows no override.
             ArchiveWriteError: the archive cannot be written; the motion was stopped.
         """
         ...

@@ -11,12 +11,13 @@ from typing import Any, Self
 from hil.errors import InputError
 from hil.files import write_atomically
 from identification.excitation import Excitation
-from planner import PiecewiseCubic, PlanFile
+from identification.excitation.excitation import trajectory_from_dict
+from planner import FourierSeries, PiecewiseCubic, PlanFile
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """1 kept no moves: of validation motions the trajectories only, and no limits. 2 knew excitations
-through via points only, without their method."""
-READ = (1, 2, FORMAT_VERSION)
+through via points only, without their method, 3 validation motions in pieces only, no sines."""
+READ = (1, 2, 3, FORMAT_VERSION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +29,7 @@ class PlannedMotion:
         moves: start, moves and limits, without the motion; None where they were not kept.
     """
 
-    trajectory: PiecewiseCubic
+    trajectory: PiecewiseCubic | FourierSeries
     moves: PlanFile | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -42,7 +43,7 @@ class PlannedMotion:
         Raises:
             KeyError, TypeError, ValueError: the data are no planned motion.
         """
-        return cls(PiecewiseCubic.from_dict(data["trajectory"]), moves_from_dict(data))
+        return cls(trajectory_from_dict(data["trajectory"]), moves_from_dict(data))
 
 
 def moves_to_dict(moves: PlanFile | None) -> dict[str, Any]:
@@ -75,13 +76,25 @@ class CampaignPlan:
 
     def save(self, path: Path) -> None:
         """Write the plan as JSON."""
+        write_atomically(path, self.to_text())
+
+    def to_text(self) -> str:
+        """The plan as JSON."""
         content = {
             "format_version": FORMAT_VERSION,
             "excitation": self.excitation.to_dict(),
             **moves_to_dict(self.moves),
             "validation": [motion.to_dict() for motion in self.validation],
         }
-        write_atomically(path, json.dumps(content) + "\n")
+        return json.dumps(content) + "\n"
+
+    def is_of(self, text: str) -> bool:
+        """Whether a text is this plan's, in whatever version and layout."""
+        own = self.to_text()
+        try:
+            return text == own or CampaignPlan.from_text(text).to_text() == own
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return False
 
     @classmethod
     def load(cls, path: Path) -> CampaignPlan:
@@ -91,22 +104,30 @@ class CampaignPlan:
             InputError: the file is not a plan.
         """
         try:
-            content: dict[str, Any] = json.loads(path.read_text("utf-8"))
-            version = content["format_version"]
-            if version not in READ:
-                raise ValueError(f"format version {version}")
-            motions = content["validation"]
-            return cls(
-                Excitation.from_dict(content["excitation"]),
-                tuple(
-                    PlannedMotion(PiecewiseCubic.from_dict(motion))
-                    if version == 1
-                    else PlannedMotion.from_dict(motion)
-                    for motion in motions
-                ),
-                moves_from_dict(content),
-            )
+            return cls.from_text(path.read_text("utf-8"))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(
                 path, f"is not a campaign plan ({error})", remedy="design the excitation again"
             ) from error
+
+    @classmethod
+    def from_text(cls, text: str) -> CampaignPlan:
+        """The plan from its JSON.
+
+        Raises:
+            ValueError, KeyError, TypeError, AttributeError: it is none.
+        """
+        content: dict[str, Any] = json.loads(text)
+        version = content["format_version"]
+        if version not in READ:
+            raise ValueError(f"format version {version}")
+        return cls(
+            Excitation.from_dict(content["excitation"]),
+            tuple(
+                PlannedMotion(PiecewiseCubic.from_dict(motion))
+                if version == 1
+                else PlannedMotion.from_dict(motion)
+                for motion in content["validation"]
+            ),
+            moves_from_dict(content),
+        )

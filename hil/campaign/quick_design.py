@@ -9,7 +9,7 @@ from typing import Final
 from hil.cell import Cell
 from hil.design import DesignSettings, preset, run_search
 from hil.design.advice import NoExcitationError, forbidden
-from hil.motion_checks import MotionChecks
+from hil.motion_checks import MotionChecks, planned
 from hil.progress import Reporter
 from identification.excitation import (
     RESCORE_PERIOD,
@@ -104,7 +104,7 @@ def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[DrawnMotion, 
             n_via=settings.n_via,
             fly=settings.fly,
             checker=checks.checker,
-            currents=checks.currents,
+            currents=planned(checks.currents),
         )
     except NoFeasibleMotionError as error:
         told = forbidden(error, checks.frame)

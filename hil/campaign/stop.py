@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import FrameType
+from typing import Final
+
+REQUESTS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, whoever ends programs, and the end of the terminal."""
 
 
 @dataclass
@@ -24,11 +28,12 @@ class Stop:
 
 @contextmanager
 def stop_on_interrupt(*, twice: bool = False) -> Iterator[Stop]:
-    """Turn SIGINT into a request to stop on the path.
+    """Turn SIGINT, SIGTERM and SIGHUP into a request to stop on the path.
 
     A second one is the ordinary interrupt: it ends the program at once. In virtual time the
     controller is then on its own; on a real link the exchange process notices, and still brings
     the arm to rest. With `twice` the second is a request too, `insisted`, and the third ends.
+    A signal that is ignored (SIGHUP under nohup) stays ignored.
     """
     stop = Stop()
 
@@ -38,8 +43,11 @@ def stop_on_interrupt(*, twice: bool = False) -> Iterator[Stop]:
         stop.insisted = stop.requested
         stop.requested = True
 
-    previous = signal.signal(signal.SIGINT, request)
-    try:
+    with ExitStack() as undo:
+        for signum in REQUESTS:
+            previous = signal.getsignal(signum)
+            if signum is signal.SIGHUP and previous is signal.SIG_IGN:
+                continue
+            signal.signal(signum, request)
+            undo.callback(signal.signal, signum, previous)
         yield stop
-    finally:
-        signal.signal(signal.SIGINT, previous)

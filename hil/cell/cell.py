@@ -34,10 +34,11 @@ from .schema import (
     LimitsTable,
     NominalTable,
     RobotTable,
-    SimulationTable,
     WorkspaceTable,
 )
+from .simulation_schema import SimulationTable
 from .text import replaced_value
+from .unknown import require_known
 
 if TYPE_CHECKING:
     from drivers.transports.base import TransportSpec
@@ -370,6 +371,7 @@ def _parse(path: Path, text: str) -> CellFile:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise CellError(path, "", None, f"is not TOML ({error})", "correct that line") from error
+    require_known(path, raw, CellFile)
     try:
         return CellFile.model_validate(raw)
     except ValidationError as error:

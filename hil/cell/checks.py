@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,14 +18,15 @@ URDF_ROUNDING = 1e-5
 """Relative; a data sheet's degrees and a URDF's radians are rounded differently."""
 
 _MAY_BE_EMPTY = {"nominal.third", "limits.torque", "simulation.elasticity"}
+_PER_JOINT = ("nominal", "limits", "drive_train", "campaign", "simulation")
 _TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
 
 
 def check_lengths(cell: Cell) -> None:
     """Every list that has one entry per joint has as many as the URDF has joints."""
     n_joints = cell.model.n_joints
-    for table_name in ("nominal", "limits", "drive_train", "campaign", "simulation"):
-        for name, value in getattr(cell.file, table_name) or ():
+    for table_name in (*_PER_JOINT, "simulation.drive_train"):
+        for name, value in _table(cell, table_name) or ():
             field = f"{table_name}.{name}"
             if not isinstance(value, list) or len(value) == n_joints:
                 continue
@@ -38,6 +39,14 @@ def check_lengths(cell: Cell) -> None:
                     f"has {len(value)} entries but the URDF has {n_joints} joints",
                     f"give one entry for each of {', '.join(cell.joint_names)}{or_none}",
                 )
+
+
+def _table(cell: Cell, dotted: str) -> Any:
+    """A table, or one within it, by its name; None where there is none."""
+    found: Any = cell.file
+    for name in dotted.split("."):
+        found = None if found is None else getattr(found, name)
+    return found
 
 
 def check_assumed(cell: Cell) -> None:

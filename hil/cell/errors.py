@@ -32,9 +32,7 @@ def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> 
     location = [part for part in detail["loc"] if not _is_union_tag(part)]
     field = _dotted(location)
     if detail["type"] == "missing":
-        return CellError(
-            path, field, None, "is missing", f"add it: {_description(schema, location)}"
-        )
+        return CellError(path, field, None, "is missing", f"add it: {described(schema, location)}")
     if detail["type"] == "extra_forbidden":
         known = ", ".join(sorted(_fields_at(schema, location[:-1])))
         return CellError(
@@ -42,7 +40,7 @@ def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> 
         )
     value = None if isinstance(detail["input"], dict) else detail["input"]
     problem, _, remedy = detail["msg"].removeprefix("Value error, ").partition("; ")
-    remedy = remedy or f"it must be {_description(schema, location)}"
+    remedy = remedy or f"it must be {described(schema, location)}"
     return CellError(path, field, value, problem[0].lower() + problem[1:], remedy)
 
 
@@ -77,7 +75,8 @@ def _model_of(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-def _description(schema: type[BaseModel], location: list[Any]) -> str:
+def described(schema: type[BaseModel], location: list[Any]) -> str:
+    """What the value at `location` must be, in the words of the schema."""
     return _walk(schema, location)[1]
 
 

@@ -56,13 +56,27 @@ def only_simulated(cell: Cell) -> bool:
     """Whether nothing but a simulated controller on this computer can be at the far end."""
     table = cell.controller
     if table.transport == "udp":
-        try:
-            return ipaddress.ip_address(table.host).is_loopback
-        except ValueError:
-            return False
+        return _is_loopback(table.host)
     if table.transport == "can":
         return table.can is not None and table.can.interface in _WITHIN_THIS_COMPUTER
     return True
+
+
+def stays_here(spec: TransportSpec) -> bool:
+    """Whether a link ends on this computer; of a kind that is not known here it is not assumed."""
+    from drivers.transports.can import CanSpec
+    from drivers.transports.udp import UdpSpec
+
+    if isinstance(spec, UdpSpec):
+        return _is_loopback(spec.peer_host)
+    return isinstance(spec, CanSpec) and spec.interface in _WITHIN_THIS_COMPUTER
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def session_settings(cell: Cell, *, accept_init: bool = False) -> dict[str, Any]:

@@ -2,35 +2,32 @@
 
 One TOML table per class. The description of a field is also the remedy that an error prints,
 so it says what the value must be, not what the code does with it. Units other than SI stand in
-the field's name.
+the field's name. `[simulation]` is in `simulation_schema`.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import Field, model_validator
 
-# Strict: TOML has numbers and truth values of its own, so "yes" and "3" are slips of the pen.
-Number = Annotated[FiniteFloat, Field(strict=True)]
-Whole = Annotated[int, Field(strict=True)]
-Choice = Annotated[bool, Field(strict=True)]
-Positive = Annotated[Number, Field(gt=0)]
-NonNegative = Annotated[Number, Field(ge=0)]
-Vector = list[Number]
-PositiveVector = list[Positive]
-Point = tuple[Number, Number, Number]
-
+from .fields import (
+    Choice,
+    NonNegative,
+    Number,
+    Point,
+    Positive,
+    PositiveVector,
+    Table,
+    Vector,
+    Whole,
+)
 
 ArmAxis = tuple[Annotated[Whole, Field(ge=1, le=4)], Annotated[Whole, Field(ge=1, le=10)]]
 Factor = Annotated[Number, Field(gt=1, le=5)]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class CellTable(_Table):
+class CellTable(Table):
     """`[cell]`: what this cell is called and which of its figures are assumptions."""
 
     name: str = Field(min_length=1, max_length=80, description="a short name of the cell")
@@ -47,7 +44,7 @@ class CellTable(_Table):
     )
 
 
-class JointFrictionTable(_Table):
+class JointFrictionTable(Table):
     """`[robot.friction.joints.NAME]`: what of the friction is different for one joint."""
 
     coulomb: Choice | None = Field(default=None, description="true or false: f0 sgn(qd)")
@@ -70,7 +67,7 @@ class JointFrictionTable(_Table):
     )
 
 
-class FrictionTable(_Table):
+class FrictionTable(Table):
     """`[robot] friction`: which friction columns each joint gets."""
 
     coulomb: Choice = Field(default=True, description="true or false: f0 sgn(qd)")
@@ -98,7 +95,7 @@ class FrictionTable(_Table):
     )
 
 
-class PayloadTable(_Table):
+class PayloadTable(Table):
     """`[robot.payload]`: a body of known mass that the arm carries; not identified."""
 
     mass: NonNegative = Field(description="its mass in kg")
@@ -114,7 +111,7 @@ class PayloadTable(_Table):
     )
 
 
-class CouplingTable(_Table):
+class CouplingTable(Table):
     """`[robot.coupling]`: motors that turn with several joints."""
 
     motor_from_joint: list[Vector] | Literal["drive_train"] = Field(
@@ -129,7 +126,7 @@ class CouplingTable(_Table):
     )
 
 
-class RobotTable(_Table):
+class RobotTable(Table):
     """`[robot]`: how the rigid body model is built from the URDF."""
 
     gravity: Annotated[Vector, Field(min_length=3, max_length=3)] = Field(
@@ -153,7 +150,7 @@ class RobotTable(_Table):
     )
 
 
-class NominalTable(_Table):
+class NominalTable(Table):
     """`[nominal]`: the manufacturer's figures beside the URDF's inertias (joint side)."""
 
     rotor_inertia: list[NonNegative] = Field(description="kg·m² at the joint, one per joint")
@@ -168,7 +165,7 @@ class NominalTable(_Table):
     )
 
 
-class LimitsTable(_Table):
+class LimitsTable(Table):
     """`[limits]`: what the arm may do; degrees, as data sheets give them."""
 
     frame: Literal["controller", "urdf"] = Field(
@@ -197,14 +194,14 @@ class LimitsTable(_Table):
         return self
 
 
-class FactorsTable(_Table):
+class FactorsTable(Table):
     """Factors on the plan's acceleration and jerk limits."""
 
     acceleration: Factor = Field(description="a factor above 1, at most 5")
     jerk: Factor = Field(description="a factor above 1, at most 5")
 
 
-class BoundsTable(_Table):
+class BoundsTable(Table):
     """`[bounds]`: plan < override < stop."""
 
     override: FactorsTable = Field(
@@ -215,7 +212,7 @@ class BoundsTable(_Table):
     )
 
 
-class DriveTrainTable(_Table):
+class DriveTrainTable(Table):
     """`[drive_train]`: motors, gears and wrist coupling (see `drivers.DriveTrain`)."""
 
     gear_ratio: Vector = Field(
@@ -247,7 +244,7 @@ class DriveTrainTable(_Table):
         return self
 
 
-class CanTable(_Table):
+class CanTable(Table):
     """`[controller.can]`: the CAN adapter, where transport = "can" (`docs/can.md`)."""
 
     interface: str = Field(
@@ -261,7 +258,7 @@ class CanTable(_Table):
     )
 
 
-class ControllerTable(_Table):
+class ControllerTable(Table):
     """`[controller]`: the link to the controller."""
 
     transport: Literal["simulated", "udp", "can"] = Field(description='"simulated", "udp" or "can"')
@@ -304,14 +301,14 @@ class ControllerTable(_Table):
         return self
 
 
-class BoxTable(_Table):
+class BoxTable(Table):
     """A box-shaped obstacle in the base frame."""
 
     lower: Point = Field(description="its lower corner, three figures in m")
     upper: Point = Field(description="its upper corner, three figures in m")
 
 
-class WorkspaceTable(_Table):
+class WorkspaceTable(Table):
     """`[workspace]`: what the arm must not touch, in the base frame."""
 
     floor: Number | Literal["none"] = Field(
@@ -323,7 +320,7 @@ class WorkspaceTable(_Table):
     margin: NonNegative = Field(default=0.05, description="clearance to keep, in m")
 
 
-class CampaignTable(_Table):
+class CampaignTable(Table):
     """`[campaign]`: how the excitation is designed and executed."""
 
     repetitions: Whole = Field(default=30, ge=1, le=1000, description="repetitions, 1 to 1000")
@@ -343,6 +340,23 @@ class CampaignTable(_Table):
     standstill_s: Positive = Field(
         default=5.0, description="seconds of standstill for the noise variance"
     )
+    warmup_drift: Annotated[Number, Field(ge=0, lt=1)] | None = Field(
+        default=None,
+        description="change of a joint's friction from one motion to the next below which it is "
+        "warm, as a share (0.002); 0 for no warm-up",
+    )
+    warmup_least: Whole = Field(
+        default=4, ge=3, le=1000, description="motions that warm up at least, 3 to 1000"
+    )
+    warmup_most: Whole = Field(
+        default=60, ge=3, le=1000, description="motions that warm up at most, 3 to 1000"
+    )
+    bad_repetitions: Whole = Field(
+        default=3,
+        ge=0,
+        le=100,
+        description="times a motion that fails its quality check is repeated, 0 to 100",
+    )
     n_via: Whole = Field(
         default=6, ge=2, le=60, description="via points of the excitation, 2 to 60"
     )
@@ -356,34 +370,4 @@ class CampaignTable(_Table):
     )
     seed: Whole = Field(
         default=1, ge=0, description="seed of the search and of the validation motions"
-    )
-
-
-class SimulationTable(_Table):
-    """`[simulation]`: what the simulated cell really is; ignored on hardware."""
-
-    seed: Whole = Field(default=1, ge=0, description="one seed is one bit-identical run")
-    initial_deg: Vector = Field(
-        description="where the simulated arm stands at first, degrees, in the frame of [limits]"
-    )
-    rotor_inertia: list[NonNegative] = Field(description="planted truth, kg·m² at the joint")
-    coulomb: Vector = Field(description="planted truth, N·m, one per joint")
-    viscous: Vector = Field(description="planted truth, N·m·s/rad, one per joint")
-    third: Vector = Field(description="planted truth of the third friction term, one per joint")
-    current_noise: NonNegative = Field(description="A rms about the target current, each motor")
-    current_resolution: NonNegative = Field(description="step of the target current, A")
-    torque_ripple: NonNegative = Field(
-        default=0.0, description="size of an unmodelled effect: share of the Coulomb torque"
-    )
-    friction_drift: Annotated[Number, Field(ge=0, lt=1)] = Field(
-        default=0.0,
-        description="size of an unmodelled effect: fall of the friction from cold to hot",
-    )
-    elasticity: list[NonNegative] = Field(
-        default_factory=list,
-        description="size of an unmodelled effect: rad/(N·m) of each gear, or nothing",
-    )
-    delay: NonNegative = Field(
-        default=0.0,
-        description="size of an unmodelled effect: later effect of the target current, s",
     )

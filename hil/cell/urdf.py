@@ -14,15 +14,16 @@ Array = NDArray[np.float64]
 
 
 class UrdfLimits(NamedTuple):
-    """Limits per joint (n,), rad and rad/s; infinite where the URDF states none."""
+    """Limits per joint (n,), rad, rad/s and N·m; infinite where the URDF states none."""
 
     lower: Array
     upper: Array
     velocity: Array
+    effort: Array
 
 
 def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
-    """Limits of these joints, in their order; a speed of 0 counts as not stated.
+    """Limits of these joints, in their order; a speed or effort of 0 counts as not stated.
 
     Only the robot's own joints: a transmission names joints of the same name again.
     """
@@ -37,7 +38,8 @@ def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
                 -math.inf if turns else float(stated.get("lower", 0.0)),
                 math.inf if turns else float(stated.get("upper", 0.0)),
                 float(stated.get("velocity", 0.0)) or math.inf,
+                float(stated.get("effort", 0.0)) or math.inf,
             )
         )
-    lower, upper, velocity = np.array(rows, dtype=np.float64).T
-    return UrdfLimits(lower, upper, velocity)
+    lower, upper, velocity, effort = np.array(rows, dtype=np.float64).T
+    return UrdfLimits(lower, upper, velocity, effort)

@@ -7,31 +7,58 @@ archives of a batch that could not be used), 130 stopped by the operator.
 
 from __future__ import annotations
 
+import os
 import sys
+from typing import Any
 
 import typer
 from rich.console import Console
+from typer.core import TyperGroup
 
 from hil.errors import HilError
 from identification import IdentificationError
 from planner import PlannerError
 
-from . import (
-    archive,
-    demo,
-    design,
-    doctor,
-    gains,
-    identify,
-    imports,
-    plan,
-    record,
-    reidentify,
-    simulate,
+from .lazy import LazyCommands
+
+COMMANDS = LazyCommands(
+    (
+        "demo",
+        "design",
+        "rehearse",
+        "status",
+        "report",
+        "identify",
+        "reidentify",
+        "compare",
+        "gains",
+        "plan",
+        "plot",
+        "new",
+        "move",
+        "run",
+        "record",
+        "simulate",
+        "study",
+        "doctor",
+        "import",
+        "archive",
+    ),
+    **{"import": "imports"},
 )
+
+
+class Group(TyperGroup):
+    """The commands of `COMMANDS`."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**{**settings, "commands": COMMANDS})
+
 
 app = typer.Typer(
     name="hil",
+    cls=Group,
+    callback=lambda: None,
     help=(
         "Identify the dynamics of an industrial robot with its own controller in the loop.\n\n"
         "Start with `hil demo`: the whole way on a simulated COMAU NS 16, with a report."
@@ -41,17 +68,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-app.command("demo")(demo.demo)
-app.command("design")(design.design)
-app.command("identify")(identify.identify)
-app.command("reidentify")(reidentify.reidentify)
-app.command("gains")(gains.gains)
-app.command("plan")(plan.plan)
-app.command("record")(record.record)
-app.command("simulate")(simulate.simulate)
-app.command("doctor")(doctor.doctor)
-app.add_typer(imports.app, name="import")
-app.add_typer(archive.app, name="archive")
 
 
 def main() -> None:
@@ -67,9 +83,14 @@ def main() -> None:
 
 
 def _fail(text: str, status: int) -> None:
-    Console(stderr=True).print(
-        f"[bold red]error:[/] {_escaped(text)}", highlight=False, soft_wrap=True
-    )
+    try:
+        Console(stderr=True).print(
+            f"[bold red]error:[/] {_escaped(text)}", highlight=False, soft_wrap=True
+        )
+    except OSError:  # the terminal is gone; the status still counts
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (1, 2):
+            os.dup2(nowhere, stream)
     sys.exit(status)
 
 

@@ -37,7 +37,7 @@ def info(files: Files, as_json: Json = False) -> None:
             failed = error.exit_code
             _say_error(path, error, as_json=as_json)
             continue
-        typer.echo(json.dumps(found.to_dict()) if as_json else "\n".join(_info_lines(found)))
+        typer.echo(json.dumps(found.to_dict()) if as_json else _shown(_info_lines(found)))
     raise typer.Exit(failed)
 
 
@@ -57,7 +57,7 @@ def check(files: Files, as_json: Json = False) -> None:
             continue
         if not found.keeps and not status:
             status = NOT_KEPT
-        typer.echo(json.dumps(_check_dict(found)) if as_json else "\n".join(_check_lines(found)))
+        typer.echo(json.dumps(_check_dict(found)) if as_json else _shown(_check_lines(found)))
     raise typer.Exit(status)
 
 
@@ -81,10 +81,10 @@ def repair(
     try:
         done = repair_archive(file, output, in_place=in_place)
     except ArchiveError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(_shown([f"error: {error}"]), err=True)
         raise typer.Exit(FAILED) from error
     for loss in done.losses:
-        typer.echo(f"lost: {loss}", err=True)
+        typer.echo(_shown([f"lost: {loss}"]), err=True)
     if done.output is None:
         typer.echo(f"{file}: whole, nothing to repair")
     else:
@@ -102,7 +102,15 @@ def _say_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps({"file": str(path), "archive": False, "error": str(error)}))
     else:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(_shown([f"error: {error}"]), err=True)
+
+
+def _shown(lines: Sequence[str]) -> str:
+    """Lines for a terminal, which texts of a stranger must not steer."""
+    return "\n".join(
+        "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+        for line in lines
+    )
 
 
 def _check_lines(found: Check) -> list[str]:

@@ -23,13 +23,12 @@ from hil.campaign import (
     stop_on_interrupt,
 )
 from hil.cell import Cell
-from hil.cli.outcome import REPORT, RESULTS, write_outcome
 from hil.cli.verdict import finish
 from hil.demo_link import CAN, LOOPBACK, loopback_link
 from hil.design import DesignResult
 from hil.errors import ControllerFault, InputError, OperatorStopError
-from hil.identify import identify_campaign
 from hil.identify.exports import FILES
+from hil.outcome import REPORT, RESULTS, SERIES
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.simulation import simulated_link, simulated_provenance
@@ -126,8 +125,7 @@ def demo(
         _make_room(output)
         campaign = Campaign.create(output, cell, plan)
     _run(campaign, reporter, effects=effects)
-    found = identify_campaign(campaign.folder.root, reporter)
-    finish(write_outcome(campaign.folder.root, found, reporter), json=json, quiet=quiet)
+    finish(campaign.identify(reporter=reporter).results, json=json, quiet=quiet)
 
 
 def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
@@ -147,6 +145,7 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
                 reporter,
                 provenance=simulated_provenance(cell, effects),
                 durable=real_time,
+                unrehearsed=True,  # nothing but a simulated arm can be moved here
             )
         except ControllerFault as fault:
             if stop.requested:
@@ -193,7 +192,8 @@ def _designed(path: Path, cell: Cell, reporter: Reporter) -> Excitation:
 
 
 _OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "paper"}
-_OURS |= {"campaign.lock", RESULTS, REPORT, *FILES}
+_OURS |= {"rehearsal", "rehearsal.json", "dry_run.json", "warmup.json"}
+_OURS |= {"campaign.lock", RESULTS, REPORT, SERIES, *FILES}
 
 
 def _refuse_what_is_not_ours(output: Path, *, force: bool) -> None:

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from hil.campaign.from_design import campaign_of_design, require_replaceable
 from hil.campaign.stop import Stop, stop_on_interrupt
 from hil.cell import Cell
 from hil.design import DesignSettings, Method, load_settings, preset
@@ -21,7 +22,7 @@ from hil.design.earlier import known_from
 from hil.design.folder import DesignFolder, require_same
 from hil.design.run import Designed, run_design
 from hil.design.settings import preset_text
-from hil.errors import InputError, OperatorStopError
+from hil.errors import HilError, InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 
 from . import design_words as words
@@ -124,7 +125,9 @@ def design(
     which is the smaller the less the estimates of different parameters get into each other's way.
 
     Leaves `excitation.toml` (motion, criteria, settings), `excitation.png` (what the robot is
-    going to do), and a journal to resume from in OUTPUT. Ctrl-C (or SIGTERM) ends the search with
+    going to do), and a journal to resume from in OUTPUT, and makes OUTPUT a campaign, with copies
+    of the cell file and the URDF and with validation motions: `hil rehearse OUTPUT` comes next, and
+    `hil status OUTPUT` says so. Ctrl-C (or SIGTERM) ends the search with
     the best motion so far once the generation under way is scored: seconds, a few minutes if a
     motion hangs. A second one leaves at once. `hil demo --excitation OUTPUT` runs the motion.
 
@@ -153,6 +156,7 @@ def design(
         _require_view()
     reporter = make_reporter(quiet=quiet or json)
     loaded, folder = Cell.load(cell), DesignFolder(output)
+    require_replaceable(output)
     asked = _settings(folder, method, settings, seed, kinematic=kinematic, resume=resume)
     beside = references(compare or [], loaded, asked, together=bool(earlier))
     known = known_from(earlier, loaded, reporter) if earlier else None
@@ -161,7 +165,9 @@ def design(
         """Say what was found, then draw it, while no other search may enter the folder."""
         words.say(reporter, done)
         words.warn_of_unchecked(done, loaded)
-        summary = words.summary(done, folder)
+        made = _campaign(folder, loaded, done)
+        words.say_campaign(reporter, folder, made)
+        summary = words.summary(done, folder) | words.campaign_summary(folder, made)
         typer.echo(
             json_format.dumps(summary, allow_nan=False) if json else words.line(done, folder)
         )
@@ -187,6 +193,20 @@ def design(
         )
     if view:
         _show(done, loaded)
+
+
+def _campaign(folder: DesignFolder, cell: Cell, done: Designed) -> str | None:
+    """Make the design a campaign; in words why there is none, None if there is."""
+    unchecked = done.result.settings.unchecked
+    if not done.design.complete:
+        return "the search was stopped"
+    if unchecked:
+        return f"{', '.join(unchecked)} were not looked at"
+    try:
+        campaign_of_design(folder.root, cell, done.result.excitation)
+    except (HilError, OSError) as error:  # the design is as good without one
+        return str(error)
+    return None
 
 
 @contextmanager

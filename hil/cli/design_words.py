@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from typing import Any
 
 import typer
@@ -79,6 +80,21 @@ def summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
         "file": str(folder.result),
         "picture": str(folder.picture),
     }
+
+
+def say_campaign(reporter: Reporter, folder: DesignFolder, lacking: str | None) -> None:
+    """Say what comes next, or why the motion became no campaign."""
+    if lacking is None:
+        root = shlex.quote(str(folder.root))
+        reporter.say(f"{folder.root} is a campaign now; next: hil rehearse {root}")
+    else:
+        reporter.say(f"note: no campaign was made of it: {lacking}")
+
+
+def campaign_summary(folder: DesignFolder, lacking: str | None) -> dict[str, Any]:
+    """Return the same as data."""
+    campaign = str(folder.root) if lacking is None else None
+    return {"campaign": campaign, "no_campaign": lacking}
 
 
 def draw(

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 
 import typer
 
-from hil.cli.outcome import write_outcome
 from hil.cli.verdict import finish
 from hil.errors import InputError
 from hil.files import make_folder
 from hil.identify import Options, identify_archives, identify_campaign
 from hil.identify.options import ESTIMATORS, Estimator
+from hil.outcome import write_outcome
 from hil.progress import reporter as make_reporter
 from identification.preprocessing import Smoother
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -228,6 +229,10 @@ def _law(terms: str, standstill: float) -> FrictionLaw:
             f"{terms!r} is no friction law",
             field="--friction",
             remedy=f"use some of {', '.join(sorted(known))}, not both quadratic and cubic",
+        )
+    if not math.isfinite(standstill):
+        raise InputError(
+            None, f"{standstill} is no speed", field="--standstill", remedy="give rad/s, as in 0.01"
         )
     return FrictionLaw(
         coulomb="coulomb" in wanted,

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.status import Status
 
+from hil.archive.live_view import LiveView
 from hil.campaign import Progress, Stop, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.campaign.motion_link import Recorded
@@ -57,6 +58,14 @@ def record(
             "from the cell's; the archive says so.",
         ),
     ] = False,
+    live: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Let Foxglove look meanwhile, e.g. 127.0.0.1:8765.",
+            show_default=False,
+        ),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -82,10 +91,14 @@ def record(
     path = archive_path(output, kind)
     with (
         stop_on_interrupt(twice=True) as stop,
-        LiveLink.open(loaded, accept_init=accept_init) as link,
+        LiveLink.open(
+            loaded, accept_init=accept_init, live=None if live is None else LiveView.parse(live)
+        ) as link,
         View(loaded, stop, quiet=quiet or json) as view,
     ):
         view.say(f"waiting for the controller; recording to {path}. Ctrl-C ends it")
+        if link.live is not None:
+            view.say(link.live.invitation)
         for note in link.notes():
             view.say(f"note: {note}")
         done = record_motion(

@@ -17,6 +17,10 @@ from .result import RESULT
 from .settings import DesignSettings, SettingsError, load_settings
 from .toml_text import to_text
 
+PICTURE, SETTINGS, JOURNAL = "excitation.png", "settings.toml", "search.journal"
+DESIGN_FILES = frozenset((RESULT, PICTURE, SETTINGS, JOURNAL))
+"""What a design leaves; a campaign of its motion may lie beside it."""
+
 _HEAD = "# The settings of the search in this folder; `hil design --resume` goes on with them.\n"
 
 
@@ -34,17 +38,17 @@ class DesignFolder:
     @property
     def picture(self) -> Path:
         """The same for the eye."""
-        return self.root / "excitation.png"
+        return self.root / PICTURE
 
     @property
     def settings(self) -> Path:
         """What was asked for."""
-        return self.root / "settings.toml"
+        return self.root / SETTINGS
 
     @property
     def journal(self) -> Path:
         """What was scored so far."""
-        return self.root / "search.journal"
+        return self.root / JOURNAL
 
     @contextmanager
     def held(self) -> Iterator[None]:

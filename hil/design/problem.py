@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
-from hil.motion_checks import collision_checker, current_model
+from hil.motion_checks import collision_checker, current_model, planned
 from hil.violation_text import always_so, violation_text
 from identification.excitation import (
     CollisionChecker,
@@ -49,7 +49,7 @@ def problem_of(cell: Cell, settings: DesignSettings, known: Knowledge | None = N
     """
     constraints = settings.constraints
     checker = collision_checker(cell) if constraints.collision else None
-    currents = current_model(cell) if constraints.current else None
+    currents = planned(current_model(cell)) if constraints.current else None
     genome = _genome(cell, settings, checker)
     _require_beginning(cell, genome, checker, currents)
     return Problem(

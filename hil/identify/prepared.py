@@ -64,10 +64,19 @@ class Prepared:
         return tuple(source.recording.commanded_position for source in self.sources.training)
 
 
-def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> Prepared:
+def prepare_sources(
+    sources: Sources, options: Options, reporter: Reporter, *, look_for_delay: bool = True
+) -> Prepared:
     """Smooth every recording, after its time base, noise, low-pass and delay are settled.
 
     Only what is fitted is looked at to settle them.
+
+    Args:
+        sources: the recordings.
+        options: how they are turned into samples.
+        reporter: of progress.
+        look_for_delay: whether a delay that nobody asked for is looked for all the same, to be
+            reported; it takes longer than everything else.
 
     Raises:
         ArchiveError: there are currents only, and nothing that could make torques of them.
@@ -78,7 +87,9 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
     sources, noise_note = _with_noise(sources)
     sources = with_torques(sources)
     sources, preprocessing = _with_bandwidth(sources, _settings(sources, options), options)
-    delays = _delays(sources, preprocessing, options, reporter)
+    delays = None
+    if look_for_delay or options.delay == "auto":
+        delays = _delays(sources, preprocessing, options, reporter)
     delay_notes: list[str] = []
     assumed = np.full(sources.cell.model.n_joints, preprocessing.torque_delay)
     if delays is not None and options.delay == "auto":

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.campaign.conduct import conduct_of
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import InputError
@@ -91,7 +92,7 @@ def identify_campaign(
             "its manifest.json names no completed excitation that is still whole",
             remedy="run the campaign, or name the archives themselves",
         )
-    return identify_archives(
+    found = identify_archives(
         [*paths, *folder.completed("standstill")],
         reporter,
         options,
@@ -99,6 +100,8 @@ def identify_campaign(
         name=root.resolve().name,
         doubts=folder.damaged(),
     )
+    conduct = conduct_of(folder)
+    return replace(found, results=found.results.model_copy(update={"conduct": conduct}))
 
 
 def identify_archives(

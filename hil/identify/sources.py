@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
-from hil.archive import CONTROLLERS_OWN, Archive, open_archive
+from hil.archive import CONTROLLERS_OWN, Archive, ArchiveName, foreign_json, open_archive
+from hil.archive.amend import REJECTED
+from hil.campaign.errors import CampaignFolderError
+from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.importers import Findings
@@ -84,17 +87,9 @@ def cell_of(archive: Archive) -> Cell:
     """The cell that travels inside an archive.
 
     Raises:
-        ArchiveError: the archive carries no cell or no URDF.
+        ArchiveError: the archive carries no cell or no URDF, or one that is not UTF-8.
     """
-    try:
-        text, urdf = archive.attachments["cell.toml"], archive.attachments["robot.urdf"]
-    except KeyError as error:
-        raise ArchiveError(
-            archive.path,
-            f"carries no {error.args[0]}",
-            remedy="import the recording again with a URDF or a cell file",
-        ) from error
-    return Cell.from_texts(text.decode(), urdf.decode(), archive.path)
+    return Cell.from_texts(archive.text("cell.toml"), archive.text("robot.urdf"), archive.path)
 
 
 def gather_sources(
@@ -123,26 +118,32 @@ def gather_sources(
         )
     _refuse_duplicates([*paths, *predict])
     archives = [open_archive(path) for path in [*paths, *predict]]
-    by_kind = _by_kind(archives[: len(paths)], archives[len(paths) :])
+    rejected = [archive for archive in archives if _rejected(archive)]
+    by_kind = _by_kind(
+        [archive for archive in archives[: len(paths)] if not _rejected(archive)],
+        [archive for archive in archives[len(paths) :] if not _rejected(archive)],
+    )
     fitted = by_kind.get("excitation", [])
     if in_sample:
         fitted = [*fitted, *by_kind.pop("validation", [])]
     if not fitted:
         raise InputError(
             paths[0] if paths else None,
-            "there is no excitation and no imported recording among the archives",
+            "there is no excitation and no imported recording among the archives"
+            + ("" if not rejected else " but rejected ones"),
             remedy="name archives of kind excitation or imported",
         )
     cell = cell_of(fitted[0])
     _refuse_strangers(archives)
     training = [source_of(archive, cell) for archive in fitted]
     held_out = [source_of(archive, cell) for archive in by_kind.get("validation", [])]
-    doubts = [*_doubts_of(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
+    doubts = [*known_doubts(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
     doubts += [
         f"{archive.path.name}: {doubt}"
         for archive in archives
         for doubt in Findings.of(archive.metadata).doubts
     ]
+    doubts += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
     same_motion = len({archive.attachments.get("plan.json") for archive in fitted}) == 1
     tested_on = "unseen motion"
     if in_sample:
@@ -159,11 +160,11 @@ def gather_sources(
         training, held_out, doubt = _split(training, split)
         doubts.append(doubt)
     rest = [source_of(archive, cell, to_fit=False) for archive in by_kind.get("standstill", [])]
-    plan = fitted[0].attachments.get("plan.json")
+    plan = _plan_of(fitted[0])
     return Sources(
         cell=cell,
         metadata=dict(fitted[0].metadata),
-        plan=None if plan is None else json.loads(plan),
+        plan=plan,
         training=tuple(training),
         same_motion=same_motion and plan is not None,
         held_out=tuple(held_out),
@@ -173,6 +174,21 @@ def gather_sources(
         tested_on=tested_on,
         in_sample=in_sample,
     )
+
+
+def _plan_of(archive: Archive) -> dict[str, Any] | None:
+    """The plan that travels inside an archive, None where there is none."""
+    if "plan.json" not in archive.attachments:
+        return None
+    plan = foreign_json.loads(archive.attachments["plan.json"])
+    if not isinstance(plan, dict):
+        raise ArchiveError(
+            archive.path,
+            "is no JSON object",
+            field="plan.json",
+            remedy="leave the archive out, or take the attachment from another of its campaign",
+        )
+    return plan
 
 
 def _by_kind(archives: Sequence[Archive], predicted: Sequence[Archive]) -> dict[str, list[Archive]]:
@@ -218,11 +234,34 @@ def _incomplete(archive: Archive) -> str | None:
     if archive.missing is not None:
         return archive.missing
     outcome = (archive.outcome or {}).get("outcome", "completed")
+    if outcome == REJECTED:
+        reason = (archive.outcome or {}).get("reason", "")
+        return f"{archive.path.name} was rejected and left out: {reason}"
     return None if outcome == "completed" else f"{archive.path.name} ended {outcome}"
 
 
-def _doubts_of(cell: Cell, archive: Archive) -> list[str]:
-    """What is known beforehand to stand between the numbers and the truth."""
+def _not_judged(archive: Archive) -> str | None:
+    """What a reader must know about an archive that its campaign's manifest does not name."""
+    path = archive.path
+    folder = CampaignFolder(path.parent.parent)
+    if path.parent.name != folder.archives.name or ArchiveName.parse(path) is None:
+        return None
+    with suppress(CampaignFolderError):
+        if folder.sealed and path.name not in {entry.name for entry in folder.manifest()}:
+            return (
+                f"{path.name} is not named in its campaign's manifest.json: the run that made it "
+                "was killed before it was judged"
+            )
+    return None
+
+
+def _rejected(archive: Archive) -> bool:
+    """Whether the run that made an archive found that it is of no use."""
+    return (archive.outcome or {}).get("outcome") == REJECTED
+
+
+def known_doubts(cell: Cell, archive: Archive) -> list[str]:
+    """What is known beforehand to stand between the numbers and the truth, in sentences."""
     doubts = []
     if "drive_train.torque_constant" in cell.file.cell.assumed and (
         archive.metadata.get("simulated") != "yes"
@@ -269,7 +308,7 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     Where the PC moved the arm, those it commanded. Where the controller's own program did, those
     with the drive on: with it off the brakes carry the arm, and no current tells of it.
     """
-    if archive.metadata.get("motion") == CONTROLLERS_OWN:
+    if archive.metadata.get("motion") == CONTROLLERS_OWN and "status" in archive.columns:
         powered = np.flatnonzero(archive.columns["status"] == DRIVE_ON)
         if not powered.size:
             raise ArchiveError(archive.path, "the drive was never on in it")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -71,7 +71,7 @@ def summarise(
     ]
     gram = information(_executed(cell.model, training, rows))
     simulated = sources.metadata.get("simulated") == "yes"
-    truth = planted_values(cell) if simulated and cell.file.simulation else None
+    truth = _planted(cell, sources.metadata) if simulated else None
     return Results(
         name=name,
         cell=cell.name,
@@ -107,6 +107,14 @@ def summarise(
         essential=essential_result(essential),
         consistency=consistency_result(model, consistency),
     )
+
+
+def _planted(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
+    """What was planted in the simulated arm (p,): as the archive says, or else its cell."""
+    if "planted" in metadata:
+        told = json.loads(metadata["planted"])
+        return np.array([told[name] for name in cell.model.parameter_names])
+    return planted_values(cell) if cell.file.simulation else None
 
 
 def _period(samples: Samples) -> float:

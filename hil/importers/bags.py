@@ -18,9 +18,14 @@ import zstandard
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.mcap_messages import Topic
+from hil.importers.mcap_sizes import MOST_INFLATION
 
 SUFFIXES = (".db3", ".mcap")
 _PACKED = (".zstd", ".zst")
+_LONGEST_MESSAGE = 1 << 24  # bytes
+_LONGEST_ROW = 1 << 28  # bytes
+_SLACK = 1 << 20  # bytes
+_TABLES = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins no CDR message
 
 
@@ -36,7 +41,10 @@ def bag_files(source: Path) -> list[Path]:
         )
     if not source.is_dir():
         return [source]
-    files = [path for path in source.iterdir() if _storage(path) in SUFFIXES]
+    try:
+        files = [path for path in source.iterdir() if _storage(path) in SUFFIXES]
+    except OSError as error:
+        raise SourceError(source, f"cannot be read: {error.strerror}") from error
     if not files:
         raise SourceError(
             source, "has no .db3 and no .mcap file in it", remedy="name the folder of a rosbag2"
@@ -52,9 +60,9 @@ def topics(file: Path) -> dict[str, Topic]:
     """
     if file.suffix == ".mcap":
         return mcap_messages.topics(file)
-    with closing(_connect(file)) as bag:
+    with _connected(file) as bag:
         query = "SELECT name, type, serialization_format FROM topics ORDER BY name"
-        return {name: Topic(kind, encoding) for name, kind, encoding in bag.execute(query)}
+        return {str(name): Topic(str(kind), str(code)) for name, kind, code in bag.execute(query)}
 
 
 def messages(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
@@ -64,9 +72,8 @@ def messages(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
         SourceError: the file cannot be read.
     """
     found = _of_mcap(file, topic) if file.suffix == ".mcap" else _of_sqlite(file, topic)
-    unpack = zstandard.ZstdDecompressor()
     for stamp, data in found:
-        yield stamp, unpack.decompress(data) if data.startswith(_ZSTD) else data
+        yield stamp, _decompressed(data, file) if data.startswith(_ZSTD) else data
 
 
 @contextmanager
@@ -85,11 +92,26 @@ def _unpacked(file: Path, folder: Path) -> Path:
         return file
     target = folder / file.stem
     try:
+        most = _SLACK + MOST_INFLATION * file.stat().st_size
         with file.open("rb") as packed, target.open("wb") as plain:
-            zstandard.ZstdDecompressor().copy_stream(packed, plain)
+            for block in zstandard.ZstdDecompressor().read_to_iter(packed):
+                plain.write(block)
+                if plain.tell() > most:
+                    raise SourceError(file, f"becomes more than {MOST_INFLATION} times as large")
     except (OSError, zstandard.ZstdError) as error:
         raise SourceError(file, f"cannot be decompressed ({error})") from error
     return target
+
+
+def _decompressed(data: bytes, file: Path) -> bytes:
+    """A message that was compressed by itself."""
+    try:
+        size = zstandard.frame_content_size(data)
+        if size > _LONGEST_MESSAGE:
+            raise SourceError(file, f"has a message of {size} bytes")
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=_LONGEST_MESSAGE)
+    except zstandard.ZstdError as error:
+        raise SourceError(file, f"has a message that cannot be decompressed ({error})") from error
 
 
 def _storage(path: Path) -> str:
@@ -109,26 +131,43 @@ def _of_mcap(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
 
 
 def _of_sqlite(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
-    with closing(_connect(file)) as bag:
-        yield from bag.execute(
-            "SELECT messages.timestamp, messages.data FROM messages"
-            " JOIN topics ON topics.id = messages.topic_id WHERE topics.name = ?"
-            " ORDER BY messages.timestamp, messages.id",
-            (topic,),
-        )
+    query = (
+        "SELECT messages.timestamp, messages.data FROM messages"
+        " JOIN topics ON topics.id = messages.topic_id WHERE topics.name = ?"
+        " ORDER BY messages.timestamp, messages.id"
+    )
+    with _connected(file) as bag:
+        for number, (stamp, data) in enumerate(bag.execute(query, (topic,))):
+            if not isinstance(stamp, int) or not isinstance(data, bytes):
+                raise SourceError(
+                    file,
+                    f"message {number} has no time or no data",
+                    field=topic,
+                    remedy="take it out, or record again",
+                )
+            yield stamp, data
 
 
-def _connect(file: Path) -> sqlite3.Connection:
-    """Open for reading only; leave no side files beside a bag that nobody writes."""
+@contextmanager
+def _connected(file: Path) -> Iterator[sqlite3.Connection]:
+    """The bag, for reading only; no side files are left beside one that nobody writes.
+
+    Raises:
+        SourceError: it is no bag, or is found damaged while this lasts.
+    """
     options = "mode=ro" if file.with_name(file.name + "-wal").exists() else "mode=ro&immutable=1"
     try:
-        bag = sqlite3.connect(f"{file.resolve().as_uri()}?{options}", uri=True)
-        bag.execute("SELECT id, name, type, serialization_format FROM topics").close()
-        bag.execute("SELECT topic_id, timestamp, data FROM messages LIMIT 1").close()
+        with closing(sqlite3.connect(f"{file.resolve().as_uri()}?{options}", uri=True)) as bag:
+            bag.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_ROW)
+            # A view could make rows without end.
+            tables = {name for (name,) in bag.execute(_TABLES)}
+            absent = sorted({"topics", "messages"} - tables)
+            if absent:
+                raise sqlite3.DatabaseError(f"it has no table {absent[0]}")
+            yield bag
     except sqlite3.Error as error:
         raise SourceError(
             file,
-            f"is not a rosbag2 in sqlite3 storage ({error})",
+            f"is not a rosbag2 in sqlite3 storage, or damaged ({error})",
             remedy="name the .db3 or .mcap file, or the bag's folder",
         ) from error
-    return bag

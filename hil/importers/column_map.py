@@ -204,11 +204,46 @@ class ColumnMap(_Table):
                 path, f"cannot be read ({error})", remedy="name a TOML file"
             ) from error
         except ValidationError as error:
-            detail = error.errors(include_url=False)[0]
-            place = ".".join(str(part) for part in detail["loc"])
-            problem = detail["msg"].removeprefix("Value error, ")
-            if detail["type"] == "extra_forbidden":
-                problem = "is not an entry of a column map"
+            place, problem = _complaint(error)
             raise SourceError(
                 path, problem, field=place, remedy="see the column map in docs/archive-format.md"
             ) from error
+
+
+_PER_JOINT = "must be a list of numbers, one per joint"
+_ONE_OR_EACH = "must be a number, or a list of one per joint"
+_MUST_BE = {
+    "sample_rate": "must be a number above 0, in Hz",
+    "joints": "must be a list of names",
+    "columns": "must be a name, or a list of names or of indices from 0",
+    "column": "must be a name or an index from 0",
+    "offset": _ONE_OR_EACH,
+    "scale": _ONE_OR_EACH,
+    "gear_ratio": _PER_JOINT,
+    "joint_offset": _PER_JOINT,
+    "torque_constant": _PER_JOINT,
+    "coupling": "must be a list of [motor, joint, motor turns per joint turn], numbered from 1",
+    "motor_from_joint": "must be a matrix of numbers, as a list of its rows",
+    "delimiter": "must be a single character",
+    "skip_rows": "must be a number of lines",
+}
+_OF_ANY = {
+    "missing": "is missing",
+    "extra_forbidden": "is not an entry of a column map",
+    "model_type": "must be a table",
+    "string_type": "must be a text",
+}
+_KINDS_OF_A_UNION = frozenset({"float", "str", "int"})
+
+
+def _complaint(error: ValidationError) -> tuple[str, str]:
+    """The entry that pydantic complains of first, and what is wrong with it, in our words."""
+    detail = error.errors(include_url=False)[0]
+    entries = [part for part in detail["loc"] if isinstance(part, str) and part.isidentifier()]
+    entries = [part for part in entries if part not in _KINDS_OF_A_UNION]
+    problem = _OF_ANY.get(detail["type"])
+    if problem is None and entries:
+        problem = _MUST_BE.get(entries[-1])
+    if problem is None:
+        problem = detail["msg"].removeprefix("Value error, ").replace("Input should", "must")
+    return ".".join(entries), problem

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Samples
+from hil.archive import Samples, foreign_json
 from identification.resampling import time_base
 
 Array = NDArray[np.float64]
@@ -62,8 +62,20 @@ class Findings:
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> Findings:
         """From an archive's metadata; nothing where they have none."""
-        stored = json.loads(metadata.get(METADATA, "{}"))
-        return cls(tuple(stored.get("lines", ())), tuple(stored.get("doubts", ())))
+        if METADATA not in metadata:
+            return cls((), ())
+        stored = foreign_json.loads(metadata[METADATA])
+        entries = stored if isinstance(stored, dict) else {}
+        lines, doubts = (_sentences(entries.get(key)) for key in ("lines", "doubts"))
+        if lines is None or doubts is None:
+            return cls((), ("what its import found cannot be read",))
+        return cls(lines, doubts)
+
+
+def _sentences(stored: object) -> tuple[str, ...] | None:
+    if not isinstance(stored, list) or not all(isinstance(line, str) for line in stored):
+        return None
+    return tuple(stored)
 
 
 @dataclass(frozen=True)

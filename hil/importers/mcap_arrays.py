@@ -10,9 +10,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from hil.importers.mcap_messages import Topic
 STAMP = "stamp"
 """Name of the time of a topic's messages [ns]: that of their header, or else the file's."""
 
+MOST_BYTES: Final = 4 << 30
+"""Of messages that become arrays, all topics together."""
+
 _SIZES = {
     "bool": 1, "byte": 1, "char": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
     "int32": 4, "uint32": 4, "float32": 4, "int64": 8, "uint64": 8, "float64": 8,
@@ -34,6 +37,9 @@ _CONSTANT = re.compile(r"^\s*\w+(\[[^\]]*\])?\s+\w+\s*=")
 _SEPARATOR = re.compile(r"^=+\n", re.MULTILINE)
 _LARGEST = 4096  # elements; what is larger is an image or a cloud of points
 _BATCH = 10_000  # messages
+_MOST_PLACES = 10_000  # in one message where a type is laid out
+_DEEPEST = 32  # types within types
+_LONGEST_COUNT = 9  # digits
 
 
 @dataclass(frozen=True)
@@ -58,8 +64,15 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     """
     known = mcap_messages.topics(path)
     topics = {name: _Reader(topic) for name, topic in known.items() if topic.is_ros2}
+    kept = 0
     for name, stamp, data in mcap_messages.messages(path, list(topics)):
-        topics[name].add(stamp, data)
+        kept += len(data) if topics[name].add(stamp, data) else 0
+        if kept > MOST_BYTES:
+            raise SourceError(
+                path,
+                f"holds more than {MOST_BYTES} bytes of numbers: too large to be read at once",
+                remedy="cut it, or leave out topics (`mcap filter`)",
+            )
     refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
     arrays: dict[str, NDArray[Any]] = {}
     for name, reader in topics.items():
@@ -90,16 +103,17 @@ class _Reader:
         self._batch: list[bytes] = []
         self._parts: list[dict[str, NDArray[Any]]] = []
 
-    def add(self, stamp: int, data: bytes) -> None:
-        """Take the next message."""
+    def add(self, stamp: int, data: bytes) -> bool:
+        """Take the next message; whether it is kept."""
         if self._refusal is None and self._layout is None:
             self._begin(data)
         if self._refusal is not None:
-            return
+            return False
         self._stamps.append(stamp)
         self._batch.append(data)
         if len(self._batch) >= _BATCH:
             self._take_batch()
+        return True
 
     def finished(self) -> dict[str, NDArray[Any]]:
         """All columns; none of a topic without messages.
@@ -180,15 +194,19 @@ class _Walk:
         self.builder = LayoutBuilder()
         self._types = types
         self._message = message
+        self._places = 0
 
-    def fields(self, kind: str, path: str) -> None:
-        """Lay out the fields of a type."""
+    def fields(self, kind: str, path: str, depth: int = 0) -> None:
+        """Lay out the fields of a type; types may hold themselves, or nothing."""
         if kind not in self._types:
             raise LayoutError(f"its definition lacks {kind}")
+        self._places += 1
+        if depth > _DEEPEST or self._places > _MOST_PLACES:
+            raise LayoutError(f"its definition nests {kind} too deep or too often")
         for field in self._types[kind]:
-            self._field(field, path + field.name)
+            self._field(field, path + field.name, depth)
 
-    def _field(self, field: _Field, path: str) -> None:
+    def _field(self, field: _Field, path: str, depth: int) -> None:
         count = self._count() if field.count == -1 else field.count
         if field.kind in _SIZES:
             if count is not None and count > _LARGEST:
@@ -202,7 +220,7 @@ class _Walk:
             if field.kind in ("string", "wstring"):
                 self._string(field.kind, place)
             else:
-                self.fields(_short(field.kind), f"{place}/")
+                self.fields(_short(field.kind), f"{place}/", depth + 1)
 
     def _count(self) -> int:
         count = self._number()
@@ -238,7 +256,7 @@ def _short(kind: str) -> str:
     return kind.replace("/msg/", "/")
 
 
-@cache
+@lru_cache(maxsize=64)
 def _types(kind: str, definition: str) -> dict[str, tuple[_Field, ...]]:
     """Fields by type, of a definition with its dependencies."""
     own, *others = _SEPARATOR.split(definition)
@@ -265,5 +283,5 @@ def _fields(text: str, package: str) -> Iterator[_Field]:
             raise LayoutError("its definition is that of ROS 1")
         if kind not in _SIZES and kind not in ("string", "wstring") and "/" not in kind:
             kind = f"{package}/{kind}"
-        fixed = int(count) if count is not None and count.isdecimal() else -1
+        fixed = int(count[:_LONGEST_COUNT]) if count is not None and count.isdecimal() else -1
         yield _Field(kind, match["name"], None if count is None else fixed)

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import zstandard
-from mcap.exceptions import McapError
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader, make_reader
 from mcap.records import Channel, Schema
 
 from hil.errors import SourceError
+from hil.importers.mcap_sizes import check_sizes
 
 JOINT_STATES = frozenset({"sensor_msgs/msg/JointState", "sensor_msgs/JointState"})
 """Names of the type that ROS 2 has for joint states."""
-
-_BROKEN = (McapError, zstandard.ZstdError, RuntimeError, EOFError, struct.error, ValueError)
-"""What the readers below raise for bytes that are no MCAP."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +50,7 @@ def topics(path: Path) -> dict[str, Topic]:
         SourceError: it cannot be read, is no MCAP file or is cut off.
     """
     with _opened(path) as stream:
+        check_sizes(stream)
         summary = make_reader(stream).get_summary()
         if summary is not None and summary.channels:
             channels = [(summary.schemas.get(c.schema_id), c) for c in summary.channels.values()]
@@ -70,6 +66,7 @@ def messages(path: Path, wanted: Collection[str]) -> Iterator[tuple[str, int, by
         SourceError: the file cannot be read or is cut off.
     """
     with _opened(path) as stream:
+        check_sizes(stream)
         for _, channel, message in _reader(stream).iter_messages(wanted):
             yield channel.topic, message.log_time, message.data
 
@@ -109,7 +106,7 @@ def _opened(path: Path) -> Iterator[Any]:
             yield stream
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror or error}") from error
-    except _BROKEN as error:
+    except Exception as error:  # nobody lists what the readers raise for bytes that are no MCAP
         raise SourceError(
             path,
             f"is no MCAP file, or cut off ({type(error).__name__}: {error})",

@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
 from hil.archive import Samples
@@ -151,9 +150,11 @@ class _States:
         """Take a message in, unless it has none of the joints."""
         try:
             message: Any = self._store.deserialize_cdr(data, JOINT_STATE)
-        except (SerdeError, ValueError, IndexError, UnicodeDecodeError) as error:
+        except Exception as error:  # rosbags does not list what it raises for other bytes
             raise SourceError(
-                self.source, f"message {len(self.bag_stamps)} cannot be decoded ({error})"
+                self.source,
+                f"message {len(self.bag_stamps)} cannot be decoded "
+                f"({error or type(error).__name__})",
             ) from error
         order = self._order(tuple(message.name))
         if not order:

@@ -6,7 +6,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ _WRITTEN = (
     (";", ","), ("\t", ","), ("|", ","), (None, ","),
 )  # fmt: skip
 _PROBED = 20  # lines
+_LONGEST_TIME = 30  # digits before the point, more than nanoseconds since 1970 have
 # 1.0D+03: double precision as Fortran writes it.
 _FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d)")
 _MISSING = frozenset({"", "-", "--", "na", "n/a", "null", "none"})
@@ -148,8 +149,8 @@ class Table:
         found = []
         for number, text in texts:
             try:
-                found.append(int(Decimal(text.strip()).scaleb(9 - decimals).to_integral()))
-            except (InvalidOperation, ValueError, OverflowError) as error:
+                found.append(_nanoseconds(text, decimals))
+            except (ArithmeticError, ValueError) as error:
                 found_there = repr(text.strip()) if text.strip() else "nothing"
                 raise SourceError(
                     self.path,
@@ -256,6 +257,14 @@ def _written(lines: Sequence[str], form: Format) -> tuple[str | None, str]:
         if delimiter is not None and all(delimiter in line for line in lines[:2]):
             return delimiter, mark
     return form.delimiter, marks[0]
+
+
+def _nanoseconds(text: str, decimals: int) -> int:
+    """A time as written; ValueError or ArithmeticError where it is none of any clock."""
+    time = Decimal(text.strip())
+    if time and time.adjusted() > _LONGEST_TIME:
+        raise ValueError(f"{text!r} is no time")
+    return int(time.scaleb(9 - decimals).to_integral())
 
 
 def _cells(line: str, delimiter: str | None) -> list[str]:

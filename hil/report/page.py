@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
-from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
-
 from hil.report import (
+    conduct,
     consistency,
     essential,
     estimation,
@@ -19,23 +15,9 @@ from hil.report import (
     validation,
     verdict,
 )
+from hil.report.rendering import Numbering, environment, page_bytes
 from hil.report.series import ReportSeries
 from hil.results import Results
-
-_TEMPLATES = Path(__file__).parent / "templates"
-
-
-class _Numbering:
-    """Numbers figures and tables in the order in which the page shows them."""
-
-    def __init__(self) -> None:
-        self._figures, self._tables = itertools.count(1), itertools.count(1)
-
-    def figure(self) -> int:
-        return next(self._figures)
-
-    def table(self) -> int:
-        return next(self._tables)
 
 
 def report_bytes(results: Results, series: ReportSeries) -> bytes:
@@ -44,8 +26,7 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
     Raises:
         SeriesError: the series belong to another number of joints than the results.
     """
-    # A name read from an archive may hold what UTF-8 cannot; the page must come out all the same.
-    return render_report(results, series).encode("utf-8", errors="replace")
+    return page_bytes(render_report(results, series))
 
 
 def render_report(results: Results, series: ReportSeries) -> str:
@@ -55,21 +36,8 @@ def render_report(results: Results, series: ReportSeries) -> str:
         SeriesError: the series belong to another number of joints than the results.
     """
     series = series.checked_for(len(results.joint_names))
-    template = _environment().get_template("report.html.j2")
+    template = environment().get_template("report.html.j2")
     return template.render(**_context(results, series))
-
-
-def _environment() -> Environment:
-    # Autoescape without conditions: names come out of archives, and archives out of anywhere.
-    environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.globals["style"] = Markup((_TEMPLATES / "report.css").read_text(encoding="utf-8"))
-    return environment
 
 
 def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
@@ -77,7 +45,7 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
     base, friction = parameters.table_rows(results)
     routes = parameters.routes(results)
     return {
-        "numbering": _Numbering(),
+        "numbering": Numbering(),
         "results": results,
         "series": series,
         "facts": overview.facts(results),
@@ -105,4 +73,5 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         **verdict.verdict_context(results),
         **essential.context(results),
         **consistency.context(results),
+        **conduct.context(results),
     }

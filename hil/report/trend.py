@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from hil.batch.chart import FEWEST
+from hil.batch.payload_trend import Statement, Verdict
 from hil.batch.trend import (
     FALSE_ALARMS,
     LEAST_EFFECT,
@@ -20,7 +22,7 @@ from hil.batch.trend import (
     Trends,
     Watched,
 )
-from hil.batch.trend_words import Finding, campaign_name, findings, summary
+from hil.batch.trend_words import Finding, campaign_folder, findings, summary
 from hil.report import numbers
 from hil.report.figures.svg import Panel
 from hil.report.figures.trend import (
@@ -29,9 +31,16 @@ from hil.report.figures.trend import (
     parameter_trend_panels,
     payload_panels,
 )
-from hil.report.page import _environment, _Numbering
+from hil.report.rendering import Numbering, environment, page_bytes
 
 _NORMAL_INTERVAL = 1.96
+_VERDICTS: Final[dict[Verdict, str]] = {
+    "agrees": "torques agree",
+    "statement only": "carried before as well",
+    "either": "torques cannot tell",
+    "differs": "torques do not agree",
+    "untested": "not tested",
+}
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,7 @@ class CampaignRow:
     mass: str
     p_value: str
     payload: str
+    stated: str
     axes: str
     departs: bool
 
@@ -85,6 +95,7 @@ class ArmPart:
     good: bool
     line: str
     findings: list[Finding]
+    doubts: tuple[str, ...]
     campaigns: int
     span: str
     untested: str
@@ -100,16 +111,15 @@ class ArmPart:
 
 def write_trend_report(path: Path, trends: Trends) -> None:
     """Write the page as one HTML file; the same input gives the same bytes."""
-    # A name read from an archive may hold what UTF-8 cannot; the page must come out all the same.
-    path.write_bytes(render_trend_report(trends).encode("utf-8", errors="replace"))
+    path.write_bytes(page_bytes(render_trend_report(trends)))
 
 
 def render_trend_report(trends: Trends) -> str:
     """The page as text."""
     parts = [_arm_part(arm, f"t{k}") for k, arm in enumerate(trends.arms)]
-    template = _environment().get_template("trend.html.j2")
+    template = environment().get_template("trend.html.j2")
     return template.render(
-        numbering=_Numbering(),
+        numbering=Numbering(),
         trends=trends,
         parts=parts,
         title=_title(parts),
@@ -137,11 +147,12 @@ def _arm_part(arm: ArmTrend, key: str) -> ArmPart:
         good=all(one.level != "alarm" for one in found),
         line=summary(arm),
         findings=found,
+        doubts=arm.doubts,
         campaigns=len(arm.campaigns),
         span=_span(arm),
         untested=arm.payload.untested,
         campaign_rows=[_campaign_row(arm, k) for k in range(len(arm.campaigns))],
-        axis_rows=[_axis_row(arm, axis) for axis in arm.axes],
+        axis_rows=[_axis_row(axis) for axis in arm.axes],
         parameter_rows=[_parameter_row(one) for one in arm.parameters],
         friction=friction_trend_panels(arm, key),
         error=error_trend_panels(arm, key),
@@ -153,7 +164,7 @@ def _arm_part(arm: ArmTrend, key: str) -> ArmPart:
 
 def _span(arm: ArmTrend) -> str:
     if not arm.dated:
-        return "times not known"
+        return "in the order of their names, since no time of recording is known"
     first, last = arm.when[0][:10], arm.when[-1][:10]
     return first if first == last else f"{first} to {last}"
 
@@ -165,14 +176,23 @@ def _campaign_row(arm: ArmTrend, k: int) -> CampaignRow:
         f"{axis.joint} ({' and '.join(what)})" for axis in arm.axes if (what := _what(axis, k))
     ]
     return CampaignRow(
-        name=campaign_name(arm, k) if not arm.dated else arm.campaigns[k].rsplit("/", 1)[-1],
+        name=campaign_folder(arm, k),
         when=arm.when[k][:16].replace("T", " ") if arm.dated else numbers.MISSING,
         mass=_with_std(float(payload.mass[k]), float(payload.mass_std[k])),
         p_value=numbers.MISSING if change is None else numbers.significant(change.p_value, 2),
         payload="changed" if payload.changed[k] else "other" if payload.other[k] else "",
+        stated=_stated(payload.statements[k]),
         axes=", ".join(departing),
         departs=bool(departing) or payload.changed[k] or payload.other[k],
     )
+
+
+def _stated(statement: Statement | None) -> str:
+    """Another payload than the campaign before states, and what the torques say of it."""
+    if statement is None:
+        return ""
+    mass = 0.0 if statement.after is None else statement.after.mass
+    return f"{mass:g} kg from here on ({_VERDICTS[statement.verdict]})"
 
 
 def _what(axis: AxisTrend, k: int) -> list[str]:
@@ -180,10 +200,10 @@ def _what(axis: AxisTrend, k: int) -> list[str]:
     return [name for name, watched in named if watched.departs[k]]
 
 
-def _axis_row(arm: ArmTrend, axis: AxisTrend) -> AxisRow:
+def _axis_row(axis: AxisTrend) -> AxisRow:
     drift = axis.drift
     size = abs(float(np.nanmedian(axis.friction.values))) if _any(axis.friction) else 0.0
-    total = None if drift is None or not size else drift.slope * float(np.ptp(arm.time)) / size
+    total = None if drift is None or not size else drift.slope * drift.span / size
     return AxisRow(
         joint=axis.joint,
         unit=axis.unit,

@@ -1,5 +1,6 @@
 """What an identification leaves behind, as plain numbers: `results.json`."""
 
+from .conduct import ConductResult, RecordedResult, StepResult, WarmUpResult
 from .consistency import ConsistencyResult, LinkResult
 from .essential import BlindResult, EliminationStepResult, EssentialParameter, EssentialResult
 from .exports import ExportResult
@@ -22,6 +23,7 @@ from .results import (
 
 __all__ = [
     "BlindResult",
+    "ConductResult",
     "ConsistencyResult",
     "CoverageResult",
     "CriteriaResult",
@@ -40,9 +42,12 @@ __all__ = [
     "LinkResult",
     "ParameterResult",
     "ProfileResult",
+    "RecordedResult",
     "Results",
     "SCHEMA_VERSION",
+    "StepResult",
     "UncertaintyResult",
     "ValidationResult",
     "VerdictResult",
+    "WarmUpResult",
 ]

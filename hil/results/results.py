@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from hil.errors import InputError
 from hil.files import write_atomically
+from hil.results.conduct import ConductResult
 from hil.results.consistency import ConsistencyResult
 from hil.results.essential import EssentialResult
 from hil.results.exports import ExportResult
@@ -243,6 +244,8 @@ class Results(Frozen):
     """Files for other tools beside this one."""
     judgement: JudgementResult | None = None
     """Every check behind the verdict, and the figures it rests on."""
+    conduct: ConductResult | None = None
+    """How the campaign was run; null of loose archives."""
 
     def to_json(self) -> str:
         """As indented JSON, the text of `results.json`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ class CurrentModel:
         current_limit: (n,) largest |current| of each motor [A].
         uncertainty: share by which the real torques may be larger than the nominal ones.
         torque_limit: (n,) largest |torque| of each joint [N·m], where one is set besides.
+        usable: share of the current limits that a motion may use.
 
     Raises:
         ShapeError: an array does not belong to the model's number of joints or parameters.
@@ -42,6 +43,7 @@ class CurrentModel:
     current_limit: Array
     uncertainty: float = 0.0
     torque_limit: Array | None = None
+    usable: float = 1.0
 
     def __post_init__(self) -> None:
         n = self.model.n_joints
@@ -72,7 +74,11 @@ class CurrentModel:
         torque = self.torque(motion)
         joints = self.model.joint_names
         motors = tuple(f"motor of {name}" for name in joints)
-        found = _beyond("current", motors, self.current(torque), self.current_limit, motion)
+        usable = self.usable * self.current_limit
+        found = _beyond("current", motors, self.current(torque), usable, motion)
+        if self.usable < 1.0:
+            wanted = f"{self.usable:.0%} of the motor's limit may be used"
+            found = [replace(violation, remedy=wanted) for violation in found]
         if self.torque_limit is not None:
             found += _beyond("torque", joints, torque, self.torque_limit, motion)
         return found

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from drivers.exchange import PacketReader, RingReader, SharedCycleRing, SharedPacketRing
 from drivers.packet_records import PacketRing
 from drivers.transports.base import Stamped
-from drivers.transports.tapped import tapped
+from drivers.transports.tapped import MOST_WAITING, tapped
 
 
 class Wire:
@@ -86,6 +86,17 @@ def test_packets_of_a_pile_wait_for_the_one_that_is_answered() -> None:
     assert [(row[0], row[3]) for row in drained(ring)] == [
         (9, b"old"), (9, b"older"), (9, b"newest")
     ]  # fmt: skip
+
+
+def test_a_flood_that_nobody_answers_takes_no_memory_without_end() -> None:
+    ring = PacketRing(10_000)
+    link = tapped(Wire(*[b"flood"] * 5000), ring, lambda: 3)
+    for _ in range(5000):
+        link.receive(0.0)
+    handed_on = drained(ring)
+    assert 5000 - MOST_WAITING <= len(handed_on) < 5000
+    link.close()
+    assert len(handed_on) + len(drained(ring)) == 5000
 
 
 def test_a_tap_changes_nothing_for_the_session() -> None:

@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from rig import Rig, init_packet, moving, still
+from rig import Cruise, Rig, init_packet, moving, still
 
 from drivers import errors, events
 from drivers.errors import (
@@ -109,6 +109,8 @@ EVENTS = {
     events.GapSeen: events.GapSeen(2, 9),
     events.AnswersLost: events.AnswersLost(1, 9),
     events.MotionStarted: events.MotionStarted(0, 10),
+    events.OverrideChanged: events.OverrideChanged(0.2, 12),
+    events.HoldChanged: events.HoldChanged(True, 14),
     events.MotionEnded: events.MotionEnded("lost", "the drive went off", 0, 20),
     events.PacketRejected: events.PacketRejected("foreign", 3),
     events.Refused: events.Refused(
@@ -125,8 +127,20 @@ def test_every_event(kind):
     assert_same(event, through_pickle(event))
 
 
+def _nothing(self, *_):
+    pass
+
+
 def test_events_of_a_real_session():
     rig, _ = moving()
+    rig.session.stop()
+    rig.run()
+    steered = type("Steered", (Cruise,), dict.fromkeys(("hold", "resume", "override"), _nothing))
+    rig.session.request(steered())
+    rig.session.override(0.5)
+    rig.session.hold()
+    rig.open()
+    rig.cycle(300)
     rig.send(b"rubbish")
     rig.miss(1)
     before = rig.axes["d"].copy()

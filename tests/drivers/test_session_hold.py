@@ -17,7 +17,16 @@ from rig import (
     smooth_move,
 )
 
-from drivers import AccelerationLimit, Mode, Refused, RequestError, SourceFailed, State
+from drivers import (
+    AccelerationLimit,
+    HoldChanged,
+    Mode,
+    OverrideChanged,
+    Refused,
+    RequestError,
+    SourceFailed,
+    State,
+)
 from planner import JointLimits, TrajectoryPlayer, plan
 
 WAY = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
@@ -43,6 +52,17 @@ def playing(cycles: int = 60) -> Rig:
 
 def nothing(self):
     pass
+
+
+def held_before_it_began() -> Rig:
+    rig = Rig()
+    rig.close()
+    rig.session.request(player())
+    rig.session.hold()
+    rig.cycle()
+    rig.open()
+    rig.cycle(10)
+    return rig
 
 
 class IgnoresHold(Cruise):
@@ -124,13 +144,69 @@ class TestHold:
         assert (rig.ended.outcome, source.stops) == ("stopped", 1)
         assert "failed to hold: SystemExit: no" in rig.ended.reason
 
-    def test_one_that_has_not_begun_is_dropped(self):
+    def test_one_that_has_not_begun_begins_at_rest_and_goes_on_from_there(self):
+        rig = held_before_it_began()
+        rig.cycle(6000)
+        sent = rig.records["commanded_position"]
+        sent = sent[np.isfinite(sent).all(axis=1)]
+        assert (sent == sent[0]).all()
+        assert rig.state is State.OPEN
+        assert rig.ended is None
+        rig.session.resume()
+        rig.run()
+        assert rig.ended.outcome == "completed"
+        end = rig.train.joint_position(rig.axes["d"][:, 0])
+        np.testing.assert_allclose(end, START + WAY, atol=1e-6)
+
+    def test_a_stop_ends_one_that_was_held_before_it_began(self):
+        rig = held_before_it_began()
+        rig.session.stop()
+        rig.run()
+        assert rig.ended.outcome == "stopped"
+        assert not np.nan_to_num(rig.records["commanded_velocity"]).any()
+
+    def test_one_that_was_held_and_released_before_it_began_does_not_rest(self):
         rig = Rig()
         rig.close()
         rig.session.request(player())
         rig.session.hold()
+        rig.session.resume()
+        rig.open()
+        rig.cycle(60)
+        assert not at_rest(rig)
+
+    def test_one_that_cannot_hold_and_has_not_begun_is_dropped(self):
+        rig = Rig()
+        rig.close()
+        rig.session.request(Cruise())
+        rig.session.hold()
         rig.cycle()
         assert (rig.ended.outcome, rig.ended.interval) == ("stopped", -1)
+
+    def test_one_that_fails_to_hold_as_it_begins_is_refused(self):
+        def fails(self):
+            raise ValueError("no")
+
+        rig = Rig()
+        rig.session.request(type("Odd", (Cruise,), {"hold": fails, "resume": nothing})())
+        rig.session.hold()
+        rig.open()
+        rig.cycle()
+        assert rig.ended.outcome == "refused"
+        assert "failed to hold: ValueError: no" in rig.ended.reason
+
+    def test_each_change_is_told_once(self):
+        rig = playing()
+        for _ in range(2):
+            rig.session.override(0.5)
+            rig.session.hold()
+        rig.cycle(20)
+        for _ in range(2):
+            rig.session.resume()
+        cycle = rig.session.cycle
+        rig.run()
+        assert rig.seen(OverrideChanged) == [OverrideChanged(0.5, cycle - 20)]
+        assert rig.seen(HoldChanged) == [HoldChanged(True, cycle - 20), HoldChanged(False, cycle)]
 
     def test_needs_a_motion_and_keeps_nothing_for_one_to_come(self):
         rig = Rig()

@@ -60,7 +60,7 @@ def test_a_session_with_a_check_taken_away_is_found_out(monkeypatch, owner, chec
             SessionMachine,
             settings=settings(
                 QUICK,
-                max_examples=400,
+                max_examples=2000,  # it stops at the first finding
                 stateful_step_count=40,
                 phases=[Phase.generate],
                 report_multiple_bugs=False,

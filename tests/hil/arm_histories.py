@@ -18,6 +18,7 @@ from hil.cell import Cell
 from identification import Motion, RobotModel
 from identification.covariance import with_block_covariance
 from identification.estimation import estimate, joint_weights
+from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Samples
 from sim_fixtures.ns16 import CELL_PATH
@@ -48,6 +49,8 @@ class Condition:
     load: Load = Load()
     louder: Array = field(default_factory=lambda: np.ones(6))
     """Factor on the noise of each joint."""
+    stated: Payload | None = None
+    """What the cell says that it carries, in the frame of the last joint."""
 
 
 Life = Callable[[int, np.random.Generator], Condition]
@@ -108,12 +111,23 @@ def torque(condition: Condition) -> Array:
 
 
 @cache
+def stated_torque(payload: Payload | None) -> Array:
+    """Of a payload whose inertia is that of `Load`."""
+    if payload is None:
+        return np.zeros(motion().position.shape)
+    load = Load(payload.mass, payload.centre)
+    return torque(Condition(load=load)) - torque(Condition())
+
+
+@cache
 def noise_size() -> Array:
     return NOISE * np.sqrt(np.mean(torque(Condition()) ** 2, axis=0))
 
 
 def campaign(condition: Condition, k: int, random: np.random.Generator) -> LevelEstimate:
-    arm, moved, clean = model(), motion(), torque(condition)
+    arm, moved = model(), motion()
+    # What is stated is known, and no part of the torque that parameters have to explain.
+    clean = torque(condition) - stated_torque(condition.stated)
     size = noise_size() * condition.louder
     phase = PhaseFactor.zero(arm)
     for _ in range(2):
@@ -156,4 +170,5 @@ def campaign(condition: Condition, k: int, random: np.random.Generator) -> Level
         settings="settings",
         speed_rms=speed_rms(arm, phase.total),
         information=phase.total.weighted(weights).A,
+        payload=condition.stated,
     )

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from hil.batch.on_workers import ArchiveTask, Part, Summed, run_task
+from hil.batch.places import Place
 from hil.batch.types import ArchiveRef, Broken
 from hil.batch.workers import Workers, summed
 
@@ -24,14 +25,20 @@ class Here(Workers):
         *,
         done: Callable[[int], None] | None = None,
     ) -> list[Summed[Any, Any]]:
-        return [summed([self._part(task) for task in group], add) for group in groups]
+        return [summed([self._part(task, done) for task in group], add) for group in groups]
 
-    def _part(self, task: ArchiveTask[Any, Any]) -> Part[Any, Any] | Broken:
+    def _part(
+        self, task: ArchiveTask[Any, Any], done: Callable[[int], None] | None
+    ) -> Part[Any, Any] | Broken:
         self.tasks.append(task)
+        if done is not None:
+            done(1)
         if any(ref.name in self.deadly for ref in _refs(task.arguments[0])):
             return Broken(task.path, "ended its process")
         return run_task(task)
 
 
 def _refs(argument: Any) -> Sequence[ArchiveRef]:
+    if isinstance(argument, Place):  # looking into an archive is harmless
+        return []
     return [argument] if isinstance(argument, ArchiveRef) else argument

@@ -47,7 +47,7 @@ def run_campaign(
     campaign = Campaign.create(folder, cell, plan)
     link = simulated_link(cell, effects=effects, drive=drive)
     provenance = simulated_provenance(cell, effects)
-    campaign.run(link, Stop(), Silent(), provenance=provenance, durable=False)
+    campaign.run(link, Stop(), Silent(), provenance=provenance, durable=False, unrehearsed=True)
     return campaign
 
 

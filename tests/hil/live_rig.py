@@ -30,7 +30,7 @@ def main() -> int:
         say(exchange=link.exchange.pid, archive=link.archive.process.pid)
         ring = RingReader(link.exchange.ring_fd, 6, acknowledge=False)
         try:
-            campaign.run(link, stop, Silent(), provenance={"simulated": "yes"})
+            campaign.run(link, stop, Silent(), provenance={"simulated": "yes"}, unrehearsed=True)
         except HilError as error:
             np.save(folder.parent / "ring.npy", ring.drain())
             say(error=type(error).__name__, text=str(error))

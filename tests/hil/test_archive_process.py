@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 
 import numpy as np
 import pytest
@@ -19,13 +20,18 @@ from drivers.exchange import (
     ArchiveState,
     ControlBlock,
     Ended,
+    EventReader,
     EventWriter,
+    PacketReader,
+    RingReader,
     SharedCycleRing,
+    SharedPacketRing,
     event_log,
 )
 from drivers.exchange import control as control_memory
 from hil.archive import Archive, ArchiveSpec, open_archive
-from hil.archive.commands import Answer, Close, Closed, Open, Opened
+from hil.archive.commands import Answer, Channel, Close, Closed, Open, Opened
+from hil.archive.process import ArchiveProcess
 from hil.archive.supervised import ArchiveProcessHandle
 
 PERIOD = 0.001
@@ -66,6 +72,18 @@ class Memory:
             os.close(fd)
 
 
+def drive_train() -> DriveTrain:
+    ones = np.ones(2)
+    return DriveTrain(
+        gear_ratio=50.0 * ones,
+        calibration=0.0 * ones,
+        joint_sign=ones,
+        joint_offset=0.0 * ones,
+        torque_constant=ones,
+        current_limit=10.0 * ones,
+    )
+
+
 class Rig:
     """An archive process on such memory."""
 
@@ -74,17 +92,9 @@ class Rig:
         self.process = ArchiveProcessHandle.start(memory, 2)
 
     def open(self, job: int, name: str = NAME, *, until_ended: bool = True) -> Path:
-        path, ones = self.folder / name, np.ones(2)
-        drives = DriveTrain(
-            gear_ratio=50.0 * ones,
-            calibration=0.0 * ones,
-            joint_sign=ones,
-            joint_offset=0.0 * ones,
-            torque_constant=ones,
-            current_limit=10.0 * ones,
-        )
+        path = self.folder / name
         spec = ArchiveSpec(path, joint_names=("a", "b"), period=PERIOD, metadata={}, durable=False)
-        self.process.send(Open(job, spec, drives, False, until_ended))
+        self.process.send(Open(job, spec, drive_train(), False, until_ended))
         assert self.answer(job) == Opened(job)
         return path
 
@@ -249,3 +259,34 @@ def test_a_process_that_takes_no_command_is_ended(rig: Rig) -> None:
     assert failure is not None
     assert "took no command" in failure
     assert rig.process.process.poll() is not None
+
+
+def test_raw_packets_overwritten_as_the_archive_closes_are_counted(tmp_path: Path) -> None:
+    memory = Memory()
+    ring = SharedPacketRing.create(10)
+    ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
+    channel, exchange = Channel(theirs), os.pidfd_open(memory.pid)
+    process = ArchiveProcess(
+        RingReader(memory.ring_fd, 2),
+        EventReader(memory.event_fd),
+        memory.control,
+        channel,
+        exchange,
+        PacketReader(ring.fd),
+    )
+    path = tmp_path / NAME
+    spec = ArchiveSpec(path, ("a", "b"), PERIOD, metadata={}, durable=False, packets=True)
+    process._open(Open(1, spec, drive_train(), from_now=True, until_ended=False))
+    memory.cycles(3)
+    process._take()
+    for cycle in range(30):  # after the last look, and before the archive is closed
+        ring.put(cycle // 10, 0.0, False, b"packet")
+    process._close("completed", "")
+    outcome = open_archive(path).outcome
+    assert outcome is not None
+    assert int(outcome["packets_lost"]) + int(outcome["packets"]) == 30
+    assert outcome["packets_lost"] != "0"
+    for end in (ours, channel):
+        end.close()
+    os.close(exchange)
+    memory.close()

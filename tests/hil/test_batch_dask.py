@@ -19,6 +19,7 @@ from hil.batch import cluster as dask_cluster
 from hil.batch import run
 from hil.batch.cluster import ClusterError
 from hil.batch.distributed import DaskWorkers
+from hil.batch.examining import examined
 from hil.batch.keys import code_digest
 from hil.batch.local import LocalWorkers
 from hil.batch.on_workers import (
@@ -307,8 +308,11 @@ class _KillsOne:
     def sums_in_turn(self, groups, add, *, done=None):
         """The work on archives."""
 
+        begun = groups[0][0].function is not examined
+
         def killing(count: int) -> None:
-            self._victim.kill()
+            if begun:
+                self._victim.kill()
             if done is not None:
                 done(count)
 

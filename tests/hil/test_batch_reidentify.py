@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -157,6 +159,46 @@ def test_workers_order_and_cache_make_no_difference_to_the_last_bit(
     assert same_bits(alone, batch(folder, plan=cached))
 
 
+# What is told of it meanwhile
+
+
+class Listening(Silent):
+    """Keeps how far each task came; one at a time, as bars are."""
+
+    def __init__(self) -> None:
+        self.done: dict[str, float] = {}
+        self.totals: dict[str, float] = {}
+        self._open = ""
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Listening]:
+        assert not self._open
+        self._open, self.totals[title] = title, total
+        yield self
+        self._open = ""
+
+    def advance(self, units: float, note: str = "") -> None:
+        self.done[self._open] = self.done.get(self._open, 0.0) + units
+
+
+@pytest.mark.parametrize("near", [True, False])
+def test_all_work_on_archives_is_reported_to_its_end(near: bool, folder: Path) -> None:
+    told = Listening()
+    reidentify([str(folder)], Plan(keep=False), Here(near=near), told)
+    reading = "reading archives" if near else "reading archives and estimating"
+    assert told.done == pytest.approx(told.totals)
+    assert told.totals["looking into archives"] == len(list(folder.rglob("*.mcap")))
+    assert told.totals[reading] == 5  # all but the standstill
+    assert ("estimating" in told.totals) == near
+
+
+def test_a_crash_far_away_is_told_below_the_one_bar(folder: Path) -> None:
+    names = [path.name for path in sorted((folder / "archives").glob("excitation*"))]
+    told = Listening()
+    workers = Here(names[1], near=False)
+    assert reidentify([str(folder)], Plan(keep=False), workers, told).broken
+
+
 # What is kept
 
 
@@ -166,7 +208,7 @@ def test_a_second_run_with_another_estimator_opens_no_archive(
     long_ago = time.time() - 100.0
     for path in (folder / "archives").glob("*.mcap"):
         os.utime(path, (long_ago, long_ago))
-    monkeypatch.setattr("hil.batch.discovery._SETTLED", 0)
+    monkeypatch.setattr("hil.batch.examining._SETTLED", 0)
     first = batch(folder)
     assert (first.read, first.cached) == (5, 0)
 
@@ -174,7 +216,7 @@ def test_a_second_run_with_another_estimator_opens_no_archive(
         raise AssertionError("an archive was opened")
 
     monkeypatch.setattr(factors, "open_archive", never)
-    monkeypatch.setattr("hil.batch.discovery.open_archive", never)
+    monkeypatch.setattr("hil.batch.examining.open_archive", never)
     workers = Here()
     second = batch(folder, plan=Plan("ols"), workers=workers)
     assert (second.read, second.cached, workers.tasks) == (0, 5, [])
@@ -337,7 +379,7 @@ def test_the_command_lists_what_is_broken_and_says_so_in_its_status(
     command = ["reidentify", str(folder), "--workers", "1", "-o", str(tmp_path / "out")]
     ran = CliRunner().invoke(app, command)
     assert ran.exit_code == 0, ran.output
-    assert "3 repetitions in 1 campaigns of 1 arms; 5 archives read" in ran.output
+    assert "3 repetitions in 1 campaign of 1 arm; 5 archives read" in ran.output
     (folder / "archives" / "bad.mcap").write_bytes(b"")
     ran = CliRunner().invoke(app, [*command, "--json"])
     assert ran.exit_code == 5, ran.output

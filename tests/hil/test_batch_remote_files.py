@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import http.server
+import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import fsspec
 import pytest
 
 from hil.batch import remote_files
+from hil.batch.errors import UnavailableError
 from hil.batch.remote_files import is_url, listed, local_copy
 from hil.errors import InputError
 from tests.hil.web_folder import served
 
 CONTENT = {"a/first.mcap": b"one" * 1_000_000, "b/c/second.mcap": b"", "b/notes.txt": b"no archive"}
 ARCHIVES = ["a/first.mcap", "b/c/second.mcap"]
+
+
+@pytest.fixture(autouse=True)
+def _patient_for_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote_files, "_PAUSES", (0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +104,60 @@ def test_what_cannot_be_read_is_one_sentence_with_the_address(address: str, mess
         listed(address)
     with pytest.raises(InputError, match=f"{address}.*{message}"), local_copy(address):
         pass
+
+
+class _Busy(http.server.SimpleHTTPRequestHandler):
+    """Refuses the first so many requests for a file."""
+
+    refusals: ClassVar[list[int]] = []
+    asked: ClassVar[list[str]] = []
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        if self.refusals:
+            self.send_error(self.refusals.pop())
+        else:
+            super().do_GET()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def busy(folder: Path) -> Iterator[str]:
+    _Busy.asked.clear()
+    handler = partial(_Busy, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_server_that_is_busy_is_asked_again(busy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Busy, "refusals", [503, 429])
+    with local_copy(f"{busy}/{ARCHIVES[0]}") as path:
+        assert path.read_bytes() == CONTENT[ARCHIVES[0]]
+    assert len(_Busy.asked) == 3
+
+
+def test_a_server_that_stays_busy_is_given_up(busy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Busy, "refusals", [503] * 10)
+    with pytest.raises(UnavailableError, match="503"), local_copy(f"{busy}/{ARCHIVES[0]}"):
+        pass
+    assert len(_Busy.asked) == 3
+
+
+def test_what_a_server_does_not_give_is_asked_for_once(
+    busy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Busy, "refusals", [403])
+    with pytest.raises(UnavailableError, match="403"), local_copy(f"{busy}/{ARCHIVES[0]}"):
+        pass
+    with pytest.raises(UnavailableError, match="not there"), local_copy(f"{busy}/absent.mcap"):
+        pass
+    assert len(_Busy.asked) == 2
 
 
 def test_without_fsspec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

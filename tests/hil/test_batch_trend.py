@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import html
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,10 +21,12 @@ from scipy.stats import kendalltau
 from hil.batch import payload_change
 from hil.batch.axis_figures import friction_of, friction_weights
 from hil.batch.chart import FEWEST, chart, drift, limits, qn_scale
-from hil.batch.trend import FALSE_ALARMS, ArmTrend, Trends, arm_trend
+from hil.batch.shifts import shifts
+from hil.batch.trend import FALSE_ALARMS, ArmTrend, Trends, Watched, arm_trend
 from hil.batch.trend_words import findings, summary
 from hil.batch.types import Broken
 from hil.report.trend import render_trend_report, write_trend_report
+from identification.payload import Payload
 
 from .arm_histories import FRICTION, Condition, Load, history, model, motion, steady, trend_of
 
@@ -28,7 +34,7 @@ from .arm_histories import FRICTION, Condition, Load, history, model, motion, st
 
 
 def judged(values: list[float], std: float = 0.0, **options: float) -> tuple[bool, ...]:
-    return chart(np.array(values), np.full(len(values), std), 0.01, **options)[1]
+    return chart(np.array(values), np.full(len(values), std), 0.01, **options).departs
 
 
 @pytest.mark.parametrize("count", [5, 6, 8, 12, 25])
@@ -85,9 +91,55 @@ def test_a_history_that_agrees_by_chance_is_no_narrower_than_its_values_are_know
     assert not judged([1.0] * 8 + [1.5], std=0.5)[-1]
 
 
-def test_a_value_that_departed_is_no_history() -> None:
-    values = [1.0, 1.1, 0.9, 1.05, 0.95, 1.02, 1.0] + [3.0] * 12
-    assert judged(values) == (False,) * 7 + (True,) * 12
+SCATTER = [1.0, 1.1, 0.9, 1.05, 0.95, 1.02, 1.0]
+
+
+def shifted(values: list[float], **options: float) -> list[tuple[str, int, int]]:
+    found = chart(np.array(values), np.zeros(len(values)), 0.01, **options)
+    stds = np.zeros(len(values))
+    watched = Watched(np.array(values), stds, found.limits, found.departs, found.levels)
+    return [(one.kind, one.first, one.last) for one in shifts(watched)]
+
+
+def test_values_that_departed_are_no_history() -> None:
+    assert judged([*SCATTER, 3.0, 3.0, 3.0, 3.0]) == (False,) * 7 + (True,) * 4
+
+
+def test_values_that_stay_away_are_a_new_level_by_which_later_ones_are_judged() -> None:
+    there = [3.0 * one for one in SCATTER]
+    found = chart(np.array([*SCATTER, *there, 4.9]), np.zeros(15), 0.01)
+    assert found.departs == (False,) * 7 + (True,) * FEWEST + (False,) * 2 + (True,)
+    assert found.levels == (0,) * 7 + (1,) * 7 + (-1,)
+    band = found.limits[-1]
+    assert band is not None
+    assert band.centre == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("stay", [1, 3, FEWEST, 9])
+@pytest.mark.parametrize("rise_only", [False, True])
+def test_a_figure_that_departs_and_is_repaired_has_changed_twice(
+    stay: int, rise_only: bool
+) -> None:
+    damaged = (3.0 * np.array(SCATTER * 2)[:stay]).tolist()
+    found = shifted([*SCATTER, *damaged, *SCATTER], rise_only=rise_only)
+    assert found == [("departs", 7, 6 + stay), ("returns", 7 + stay, 13 + stay)]
+
+
+def test_values_to_both_sides_of_a_history_make_no_level() -> None:
+    found = chart(np.array([*SCATTER, *[3.0, -1.0] * 6]), np.zeros(19), 0.01)
+    assert set(found.levels) == {0, -1}
+    assert all(found.departs[7:])
+
+
+def test_after_a_change_of_level_no_more_than_the_share_are_said_to_depart() -> None:
+    random = np.random.default_rng(11)
+    runs, share, after = 2000, 0.01, FEWEST
+    told = 0
+    for _ in range(runs):
+        values = random.standard_normal(8 + after + 1)
+        values[8:] += 1000.0
+        told += chart(values, np.zeros(len(values)), share).departs[-1]
+    assert told / runs <= share + 3.0 * math.sqrt(share / runs)
 
 
 def test_a_value_that_is_not_known_neither_departs_nor_counts() -> None:
@@ -290,11 +342,104 @@ def test_campaigns_that_scatter_more_than_they_say_raise_no_alarm() -> None:
     assert not any(arm_trend("arm", arm, restless).payload.changed)
 
 
-def test_without_times_campaigns_keep_their_order_and_are_numbered() -> None:
-    campaigns = [replace(one, when="") for one in history(steady, 2, seed=2)]
+def repaired(k: int, random: np.random.Generator) -> Condition:
+    """Axis 3 rubs in campaigns 7 to 9, until it is greased."""
+    now = steady(k, random)
+    friction = now.friction.copy()
+    friction[:, 2] *= 1.4 if 7 <= k <= 9 else 1.0
+    return replace(now, friction=friction)
+
+
+def test_an_axis_that_departs_and_is_repaired_is_told_as_two_changes() -> None:
+    arm = trend_of(repaired, 12)
+    words = [one.words for one in findings(arm)]
+    assert {one.level for one in findings(arm)} == {"past"}
+    assert len(words) == 2
+    assert re.search(r"joint_3 departs .*, from c07 \(2026-04-15\) to c09", words[0])
+    assert re.search(r"joint_3 has returned .*, since c10", words[1])
+    assert summary(arm) == "no new change; 2 earlier ones"
+
+
+SPOOL = Load(3.0)
+STATED = Payload(3.0, SPOOL.centre, inertia=(0.03, 0.0, 0.0, 0.03, 0.0, 0.03))
+
+
+def loaded(
+    carried: Callable[[int], bool], stated: Callable[[int], bool], count: int = 4
+) -> ArmTrend:
+    def life(k: int, random: np.random.Generator) -> Condition:
+        load = SPOOL if carried(k) else Load()
+        return replace(steady(k, random), load=load, stated=STATED if stated(k) else None)
+
+    return trend_of(life, count)
+
+
+def test_a_payload_that_is_put_on_and_stated_is_no_discovery() -> None:
+    arm = loaded(lambda k: k >= 2, lambda k: k >= 2)
+    assert not any(arm.payload.changed + arm.payload.other)
+    statement = arm.payload.statements[2]
+    assert statement is not None
+    assert (statement.before, statement.after, statement.verdict) == (None, STATED, "agrees")
+    assert any("states a payload of 3 kg instead of nothing" in f.words for f in findings(arm))
+    assert {one.level for one in findings(arm)} == {"quiet"}
+    np.testing.assert_allclose(arm.payload.mass, [0.0, 0.0, 3.0, 3.0], atol=0.3)
+
+
+def test_a_payload_that_is_stated_later_than_it_was_put_on_has_not_changed() -> None:
+    arm = loaded(lambda _: True, lambda k: k >= 2)
+    assert not any(arm.payload.changed + arm.payload.other)
+    assert [one and one.verdict for one in arm.payload.statements] == [
+        None,
+        None,
+        "statement only",
+        None,
+    ]
+    np.testing.assert_allclose(arm.payload.mass, 0.0, atol=0.3)
+
+
+def test_a_payload_put_on_before_it_is_stated_is_one_discovery_and_one_statement() -> None:
+    arm = loaded(lambda k: k >= 1, lambda k: k >= 3, 5)
+    assert np.flatnonzero(arm.payload.changed).tolist() == [1]
+    assert [one and one.verdict for one in arm.payload.statements][3] == "statement only"
+
+
+def test_a_stated_payload_that_weighs_something_else_is_told() -> None:
+    wrong = replace(STATED, mass=6.0, inertia=(0.06, 0.0, 0.0, 0.06, 0.0, 0.06))
+
+    def life(k: int, random: np.random.Generator) -> Condition:
+        late = k >= 2
+        load, stated = (SPOOL, wrong) if late else (Load(), None)
+        return replace(steady(k, random), load=load, stated=stated)
+
+    arm = trend_of(life, 3)
+    assert [one.level for one in findings(arm)] == ["alarm", "alarm"]
+    assert "the torques do not agree" in findings(arm)[0].words
+    change = arm.payload.changes[2]
+    assert change is not None
+    assert abs(change.mass + 3.0) < 4.0 * change.mass_std
+
+
+def test_without_any_times_campaigns_go_by_name_as_people_count_and_that_is_said() -> None:
+    names = ("c10", "c9", "c1")
+    campaigns = [
+        replace(one, when="", campaign=f"line/{name}")
+        for one, name in zip(history(steady, 3, seed=2), names, strict=True)
+    ]
     arm = arm_trend("arm", model(), campaigns)
     assert not arm.dated
-    assert arm.time.tolist() == [1.0, 2.0]
+    assert arm.time.tolist() == [1.0, 2.0, 3.0]
+    assert arm.campaigns == ("line/c1", "line/c9", "line/c10")
+    assert "in the order of their folders' names, from c1 to c10" in findings(arm)[-1].words
+
+
+def test_a_campaign_without_a_time_is_no_part_of_a_history_that_has_times() -> None:
+    campaigns = history(steady, 4, seed=2)
+    campaigns[1] = replace(campaigns[1], when="")
+    arm = arm_trend("arm", model(), campaigns)
+    assert arm.dated
+    assert arm.campaigns == ("line/c00", "line/c02", "line/c03")
+    assert arm.undated == ("line/c01",)
+    assert "1 further campaign (c01) without a time of recording" in findings(arm)[-1].words
 
 
 def test_axes_of_which_nothing_is_known_are_left_out_of_the_figures_and_judged_no_further() -> None:
@@ -351,7 +496,14 @@ def test_the_page_says_first_in_words_what_was_found() -> None:
 def test_the_page_needs_nothing_but_itself() -> None:
     addresses = re.findall(r"(?:href|src)=\"([^\"#][^\"]*)\"|url\((?!#)([^)]*)\)", page())
     assert not addresses
-    assert "<script" not in page()
+
+
+def test_the_page_runs_no_script_but_the_one_its_policy_names() -> None:
+    (script,) = re.findall(r"<script[^>]*>(.*?)</script>", page(), re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page())
+    assert f"script-src 'sha256-{digest}';" in html.unescape(policy)
+    assert "default-src 'none'" in html.unescape(policy)
 
 
 def test_what_could_not_be_used_is_listed_and_cannot_inject() -> None:

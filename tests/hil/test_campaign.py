@@ -63,6 +63,7 @@ def execute(campaign: Campaign, stop: Stop | None = None) -> None:
         Silent(),
         provenance=provenance,
         durable=False,
+        unrehearsed=True,
     )
 
 
@@ -161,7 +162,7 @@ def test_a_stop_ends_the_motion_on_its_path_and_the_rest_is_resumed(
 
     controller.accept = stop_at_speed  # type: ignore[method-assign]
     with pytest.raises(MotionFailedError, match="stopped by the operator"):
-        campaign.run(link, stop, Silent(), provenance={}, durable=False)
+        campaign.run(link, stop, Silent(), provenance={}, durable=False, unrehearsed=True)
     stopped = open_archive(campaign.folder.archives / "move_000_a1.mcap")
     assert stopped.complete
     assert stopped.outcome is not None
@@ -189,7 +190,9 @@ def test_a_stop_between_motions_begins_none(tmp_path: Path, cell: Cell, plan: Ca
             yield Stopping()
 
     with pytest.raises(MotionFailedError, match="it had not begun"):
-        campaign.run(link, stop, StopAfterTheFirst(), provenance={}, durable=False)
+        campaign.run(
+            link, stop, StopAfterTheFirst(), provenance={}, durable=False, unrehearsed=True
+        )
     assert [entry.name for entry in campaign.folder.manifest()] == ["move_000_a1.mcap"]
 
 
@@ -209,7 +212,7 @@ def test_a_controller_that_announces_another_drive_train_is_refused(
     campaign = Campaign.create(tmp_path / "init", wrong, plan)
     link = Link.over(SimulatedTransport(simulated_controller(cell)), wrong)
     with pytest.raises(ControllerFault, match=f"cannot be used: .*{named}"):
-        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False, unrehearsed=True)
     assert not list(campaign.folder.archives.iterdir())
 
 
@@ -239,7 +242,7 @@ def test_what_the_arm_does_after_a_refusal_is_recorded(
     lose = Lose(600, "to_controller")
     link = Link.over(SimulatedTransport(controller, [lose]), campaign.cell)
     with pytest.raises(MotionFailedError, match="ended lost"):
-        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False, unrehearsed=True)
     archive = open_archive(campaign.folder.archives / "move_000_a1.mcap")
     (ended,) = (event for event in archive.events if event.name == "MotionEnded")
     last = archive.columns["cycle"][-1] * campaign.cell.period
@@ -260,7 +263,7 @@ def test_whatever_goes_wrong_in_archiving_the_arm_comes_to_rest(
 
     monkeypatch.setattr(ArchiveWriter, "write", failing)
     with pytest.raises(MemoryError):
-        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False, unrehearsed=True)
     assert np.abs(controller.plant.velocity).max() < 0.01
 
 
@@ -340,7 +343,7 @@ def test_a_disk_that_refuses_brings_the_arm_to_rest_before_anything_else(
 
     monkeypatch.setattr(ArchiveWriter, "write", refusing)
     with pytest.raises(ArchiveWriteError, match="no space left"):
-        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False, unrehearsed=True)
     assert max(calls) > 0.1, "the arm was moving"
     assert np.abs(controller.plant.velocity).max() < 1e-3
     assert len(calls) == 5, "nothing was sent to be archived after that"
@@ -497,8 +500,8 @@ def test_a_plan_that_knows_no_method_is_read(tmp_path: Path, plan: CampaignPlan)
     assert read.excitation.criteria.condition is None
     assert read.excitation.trajectory.to_dict() == plan.excitation.trajectory.to_dict()
     assert read.moves is not None
-    path.write_text(json.dumps(old | {"format_version": 4}))
-    with pytest.raises(InputError, match="format version 4"):
+    path.write_text(json.dumps(old | {"format_version": 5}))
+    with pytest.raises(InputError, match="format version 5"):
         CampaignPlan.load(path)
 
 
@@ -549,13 +552,13 @@ def test_an_override_changes_as_fast_as_the_cells_bounds_allow(
     played: list[TrajectoryPlayer] = []
     link = simulated_link(campaign.cell)
 
-    def take(player: TrajectoryPlayer, *rest: object) -> None:
+    def take(player: TrajectoryPlayer, *rest: object, **options: object) -> None:
         played.append(player)
         raise Taken
 
     link.run = take  # type: ignore[method-assign, assignment]
     with pytest.raises(Taken):
-        campaign.run(link, Stop(), Silent(), provenance={}, durable=False)
+        campaign.run(link, Stop(), Silent(), provenance={}, durable=False, unrehearsed=True)
     (ours,) = played
     limits = cell.joint_limits
     way = (Move(cell.home, speed=cell.campaign.approach_speed),)

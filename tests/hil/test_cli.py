@@ -12,9 +12,11 @@ import time
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from hil.archive import open_archive
 from hil.campaign import Campaign
+from hil.cli import COMMANDS, app
 from hil.results import Results
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 
@@ -31,8 +33,17 @@ def test_help_says_where_to_start() -> None:
     done = hil("--help")
     assert done.returncode == 0
     assert "hil demo" in done.stdout
-    for command in ("demo", "identify", "import"):
-        assert hil(command, "--help").returncode == 0
+    for command in COMMANDS:
+        assert f" {command} " in done.stdout
+        assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
+
+
+def test_a_command_does_not_wait_for_the_libraries_of_another() -> None:
+    look = "import sys; from hil.cli import COMMANDS; COMMANDS['status']; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    loaded = done.stdout.split()
+    assert "hil.cli.status" in loaded
+    assert not {"hil.cli.design", "matplotlib", "cvxpy"} & set(loaded)
 
 
 def test_the_demo_leaves_archives_results_and_a_report_and_ends_with_the_verdict(
@@ -128,11 +139,11 @@ def test_bad_input_gets_one_sentence_and_status_2(
 def test_a_stopped_demo_goes_on_where_it_was(campaign: Campaign, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(campaign.folder.root, folder)
-    torn = folder / "archives" / "validation_001_a1.mcap"
-    torn.unlink()
+    (folder / "archives" / "validation_001_a1.mcap").unlink()
     done = hil("demo", "--output", folder, "--resume")
     assert done.returncode == 0, done.stderr
-    assert (folder / "archives" / "validation_001_a1.mcap").exists()
+    # A number that was given away is not given twice.
+    assert (folder / "archives" / "validation_001_a2.mcap").exists()
     assert (folder / "report.html").exists()
 
 

@@ -118,6 +118,7 @@ def test_leaves_motion_picture_settings_and_journal(made):
         "excitation.png",
         "settings.toml",
         "search.journal",
+        *("cell.toml", "robot.urdf", "plan.json", "manifest.json", "archives"),
     }
     last = output.splitlines()[-1]
     assert last.startswith("log det ") and "of 1653" in last

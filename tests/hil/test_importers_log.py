@@ -269,15 +269,21 @@ class TestMapFile:
     @pytest.mark.parametrize(
         ("text", "sentence"),
         [
-            ("sample_rate = 5\n", "position: Field required"),
+            ("sample_rate = 5\n", "position: is missing"),
             ("[position]\ncolumns = 'q{}'\n", "either a time column or sample_rate"),
             ("sample_rate = 5\n[position]\ncolumns = 'q{}'\nunit = 'inch'\n", "'inch' is no unit"),
             ("sample_rate = 5\n[position]\ncolumn = 'q{}'\n", "position.column"),
-            ("sample_rate = -5\n[position]\ncolumns = 'q{}'\n", "sample_rate: .*greater than 0"),
+            (
+                "sample_rate = -5\n[position]\ncolumns = 'q{}'\n",
+                "sample_rate: must be a number",
+            ),
             (
                 "sample_rate = 5\n[position]\ncolumns = 'q{}'\nside = 'motor'\n",
                 "drive.gear_ratio is needed",
             ),
+            ("sample_rate = 5\n[position]\ncolumns = -1\n", "position.columns: must be a name"),
+            ("sample_rate = 5\n[position]\nscale = 'x'\n", "position.scale: must be a number"),
+            ("sample_rate = 5\nposition = 3\n", "position: must be a table"),
             ("sample_rate = \n", "cannot be read"),
         ],
     )

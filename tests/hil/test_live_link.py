@@ -52,7 +52,7 @@ def test_a_campaign_over_real_sockets_leaves_whole_gap_free_archives(
 ) -> None:
     campaign = campaign_of(tmp_path / "campaign", on_loopback(cell), plan)
     with loopback_link(campaign.cell, options=PATIENT) as link:
-        campaign.run(link, Stop(), Silent(), provenance={"simulated": "yes"})
+        campaign.run(link, Stop(), Silent(), provenance={"simulated": "yes"}, unrehearsed=True)
         assert not link.exchange.alive
         assert not link.archive.alive
     names = [entry.name for entry in campaign.folder.manifest()]
@@ -91,8 +91,11 @@ def test_a_real_controller_is_not_driven_without_a_rehearsal(
     text = cell.with_link(transport="udp", host="10.2.12.150", port=free_port()).text
     real = Cell.from_texts(text, cell.urdf, cell.path)
     campaign = campaign_of(tmp_path / "real", real, plan)
-    with LiveLink.open(campaign.cell) as link, pytest.raises(NotRehearsedError) as refused:
-        campaign.run(link, Stop(), Silent(), provenance={})
+    with LiveLink.open(campaign.cell) as link:
+        with pytest.raises(NotRehearsedError, match="hil rehearse") as refused:
+            campaign.run(link, Stop(), Silent())
+        with pytest.raises(NotRehearsedError, match="leads out of this computer"):
+            campaign.run(link, Stop(), Silent(), unrehearsed=True)
     assert refused.value.exit_code == 3
     assert not list(campaign.folder.archives.iterdir())
 
@@ -102,7 +105,7 @@ def test_two_runs_of_one_campaign_are_one_too_many(
 ) -> None:
     campaign = campaign_of(tmp_path / "twice", cell, plan)
     with campaign.folder.locked(), pytest.raises(CampaignFolderError, match="another run"):
-        campaign.run(simulated_link(cell), Stop(), Silent(), provenance={})
+        campaign.run(simulated_link(cell), Stop(), Silent(), provenance={}, unrehearsed=True)
     with campaign.folder.locked():
         pass  # it was let go of
 
@@ -120,7 +123,7 @@ def test_each_difference_of_the_init_packet_is_named_before_anything_moves(
         loopback_link(campaign.cell, simulated_by=right / "cell.toml", options=PATIENT) as link,
         pytest.raises(ControllerFault, match=r"k54 of axis 5 .*k65 of axis 6 .*--accept-init"),
     ):
-        campaign.run(link, Stop(), Silent(), provenance={})
+        campaign.run(link, Stop(), Silent(), provenance={}, unrehearsed=True)
     assert not list(campaign.folder.archives.iterdir())
 
 
@@ -132,7 +135,7 @@ def test_an_archive_that_cannot_be_created_moves_nothing(
         link.connect(Stop())
         campaign.folder.archives.rmdir()
         with pytest.raises(ArchiveWriteError, match="cannot be created"):
-            campaign.run(link, Stop(), Silent(), provenance={})
+            campaign.run(link, Stop(), Silent(), provenance={}, unrehearsed=True)
         assert link.exchange.status().program_accepted == 0
 
 
@@ -159,7 +162,7 @@ def test_a_refusal_comes_with_its_flight_recorder(
         loopback_link(campaign.cell, options=(*PATIENT, *fault)) as link,
         pytest.raises(MotionFailedError) as failed,
     ):
-        campaign.run(link, Stop(), Silent(), provenance={})
+        campaign.run(link, Stop(), Silent(), provenance={}, unrehearsed=True)
     assert failed.value.outcome == "refused"
     recorder = failed.value.flight_recorder
     assert recorder is not None

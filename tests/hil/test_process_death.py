@@ -183,7 +183,14 @@ def require_resumed(campaign: Campaign) -> None:
     """The rest of the campaign runs (in virtual time), and the excitation is done again."""
     again = Campaign.open(campaign.folder.root)
     link = simulated_link(again.cell, instead_of_hardware=True)
-    again.run(link, Stop(), Silent(), provenance={"simulated": "yes"}, durable=False)
+    again.run(
+        link,
+        Stop(),
+        Silent(),
+        provenance={"simulated": "yes"},
+        durable=False,
+        unrehearsed=True,
+    )
     done = [path.name for kind in ("excitation", "validation") for path in
             again.folder.completed(kind)]  # fmt: skip
     assert done == ["excitation_000_a2.mcap", "validation_000_a1.mcap"]

@@ -15,14 +15,18 @@ from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignPlan, design, plan_around
 from hil.campaign.quick_design import LEAST, quick_settings
 from hil.cell import Cell
+from hil.cell.text import replaced_value
 from hil.design import load_design, preset
 from hil.design.folder import DesignFolder
 from hil.design.run import run_design
 from hil.errors import HilError
-from hil.motion_checks import MotionChecks
+from hil.motion_checks import PLANNED_CURRENT, MotionChecks
 from hil.progress import Silent
+from identification.excitation import sampled
 from planner import FourierSeries, PiecewiseCubic
+from planner.toml_value import toml_value
 from sim_fixtures.ns16 import CELL_PATH
+from tests.hil.fast_cell import fast_cell
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +54,35 @@ def test_the_quick_search_keeps_the_cell_and_begins_and_ends_at_home(
     assert checks.refusal(excitation.trajectory) is None
     assert all(checks.refusal(motion.trajectory) is None for motion in plan.validation)
     assert np.isfinite(excitation.criteria.fitness)
+
+
+def test_motions_are_planned_with_the_share_of_the_currents_that_a_rehearsal_allows(
+    tmp_path: Path,
+) -> None:
+    """Motors are weakened until a plan that knows no share would be at 90 % of their limits."""
+    cell = fast_cell(tmp_path)
+    strong = design(cell, Silent())
+    worst = max(_largest_shares(cell, strong))
+    limits = [float(limit * worst / 0.9) for limit in cell.drive_train.current_limit]
+    text = replaced_value(cell.text, "drive_train", "current_limit", toml_value(limits))
+    weak = Cell.from_texts(text, cell.urdf, cell.path)
+    found = design(weak, Silent())
+    assert max(_largest_shares(weak, found)) <= PLANNED_CURRENT
+    # What was designed elsewhere is judged by the whole limit before it is sent.
+    assert MotionChecks.of(weak).refusal(strong.excitation.trajectory) is None
+
+
+def _largest_shares(cell: Cell, plan: CampaignPlan) -> list[float]:
+    """Of the current limits, for each motion of a plan, by the nominal model."""
+    currents = MotionChecks.of(cell).currents
+    torques = (
+        currents.torque(sampled(motion.trajectory))
+        for motion in (plan.excitation, *plan.validation)
+    )
+    return [
+        float(np.max(np.abs(currents.current(torque)) / currents.current_limit))
+        for torque in torques
+    ]
 
 
 def test_one_seed_is_one_plan_to_the_bit_and_another_is_another(

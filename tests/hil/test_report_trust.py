@@ -12,7 +12,7 @@ from hil.identify.consistency import consistency_doubts, consistency_reasons, co
 from hil.identify.essential import essential_doubts, essential_result
 from hil.report import consistency, essential
 from hil.report.figures.elimination import elimination_panels
-from hil.report.page import _environment, _Numbering
+from hil.report.rendering import Numbering, environment
 from hil.results import BlindResult, ConsistencyResult, EssentialResult, ParameterResult
 
 from .identified_arm import IdentifiedArm, identified_arm
@@ -61,9 +61,9 @@ def rendered(sections: Any) -> str:
         '{% include "trust.html.j2" %}{% include "consistency.html.j2" %}'
     )
     return (
-        _environment()
+        environment()
         .from_string(page)
-        .render(**context, results=sections, numbering=_Numbering(), has_truth=False)
+        .render(**context, results=sections, numbering=Numbering(), has_truth=False)
     )
 
 

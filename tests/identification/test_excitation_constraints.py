@@ -117,6 +117,21 @@ def test_a_current_beyond_its_limit_is_named_with_value_bound_and_instant(make_c
         assert word in str(violation)
 
 
+def test_only_the_usable_share_of_a_current_limit_is_used_and_a_refusal_says_so(
+    make_currents, swing
+):
+    generous = make_currents([100.0, 100.0])
+    peak = np.abs(generous.current(generous.torque(sampled(swing, 0.008)))).max(axis=0)
+    limits = [100.0, peak[1] / 0.9]
+    assert check_motion(swing, LIMITS, currents=make_currents(limits)).ok
+    assert check_motion(swing, LIMITS, currents=make_currents(limits, usable=0.91)).ok
+    (violation,) = check_motion(
+        swing, LIMITS, currents=make_currents(limits, usable=0.8)
+    ).violations
+    assert violation.bound == pytest.approx(0.8 * limits[1])
+    assert "80% of the motor's limit may be used" in str(violation)
+
+
 def test_a_torque_limit_is_checked_besides(make_currents, swing):
     check = check_motion(
         swing, LIMITS, currents=make_currents([100.0, 100.0], torque_limit=np.array([5.0, 1e3]))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
 from hil.report.figures.canvas import TICK_SIZE, blank, place
 from hil.report.figures.palette import INK, MUTED
@@ -21,8 +24,16 @@ def correlation_matrix(results: Results) -> Panel | None:
     n = results.n_base
     if n == 0:
         return None
-    matrix = np.abs(np.array(results.correlation, dtype=np.float64)[:n, :n])
-    names = [label(short_label(p)) for p in results.parameters[:n]]
+    matrix = np.array(results.correlation, dtype=np.float64)[:n, :n]
+    return matrix_panel(matrix, [short_label(p) for p in results.parameters[:n]], key="c")
+
+
+def matrix_panel(
+    matrix: NDArray[np.float64], labels: Sequence[str], *, key: str, title: str = ""
+) -> Panel:
+    """|ρ| of a normalised matrix (n, n), one label for each row; `key` is the panel's own."""
+    n, matrix = len(labels), np.abs(matrix)
+    names = [label(text) for text in labels]
     above = int(np.sum(np.triu(matrix, 1) > 0.9))
     alt = (
         f"Absolute correlation between {n} base parameters, white for 0 and black for 1;"
@@ -35,7 +46,8 @@ def correlation_matrix(results: Results) -> Panel | None:
         axes.imshow(matrix, cmap="gray_r", vmin=0.0, vmax=1.0, interpolation="none", aspect="auto")
         _label_cells(axes, names, side / n)
         _scale(place(figure, _LABELS + side + 22.0, _LABELS, 14.0, min(side, 200.0)))
-        return to_panel(figure, key="c", title="", note="", alt=alt)
+        note = f"{above} of {n * (n - 1) // 2} pairs above 0.9" if title else ""
+        return to_panel(figure, key=key, title=title, note=note, alt=alt)
 
 
 def _label_cells(axes: Axes, names: list[str], cell: float) -> None:

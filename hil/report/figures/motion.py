@@ -12,12 +12,15 @@ from hil.report import numbers
 from hil.report.figures.canvas import blank, footed, headed, place, ruled, thinned
 from hil.report.figures.palette import FIRST, INK, MUTED, SECOND, WIDE
 from hil.report.figures.svg import Panel, drawing, to_panel
+from hil.report.figures.traces import Plot, Trace, traces_text
 from hil.report.series import ReportSeries
 
 Array = NDArray[np.float64]
 
 _WIDTH, _LEFT, _RIGHT = 370.0, 46.0, 10.0
 _SECONDS = "time [s]"
+_INNER = _WIDTH - _LEFT - _RIGHT
+_POINTS = 1200  # of a planned motion, which is smooth
 
 
 def excitation_panels(series: ReportSeries, joint_names: Sequence[str]) -> list[Panel]:
@@ -40,16 +43,12 @@ def _excitation(j: int, name: str, time: Array, position: Array, velocity: Array
         f"{name}: position between {numbers.significant(low)} and {numbers.significant(high)} rad,"
         f" speed up to {numbers.significant(fastest)} rad/s, over {_length(time)} s."
     )
-    with drawing():
-        figure = blank(_WIDTH, 240.0)
-        upper = place(figure, _LEFT, 20.0, _WIDTH - _LEFT - _RIGHT, 78.0)
-        lower = place(figure, _LEFT, 122.0, _WIDTH - _LEFT - _RIGHT, 78.0)
-        _line(upper, time, position, FIRST, 1.5)
-        _line(lower, time, velocity, SECOND, 1.5)
-        _time_axes(upper, lower, time)
-        headed(upper, "position [rad]")
-        headed(lower, "velocity [rad/s]")
-        return to_panel(figure, key=f"x{j}", title=name, note=note, alt=alt)
+    plots = (
+        Plot((_LEFT, 20.0, _INNER, 78.0), "position [rad]", [Trace(position, FIRST, 1.5, "q")]),
+        Plot((_LEFT, 122.0, _INNER, 78.0), "velocity [rad/s]", [Trace(velocity, SECOND, 1.5, "v")]),
+    )
+    traces = traces_text(time, plots, points=_POINTS)
+    return _panel(240.0, time, plots, key=f"x{j}", title=name, note=note, alt=alt, traces=traces)
 
 
 def torque_panels(series: ReportSeries, joint_names: Sequence[str]) -> list[Panel]:
@@ -69,18 +68,39 @@ def _torque(j: int, name: str, time: Array, measured: Array, predicted: Array) -
     size = numbers.significant(float(np.sqrt(np.mean(measured**2))))
     note = f"RMS error {rms} of {size} N·m"
     alt = f"{name}: measured and predicted torque over {_length(time)} s; {note}."
+    plots = (
+        Plot(
+            (_LEFT, 20.0, _INNER, 128.0),
+            "torque [N·m]",
+            [Trace(measured, WIDE, 4.0, "measured"), Trace(predicted, INK, 1.1, "predicted")],
+        ),
+        Plot(
+            (_LEFT, 172.0, _INNER, 50.0),
+            "measured − predicted [N·m]",
+            [Trace(error, SECOND, 0.9, "difference")],
+        ),
+    )
+    traces = traces_text(time, plots)
+    return _panel(262.0, time, plots, key=f"t{j}", title=name, note=note, alt=alt, traces=traces)
+
+
+def _panel(height: float, time: Array, plots: tuple[Plot, Plot], **words: str) -> Panel:
+    """Two plots over the same time, one above the other."""
     with drawing():
-        figure = blank(_WIDTH, 262.0)
-        upper = place(figure, _LEFT, 20.0, _WIDTH - _LEFT - _RIGHT, 128.0)
-        lower = place(figure, _LEFT, 172.0, _WIDTH - _LEFT - _RIGHT, 50.0)
-        _line(upper, time, measured, WIDE, 4.0)
-        _line(upper, time, predicted, INK, 1.1)
-        lower.axhline(0.0, color=MUTED, linewidth=0.8)
-        _line(lower, time, error, SECOND, 0.9)
+        figure = blank(_WIDTH, height)
+        upper, lower = (place(figure, *plot.box) for plot in plots)
+        for axes, plot in zip((upper, lower), plots, strict=True):
+            for trace in plot.traces:
+                _line(axes, time, trace.values, trace.colour, trace.width)
+            headed(axes, plot.heading)
+        if (
+            float(np.min(plots[1].traces[0].values))
+            < 0.0
+            < float(np.max(plots[1].traces[0].values))
+        ):
+            lower.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1.5)
         _time_axes(upper, lower, time)
-        headed(upper, "torque [N·m]")
-        headed(lower, "measured − predicted [N·m]")
-        return to_panel(figure, key=f"t{j}", title=name, note=note, alt=alt)
+        return to_panel(figure, **words)
 
 
 def _line(axes: Axes, time: Array, values: Array, color: str, width: float) -> None:

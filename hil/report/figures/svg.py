@@ -66,8 +66,13 @@ def label(text: str) -> str:
     return line if len(line) <= _LABEL_LENGTH else line[: _LABEL_LENGTH - 1] + "…"
 
 
-def to_panel(figure: Figure, *, key: str, title: str, note: str, alt: str) -> Panel:
-    """`figure` as SVG; `key` makes its ids unique in the page, `alt` says what it shows."""
+def to_panel(
+    figure: Figure, *, key: str, title: str, note: str, alt: str, traces: str = ""
+) -> Panel:
+    """`figure` as SVG; `key` makes its ids unique in the page, `alt` says what it shows.
+
+    With `traces` (see :mod:`hil.report.figures.traces`) a reader can zoom into it.
+    """
     root = ET.fromstring(_document(figure))
     _drop_document_parts(root)
     _rename_ids(root, key)
@@ -78,6 +83,8 @@ def to_panel(figure: Figure, *, key: str, title: str, note: str, alt: str) -> Pa
     root.set("viewBox", f"0 0 {width:g} {height:g}")
     root.set("role", "img")
     root.set("aria-label", " ".join("".join(c if c.isprintable() else " " for c in alt).split()))
+    if traces:
+        root.set("data-traces", traces)
     return Panel(title=title, note=note, svg=Markup(_serialised(root)), width=width)
 
 

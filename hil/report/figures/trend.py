@@ -154,12 +154,17 @@ def _band(axes: Axes, arm: ArmTrend, watched: Watched, low: float, high: float) 
 
 def _slope(axes: Axes, arm: ArmTrend, axis: AxisTrend) -> None:
     assert axis.drift is not None
-    known = np.isfinite(axis.friction.values) & ~np.asarray(axis.friction.departs)
+    known = np.flatnonzero(axis.friction.settled)
     middle = float(np.median(arm.time[known]))
     centre = float(np.median(axis.friction.values[known]))
-    ends = np.array([arm.time[0], arm.time[-1]])
+    ends = arm.time[known[[0, -1]]]
     at = _when(arm)
-    axes.plot([at[0], at[-1]], centre + axis.drift.slope * (ends - middle), color=SECOND, lw=1.2)
+    axes.plot(
+        [at[known[0]], at[known[-1]]],
+        centre + axis.drift.slope * (ends - middle),
+        color=SECOND,
+        lw=1.2,
+    )
 
 
 def _points(

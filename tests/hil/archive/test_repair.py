@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import random
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from hil.archive import Samples, container, open_archive, write_samples
+from hil.archive import Samples, container, open_archive, write_samples, written_anew
 from hil.archive.check import check_archive
 from hil.archive.repair import Repair, repair
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
@@ -247,6 +249,15 @@ class TestRefused:
         with pytest.raises(NotAnArchiveError, match="is not an MCAP file"):
             repair(broken)
 
+    def test_a_link_that_waits_under_a_name_of_ours_is_not_followed(self, broken, written):
+        victim = broken.parent / "victim"
+        victim.write_bytes(b"precious")
+        for name in (broken.name, f"{broken.stem}_repaired.mcap"):
+            (broken.parent / f".{name}.part").symlink_to(victim)
+        broken.write_bytes(written.data[:-100])
+        repair(broken)
+        assert victim.read_bytes() == b"precious"
+
     def test_a_full_disk_is_our_error_and_leaves_nothing(self, broken, written, monkeypatch):
         broken.write_bytes(written.data[:-100])
 
@@ -257,6 +268,63 @@ class TestRefused:
         with pytest.raises(ArchiveWriteError, match="No space left on device"):
             repair(broken)
         assert [path.name for path in broken.parent.iterdir()] == [broken.name]
+
+
+def test_a_repair_is_on_the_disk_before_it_has_its_name_and_the_name_after(
+    broken: Path, written, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[str] = []
+    sync, replace = os.fsync, Path.replace
+
+    def synced(descriptor: int) -> None:
+        mode = os.fstat(descriptor).st_mode
+        steps.append("folder" if stat.S_ISDIR(mode) else "file")
+        sync(descriptor)
+
+    def renamed(path: Path, target: Path) -> Path:
+        steps.append("name")
+        return replace(path, target)
+
+    monkeypatch.setattr("os.fsync", synced)
+    monkeypatch.setattr(Path, "replace", renamed)
+    broken.write_bytes(written.data[:-100])
+    repair(broken)
+    assert steps == ["file", "name", "folder"]
+
+
+def test_repairs_of_one_archive_at_once_do_not_meet(broken: Path, written, monkeypatch) -> None:
+    """The second runs from beginning to end while the first reads back what it wrote."""
+    broken.write_bytes(written.data[:-100])
+    second: list[Repair] = []
+
+    def meanwhile(path: object, **options: Any) -> Any:
+        monkeypatch.setattr(written_anew, "open_archive", open_archive)
+        second.append(repair(broken, in_place=True))
+        return open_archive(path, **options)
+
+    monkeypatch.setattr(written_anew, "open_archive", meanwhile)
+    first = repair(broken, in_place=True)
+    assert broken.read_bytes() == written.data
+    assert first.samples == second[0].samples == 43
+    assert [path.name for path in broken.parent.iterdir()] == [broken.name]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o644])
+def test_a_repaired_archive_is_as_open_to_others_as_it_was(broken: Path, written, mode) -> None:
+    broken.write_bytes(written.data[:-100])
+    broken.chmod(mode)
+    output = repair(broken).output
+    assert output is not None
+    assert stat.S_IMODE(output.stat().st_mode) == mode
+
+
+def test_in_place_through_a_link_leaves_the_link(broken: Path, written) -> None:
+    broken.write_bytes(written.data[:-100])
+    link = broken.with_name("link.mcap")
+    link.symlink_to(broken)
+    repair(link, in_place=True)
+    assert link.is_symlink()
+    assert broken.read_bytes() == written.data
 
 
 def test_in_place_replaces_the_archive_when_all_is_done(broken: Path, written) -> None:

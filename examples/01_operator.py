@@ -1,0 +1,48 @@
+"""The operator's day in twenty lines: design, rehearse, run, identify, report.
+
+One sees each step on the simulated NS 16, then the verdict: the torque error on motions that were
+never fitted. The picture is one repetition as it was archived. Typed again, it goes on where it
+was stopped. For a real arm, name its cell file: `examples/01_operator.py my_cell.toml runs/mine`.
+"""
+
+import sys
+from pathlib import Path
+
+from hil import Campaign, Cell
+from hil.campaign import design, stop_on_interrupt
+from hil.plots import save
+from hil.plots.archive_picture import draw_archive
+from hil.plots.archive_view import view_of
+from hil.progress import reporter as progress
+from hil.screen import Screen
+
+PICTURES = Path(__file__).parent / "pictures"
+
+
+def operate(cell: Cell, folder: Path) -> Campaign:
+    """Everything from a cell file to a validated model."""
+    here = folder / "plan.json"
+    reporter = progress()
+    if here.exists():
+        campaign = Campaign.open(folder)
+    else:
+        campaign = Campaign.create(folder, cell, design(cell, reporter))
+    with stop_on_interrupt() as stop:
+        print(campaign.rehearse(reporter=reporter, stop=stop).line)
+        with Screen(cell.joint_names, stop, title=cell.name) as screen:
+            simulated = cell.only_simulated  # on a real arm, the screen asks the person
+            campaign.run(stop=stop, operator=screen, reporter=screen, accept_dry_run=simulated)
+    print(campaign.identify(reporter=reporter).results.verdict.line)
+    print(campaign.report())
+    return campaign
+
+
+if __name__ == "__main__":
+    quick = "--quick" in sys.argv
+    path, folder = ([a for a in sys.argv[1:] if a != "--quick"] + ["", ""])[:2]
+    cell = Cell.load(path or "sim_fixtures/ns16/cell.toml")
+    if quick:
+        cell = cell.with_campaign(repetitions=3, validation_runs=2)
+    campaign = operate(cell, Path(folder or "runs/examples/operator"))
+    repetition = campaign.folder.completed("excitation")[0]
+    save(draw_archive(view_of(repetition)), PICTURES / "01_operator.png")

@@ -1,0 +1,38 @@
+"""A first motion: the simulated NS 16 goes home, and every cycle of it is archived.
+
+One sees where the arm stood, how long the way takes, how it ended, and in the picture what the
+archive holds: position, speed, currents against their limits, following error, events.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hil import Cell
+from hil.campaign import stop_on_interrupt
+from hil.cell_link import cell_link
+from hil.move import send, straight_way
+from hil.plots import save
+from hil.plots.archive_picture import draw_archive
+from hil.plots.archive_view import view_of
+
+PICTURE = Path(__file__).parent / "pictures" / "02_first_motion.png"
+
+
+def main() -> None:
+    """Connect, plan, check, move, look."""
+    cell = Cell.load("sim_fixtures/ns16/cell.toml")
+    with TemporaryDirectory() as folder, cell_link(cell) as link, stop_on_interrupt() as stop:
+        here = link.connect(stop)  # a controller that does not fit the cell file is refused here
+        print("the arm stands at", np.degrees(here).round(1), "degrees (URDF)")
+        way = straight_way(cell, here, cell.home)  # limits, contacts, currents: checked
+        print(f"home is {way.duration:.2f} s away")
+        archive = Path(folder) / "move_000_a1.mcap"
+        ended = send(way, cell, link, archive, stop=stop)
+        print(f"{ended.outcome}; {archive.stat().st_size / 1e3:.0f} kB archived")
+        save(draw_archive(view_of(archive)), PICTURE)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""An arm of one's own: a URDF and a cell file of fifty lines, `two_joints/`, are enough.
+
+One sees what was planted in the simulated arm, which is not what its maker says, and what was
+found with its 95 % interval. The picture is the torque of a motion that was never fitted, measured
+and predicted. Put your own URDF and cell file there (`hil new` writes one).
+"""
+
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import matplotlib.pyplot as plt
+
+from hil import Campaign, Cell
+from hil.campaign import design
+from hil.progress import Silent
+
+HERE = Path(__file__).parent
+
+
+def main(cell_file: Path) -> None:
+    """Design, run and identify; draw the prediction."""
+    cell = Cell.load(cell_file)
+    with TemporaryDirectory() as folder:
+        campaign = Campaign.create(Path(folder) / "campaign", cell, design(cell, Silent()))
+        campaign.run(unrehearsed=True)  # a simulated arm only; a real one is rehearsed first
+        found = campaign.identify()
+    print(found.results.verdict.line)
+    for one in found.results.parameters:
+        planted = "" if one.truth is None else f"{one.truth:9.3f}"
+        print(f"{one.name:>40s}  {one.estimate:9.3f} ± {1.96 * one.std:.3f}  planted {planted}")
+    series = found.series
+    names = cell.joint_names
+    figure, rows = plt.subplots(len(names), sharex=True, figsize=(8, 4.5), layout="constrained")
+    for joint, (axes, name) in enumerate(zip(rows, names, strict=True)):
+        axes.plot(series.example_time, series.example_measured[:, joint], "k", label="measured")
+        axes.plot(series.example_time, series.example_predicted[:, joint], "--", color="#d98200",
+                  label="predicted")  # fmt: skip
+        axes.set_ylabel(f"{name} [N·m]")
+    rows[0].legend(loc="upper right", ncols=2)
+    rows[-1].set_xlabel(f"time of {series.example_archive} [s]")
+    figure.savefig(HERE / "pictures" / "03_own_robot.png", dpi=90)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else HERE / "two_joints" / "cell.toml")

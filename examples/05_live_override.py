@@ -1,0 +1,62 @@
+"""Overriding a motion while it runs: slower, then on at full speed, on the path all the time.
+
+One sees how far the commanded positions are from the straight way that was planned: rounding. The
+picture shows what was wished, the speed along the path that followed within the limits of
+`[bounds]`, and that of the joints. On a real arm the keys of `hil run` do this; any object with
+`show` and `wish` can.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from hil import Cell
+from hil.archive import open_archive
+from hil.campaign import stop_on_interrupt
+from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.cell_link import cell_link
+from hil.move import send, straight_way
+
+PICTURE = Path(__file__).parent / "pictures" / "05_live_override.png"
+
+
+class Person:
+    """Slows the motion down from a quarter to half of the way."""
+
+    def __init__(self) -> None:
+        self.wishes, self.seen = Wish(), []
+
+    def show(self, progress: MotionProgress) -> None:
+        """Look where the motion is, about ten times a second."""
+        done = (progress.motion_time or 0.0) / (progress.duration or 1.0)
+        self.wishes = Wish(override=0.25 if 0.25 < done < 0.5 else 1.0)
+        self.seen.append((progress.cycles, self.wishes.override, progress.rate or 0.0))
+
+    def wish(self) -> Wish:
+        """What it shall do now."""
+        return self.wishes
+
+
+cell, person = Cell.load("sim_fixtures/ns16/cell.toml"), Person()
+with TemporaryDirectory() as folder, cell_link(cell) as link, stop_on_interrupt() as stop:
+    way = straight_way(cell, link.connect(stop), cell.home, speed=0.02)
+    archive = Path(folder) / "move_000_a1.mcap"
+    print(send(way, cell, link, archive, stop=stop, watch=person).outcome)
+    q = open_archive(archive).columns["commanded_position"]
+    q = q[np.isfinite(q).all(axis=1)]
+along = (way.target - way.start) / np.linalg.norm(way.target - way.start)
+beside = (q - way.start) - np.outer((q - way.start) @ along, along)
+print(f"{way.duration:.2f} s planned, {len(q) * cell.period:.2f} s executed")
+print(f"largest distance from the planned path: {np.abs(beside).max():.1e} rad")
+figure, rows = plt.subplots(2, sharex=True, figsize=(8, 4.5), layout="constrained")
+cycles, wished, rate = np.array(person.seen).T
+rows[0].step(cycles * cell.period, wished, "--", where="post", color="#666666", label="wished")
+rows[0].plot(cycles * cell.period, rate, color="#0072b2", label="speed along the path")
+rows[0].legend(loc="lower right")
+speed = np.degrees(np.diff(q, axis=0)) / cell.period
+rows[1].plot(np.arange(len(speed)) * cell.period, speed, label=cell.joint_names)
+rows[1].set(xlabel="time [s]", ylabel="commanded speed [°/s]")
+rows[1].legend(ncols=3, fontsize="small")
+figure.savefig(PICTURE, dpi=90)

@@ -1,0 +1,53 @@
+"""Many archives at once: three campaigns of one arm, whose shoulder runs dry before the last.
+
+One sees the friction of every campaign with its 95 % interval, out of nothing but the folders with
+archives. The picture shows the trend. The same on the command line: `hil reidentify FOLDER...`.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import matplotlib.pyplot as plt
+
+from hil import Campaign, Cell
+from hil.batch.local import LocalWorkers
+from hil.batch.run import Plan, reidentify
+from hil.campaign import design
+from hil.cell.text import replaced_value
+from hil.progress import Silent
+
+HERE = Path(__file__).parent
+
+
+def record(root: Path) -> None:
+    """Three campaigns; the arm of the third has more friction in its shoulder."""
+    arm = Cell.load(HERE / "two_joints" / "cell.toml").with_campaign(
+        repetitions=2, validation_runs=1
+    )
+    plan = design(arm, Silent())
+    for month, shoulder in (("2026-04", 8.2), ("2026-05", 8.2), ("2026-06", 12.3)):
+        text = replaced_value(arm.text, "simulation", "coulomb", f"[{shoulder}, 3.1]")
+        cell = Cell.from_texts(text, arm.urdf, arm.path)
+        Campaign.create(root / month, cell, plan).run(unrehearsed=True)
+
+
+def main() -> None:
+    """Record, re-identify, draw."""
+    with TemporaryDirectory() as folder, LocalWorkers(2) as workers:
+        record(Path(folder))
+        result = reidentify([folder], Plan(), workers, Silent())
+    figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
+    for level in result.campaigns:
+        month = Path(level.campaign).name
+        for name, value, std in zip(level.names, level.values, level.std, strict=True):
+            if name.startswith("f0"):
+                print(f"{month:6s} {name}: {value:6.2f} ± {1.96 * std:.2f} N·m")
+                style = {"f0_1": "ko", "f0_2": "C1s"}[name]
+                axes.errorbar(month, value, 1.96 * std, fmt=style, capsize=4)
+    axes.set(ylabel="Coulomb friction [N·m]", ylim=(0, None))
+    axes.set_title("round: shoulder, square: elbow; 95 % intervals", fontsize="medium")
+    figure.savefig(HERE / "pictures" / "06_batch.png", dpi=90)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""A link of one's own: what carries packets is an object of seven methods, here a pipe.
+
+The controller runs in another process and waits for each answer, so that time is virtual. One sees
+how the motion ended and how many packets went through the pipe; the picture is the archive of it.
+`drivers.Transport` says what a link must do; one in real time runs in the exchange process
+(`drivers.exchange`), opened there from a `TransportSpec`.
+"""
+
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from drivers import CycleRing, Guard, Session, TransportClosed
+from hil import Cell
+from hil.campaign import Link, stop_on_interrupt
+from hil.move import send, straight_way
+from hil.plots import save
+from hil.plots.archive_picture import draw_archive
+from hil.plots.archive_view import view_of
+from hil.simulation import simulated_controller
+
+CELL = "sim_fixtures/ns16/cell.toml"
+PICTURE = Path(__file__).parent / "pictures" / "07_own_transport.png"
+PATIENCE = 60.0  # s that the controller waits for an answer
+
+
+class PipeTransport:
+    """One message is one packet; the far end sends the next one when it has its answer."""
+
+    ages = None  # every packet carries all values
+
+    def __init__(self, end: Connection, period: float) -> None:
+        self.end, self.period, self.packets = end, period, 0
+
+    @property
+    def now(self) -> float:
+        """Seconds since the first packet."""
+        return self.packets * self.period
+
+    def receive(self, timeout: float) -> bytes | None:
+        """The next packet, None if there is none in time."""
+        try:
+            packet = self.end.recv_bytes() if self.end.poll(timeout) else None
+        except (EOFError, OSError) as error:
+            raise TransportClosed("the far end has gone") from error
+        self.packets += packet is not None
+        return packet
+
+    def send(self, packet: bytes) -> None:
+        """The answer."""
+        try:
+            self.end.send_bytes(packet)
+        except OSError as error:
+            raise TransportClosed("the far end has gone") from error
+
+    def rejected(self) -> dict[str, int]:
+        """Nothing is discarded on the way."""
+        return {}
+
+    def forget_peer(self) -> None:
+        """There is only one."""
+
+    def close(self) -> None:
+        """Give the link up."""
+        self.end.close()
+
+
+def controller(end: Connection) -> None:
+    """The other process: a packet, its answer, the next packet."""
+    arm = simulated_controller(Cell.load(CELL))
+    while (packet := arm.next_packet()) is not None:
+        if packet:
+            end.send_bytes(packet)
+        arm.accept(end.recv_bytes() if packet and end.poll(PATIENCE) else None)
+
+
+def main() -> None:
+    """Connect through the pipe and go home."""
+    cell, (near, far) = Cell.load(CELL), Pipe()
+    get_context("fork").Process(target=controller, args=(far,), daemon=True).start()
+    ring = CycleRing(len(cell.joint_names), capacity=1000)
+    guard = Guard(cell.guard_limits, cell.period)
+    session = Session(cell.drive_train, guard, ring, **cell.session_settings())
+    link = Link(PipeTransport(near, cell.period), session, ring, guard)
+    with TemporaryDirectory() as folder, stop_on_interrupt() as stop:
+        archive = Path(folder) / "move_000_a1.mcap"
+        way = straight_way(cell, link.connect(stop), cell.home)
+        print(send(way, cell, link, archive, stop=stop).outcome)
+        print(f"{link.transport.packets} packets, the last one after {link.transport.now:.3f} s")
+        save(draw_archive(view_of(archive, joints=("1",))), PICTURE)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,229 @@
+"""The slow dry run: every motion of the plan at a fifth of its speed, and a person's word on it."""
+
+from __future__ import annotations
+
+import getpass
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+
+from hil.archive import open_archive
+from hil.cell import Cell
+from hil.files import write_or_tell
+
+from .errors import CampaignFolderError
+from .folder import CampaignFolder
+from .gravity_check import AGAINST, GravityCheck
+from .operator import DryRunSummary
+
+OVERRIDE: Final = 0.2
+"""Largest share of the planned speed."""
+FORMAT_VERSION: Final = 2
+"""1 did not look at torques."""
+_FIELDS: Final = ("cycle", "gap", "position", "target_position", "target_current")
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Who accepted a dry run, and when.
+
+    Attributes:
+        by: name of the user on this computer.
+        at: time of day, ISO 8601.
+    """
+
+    by: str
+    at: str
+
+    @classmethod
+    def now(cls) -> Self:
+        """That of whoever runs this program."""
+        try:
+            user = getpass.getuser()
+        except (OSError, KeyError):  # a user without a name
+            user = "unknown"
+        return cls(user, datetime.now(UTC).isoformat(timespec="seconds"))
+
+
+@dataclass(frozen=True)
+class DryRun:
+    """A whole dry run; `dry_run.json`.
+
+    Attributes:
+        plan_hash: of exactly the plan that was run.
+        override: largest share of the planned speed.
+        archives: file names, one for each motion of the plan.
+        duration: of the motions [s].
+        simulated: whether nothing but a simulated arm can have moved.
+        joint_names: of the n joints.
+        current_share: (n) largest current as a share of its limit.
+        following_error: (n) largest [rad].
+        missed: packets that never arrived.
+        late: packets whose answer was late.
+        accepted: by whom; None as long as nobody has.
+        against_gravity: joints whose torque runs against the model's gravity.
+        gravity_not_seen: joints with too little gravity to tell.
+    """
+
+    plan_hash: str
+    override: float
+    archives: tuple[str, ...]
+    duration: float
+    simulated: bool
+    joint_names: tuple[str, ...]
+    current_share: tuple[float, ...]
+    following_error: tuple[float, ...]
+    missed: int
+    late: int
+    accepted: Acceptance | None = None
+    against_gravity: tuple[str, ...] = ()
+    gravity_not_seen: tuple[str, ...] = ()
+
+    @classmethod
+    def load(cls, folder: CampaignFolder, plan_hash: str | None = None) -> Self | None:
+        """That of a plan, as it was written down; None where there is none.
+
+        Args:
+            folder: of the campaign.
+            plan_hash: of the plan; the folder's as it lies there if left out.
+
+        Raises:
+            CampaignFolderError: the file is damaged, or of another version.
+        """
+        path = folder.dry_run
+        if not path.exists():
+            return None
+        try:
+            content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+            version = content.pop("format_version")
+            if version != FORMAT_VERSION:
+                raise ValueError(f"format version {version}, this is {FORMAT_VERSION}")
+            accepted = content.pop("accepted")
+            lists = {key: tuple(item) for key, item in content.items() if isinstance(item, list)}
+            found = cls(**{**content, **lists})
+            found = replace(found, accepted=None if accepted is None else Acceptance(**accepted))
+            if not isinstance(found.simulated, bool):
+                raise TypeError(f"simulated is {found.simulated!r}, no truth value")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise CampaignFolderError(
+                path.parent,
+                f"{path.name} is damaged, or of another version ({error})",
+                "remove it; its archives are looked at again, or the dry run is done again",
+            ) from error
+        now = folder.plan_hash if plan_hash is None else plan_hash
+        return found if found.plan_hash == now else None
+
+    @classmethod
+    def that_counts(
+        cls, folder: CampaignFolder, *, plan_hash: str, motions: int, simulated: bool
+    ) -> Self | None:
+        """That of a plan, where everything it says was seen can still be seen.
+
+        What a simulated arm did says nothing of the room around a real one, and a file that was
+        copied, or whose archives are gone, says nothing at all.
+
+        Args:
+            folder: of the campaign.
+            plan_hash: of the plan.
+            motions: that are to be run slowly.
+            simulated: whether nothing but a simulated arm can move now.
+
+        Raises:
+            CampaignFolderError: the file is damaged, or of another version.
+        """
+        found = cls.load(folder, plan_hash)
+        if found is None or found.simulated is not simulated:
+            return None
+        whole = [path.name for path in folder.completed("dryrun")]
+        return found if len(whole) >= motions and whole[:motions] == [*found.archives] else None
+
+    @classmethod
+    def of(
+        cls,
+        folder: CampaignFolder,
+        cell: Cell,
+        names: Sequence[str],
+        *,
+        plan_hash: str,
+        simulated: bool,
+    ) -> Self:
+        """What the archives of a dry run say.
+
+        Args:
+            folder: of the campaign.
+            cell: of the campaign.
+            names: of the archives, one for each motion.
+            plan_hash: of the plan that was run.
+            simulated: whether nothing but a simulated arm can have moved.
+
+        Raises:
+            ArchiveError: one of them cannot be read.
+        """
+        limit = cell.drive_train.current_limit
+        current, following = np.zeros(len(limit)), np.zeros(len(limit))
+        missed = late = cycles = 0
+        for name in names:
+            archive = open_archive(folder.archives / name, fields=_FIELDS)
+            columns = archive.columns
+            current = np.maximum(current, np.abs(columns["target_current"]).max(axis=0) / limit)
+            behind = np.abs(columns["target_position"] - columns["position"])
+            following = np.maximum(following, np.nanmax(behind, axis=0))
+            missed += int(columns["gap"].sum())
+            late += int((archive.outcome or {}).get("late_answers", "0"))
+            cycles += archive.n_samples
+        gravity = GravityCheck.of(cell, [folder.archives / name for name in names])
+        return cls(
+            plan_hash=plan_hash,
+            override=OVERRIDE,
+            archives=tuple(names),
+            duration=cycles * cell.period,
+            simulated=simulated,
+            joint_names=cell.joint_names,
+            current_share=tuple(current.tolist()),
+            following_error=tuple(following.tolist()),
+            missed=missed,
+            late=late,
+            against_gravity=gravity.against,
+            gravity_not_seen=gravity.not_seen,
+        )
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What speaks against it, in sentences."""
+        return tuple(f"{joint}: {AGAINST}" for joint in self.against_gravity)
+
+    def save(self, path: Path) -> None:
+        """Write it.
+
+        Raises:
+            OutputError: the disk refuses.
+        """
+        content = {"format_version": FORMAT_VERSION, **asdict(self)}
+        write_or_tell(path, json.dumps(content, indent=1) + "\n")
+
+    def accepted_now(self) -> DryRun:
+        """This dry run, accepted by whoever runs the program."""
+        return replace(self, accepted=Acceptance.now())
+
+    def summary(self, campaign: str) -> DryRunSummary:
+        """What a person is to accept."""
+        return DryRunSummary(
+            campaign=campaign,
+            plan_hash=self.plan_hash,
+            archives=self.archives,
+            override=self.override,
+            duration=self.duration,
+            simulated=self.simulated,
+            joint_names=self.joint_names,
+            current_share=np.array(self.current_share),
+            following_error=np.array(self.following_error),
+            missed=self.missed,
+            late=self.late,
+            against_gravity=self.against_gravity,
+            gravity_not_seen=self.gravity_not_seen,
+        )

@@ -1,0 +1,302 @@
+"""A run: what is still missing of a campaign, in order, behind the gates.
+
+Dry run, warm-up, standstill, repetitions, validation, and back to where the arm was. Everything
+that is sent has been checked before the first motion; each motion is archived, judged and entered
+in the manifest before the next one begins, so that a run which is killed at any moment goes on
+with the first motion that is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hil.archive.live_view import LiveView
+from hil.cell import Cell
+from hil.motion_checks import MotionChecks
+from hil.progress import Reporter, Silent
+
+from .dry_run import OVERRIDE
+from .dry_run_stage import DryRunStage
+from .execution_archive import Archiving, provenance_of
+from .execution_result import DryRunState, RunResult
+from .execution_runner import Runner
+from .execution_watch import RunWatch
+from .gates import (
+    require_dry_run,
+    require_link_of,
+    require_one_world,
+    require_own_figures,
+    require_rehearsed,
+    require_simulated,
+)
+from .intervals import Interval, require_joined, require_sound, wanted, with_ways
+from .link import Link
+from .live_link import LiveLink
+from .motion_link import MotionLink
+from .operator import Operator, Unattended
+from .quality_entry import Entering
+from .repeating import play_until_good
+from .stop import Stop
+from .warmup_stage import WarmUpStage
+from .ways import Ways, seen_in_dry_run
+
+if TYPE_CHECKING:
+    from .campaign import Campaign
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What the caller of a run wants of it.
+
+    Attributes:
+        unrehearsed: without rehearsal and dry run, which only a simulated arm allows.
+        dry_run_only: end after the dry run.
+        accept_dry_run: the caller accepts the dry run that was done; of a simulated arm also the
+            one that this run does.
+        accept_torque: joints whose torque ran against the model's gravity in the dry run that an
+            earlier run did, and that the caller accepts by name.
+        durable: wait at each flush until the disk has the data; None: in real time only.
+        live: of the cell's own link: lets viewers look at what is recorded.
+    """
+
+    unrehearsed: bool = False
+    dry_run_only: bool = False
+    accept_dry_run: bool = False
+    accept_torque: tuple[str, ...] = ()
+    durable: bool | None = None
+    live: LiveView | None = None
+
+
+def run_campaign(
+    campaign: Campaign,
+    link: MotionLink | None,
+    stop: Stop | None,
+    reporter: Reporter | None,
+    *,
+    operator: Operator | None,
+    provenance: Mapping[str, str] | None,
+    choices: Choices,
+) -> RunResult:
+    """See `Campaign.run`."""
+    folder, cell = campaign.folder, campaign.cell
+    operator = operator or Unattended()
+    simulated = cell.only_simulated if link is None else link.only_simulated
+    with folder.locked():
+        folder.require_unchanged()
+        # One hash of what is in memory and on the disk goes through the whole run.
+        plan_hash = folder.hash_of(cell, campaign.plan)
+        require_one_world(folder, simulated)
+        if link is not None:
+            require_link_of(cell, link, folder.root)
+        virtual = isinstance(link, Link) or (link is None and _is_virtual(cell))
+        archiving = Archiving(
+            folder,
+            cell,
+            campaign.plan,
+            provenance_of(cell, virtual=virtual, only_simulated=simulated)
+            if provenance is None
+            else provenance,
+            not virtual if choices.durable is None else choices.durable,
+            plan_hash,
+        )
+        run = _Run(
+            campaign, archiving, stop or Stop(), reporter or Silent(), operator, choices, simulated
+        )
+        run.require_gates()
+        return run.all_of_it(link)
+
+
+class _Run:
+    """One run of a campaign, from the gates to the way back."""
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        archiving: Archiving,
+        stop: Stop,
+        reporter: Reporter,
+        operator: Operator,
+        choices: Choices,
+        simulated: bool,
+    ) -> None:
+        folder, cell, plan = campaign.folder, campaign.cell, campaign.plan
+        self._folder, self._cell, self._archiving = folder, cell, archiving
+        self._stop, self._reporter, self._choices = stop, reporter, choices
+        self._operator, self._simulated = operator, simulated
+        self._wanted = wanted(cell, plan)
+        self._watch = RunWatch(operator, stop)
+        self._entering = Entering(folder, cell, plan)
+        self._warm_up = WarmUpStage(
+            folder,
+            cell,
+            plan,
+            archiving.plan_hash,
+            reporter,
+            self._watch,
+            simulated=simulated,
+        )
+        self._dry_run = DryRunStage(
+            folder,
+            cell,
+            [one for one in self._wanted if one.kind != "standstill"],
+            operator,
+            accept=choices.accept_dry_run,
+            accept_torque=choices.accept_torque,
+            simulated=simulated,
+            plan_hash=archiving.plan_hash,
+            stop=stop,
+        )
+        self._dry_state: DryRunState = "left out"
+
+    def require_gates(self) -> None:
+        """Refuse what was not rehearsed, or whose dry run nobody can accept.
+
+        Raises:
+            NotRehearsedError, DryRunError: each says what to do.
+        """
+        choices = self._choices
+        if choices.unrehearsed:
+            require_simulated(self._folder, self._simulated)
+            return
+        require_rehearsed(self._folder, self._archiving.plan_hash)
+        require_dry_run(
+            self._folder,
+            self._dry_run.found(),
+            can_answer=self._operator.can_answer or choices.dry_run_only,
+            accept=choices.accept_dry_run,
+            only_simulated=self._simulated,
+        )
+
+    def all_of_it(self, link: MotionLink | None) -> RunResult:
+        """Run what is missing; connect only where something is."""
+        warming = [] if (one := self._warm_up.next_motion()) is None else [one]
+        self._entering.adopt(self._archiving, [*self._wanted, *self._dry_run.intervals, *warming])
+        dry = [] if self._choices.unrehearsed else [one for one, _ in self._dry_run.missing()]
+        if not dry:
+            self._settle_dry_run()
+        missing = [] if self._choices.dry_run_only else self._missing()
+        archives: list[str] = []
+        cycles = 0
+        if dry or missing:
+            checks = MotionChecks.of(self._cell)
+            if checks.not_checked is not None:
+                self._reporter.say(checks.not_checked)
+            # What is wrong with a motion itself is told before anything is connected.
+            require_sound([*dry, *missing, *(warming if missing else [])], checks)
+            with self._opened(link) as opened:
+                before = opened.cycles
+                self._stages(opened, checks, dry, missing, archives)
+                cycles = opened.cycles - before
+        return self._result(archives, cycles)
+
+    def _opened(self, link: MotionLink | None) -> AbstractContextManager[MotionLink]:
+        """The caller's link, or the cell's own."""
+        if link is not None:
+            return nullcontext(link)
+        from hil.cell_link import cell_link  # which opens links of campaigns
+
+        return cell_link(self._cell, live=self._choices.live)
+
+    def _stages(
+        self,
+        link: MotionLink,
+        checks: MotionChecks,
+        dry: list[Interval],
+        missing: list[Interval],
+        archives: list[str],
+    ) -> None:
+        if isinstance(link, LiveLink):
+            for note in link.notes():
+                self._reporter.say(f"note: {note}")
+            if link.live is not None:
+                self._reporter.say(link.live.invitation)
+        where = link.connect(self._stop)
+        require_own_figures(link, self._folder.root)
+        # A dry run and a warm-up go the ways of the motions that they are made of.
+        joined = with_ways(self._cell, [*dry, *missing], where)
+        require_sound([one for one in joined if one.kind == "move"], checks)
+        require_joined(joined)
+        seen = None if self._choices.unrehearsed else seen_in_dry_run(self._folder)
+        ways = Ways(self._cell, checks, joined, seen)
+        slow = sum(one.trajectory.duration for one in dry) / OVERRIDE
+        total = slow + sum(one.trajectory.duration for one in joined[len(dry) :])
+        with self._reporter.task("running the campaign (s of motion)", total) as task:
+            runner = Runner(
+                self._cell,
+                link,
+                ways,
+                self._archiving,
+                self._stop,
+                self._watch,
+                task,
+                where,
+                archives,
+            )
+            self._watch.time_left = total
+            if dry:
+                self._dry_run.run(runner, self._entering)
+                self._settle_dry_run()
+            if any(one.kind != "standstill" for one in missing):
+                self._warm_up.run(runner, self._entering)
+            for interval in missing:
+                self._run_until_good(runner, interval)
+            if missing:  # the first repetition may have turned out to be of no use
+                for interval in self._missing():
+                    self._run_until_good(runner, interval)
+            runner.go_back(OVERRIDE if self._choices.dry_run_only else 1.0)
+        link.close()
+
+    def _run_until_good(self, runner: Runner, interval: Interval) -> None:
+        """Run a motion of the plan, as often as it takes and is allowed."""
+        total = sum(one.kind == interval.kind for one in self._wanted)
+        play_until_good(runner, self._entering, interval, interval.index + 1, total, self._reporter)
+        if interval.kind == "standstill":
+            return
+        self._warm_up.moved()
+        if interval.kind == "excitation":
+            self._watch.note(f"{interval}: good, {self._entering.agreement()}")
+
+    def _settle_dry_run(self) -> None:
+        if not self._choices.unrehearsed:
+            self._dry_state = self._dry_run.settle(ask=not self._choices.dry_run_only)
+
+    def _missing(self) -> list[Interval]:
+        """What is still to be run at full speed."""
+        return [one for one in self._wanted if self._folder.whole(one.kind, one.index) is None]
+
+    def _result(self, archives: list[str], cycles: int) -> RunResult:
+        missing = {(one.kind, one.index) for one in self._missing()}
+
+        def whole(kind: str) -> tuple[int, int]:
+            total = [one for one in self._wanted if one.kind == kind]
+            return sum((one.kind, one.index) not in missing for one in total), len(total)
+
+        found = None if self._choices.unrehearsed else self._dry_run.found()
+        notes = [] if found is None else [f"dry run: {doubt}" for doubt in found.doubts]
+        if (cold := self._warm_up.note) is not None:
+            notes.append(cold)
+        notes += self._watch.troubles
+        return RunResult(
+            campaign=str(self._folder.root),
+            plan_hash=self._archiving.plan_hash,
+            simulated=self._simulated,
+            archives=tuple(archives),
+            rejected=tuple(self._entering.rejected),
+            adopted=tuple(self._entering.adopted),
+            dry_run=self._dry_state,
+            against_gravity=() if found is None else found.against_gravity,
+            warm_up=self._warm_up.outcome,
+            repetitions=whole("excitation"),
+            validations=whole("validation"),
+            complete=not missing,
+            cycles=cycles,
+            notes=tuple(notes),
+        )
+
+
+def _is_virtual(cell: Cell) -> bool:
+    """Whether the cell's own link is one in virtual time."""
+    return cell.controller.transport == "simulated"

@@ -1,0 +1,128 @@
+"""Between a motion and the operator: what is shown of it, and what is wished of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from .motion_watch import MotionProgress, Wish
+from .operator import DriftCurve, Operator, Phase, RunStatus
+from .stop import Stop
+
+NOTES = 4
+"""Last notes on quality that are shown."""
+PHASES: dict[str, Phase] = {
+    "dryrun": "dry run",
+    "warmup": "warm-up",
+    "standstill": "standstill",
+    "excitation": "repetition",
+    "validation": "validation",
+    "move": "move",
+}
+"""What a kind of archive is called on the screen."""
+
+
+@dataclass(eq=False)
+class RunWatch:
+    """A `MotionWatch` that tells the operator where the whole run stands.
+
+    What an operator's screen gets wrong must not end a motion: it is told, and the motion goes on
+    at the speed wished for last. Each wish is asked for anew, whatever the last one met with. A
+    hold is another matter: one that nobody can release any more becomes a stop.
+
+    Attributes:
+        operator: who looks.
+        stop: brings the arm to rest on its path.
+        time_left: s of motion after the present one, at full speed.
+        drift: of the warm-up so far.
+        blind: what went wrong with showing, None for nothing; nothing is shown from then on.
+        deaf: what went wrong first with asking for a wish, None for nothing.
+    """
+
+    operator: Operator
+    stop: Stop
+    time_left: float = 0.0
+    drift: DriftCurve | None = None
+    blind: Exception | None = None
+    deaf: Exception | None = None
+    _held_deaf: bool = False
+    _phase: Phase = "move"
+    _number: int = 1
+    _total: int = 1
+    _duration: float = 0.0
+    _most: float = 1.0
+    _wish: Wish = field(default_factory=Wish)
+    _notes: tuple[str, ...] = ()
+
+    def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
+        """The next motion.
+
+        Args:
+            kind: of its archive.
+            number: which of its kind, from 1.
+            total: of how many.
+            duration: at full speed [s].
+            most: largest override.
+        """
+        self._phase, self._number, self._total = PHASES[kind], number, total
+        self._duration, self._most = duration, most
+        self._tell(None)
+
+    def note(self, text: str) -> None:
+        """A line on the quality of a motion."""
+        self._notes = (*self._notes, text)[-NOTES:]
+        self._tell(None)
+
+    def show(self, progress: MotionProgress) -> None:
+        """See `MotionWatch.show`."""
+        self._tell(progress)
+
+    def wish(self) -> Wish:
+        """See `MotionWatch.wish`."""
+        try:
+            wish: object = self.operator.wish()
+            if not isinstance(wish, Wish):
+                raise TypeError(f"{wish!r} is no wish")
+            self._wish = wish
+        except Exception as error:  # the arm moves: a screen must not decide how it ends
+            self.deaf = self.deaf or error
+            if self._wish.held and not self.stop.requested:
+                self._held_deaf = self.stop.requested = True
+        return self._wish
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What went wrong with the operator's screen, in sentences."""
+        told = []
+        if self.blind is not None:
+            told.append(f"the operator's screen failed ({_words(self.blind)}); nothing was shown")
+        if self.deaf is not None:
+            became = "what was wished for last counted"
+            if self._held_deaf:
+                became = "the arm was held, which nobody could end any more: the run was stopped"
+            why = _words(self.deaf)
+            told.append(f"the operator could not be asked for wishes ({why}); {became}")
+        return tuple(told)
+
+    def _tell(self, progress: MotionProgress | None) -> None:
+        if self.blind is not None:
+            return
+        done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
+        speed = max(min(self._most, self._wish.override), 0.01)
+        left = (max(self._duration - done, 0.0) + self.time_left) / speed
+        status = RunStatus(
+            self._phase,
+            self._number,
+            self._total,
+            left,
+            motion=progress,
+            drift=self.drift,
+            notes=self._notes,
+        )
+        try:
+            self.operator.show(status)
+        except Exception as error:  # likewise
+            self.blind = error
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

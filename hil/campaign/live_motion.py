@@ -1,0 +1,168 @@
+"""One motion on a real link: asked for, watched, steered, and followed to its archive."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import TYPE_CHECKING, Final, get_args
+
+from drivers.errors import DriverError, RequestError
+from drivers.events import MotionEnded, Outcome
+from drivers.motion_source import MotionSource
+from hil.archive import ArchiveSpec
+from hil.archive.commands import Closed, Failed
+from hil.errors import ControllerFault
+
+from .errors import write_error
+from .motion_link import drives_in_force
+from .motion_watch import MotionWatch
+from .sight import Counted, Sight, duration_of, guard_in_force
+from .steering import NOT_BEGUN, Steering
+from .stop import Stop
+
+if TYPE_CHECKING:
+    from .live_link import LiveLink
+
+POLL: Final = 0.02
+"""s between two looks at everything while a motion runs."""
+REST_TIMEOUT: Final = 30.0
+"""s for an arm that was told to stop to rest, and for the archive of a motion that has ended."""
+
+
+class LiveMotion:
+    """One motion on a `LiveLink`.
+
+    Whatever happens here delays no answer: the exchange is asked through shared memory.
+    """
+
+    def __init__(self, link: LiveLink, stop: Stop, watch: MotionWatch, override: float) -> None:
+        self._link, self._stop, self._watch = link, stop, watch
+        self._view, self._exchange = link.view, link.exchange
+        self._steering = Steering(watch, override)
+        self._reader = link.reader()
+        self._told = False
+
+    def run(self, source: MotionSource, spec: ArchiveSpec) -> MotionEnded:
+        """See `MotionLink.run`."""
+        self._steering.begin(source, self._stop)  # no archive is open while a hold stands
+        self._view.look()
+        self._link.open_archive(spec, from_now=True, until_ended=True)
+        # That may have taken seconds: nothing is asked for that is no longer wanted.
+        if not self._wanted(source):
+            self._link.complete("stopped", NOT_BEGUN)
+            return MotionEnded("stopped", NOT_BEGUN, -1, -1)
+        self._view.forget_motion()
+        sight = self._sight(source)
+        self._submit(source, spec)
+        due = math.inf
+        while True:
+            self._look(sight)
+            if (idle := self._view.not_begun()) is not None:
+                return self._give_up(idle)
+            answer = self._link.archive.answer(POLL, self._link.job)
+            if isinstance(answer, Closed):
+                return self._ending(answer)
+            if isinstance(answer, Failed):
+                self._link.open_path = ""
+                self._come_to_rest()
+                raise write_error(answer)
+            self._raise_failure()
+            if self._view.motion_ended or self._view.failure() is not None:
+                due = min(due, time.monotonic() + REST_TIMEOUT)
+            if time.monotonic() > due:
+                what = f"{spec.path} was not completed within {REST_TIMEOUT:g} s"
+                raise ControllerFault(f"the motion is over, but {what}")
+
+    def _wanted(self, source: MotionSource) -> bool:
+        """Whether the motion is still to begin; waits while it is held."""
+        try:
+            return self._steering.begin(source, self._stop)
+        except ControllerFault as error:
+            self._link.complete("void", str(error))
+            raise
+
+    def _submit(self, source: MotionSource, spec: ArchiveSpec) -> None:
+        try:
+            self._exchange.submit(source)
+        except RequestError as error:
+            self._link.complete("refused", str(error))
+            raise ControllerFault(f"{error}; {spec.path} says so") from error
+        except DriverError as error:
+            self._raise_failure()
+            self._exchange.stop()
+            closed = self._link.complete("void", str(error))
+            raise ControllerFault(f"{error}; {spec.path} is {closed.outcome}") from error
+
+    def _look(self, sight: Sight) -> None:
+        """Take in what is new, pass wishes on, and show it if that is due."""
+        sight.note(self._view.look())
+        if self._stop.requested and not self._told:
+            self._exchange.stop()
+            self._told = True
+        if not self._view.motion_ended:
+            self._steering.follow(self._exchange)
+        if sight.due:
+            sight.take(self._reader.drain())
+            status = self._view.status
+            sight.show(self._watch, status.state, self._counted(), status.motion_time, status.rate)
+
+    def _sight(self, source: MotionSource) -> Sight:
+        connection, cell = self._link.connection, self._link.cell
+        drives = drives_in_force(cell, connection)
+        guard = guard_in_force(cell, drives, connection.init)
+        self._reader.drain()
+        return Sight(drives, guard, self._steering, duration_of(source), self._counted())
+
+    def _counted(self) -> Counted:
+        status = self._view.status
+        return Counted(
+            status.answered,
+            status.missed,
+            status.late,
+            status.unanswered,
+            status.latencies,
+            1e-6 * status.worst_turnaround_us,
+        )
+
+    def _ending(self, closed: Closed) -> MotionEnded:
+        self._link.count(closed)
+        self._view.look()
+        if self._view.ended is not None:
+            return self._view.ended
+        if closed.outcome in get_args(Outcome) and self._view.motion_ended:
+            outcome: Outcome = closed.outcome  # type: ignore[assignment]
+            return MotionEnded(outcome, closed.reason, closed.interval, -1)
+        failure = self._view.failure() or closed.reason
+        alone = "the controller gets no answers and acts by its own watch"
+        raise ControllerFault(f"{failure}; {alone}; the archive ({closed.outcome}) is whole so far")
+
+    def _give_up(self, why: str) -> MotionEnded:
+        """A motion that has not begun is dropped; without an archive it cannot begin any more."""
+        path, refused = self._link.open_path, self._view.refused
+        outcome = "void" if refused is None else "refused"
+        self._link.complete(outcome, why if refused is None else str(refused.error))
+        self._exchange.stop()
+        if refused is None:
+            raise ControllerFault(f"{why}; nothing was sent ({path})")
+        return MotionEnded("refused", str(refused.error), -1, -1)
+
+    def _raise_failure(self) -> None:
+        """Raise ControllerFault if the archive process is gone or hangs; the arm rests first."""
+        path = self._link.open_path
+        if (failure := self._link.archive_failure()) is not None:
+            rests = "the arm was brought to rest"
+            if not self._come_to_rest():
+                state = self._view.state.name
+                rests = f"the arm was told to stop, but not seen to rest ({state})"
+            raise ControllerFault(f"{failure}; {rests}, and {path} is readable up to its last part")
+
+    def _come_to_rest(self) -> bool:
+        """Whether the motion has ended; the exchange stops it by itself, but is told to again."""
+        self._exchange.stop()
+        deadline = time.monotonic() + REST_TIMEOUT
+        while not self._view.motion_ended and time.monotonic() < deadline:
+            if self._view.failure() is not None:
+                return False
+            self._view.look()
+            time.sleep(POLL)
+        return self._view.motion_ended

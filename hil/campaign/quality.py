@@ -1,0 +1,264 @@
+"""Whether a motion that ended well is of use: looked at when its archive is closed.
+
+Repetitions are compared set-point by set-point, not by the clock: across a packet that was missed
+the motion waits. What repetitions of one motion differ by is noise, and friction that changes
+slowly; a larger difference means that something touched the arm, slipped, or was changed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.events import MotionStarted
+from hil.archive import Archive, open_archive
+from hil.cell import Cell
+from planner import FourierSeries, PiecewiseCubic
+
+Array = NDArray[np.float64]
+
+FIELDS: Final = ("cycle", "gap", "position", "target_current", "commanded_position")
+"""Columns of an archive that are looked at."""
+MISSED_SHARE: Final = 0.01
+"""Of all cycles: more missed packets than that, and the recording is too torn."""
+OFF_PATH: Final = 1e-4
+"""rad between set-point and plan: the motion is made of float32 targets, exact to 2e-6."""
+SATURATED: Final = 0.98
+"""Share of the current limit that counts as reaching it."""
+SATURATED_CYCLES: Final = 3
+"""So many in a row are no noise."""
+KEPT: Final = 9
+"""Earlier repetitions that a new one is compared with."""
+FEWEST: Final = 4
+"""Earlier repetitions that tell their own scatter."""
+_FIRST_FOLLOWING: Final = 0.05
+"""Share of the following-error threshold by which the first repetitions may differ (rms)."""
+_FIRST_CURRENT: Final = 0.1
+"""Share of the motion's rms current by which they may."""
+_LEAST_FOLLOWING: Final = 0.005
+_LEAST_CURRENT: Final = 0.02
+"""Likewise: differences below that never reject, however well the earlier ones agree."""
+_WIDE: Final = 3.0
+"""Times the median difference of the earlier ones that is never rejected."""
+_OUTLYING: Final = 6.0
+"""Robust standard deviations above the median difference."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Why a motion is of no use.
+
+    Attributes:
+        sentence: in words.
+        by_hand: whether somebody held or slowed it: that says nothing against the arm.
+        apart: whether it is only unlike the repetitions before it.
+    """
+
+    sentence: str
+    by_hand: bool = False
+    apart: bool = False
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """The part of an archive in which the arm was commanded; row k is set-point k.
+
+    Attributes:
+        position: (m, n) measured [rad].
+        current: (m, n) [A].
+        commanded: (m, n) [rad].
+        missed: packets that never arrived.
+    """
+
+    position: Array
+    current: Array
+    commanded: Array
+    missed: int
+
+    @classmethod
+    def of(cls, archive: Archive) -> Played:
+        """Its rows from the first set-point of the motion on.
+
+        A controller may open its axes before a motion is asked for; it is held there till then.
+        """
+        columns = archive.columns
+        began = [event.time for event in archive.events if event.name == MotionStarted.__name__]
+        rows = ~np.isnan(columns["commanded_position"]).any(axis=1)
+        if began:
+            rows &= columns["stamp"] >= round(began[-1] * 1e9)
+        return cls(
+            position=columns["position"][rows],
+            current=columns["target_current"][rows],
+            commanded=columns["commanded_position"][rows],
+            missed=int(columns["gap"][rows].sum()),
+        )
+
+
+def problem_of(
+    played: Played, trajectory: PiecewiseCubic | FourierSeries, cell: Cell
+) -> Problem | None:
+    """What is wrong with a motion by itself; None if nothing is.
+
+    Args:
+        played: it, as archived.
+        trajectory: it, as planned.
+        cell: its period and current limits.
+    """
+    wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
+    torn = torn_or_slowed(played, trajectory, cell)
+    if torn is not None:
+        return torn
+    if played.missed > MISSED_SHARE * wanted:
+        words = f"{played.missed} of {wanted} packets were missed; {MISSED_SHARE:.0%} are bearable"
+        return Problem(words)
+    return _saturation(played.current, cell)
+
+
+def torn_or_slowed(
+    played: Played, trajectory: PiecewiseCubic | FourierSeries, cell: Cell
+) -> Problem | None:
+    """Whether a motion is not all there, or was held or slowed: it is another motion then."""
+    wanted, rows = int(np.ceil(trajectory.duration / cell.period - 1e-6)), len(played.commanded)
+    if rows < wanted - 1:
+        return Problem(f"{rows} of its {wanted} cycles are archived")
+    times = np.minimum(np.arange(rows) * cell.period, trajectory.duration)
+    planned = trajectory.sample(times)[0]
+    offset = played.commanded[0] - planned[0]
+    off = np.abs(played.commanded - planned - offset).max(axis=1)
+    if off.max() <= OFF_PATH:
+        return None
+    at = int(np.argmax(off > OFF_PATH)) * cell.period
+    return Problem(
+        f"it was held or slowed about {at:.1f} s after its begin, so it is no repetition; leave "
+        "the override at 100 %",
+        by_hand=True,
+    )
+
+
+def _saturation(current: Array, cell: Cell) -> Problem | None:
+    high = np.abs(current) >= SATURATED * cell.drive_train.current_limit
+    for joint, column in enumerate(high.T):
+        run = _longest_run(column)
+        if run >= SATURATED_CYCLES:
+            return Problem(
+                f"the current of {cell.joint_names[joint]} was at its limit for "
+                f"{run * cell.period * 1e3:.0f} ms"
+            )
+    return None
+
+
+def _longest_run(flags: NDArray[np.bool_]) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Of one repetition from the median of others, rms over time, (n,) each.
+
+    Attributes:
+        position: as a share of the following-error threshold.
+        current: as a share of the motion's rms current.
+    """
+
+    position: Array
+    current: Array
+
+
+class RepetitionCheck:
+    """Compares repetitions of one motion with the last ones that were found good.
+
+    Args:
+        cell: whose thresholds count.
+        trajectory: the motion.
+    """
+
+    def __init__(self, cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> None:
+        self._cell, self._trajectory = cell, trajectory
+        self._earlier: deque[Played] = deque(maxlen=KEPT)
+        self._differences: deque[Difference] = deque(maxlen=2 * KEPT)
+
+    def learn(self, archives: Sequence[Path]) -> None:
+        """Take in repetitions that were found good before."""
+        for path in archives[-2 * KEPT :]:
+            self.accept(Played.of(open_archive(path, fields=FIELDS)))
+
+    def accept(self, played: Played) -> None:
+        """Compare later ones with this one too."""
+        if self._earlier:
+            self._differences.append(self._difference(played))
+        self._earlier.append(played)
+
+    @property
+    def known(self) -> int:
+        """Repetitions that a new one is compared with."""
+        return len(self._earlier)
+
+    def problem(self, played: Played) -> Problem | None:
+        """Why a repetition is of no use; None if it is good."""
+        found = problem_of(played, self._trajectory, self._cell)
+        if found is not None or not self._earlier:
+            return found
+        new = self._difference(played)
+        for what, values, first, least in (
+            ("position", new.position, _FIRST_FOLLOWING, _LEAST_FOLLOWING),
+            ("current", new.current, _FIRST_CURRENT, _LEAST_CURRENT),
+        ):
+            past = np.array([getattr(one, what) for one in self._differences])
+            bound = _bounds(past, first, least, len(values))
+            joint = int(np.argmax(values / bound))
+            if values[joint] > bound[joint]:
+                return self._told(what, joint, float(values[joint]), float(bound[joint]))
+        return None
+
+    @property
+    def agreement(self) -> str:
+        """How well the last good repetition agrees with those before, in a few words."""
+        if not self._differences:
+            return "nothing to compare with yet"
+        return f"currents agree within {self._differences[-1].current.max():.1%} (rms)"
+
+    def _difference(self, played: Played) -> Difference:
+        rows = min(len(played.position), *(len(one.position) for one in self._earlier))
+        cell = self._cell
+        usual = np.median([one.position[:rows] for one in self._earlier], axis=0)
+        apart = np.sqrt(np.mean((played.position[:rows] - usual) ** 2, axis=0))
+        currents = np.median([one.current[:rows] for one in self._earlier], axis=0)
+        off = np.sqrt(np.mean((played.current[:rows] - currents) ** 2, axis=0))
+        size = np.sqrt(np.mean(currents**2, axis=0))
+        floor = 1e-3 * cell.drive_train.current_limit
+        return Difference(apart / following_threshold(cell), off / np.maximum(size, floor))
+
+    def _told(self, what: str, joint: int, value: float, bound: float) -> Problem:
+        name, earlier = self._cell.joint_names[joint], len(self._earlier)
+        scale = "the following-error threshold" if what == "position" else "its rms current"
+        return Problem(
+            f"the {what} of {name} differs from that of the {earlier} repetitions before by "
+            f"{value:.2%} of {scale} (rms); {bound:.2%} are allowed",
+            apart=True,
+        )
+
+
+def following_threshold(cell: Cell) -> Array:
+    """The cell's following-error thresholds as joint angles (n,) [rad]."""
+    turns = np.array(cell.drive_table.following_error)
+    return np.asarray(np.abs(cell.drive_train.joint_from_motor) @ (2.0 * np.pi * turns))
+
+
+def _bounds(past: Array, first: float, least: float, n_joints: int) -> Array:
+    """Largest difference allowed (n,), from those of earlier repetitions (k, n)."""
+    if len(past) < FEWEST - 1:
+        return np.full(n_joints, first)
+    middle = np.median(past, axis=0)
+    scatter = 1.4826 * np.median(np.abs(past - middle), axis=0)
+    usual = np.maximum(_WIDE * middle, middle + _OUTLYING * scatter)
+    return np.asarray(np.maximum(usual, least))

@@ -1,0 +1,121 @@
+"""How the rehearsal of a plan went: `rehearsal.json`.
+
+This says what was found; `hil.campaign.rehearsal_run` finds it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, Literal, Self
+
+from pydantic import StrictBool, ValidationError, model_validator
+
+from hil.files import write_or_tell
+from hil.results.frozen import Frozen
+
+from .errors import CampaignFolderError
+from .folder import CampaignFolder
+
+FORMAT_VERSION: Final = 1
+PLAIN: Final = "as modelled"
+EFFECTS: Final = "with what the model leaves out"
+"""The two runs of a rehearsal, in words."""
+CRITERIA: Final = (
+    f"motions ({PLAIN})",
+    f"current ({PLAIN})",
+    "excitation",
+    "parameters",
+    "unseen motion",
+    f"motions ({EFFECTS})",
+    f"current ({EFFECTS})",
+)
+"""What a rehearsal that passed was judged by, all of it."""
+
+
+class Criterion(Frozen):
+    """One thing that a rehearsal is judged by."""
+
+    name: str
+    value: float | None
+    """What was found; null where it could not be found."""
+    bound: float
+    """The largest value that passes."""
+    passed: StrictBool
+    sentence: str
+
+
+class Rehearsal(Frozen):
+    """The rehearsal of exactly one plan."""
+
+    format_version: Literal[1] = FORMAT_VERSION
+    plan_hash: str
+    """Of cell, URDF and plan as they were rehearsed."""
+    seed: int
+    """Of the planted parameters, the noise and the link's faults."""
+    passed: StrictBool
+    criteria: list[Criterion]
+    assumed: list[str]
+    """What the simulated arm has by assumption, in sentences."""
+    not_seen: list[str]
+    """What this rehearsal cannot show, in sentences."""
+    repetitions: int
+    motion_seconds: float
+    software: dict[str, str]
+
+    @model_validator(mode="after")
+    def _judged_by_its_criteria(self) -> Self:
+        """Passed is what met every criterion there is, and nothing else."""
+        met = [one.name for one in self.criteria if one.passed]
+        if self.passed != (len(met) == len(self.criteria) and set(met) == {*CRITERIA}):
+            raise ValueError("passed is not what its criteria say")
+        return self
+
+    @classmethod
+    def load(cls, folder: CampaignFolder) -> Rehearsal | None:
+        """The rehearsal of a campaign, whatever plan it was of; None if there was none.
+
+        Raises:
+            CampaignFolderError: the file cannot be read.
+        """
+        path = folder.rehearsal
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as error:
+            raise CampaignFolderError(
+                folder.root,
+                f"{path.name} cannot be read ({_why(error)})",
+                f"rehearse again (`hil rehearse {folder.root} --again`)",
+            ) from error
+
+    def save(self, path: Path) -> None:
+        """Write the file, whole or not at all.
+
+        Raises:
+            OutputError: the disk refuses.
+        """
+        write_or_tell(path, self.model_dump_json(indent=1) + "\n")
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """What did not pass, in sentences."""
+        return tuple(one.sentence for one in self.criteria if not one.passed)
+
+    @property
+    def line(self) -> str:
+        """How it went, in one sentence."""
+        if self.passed:
+            return (
+                f"the rehearsal passed all {len(self.criteria)} criteria; what it cannot see is "
+                "in rehearsal.json (not_seen)"
+            )
+        return f"the rehearsal failed: {'; '.join(self.failures)}"
+
+
+def _why(error: OSError | ValidationError) -> str:
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    first = error.errors()[0]
+    place = ".".join(map(str, first["loc"]))
+    return f"{place}: {first['msg']}" if place else str(first["msg"])

@@ -1,0 +1,76 @@
+"""What exactly is going to be run: cell, URDF, plan and collision meshes, by their checksums."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+MESH: Final = "mesh "
+"""Begins the entry of a mesh, by its name in the URDF."""
+MISSING: Final = "missing"
+_PACKAGE: Final = "package://"
+_FILE: Final = "file://"
+
+
+def checksum(content: bytes) -> str:
+    """SHA-256 in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
+    """Checksums of the inputs of a plan, and of the collision meshes that they name.
+
+    Args:
+        contents: of `cell.toml`, `robot.urdf` and `plan.json`, as far as they are there.
+        root: folder that relative paths in them begin at.
+
+    Returns:
+        By file name; a mesh that is not to be found is "missing" (no motion is checked without).
+    """
+    sums = {name: checksum(content) for name, content in contents.items()}
+    for mesh in _collision_meshes(contents.get("robot.urdf", b"")):
+        path = _found(mesh, _mesh_folders(contents.get("cell.toml", b""), root), root)
+        sums[MESH + mesh] = MISSING if path is None else checksum(path.read_bytes())
+    return sums
+
+
+def combined(sums: Mapping[str, str]) -> str:
+    """One checksum over all."""
+    return checksum(json.dumps(dict(sums), sort_keys=True).encode())
+
+
+def as_text(content: bytes) -> str:
+    """A file's content as reading it as text gives it (UTF-8, any line ends)."""
+    return io.TextIOWrapper(io.BytesIO(content), "utf-8").read()
+
+
+def _collision_meshes(urdf: bytes) -> list[str]:
+    try:
+        root = ElementTree.fromstring(urdf)
+    except ElementTree.ParseError:  # whoever loads it says so
+        return []
+    found = root.iterfind("./link/collision/geometry/mesh")
+    return sorted({name for mesh in found if (name := mesh.get("filename"))})
+
+
+def _mesh_folders(cell: bytes, root: Path) -> list[Path]:
+    try:
+        named = tomllib.loads(as_text(cell))["cell"]["mesh_folders"]
+        return [root / name for name in named]
+    except (ValueError, KeyError, TypeError):  # likewise
+        return []
+
+
+def _found(mesh: str, folders: list[Path], root: Path) -> Path | None:
+    if mesh.startswith(_PACKAGE):
+        places = [folder / mesh.removeprefix(_PACKAGE) for folder in folders]
+    else:
+        name = mesh.removeprefix(_FILE)
+        places = [root / name, *(folder / name for folder in folders)]
+    return next((place for place in places if place.is_file()), None)

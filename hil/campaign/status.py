@@ -1,0 +1,239 @@
+"""Where a campaign stands: its steps, which are done, which is next, and what to type."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from hil.errors import HilError
+from hil.results import Results
+
+from .dry_run import DryRun
+from .folder import CampaignFolder, Entry
+from .intervals import wanted
+from .rehearsal import Rehearsal
+from .warmup import WarmUp, drift_wanted
+
+if TYPE_CHECKING:
+    from .campaign import Campaign
+
+State = Literal["done", "next", "blocked"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a campaign.
+
+    Attributes:
+        name: "design", "rehearse", "dry run", "warm-up", "repetitions", "validation", "identify"
+            or "report".
+        state: whether it is done, is to be done next, or waits for one before it.
+        sentence: what is known of it.
+        command: what to type for it; "" for what is done.
+    """
+
+    name: str
+    state: State
+    sentence: str
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class CampaignStatus:
+    """Where a campaign stands.
+
+    Attributes:
+        root: its folder.
+        plan_hash: of cell, URDF and plan as they lie there.
+        steps: in the order in which they are done.
+        notes: archives that are torn, damaged or rejected, and why, in sentences.
+    """
+
+    root: str
+    plan_hash: str
+    steps: tuple[Step, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every step is done."""
+        return all(step.state == "done" for step in self.steps)
+
+    @property
+    def next_command(self) -> str:
+        """What to type next; "" where nothing is left to do."""
+        return next((step.command for step in self.steps if step.state == "next"), "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return asdict(self) | {"complete": self.complete, "next_command": self.next_command}
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What is known of a step by itself: whether it is done, in words, and how to do it."""
+
+    done: bool
+    sentence: str
+    command: str
+
+
+def status_of(campaign: Campaign) -> CampaignStatus:
+    """Look at what lies in a campaign's folder; nothing is changed.
+
+    Raises:
+        CampaignFolderError: its manifest cannot be read.
+    """
+    folder = campaign.folder
+    looks: list[tuple[str, Callable[[], _Found]]] = [
+        ("design", lambda: _design(campaign)),
+        ("rehearse", lambda: _rehearsal(folder)),
+        ("dry run", lambda: _dry_run(campaign)),
+        ("warm-up", lambda: _warm_up(campaign)),
+        ("repetitions", lambda: _motions(campaign, "excitation", "repetitions")),
+        ("validation", lambda: _motions(campaign, "validation", "validation motions")),
+        ("identify", lambda: _identified(folder)),
+        ("report", lambda: _reported(folder)),
+    ]
+    steps: list[Step] = []
+    waits_for = ""
+    for name, look in looks:
+        found = _looked(look, folder)
+        if found.done:
+            steps.append(Step(name, "done", found.sentence))
+        elif not waits_for:
+            waits_for = name
+            steps.append(Step(name, "next", found.sentence, found.command))
+        else:
+            sentence = f"{found.sentence}; waits for: {waits_for}"
+            steps.append(Step(name, "blocked", sentence, found.command))
+    return CampaignStatus(str(folder.root), folder.plan_hash, tuple(steps), _notes(folder))
+
+
+def _looked(look: Callable[[], _Found], folder: CampaignFolder) -> _Found:
+    try:
+        return look()
+    except HilError as error:  # a file of one step says nothing of the others
+        return _Found(False, str(error), f"hil status {_quoted(folder)}")
+
+
+def _design(campaign: Campaign) -> _Found:
+    excitation, folder = campaign.plan.excitation, campaign.folder
+    sentence = (
+        f"an excitation of {excitation.trajectory.duration:.1f} s and "
+        f"{len(campaign.plan.validation)} validation motions"
+    )
+    if folder.manifest():  # until something is recorded, a rehearsal takes changes in
+        folder.require_unchanged()
+    return _Found(True, sentence, "")
+
+
+def _rehearsal(folder: CampaignFolder) -> _Found:
+    command = f"hil rehearse {_quoted(folder)}"
+    found = Rehearsal.load(folder)
+    if found is None:
+        return _Found(False, "not rehearsed on the simulated arm yet", command)
+    if found.plan_hash != folder.plan_hash:
+        sentence = "rehearsed with another cell, URDF or plan than it has now"
+        return _Found(False, sentence, command)
+    if not found.passed:
+        return _Found(False, found.line, command)
+    return _Found(True, f"passed all {len(found.criteria)} criteria", "")
+
+
+def _dry_run(campaign: Campaign) -> _Found:
+    folder, simulated = campaign.folder, campaign.cell.only_simulated
+    found = DryRun.that_counts(
+        folder,
+        plan_hash=folder.plan_hash,
+        motions=1 + len(campaign.plan.validation),
+        simulated=simulated,
+    )
+    command = f"hil run {_quoted(folder)} --dry-run"
+    if found is None:
+        if folder.dry_run.exists():
+            was = "of another plan, of another kind of arm, or its archives are gone"
+            return _Found(False, f"the one on record does not count: it is {was}", command)
+        if simulated and folder.completed("excitation"):
+            return _Found(True, "left out, as a simulated arm allows", "")
+        return _Found(False, "not done: every motion at a fifth of its speed", command)
+    if found.accepted is None:
+        accept = f"hil run {_quoted(folder)} --accept-dry-run"
+        names = "".join(f" --accept-torque {joint}" for joint in found.against_gravity)
+        but = "".join(f"; {doubt}" for doubt in found.doubts)
+        words = f"done ({found.duration:.0f} s), but not accepted{but}"
+        return _Found(False, words, accept + names)
+    return _Found(True, f"accepted by {found.accepted.by}, {found.accepted.at}", "")
+
+
+def _warm_up(campaign: Campaign) -> _Found:
+    folder = campaign.folder
+    if not drift_wanted(campaign.cell):
+        return _Found(True, "none wanted (warmup_drift)", "")
+    found = WarmUp.load(folder.warmup, folder.plan_hash)
+    if found is None:
+        if _motions(campaign, "excitation", "repetitions").done:
+            return _Found(True, "left out", "")
+        return _Found(False, "not done", f"hil run {_quoted(folder)}")
+    done = found.outcome != "going on"
+    words = f"{found.outcome} after {len(found.motions)} motions"
+    return _Found(done, words, f"hil run {_quoted(folder)}")
+
+
+def _motions(campaign: Campaign, kind: str, words: str) -> _Found:
+    folder = campaign.folder
+    total = sum(one.kind == kind for one in wanted(campaign.cell, campaign.plan))
+    whole = len(folder.completed(kind))
+    return _Found(whole >= total, f"{whole} of {total} {words} whole", f"hil run {_quoted(folder)}")
+
+
+def _identified(folder: CampaignFolder) -> _Found:
+    command = f"hil identify {_quoted(folder)}"
+    if not folder.results.exists():
+        return _Found(False, "not identified yet", command)
+    results = Results.load(folder.results)
+    used = {*results.repetitions, *(one.archive for one in results.validation)}
+    kinds = ("excitation", "validation")
+    new = [path.name for kind in kinds for path in folder.completed(kind) if path.name not in used]
+    if new:
+        return _Found(False, f"identified without {len(new)} of the archives ({new[0]})", command)
+    return _Found(True, results.verdict.line, "")
+
+
+def _reported(folder: CampaignFolder) -> _Found:
+    command = f"hil report {_quoted(folder)}"
+    if not folder.report.exists():
+        return _Found(False, "no report yet", command)
+    if (
+        folder.results.exists()
+        and folder.results.stat().st_mtime > folder.report.stat().st_mtime + 1.0
+    ):
+        return _Found(False, "older than the results", command)
+    return _Found(True, str(folder.report), "")
+
+
+def _quoted(folder: CampaignFolder) -> str:
+    """The folder as a shell takes it."""
+    return shlex.quote(str(folder.root))
+
+
+def _notes(folder: CampaignFolder) -> tuple[str, ...]:
+    """Archives that are of no use, and why."""
+    entries = folder.manifest()
+    known = {entry.name for entry in entries}
+    there = sorted(path.name for path in folder.archives.glob("*.mcap"))
+    torn = [
+        f"{name} is torn or was never entered; its motion is run again"
+        for name in there
+        if name not in known
+    ]
+    busy = ("a run or a rehearsal is at work on it now",) if folder.busy else ()
+    return (*busy, *folder.damaged(), *torn, *filter(None, map(_of_no_use, entries)))
+
+
+def _of_no_use(entry: Entry) -> str:
+    if entry.outcome == "completed":
+        return ""
+    return f"{entry.name} is {entry.outcome}" + (f": {entry.reason}" if entry.reason else "")

@@ -1,0 +1,132 @@
+"""Passing on what the person wishes of a motion."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from drivers.errors import RequestError
+from drivers.motion_source import MotionSource
+from hil.errors import ControllerFault
+
+from .motion_watch import MotionWatch
+from .stop import Stop
+
+NOT_BEGUN: Final = "it had not begun"
+"""Why a motion ends that was stopped before it was asked for."""
+ASKED_EVERY: Final = 0.02
+"""s between two questions for a wish where nothing else is to be done."""
+
+
+class Steered(Protocol):
+    """A motion that can be told to go slower, to rest and to go on: `Session`, the exchange."""
+
+    def override(self, fraction: float) -> None:
+        """Go on at this fraction of the speed."""
+        ...
+
+    def hold(self) -> None:
+        """Rest on the path."""
+        ...
+
+    def resume(self) -> None:
+        """Go on."""
+        ...
+
+
+class Steering:
+    """Takes the wishes of one motion's watch to the motion.
+
+    Args:
+        watch: has the wishes.
+        most: largest fraction of the planned speed, whatever is wished.
+
+    Attributes:
+        fraction: asked of the motion last.
+        held: whether it was asked to rest.
+
+    Raises:
+        ValueError: `most` is not one of 0..1.
+    """
+
+    def __init__(self, watch: MotionWatch, most: float) -> None:
+        if not 0.0 < most <= 1.0:
+            raise ValueError(f"an override of {most!r} is not above 0 and at most 1")
+        self._watch, self._most = watch, most
+        self.fraction, self.held = most, False
+
+    def begin(self, source: MotionSource, stop: Stop) -> bool:
+        """Have a motion begin at the speed wished for; waits while a hold is wished for.
+
+        Returns:
+            Whether it may be asked for now; False once a stop is asked for.
+
+        Raises:
+            ControllerFault: it is to be slower than planned and knows no override.
+        """
+        wish = self._watch.wish()
+        while wish.held and not stop.requested:
+            time.sleep(ASKED_EVERY)
+            wish = self._watch.wish()
+        if stop.requested:
+            return False
+        self.fraction = min(self._most, wish.override)
+        change = getattr(source, "override", None)
+        if callable(change):
+            change(self.fraction)
+        elif self.fraction < 1.0:
+            raise ControllerFault(
+                f"a {type(source).__name__} knows no override and cannot be run at "
+                f"{100.0 * self.fraction:.0f} %; nothing was sent"
+            )
+        return True
+
+    def follow(self, motion: Steered) -> None:
+        """Pass on what is wished now. A motion held before it began begins at rest."""
+        wish = self._watch.wish()
+        fraction = min(self._most, wish.override)
+        if fraction != self.fraction:
+            self.fraction = fraction
+            motion.override(fraction)
+        if wish.held is not self.held:
+            self.held = wish.held
+            if wish.held:
+                motion.hold()
+            else:
+                motion.resume()
+
+
+@dataclass
+class Polite:
+    """A `Steered` whose refusals are told instead of raised, as the exchange process tells them.
+
+    Attributes:
+        motion: what is steered.
+        told: takes the refusals in words.
+    """
+
+    motion: Steered
+    told: deque[str]
+
+    def override(self, fraction: float) -> None:
+        """Go on at this fraction of the speed."""
+        try:
+            self.motion.override(fraction)
+        except RequestError as error:
+            self.told.append(str(error))
+
+    def hold(self) -> None:
+        """Rest on the path."""
+        try:
+            self.motion.hold()
+        except RequestError as error:
+            self.told.append(str(error))
+
+    def resume(self) -> None:
+        """Go on."""
+        try:
+            self.motion.resume()
+        except RequestError as error:
+            self.told.append(str(error))

@@ -1,0 +1,245 @@
+"""Warm-up: the excitation is repeated until friction changes but little from motion to motion.
+
+**Measure.** Over a motion that begins and ends at rest, inertial and gravity torques do no work on
+the whole; what a joint's torque does beyond that of the rigid arm,
+
+    F_j = (∫ tau_j qd_j dt - ∫ tau_rigid,j qd_j dt) / ∫ |qd_j| dt,
+
+is its friction torque, averaged along the way. The rigid part is that of the nominal model on the
+planned motion: the same in each repetition, so that its error drops out of every change.
+
+**Criterion.** The change per motion is the slope of a straight line through the last motions
+(Theil and Sen: the median of all slopes between two of them), as a share of the friction.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import theilslopes
+
+from hil.archive import open_archive
+from hil.cell import Cell
+from hil.files import write_or_tell
+from planner import FourierSeries, PiecewiseCubic
+
+from .errors import CampaignFolderError
+from .operator import DriftCurve
+
+Array = NDArray[np.float64]
+
+DEFAULT_DRIFT: Final = 0.002
+"""Change per motion that counts as warm on a real arm. Thirty repetitions then change friction by
+a few per cent at most; with half a minute each and a time constant of 20 min, which is usual, the
+slope falls to it from 1 % within about 40 motions."""
+WINDOW: Final = 4
+"""Motions that a slope is taken from."""
+COLD_AFTER: Final = 600.0
+"""s without motion after which the joints are taken to have cooled down."""
+FORMAT_VERSION: Final = 2
+"""1 did not say when the joints moved last."""
+_FIELDS: Final = ("torque", "commanded_position", "position")
+_LEAST_SHARE: Final = 0.02
+"""Of a joint's rms torque: less friction than that is not the nominal model's to tell."""
+_LEAST_WAY: Final = 1e-2
+"""rad; a joint that goes less far tells nothing."""
+
+
+def drift_wanted(cell: Cell, *, only_simulated: bool | None = None) -> float:
+    """Change per motion below which the arm counts as warm; 0 where no warm-up is wanted.
+
+    Args:
+        cell: its own link says whether only a simulated arm can move, where that is left out.
+        only_simulated: of the link that is really used.
+    """
+    wanted = cell.campaign.warmup_drift
+    if wanted is not None:
+        return wanted
+    simulated = cell.only_simulated if only_simulated is None else only_simulated
+    return 0.0 if simulated else DEFAULT_DRIFT
+
+
+@dataclass(frozen=True)
+class WarmMotion:
+    """One motion of a warm-up.
+
+    Attributes:
+        archive: its file name.
+        friction: of each joint (n) [N·m], None for one that hardly moves.
+    """
+
+    archive: str
+    friction: tuple[float | None, ...]
+
+
+@dataclass(frozen=True)
+class WarmUp:
+    """Warm-up of a campaign; `warmup.json`.
+
+    Attributes:
+        plan_hash: of the plan it belongs to.
+        joint_names: of the n joints.
+        threshold: change per motion that counts as warm.
+        motions: of the present warm-up, in order.
+        outcome: "going on", "warm", or "not warm" where the most motions were not enough.
+        earlier: motions of warm-ups whose warmth was lost in a pause, oldest first.
+        moved_at: when a motion that keeps the joints warm ended last [s since 1970]; None if that
+            is not known.
+    """
+
+    plan_hash: str
+    joint_names: tuple[str, ...]
+    threshold: float
+    motions: tuple[WarmMotion, ...] = ()
+    outcome: str = "going on"
+    earlier: tuple[WarmMotion, ...] = ()
+    moved_at: float | None = None
+
+    @classmethod
+    def load(cls, path: Path, plan_hash: str) -> Self | None:
+        """Read it; None where there is none for this plan.
+
+        Raises:
+            CampaignFolderError: the file is damaged.
+        """
+        if not path.exists():
+            return None
+        try:
+            content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+            motions, earlier = (
+                tuple(WarmMotion(one["archive"], tuple(one["friction"])) for one in content[key])
+                for key in ("motions", "earlier")
+            )
+            found = cls(
+                content["plan_hash"],
+                tuple(content["joint_names"]),
+                content["threshold"],
+                motions,
+                content["outcome"],
+                earlier,
+                _time_of_day(content.get("moved_at")),
+            )
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CampaignFolderError(
+                path.parent, f"{path.name} is damaged ({error})", "remove that file"
+            ) from error
+        return found if found.plan_hash == plan_hash else None
+
+    def save(self, path: Path) -> None:
+        """Write it.
+
+        Raises:
+            OutputError: the disk refuses.
+        """
+        content = {"format_version": FORMAT_VERSION, **asdict(self)}
+        write_or_tell(path, json.dumps(content, indent=1) + "\n")
+
+    @property
+    def next_index(self) -> int:
+        """Of the archive of the next motion; none is given twice."""
+        return len(self.earlier) + len(self.motions)
+
+    def cold(self, now: float) -> bool:
+        """Whether the joints have cooled down by `now` [s since 1970].
+
+        Not known, or in the future (a clock was put back): cold. A motion too many harms nothing.
+        """
+        return self.moved_at is None or not 0.0 <= now - self.moved_at <= COLD_AFTER
+
+    @property
+    def curve(self) -> DriftCurve:
+        """Friction and its change, motion by motion."""
+        friction = np.array([one.friction for one in self.motions], dtype=np.float64)
+        friction = friction.reshape(len(self.motions), len(self.joint_names))
+        change = [change_per_motion(friction[: k + 1]) for k in range(len(friction))]
+        return DriftCurve(self.joint_names, friction, np.array(change), self.threshold)
+
+    def with_motion(self, archive: str, friction: Array, least: int, most: int) -> WarmUp:
+        """This warm-up after one more motion, and what has come of it.
+
+        Args:
+            archive: file name.
+            friction: (n,) [N·m], NaN for a joint that hardly moves.
+            least: motions at least.
+            most: and at most.
+        """
+        known = tuple(float(f) if np.isfinite(f) else None for f in friction)
+        longer = replace(self, motions=(*self.motions, WarmMotion(archive, known)))
+        done, change = len(longer.motions), longer.curve.change[-1]
+        if done >= max(least, WINDOW) and change <= self.threshold:
+            return replace(longer, outcome="warm")
+        untold = done >= least and np.isnan(change)  # more motions would not tell either
+        return replace(longer, outcome="not warm") if untold or done >= most else longer
+
+    def cooled(self) -> WarmUp:
+        """A new warm-up after this one was lost in a pause."""
+        kept = (*self.earlier, *self.motions)
+        return replace(self, motions=(), outcome="going on", earlier=kept)
+
+
+def _time_of_day(found: object) -> float | None:
+    """A time as a number, None where there is none."""
+    if found is None:
+        return None
+    if not isinstance(found, int | float):
+        raise TypeError(f"moved_at is {found!r}, no number")
+    return float(found)
+
+
+def change_per_motion(friction: Sequence[Array] | Array) -> float:
+    """Largest change per motion of any joint at the end of a row of motions, as a share.
+
+    Args:
+        friction: (k, n) [N·m].
+
+    Returns:
+        NaN for fewer than two motions, or if no joint moves.
+    """
+    last = np.asarray(friction, dtype=np.float64)[-WINDOW:]
+    moves = np.isfinite(last).all(axis=0) if len(last) else np.zeros(0, bool)
+    if len(last) < 2 or not moves.any():
+        return float("nan")
+    slopes = np.array([theilslopes(column).slope for column in last[:, moves].T])
+    return float(np.max(np.abs(slopes) / np.abs(np.median(last[:, moves], axis=0))))
+
+
+class FrictionMeter:
+    """Measures the friction of archived repetitions of one motion.
+
+    Args:
+        cell: with its nominal model.
+        trajectory: the motion.
+    """
+
+    def __init__(self, cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> None:
+        self._period, self._trajectory = cell.period, trajectory
+        model, values = cell.model, cell.nominal_values()
+        rigid = np.where(model.friction_columns, 0.0, values)
+        time = np.arange(0.0, trajectory.duration, cell.period)
+        q, qd, qdd = trajectory.sample(time)
+        torque = model.torque(rigid, q, qd, qdd) + model.load_torque(q, qd, qdd)
+        self._rigid_work = (torque * qd).sum(axis=0) * cell.period
+        self._way = np.abs(qd).sum(axis=0) * cell.period
+
+    def measure(self, path: Path) -> Array:
+        """Friction torque of each joint along the way (n,) [N·m]; NaN where it hardly moves.
+
+        Raises:
+            ArchiveError: the archive cannot be read.
+        """
+        columns = open_archive(path, fields=_FIELDS).columns
+        rows = ~np.isnan(columns["commanded_position"]).any(axis=1)
+        torque = columns["torque"][rows]
+        # Measured, not commanded: while the arm lags behind, inertial torque works on the command.
+        work = (torque * np.gradient(columns["position"][rows], axis=0)).sum(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            friction = (work - self._rigid_work) / self._way
+        size = np.sqrt(np.mean(torque**2, axis=0))
+        known = (self._way > _LEAST_WAY) & (np.abs(friction) > _LEAST_SHARE * size)
+        return np.where(known, friction, np.nan)

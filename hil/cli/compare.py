@@ -1,0 +1,69 @@
+"""`hil compare`: what changed on an arm from one campaign to another."""
+
+from __future__ import annotations
+
+import json as json_module
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from hil.batch.local import LocalWorkers
+from hil.compare import compare_campaigns, gather
+from hil.compare.record import to_dict
+from hil.compare.words import caveat, told, verdict
+from hil.files import make_folder, write_together
+from hil.progress import reporter as make_reporter
+
+CHANGED: Final = 5
+"""Exit status with --fail-on-change: something has changed."""
+
+
+def compare(
+    campaigns: Annotated[
+        list[str],
+        typer.Argument(
+            help="Campaign folders of one arm, two or more, or folders with campaigns below.",
+            show_default=False,
+            metavar="CAMPAIGN...",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="HTML file for the report; none if left out.", show_default=False
+        ),
+    ] = None,
+    fail_on_change: Annotated[
+        bool, typer.Option("--fail-on-change", help="Exit status 5 if something has changed.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+) -> None:
+    """Compare campaigns of one arm: did the friction change, on which axis, what does it carry?
+
+    The earliest campaign is what the others are compared with; the first one named, where not all
+    have a time of recording. Archives are read as `hil reidentify` reads them. Exit status 0,
+    whatever came out, unless --fail-on-change is given.
+    """
+    reporter = make_reporter(quiet=quiet or json)
+    with LocalWorkers() as workers:
+        found = compare_campaigns(gather(campaigns, workers, reporter))
+    if output is not None:
+        from hil.report.comparison import comparison_bytes  # figures are slow to import
+
+        make_folder(output.parent)
+        write_together(output.parent, {output.name: comparison_bytes(found)})
+        reporter.say(f"report: {output}")
+    if json:
+        typer.echo(json_module.dumps(to_dict(found), ensure_ascii=False))
+    else:
+        if not quiet:
+            for one in told(found):
+                typer.echo(f"{one.words} {one.next_step}".rstrip(), err=True)
+            for doubt in found.doubts:
+                typer.echo(f"note: {doubt}", err=True)
+            typer.echo(f"note: {caveat(found)}", err=True)
+        typer.echo(f"{verdict(found)}.")
+    if fail_on_change and found.changed:
+        raise typer.Exit(CHANGED)

@@ -1,0 +1,283 @@
+"""`hil move`: the arm goes a checked straight way to a posture."""
+
+from __future__ import annotations
+
+import json as json_format
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import click
+import numpy as np
+import typer
+
+from drivers.events import MotionEnded
+from hil.campaign import Campaign, MotionLink, stop_on_interrupt
+from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.cell import AngleFrame, Cell
+from hil.cell_link import cell_link
+from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
+from hil.files import make_folder
+from hil.move import THERE, Way, posture, send, straight_way, turned
+from hil.progress import Task
+from hil.progress import reporter as make_reporter
+from hil.recording import archive_path
+
+
+def move(
+    where: Annotated[
+        Path,
+        typer.Argument(metavar="CELL|CAMPAIGN", help="A cell file, or a campaign's folder."),
+    ] = Path("cell.toml"),
+    to: Annotated[
+        str | None,
+        typer.Option(
+            metavar="start|home|POSTURE",
+            help="home_deg of the cell; the start of the campaign's excitation (of a cell alone: "
+            'home); or angles in degrees in the frame of [limits], "0,-20,-90,0,60,0".',
+            show_default=False,
+        ),
+    ] = None,
+    joint: Annotated[
+        str | None,
+        typer.Option(
+            help="Instead of --to: one joint, by name or number from 1.", show_default=False
+        ),
+    ] = None,
+    by: Annotated[
+        float | None, typer.Option(help="How far it turns, degrees.", show_default=False)
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            max=100.0,
+            help="Percent of the joints' speeds; the cell's approach_speed if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="The archive (*.mcap), or a folder to number it in; runs/move if left out, of a "
+            "campaign its own archives.",
+            show_default=False,
+        ),
+    ] = None,
+    yes: Annotated[
+        bool,
+        typer.Option(
+            "--yes",
+            "-y",
+            help="Do not ask: the way is free, and somebody looks. What may be a real arm then "
+            "goes no faster than the cell's approach_speed.",
+        ),
+    ] = False,
+    accept_init: Annotated[
+        bool,
+        typer.Option(
+            "--accept-init",
+            help="Use the controller's gear ratios, calibration and coupling where they differ "
+            "from the cell's; the archive says so.",
+        ),
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON.")] = False,
+) -> None:
+    """Move the arm on a straight way in joint space, slowly, and archive it.
+
+    The way is planned from where the arm stands and checked against limits, motor currents, floor,
+    walls and the arm itself; then it is shown, and sent once a person says yes. Without a terminal
+    nothing that may be a real arm moves unless --yes is given. Ctrl-C brings the arm to rest on
+    its way. With transport "simulated" the controller is simulated here, and the arm stands again
+    at initial_deg the next time.
+
+    **Example:** `hil move cell.toml --joint 1 --by 5 --speed 5`, then
+    `hil move cell.toml --to start`.
+
+    Exit status 0 when it arrived (or was there), 3 when the way is refused or nobody confirmed it,
+    4 when the controller or the link failed, 130 when it was stopped.
+    """
+    if (to is None) == (joint is None) or (joint is None) != (by is None):
+        raise InputError(
+            None, "where is the arm to go?", remedy="give either --to, or --joint and --by"
+        )
+    campaign = Campaign.open(where) if where.is_dir() else None
+    cell = Cell.load(where) if campaign is None else campaign.cell
+    start_of = None
+    if campaign is not None:
+        start_of = campaign.plan.excitation.trajectory.sample(np.array([0.0]))[0][0]
+    wanted = None if to is None else posture(cell, to, start_of)
+    with _reserved(campaign), cell_link(cell, accept_init=accept_init) as link:
+        if yes and not link.only_simulated:
+            _require_slow(cell, speed)
+        with stop_on_interrupt() as stop:
+            here = link.connect(stop)
+        target = turned(cell, here, joint or "", by or 0.0) if wanted is None else wanted
+        if np.max(np.abs(target - here)) <= THERE:
+            link.close()
+            _tell("the arm is there already; nothing was sent", {"outcome": "there"}, json=json)
+            return
+        way = straight_way(cell, here, target, speed=None if speed is None else speed / 100.0)
+        if not json:
+            typer.echo(_described(way, cell, link))
+        _confirm(cell, link, yes=yes, json=json)
+        with _archive(campaign, output) as (path, ended_as):
+            ended, stopped = _sent(way, cell, link, path, quiet=json)
+            ended_as.append(ended)
+        _report(ended, path, way, cell, link, json=json)
+        link.close()
+    if ended.outcome == "stopped" and stopped:
+        raise OperatorStopError(f"the arm was stopped on its way; {path} is whole.")
+    if ended.outcome != "completed":
+        raise ControllerFault(f"the move ended {ended.outcome}: {ended.reason}; {path} is whole.")
+
+
+def _sent(
+    way: Way, cell: Cell, link: MotionLink, path: Path, *, quiet: bool
+) -> tuple[MotionEnded, bool]:
+    """How the motion ended, and whether a person asked for its end."""
+    reporter = make_reporter(quiet=quiet)
+    with stop_on_interrupt() as stop, reporter.task("moving (s)", way.duration) as task:
+        ended = send(
+            way,
+            cell,
+            link,
+            path,
+            stop=stop,
+            watch=_Shown(task),
+            durable=cell.controller.transport != "simulated",
+        )
+        return ended, stop.requested
+
+
+class _Shown:
+    """Moves the bar on with the arm."""
+
+    def __init__(self, task: Task) -> None:
+        self._task, self._done = task, 0.0
+
+    def show(self, progress: MotionProgress) -> None:
+        """Look at the motion."""
+        if progress.motion_time is not None and progress.motion_time > self._done:
+            self._task.advance(progress.motion_time - self._done)
+            self._done = progress.motion_time
+
+    def wish(self) -> Wish:
+        """The motion as it was planned; only Ctrl-C stops it."""
+        return Wish()
+
+
+@contextmanager
+def _archive(
+    campaign: Campaign | None, output: Path | None
+) -> Iterator[tuple[Path, list[MotionEnded]]]:
+    """Where the move is archived; a campaign's manifest learns of it once it has ended."""
+    ended: list[MotionEnded] = []
+    if campaign is None or output is not None:
+        yield archive_path(output or Path("runs/move"), "move"), ended
+        return
+    folder = campaign.folder
+    make_folder(folder.archives)
+    name = folder.next_name("move", 0)
+    yield folder.archives / name.filename, ended
+    if ended:
+        folder.add(name.filename, ended[0].outcome)
+
+
+@contextmanager
+def _reserved(campaign: Campaign | None) -> Iterator[None]:
+    """Keep runs out of a campaign's folder from before the controller is connected.
+
+    Raises:
+        CampaignFolderError: one is at work on it, or the folder was changed.
+    """
+    if campaign is None:
+        yield
+        return
+    with campaign.folder.locked():
+        campaign.folder.require_unchanged()
+        yield
+
+
+def _require_slow(cell: Cell, speed: float | None) -> None:
+    """With --yes nobody has seen the way: it is not gone faster than the cell's approaches.
+
+    Raises:
+        UnsafeError: it would be.
+    """
+    most = 100.0 * cell.campaign.approach_speed
+    if speed is not None and speed > most:
+        raise UnsafeError(
+            f"--speed {speed:g} with --yes is faster than the cell's approach_speed ({most:g} %), "
+            "and nobody confirms the way; nothing was sent: leave out --yes, or go slower."
+        )
+
+
+def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
+    """Ask the person; what may be a real arm does not move without an answer.
+
+    Raises:
+        UnsafeError: nobody is here to answer.
+        OperatorStopError: the answer was no.
+    """
+    if yes:
+        return
+    if json or not sys.stdin.isatty():
+        if link.only_simulated:
+            return
+        raise UnsafeError(
+            "nobody is here to confirm the way, and the controller may be a real one; nothing was "
+            "sent: run it in a terminal, or add --yes where somebody looks at the arm."
+        )
+    who = "the simulated arm" if link.only_simulated else f"the arm of {cell.name}"
+    try:
+        agreed = typer.confirm(f"The way is free, and {who} may move?")
+    except click.Abort:
+        agreed = False
+    if not agreed:
+        raise OperatorStopError("not confirmed; nothing was sent.")
+
+
+def _described(way: Way, cell: Cell, link: MotionLink) -> str:
+    """The way, joint by joint."""
+    frame = AngleFrame.of(cell)
+    start, end = frame.shown(way.start), frame.shown(way.target)
+    peaks = np.degrees(way.trajectory.extrema().velocity)
+    width = max(len(name) for name in (*cell.joint_names, "joint"))
+    lines = [f"{'joint':{width}}  {'from':>9}  {'to':>9}  {'by':>9}   peak speed"]
+    lines += [
+        f"{name:{width}}  {a:8.2f}°  {b:8.2f}°  {b - a:+8.2f}°  {peak:7.2f} °/s"
+        for name, a, b, peak in zip(cell.joint_names, start, end, peaks, strict=True)
+    ]
+    who = "a SIMULATED controller" if link.only_simulated else f"the controller of {cell.name}"
+    lines.append(
+        f"{way.duration:.2f} s at {100.0 * way.speed:.3g} % of the joints' speeds, {frame.whose}; "
+        f"limits, motor currents, floor, walls and the arm itself are kept; to {who}"
+    )
+    return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
+
+
+def _report(
+    ended: MotionEnded, path: Path, way: Way, cell: Cell, link: MotionLink, *, json: bool
+) -> None:
+    figures = {
+        "archive": str(path),
+        "outcome": ended.outcome,
+        "reason": ended.reason,
+        "simulated": link.only_simulated,
+        "duration": way.duration,
+        "target_deg": AngleFrame.of(cell).shown(way.target).tolist(),
+    }
+    _tell(
+        f"{ended.outcome}: {ended.reason or 'the arm is there'}; archived in {path}",
+        figures,
+        json=json,
+    )
+
+
+def _tell(text: str, figures: dict[str, object], *, json: bool) -> None:
+    typer.echo(json_format.dumps(figures) if json else text)

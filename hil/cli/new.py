@@ -1,0 +1,155 @@
+"""`hil new`: a commented cell file for an arm."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hil.campaign import stop_on_interrupt
+from hil.errors import InputError
+from hil.files import write_atomically
+from hil.new import Known, cell_of_urdf, from_archive, from_init, read_init
+
+PORT = 1000
+"""On which a PC listens to a C4G Open, as delivered."""
+
+
+def new(
+    urdf: Annotated[Path, typer.Option(help="The arm's URDF.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The cell file to write.")] = Path(
+        "cell.toml"
+    ),
+    from_controller: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST[:PORT]",
+            help="Take gears, calibration, coupling, current limits, following errors and cycle "
+            "from the init packet of the controller at HOST; this PC listens on PORT (1000).",
+            show_default=False,
+        ),
+    ] = None,
+    from_archive_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--from-archive",
+            metavar="ARCHIVE",
+            help="Take what an archive of this arm carries: its cell and its init packet.",
+            show_default=False,
+        ),
+    ] = None,
+    bind: Annotated[
+        str, typer.Option(help="Address of this PC to listen on; 0.0.0.0 for all of them.")
+    ] = "0.0.0.0",
+    arm: Annotated[int, typer.Option(min=1, max=4, help="Arm of the controller.")] = 1,
+    wait: Annotated[
+        float, typer.Option(min=0.0, help="Seconds to wait for the controller.")
+    ] = 300.0,
+    fix: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT[=POSITION]",
+            help="A joint that is not to move, at a position in rad or m (0 if left out); may be "
+            "repeated. Sliding joints are fixed in any case.",
+            show_default=False,
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an earlier file.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+) -> None:
+    """Write a commented cell file for an arm; what nobody has said is marked "?".
+
+    Limits come from the URDF where it states them. With --from-controller this PC listens until
+    the controller's Open program starts, answers safely (nothing can move), and reads the init
+    packet: start this command first, then that program. With --from-archive the same comes from
+    an archive. Everything else is yours to fill in: a file with a "?" in it is refused, with a
+    list of all that is missing and where each figure is found.
+
+    **Example:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`
+    """
+    if from_controller is not None and from_archive_file is not None:
+        raise InputError(
+            None, "controller and archive at once", remedy="give one of the two --from options"
+        )
+    _require_free(output, force=force)
+    made = cell_of_urdf(urdf, _positions(fix or []))
+    if made.urdf is not None:
+        _require_free(made.urdf_beside(output), force=force, own=urdf)
+    known = made.known
+    if from_controller is not None:
+        known |= _asked(from_controller, bind, len(made.joint_names), arm, wait, quiet=json)
+    if from_archive_file is not None:
+        told = from_archive(from_archive_file, made.joint_names)
+        # Limits belong together, with their frame.
+        known = (known.without("limits") if "limits.frame" in told.values else known) | told
+    text, unknown = made.with_known(known).text(output)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        if made.urdf is not None:
+            write_atomically(made.urdf_beside(output), made.urdf)
+        write_atomically(output, text)
+    except OSError as error:
+        raise InputError(output, f"cannot be written ({error.strerror})") from error
+    if json:
+        summary = {
+            "cell": str(output),
+            "joints": list(made.joint_names),
+            "unknown": list(unknown),
+            "notes": list(known.notes),
+        }
+        typer.echo(json_format.dumps(summary))
+        return
+    for note in known.notes:
+        typer.echo(f"note: {note}")
+    typer.echo(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})")
+    if unknown:
+        typer.echo(f'still unknown, marked "?": {", ".join(unknown)}')
+        typer.echo(f"fill them in, then `hil doctor {output}`; whatever is missing is named again")
+
+
+def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool) -> Known:
+    """What the controller at HOST[:PORT] says of itself."""
+    from drivers.transports.udp import UdpSpec
+
+    host, _, port_text = address.partition(":")
+    if not host or not (port_text or "1").isdigit() or int(port_text or PORT) > 65535:
+        raise InputError(
+            None, f"{address!r} is no HOST or HOST:PORT", remedy="e.g. 10.2.12.150:1000"
+        )
+    port = int(port_text or PORT)
+    if not quiet:
+        typer.echo(
+            f"listening on {bind}:{port}; now start the controller's Open program at {host} "
+            f"(waiting {wait:g} s, Ctrl-C ends it). Nothing is moved"
+        )
+    with stop_on_interrupt() as stop:
+        init = read_init(UdpSpec(host, port, bind), n_joints, arm=arm, wait=wait, stop=stop)
+    link = {"controller.transport": "udp", "controller.host": host, "controller.port": port}
+    if bind != "0.0.0.0":
+        link["controller.bind"] = bind
+    return from_init(init, n_joints, arm) | Known.said_by("as given to hil new", link)
+
+
+def _positions(fixed: list[str]) -> dict[str, float]:
+    positions = {}
+    for text in fixed:
+        name, equals, value = text.partition("=")
+        try:
+            positions[name] = float(value) if equals else 0.0
+        except ValueError:
+            raise InputError(
+                None, f"{text!r} is no JOINT=POSITION", field="--fix", remedy="e.g. finger=0.02"
+            ) from None
+    return positions
+
+
+def _require_free(path: Path, *, force: bool, own: Path | None = None) -> None:
+    """Refuse to replace a file that is there, and the URDF that is read in any case."""
+    if own is not None and path.resolve() == own.resolve():
+        raise InputError(
+            path, "is the URDF itself, of which a copy is needed", remedy="name another --output"
+        )
+    if path.exists() and not force:
+        raise InputError(path, "exists already", remedy="name another --output, or add --force")

@@ -1,0 +1,180 @@
+"""`hil run`: a campaign on its controller, then identification and report."""
+
+from __future__ import annotations
+
+import json as json_format
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hil.archive.live_view import LiveView
+from hil.campaign import Campaign, stop_on_interrupt
+from hil.campaign.execution_result import RunResult
+from hil.cli.verdict import NOT_GOOD, as_json, finish
+from hil.errors import ControllerFault, HilError, InputError, OperatorStopError
+from hil.progress import reporter as make_reporter
+from hil.screen import Screen
+
+
+def run(
+    campaign: Annotated[
+        Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
+    ],
+    rehearse: Annotated[
+        bool,
+        typer.Option("--rehearse", help="Rehearse the plan first, where that was not passed yet."),
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only the dry run: every motion at 20 % of its speed.")
+    ] = False,
+    accept_dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--accept-dry-run",
+            help="I watched the dry run and the motions are free. On a simulated controller it "
+            "need not have been done before.",
+        ),
+    ] = False,
+    accept_torque: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--accept-torque",
+            metavar="JOINT",
+            help="With --accept-dry-run: I know why the torque of this joint ran against the "
+            "model's gravity in the dry run that was done before. Repeat it.",
+            show_default=False,
+        ),
+    ] = None,
+    no_identify: Annotated[
+        bool, typer.Option("--no-identify", help="Only run; no parameters, no report.")
+    ] = False,
+    live: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Let Foxglove look at the run as it goes on; on 127.0.0.1 unless a HOST is named.",
+            show_default=False,
+        ),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object at the end, errors too.")
+    ] = False,
+) -> None:
+    """Run what is missing of a campaign on its controller, then identify and report.
+
+    In this order: the plan's rehearsal must have been passed (`hil rehearse`); every motion is
+    run once at 20 % of its speed and a person accepts what he saw; the excitation is repeated
+    until friction hardly changes any more; then standstill, repetitions, validation motions, and
+    back to where the arm was. A repetition that fails its quality check is archived with the
+    reason and run again. Ctrl-C brings the arm to rest on its path; the same command goes on.
+
+    **Without a terminal:** `hil run C --dry-run`, somebody looks, then
+    `hil run C --accept-dry-run --json`.
+
+    Exit status 0 when the model is good (with --dry-run or --no-identify: when all was run), 3
+    when a gate refuses, 4 when the controller or the link failed, 5 when the model is not good or
+    a motion was of no use again and again, 130 when it was stopped.
+    """
+    try:
+        if dry_run and accept_dry_run:
+            raise InputError(
+                None,
+                "--dry-run and --accept-dry-run together",
+                remedy="run the one, look at the arm, then the other",
+            )
+        opened = Campaign.open(campaign)
+        if rehearse:
+            with stop_on_interrupt() as stop:
+                opened.rehearse(reporter=make_reporter(quiet=quiet or json), stop=stop)
+        result = _run(
+            opened,
+            quiet=quiet or json,
+            live=live,
+            dry_run_only=dry_run,
+            accept_dry_run=accept_dry_run,
+            accept_torque=accept_torque or (),
+        )
+        if dry_run or no_identify:
+            _tell(result, json=json)
+            return
+        _identify(opened, result, quiet=quiet, json=json)
+    except HilError as error:
+        if json:
+            typer.echo(json_format.dumps(_failure(campaign, error), ensure_ascii=False))
+        raise
+
+
+def _run(
+    campaign: Campaign,
+    *,
+    quiet: bool,
+    live: str | None,
+    dry_run_only: bool,
+    accept_dry_run: bool,
+    accept_torque: Sequence[str],
+) -> RunResult:
+    """Run with the screen; Ctrl-C stops the arm, then the program."""
+    name, names = campaign.folder.root.resolve().name, campaign.cell.joint_names
+    with (
+        stop_on_interrupt() as stop,
+        Screen(names, stop, title=name, quiet=quiet) as operator,
+    ):
+        try:
+            return campaign.run(
+                None,
+                stop,
+                operator,
+                operator=operator,
+                live=None if live is None else LiveView.parse(live),
+                dry_run_only=dry_run_only,
+                accept_dry_run=accept_dry_run,
+                accept_torque=accept_torque,
+            )
+        except (ControllerFault, OSError) as fault:
+            if stop.requested:  # an OSError: of a terminal that was closed
+                again = f"Go on with `hil run {campaign.folder.root}`."
+                raise OperatorStopError(f"{fault} {again}") from fault
+            raise
+
+
+def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool) -> None:
+    """Identify from all that is whole, report, and end with the verdict."""
+    found = campaign.identify(reporter=make_reporter(quiet=quiet or json))
+    if not json:
+        finish(found.results, json=False, quiet=quiet)
+        return
+    verdict = json_format.loads(as_json(found.results))
+    typer.echo(json_format.dumps({**result.to_dict(), "verdict": verdict}, ensure_ascii=False))
+    if not found.verdict.good:
+        raise typer.Exit(NOT_GOOD)
+
+
+def _tell(result: RunResult, *, json: bool) -> None:
+    """What was done, where nothing is identified."""
+    if json:
+        typer.echo(json_format.dumps({**result.to_dict(), "verdict": None}, ensure_ascii=False))
+        return
+    done, wanted = result.repetitions
+    tested, tests = result.validations
+    typer.echo(
+        f"{result.campaign}: dry run {result.dry_run}, repetitions {done} of {wanted}, validation "
+        f"{tested} of {tests}, {len(result.rejected)} rejected"
+    )
+    for note in result.notes:
+        typer.echo(note)
+    for one in result.rejected:
+        typer.echo(f"{one.archive}: {one.reason}")
+    if result.dry_run == "to be accepted":
+        known = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
+        right = (
+            "you know why, and the motions looked right" if known else "the motions looked right"
+        )
+        typer.echo(f"if {right}, go on with `hil run {result.campaign} --accept-dry-run{known}`")
+
+
+def _failure(campaign: Path, error: HilError) -> dict[str, Any]:
+    """What a script is told of a run that ended with an error."""
+    return {"campaign": str(campaign), "error": str(error), "exit_code": error.exit_code}

@@ -1,0 +1,51 @@
+"""`hil status`: where a campaign stands, and what to type next."""
+
+from __future__ import annotations
+
+import json as json_module
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from hil.campaign import Campaign
+from hil.campaign.status import CampaignStatus
+
+_MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("waits", "dim")}
+
+
+def status(
+    campaign: Annotated[
+        Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
+    ],
+    json: Annotated[bool, typer.Option("--json", help="Print the same as JSON.")] = False,
+) -> None:
+    """Show which steps of CAMPAIGN are done, which is next, and what to type for it.
+
+    Names archives that are torn, damaged or rejected. Changes nothing, and may be asked while the
+    campaign runs.
+    """
+    found = Campaign.open(campaign).status()
+    if json:
+        typer.echo(json_module.dumps(found.to_dict(), ensure_ascii=False))
+        return
+    console = Console()
+    console.print(_table(found))
+    for note in found.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    last = f"next: {found.next_command}" if found.next_command else "every step is done"
+    console.print(last, markup=False, highlight=False, soft_wrap=True)
+
+
+def _table(found: CampaignStatus) -> Table:
+    table = Table(title=found.root, title_justify="left", box=None, pad_edge=False)
+    table.add_column("step", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    table.add_column("what is known", overflow="fold")
+    for step in found.steps:
+        word, style = _MARKS[step.state]
+        table.add_row(step.name, Text(word, style=style), Text(step.sentence))
+    return table

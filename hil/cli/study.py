@@ -1,0 +1,141 @@
+"""`hil study`: the paper's two methods, run and compared."""
+
+from __future__ import annotations
+
+import json as json_format
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from hil.cell import Cell
+from hil.errors import InputError, OperatorStopError
+from hil.progress import reporter as make_reporter
+from hil.study import run_study, study_campaigns, study_settings
+from hil.study.reading import answer_of
+
+_DEFAULT: Final = signal.SIG_DFL
+
+
+def study(
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder for the whole study.", show_default=True),
+    ] = Path("runs/study"),
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help="Short searches, few repetitions and motions: minutes."),
+    ] = False,
+    campaign: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Study these recorded campaigns, of one arm, instead of the simulated NS 16. "
+            "May be repeated: the first two are compared as A and B are.",
+            show_default=False,
+        ),
+    ] = None,
+    cell: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Cell file of another simulated arm than the paper's NS 16.",
+            show_default=False,
+        ),
+    ] = None,
+    repetitions: Annotated[
+        int | None,
+        typer.Option(min=2, help="Executions of each excitation; 30 if left out, 4 with --quick."),
+    ] = None,
+    motions: Annotated[
+        int | None,
+        typer.Option(
+            min=5, help="Held-out motions of each class; 30 if left out, 10 with --quick."
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="One seed, one study; 1 if left out.")
+    ] = None,
+    effects: Annotated[
+        bool,
+        typer.Option(
+            "--effects/--no-effects",
+            help="Run everything again with what the model leaves out: torque ripple, friction "
+            "drift, elasticity, delay.",
+        ),
+    ] = True,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=256, help="Processes; one for each processor if left out."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the answer.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
+) -> None:
+    """Reproduce the paper: A (sines) against B (via points), on the simulated COMAU NS 16.
+
+    Both are designed, executed, and asked to predict motions they have never seen, of three
+    classes; then one thing after another is varied. Leaves `report.html` and `results.json` in
+    OUTPUT, with every archive they rest on. Ctrl-C at any time: the same command goes on there,
+    and does nothing whole again.
+
+    **Examples:**
+
+    - `hil study --quick --output runs/quick`: the whole way in minutes
+    - `hil study --output runs/study`: as the paper's, some 40 minutes on two free processors
+    - `hil study --campaign runs/a --campaign runs/b`: what two recorded campaigns tell
+    """
+    reporter = make_reporter(quiet=quiet or json)
+    count = workers or len(os.sched_getaffinity(0))
+    try:
+        with _ended_like_ctrl_c():
+            if campaign:
+                if quick or any(given is not None for given in (cell, repetitions, motions, seed)):
+                    raise InputError(
+                        campaign[0],
+                        "is recorded already: nothing is searched or run for it",
+                        field="--campaign",
+                        remedy="leave out --quick, --cell, --repetitions, --motions and --seed",
+                    )
+                found = study_campaigns(output, campaign, reporter, workers=count)
+            else:
+                settings = study_settings(
+                    quick=quick,
+                    repetitions=repetitions,
+                    motions=motions,
+                    seed=seed,
+                    effects=effects,
+                )
+                found = run_study(
+                    output,
+                    settings,
+                    reporter,
+                    workers=count,
+                    cell=None if cell is None else Cell.load(cell),
+                )
+    except KeyboardInterrupt:
+        raise OperatorStopError(
+            f"stopped; what is whole is kept in {output}: the same command goes on there"
+        ) from None
+    answer = answer_of(found)
+    typer.echo(json_format.dumps(answer, indent=1) if json else answer["line"])
+
+
+@contextmanager
+def _ended_like_ctrl_c() -> Iterator[None]:
+    """A terminal that is closed, or `kill`, ends the study's own processes with it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    endings = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is _DEFAULT]
+    for one in endings:  # nohup ignores the second on purpose
+        signal.signal(one, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for one in endings:
+            signal.signal(one, _DEFAULT)

@@ -1,0 +1,311 @@
+"""What changed from one campaign of an arm to another: pure, from estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.batch.axis_figures import friction_of, friction_weights
+from hil.batch.estimates import errors
+from hil.batch.payload_trend import PayloadTrend, freedom_of, payload_trend
+from hil.batch.trend import FALSE_ALARMS, LEAST_FRICTION
+from hil.batch.types import LevelEstimate
+from identification import RobotModel
+
+from .gather import Gathered
+from .spread import Difference, Known, difference, holm, known
+
+Array = NDArray[np.float64]
+
+CONFIDENCE: Final = 0.95
+"""Of intervals, each by itself."""
+OTHER_SPEED: Final = 1.2
+"""Ratio of typical speeds from which two campaigns count as having moved differently."""
+_SHARE: Final = FALSE_ALARMS / 2.0  # of comparisons, each for friction and for what it carries
+
+
+@dataclass(frozen=True, eq=False)
+class AxisChange:
+    """Friction of an axis in k campaigns, at one speed, mean of both directions.
+
+    Attributes:
+        joint: its name.
+        unit: of the friction.
+        speed: that it is compared at; NaN if it does not depend on speed.
+        speed_unit: of the speed.
+        known: of each campaign.
+        repetitions: friction by each single repetition, campaign by campaign.
+        differences: of each campaign against the first; the first's is None.
+        p_values: adjusted for all axes and campaigns (k,); NaN of the first.
+        changed: which campaigns differ from the first by more than chance and enough to matter.
+        smallest: change that would have been told (k,), as a share; NaN of the first.
+    """
+
+    joint: str
+    unit: str
+    speed: float
+    speed_unit: str
+    known: tuple[Known, ...]
+    repetitions: tuple[Array, ...]
+    differences: tuple[Difference | None, ...]
+    p_values: Array
+    changed: tuple[bool, ...]
+    smallest: Array
+
+    def relative(self, k: int) -> tuple[float, float, float]:
+        """Change of campaign k against the first as a share, and its 95 % interval."""
+        one, size = self.differences[k], abs(self.known[0].value)
+        assert one is not None
+        half = one.half(1.0 - CONFIDENCE)
+        return one.value / size, (one.value - half) / size, (one.value + half) / size
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterChange:
+    """One parameter in k campaigns; as :class:`AxisChange`."""
+
+    name: str
+    unit: str
+    is_friction: bool
+    known: tuple[Known, ...]
+    differences: tuple[Difference | None, ...]
+    p_values: Array
+
+    def differs(self, k: int) -> bool:
+        """Whether campaign k differs from the first by more than chance."""
+        return bool(self.p_values[k] < FALSE_ALARMS)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """How the model of one campaign predicts the validation motions of another.
+
+    Attributes:
+        overall: ||e|| / ||tau|| over all joints (k, k): of the model by row, motion by column; NaN
+            where a campaign has no validation motion.
+        joints: the same per joint (k, k, n).
+    """
+
+    overall: Array
+    joints: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What changed over k campaigns of one arm, the first being what others are compared with.
+
+    Attributes:
+        arm: its name.
+        joint_names: of the arm.
+        campaigns: as they were estimated.
+        dated: whether they are in order of time.
+        simulated: whether no robot moved.
+        axes: friction.
+        parameters: one by one.
+        payload: what the last link carries.
+        prediction: of each other's motions.
+        doubts: what a reader must know.
+    """
+
+    arm: str
+    joint_names: tuple[str, ...]
+    campaigns: tuple[LevelEstimate, ...]
+    dated: bool
+    simulated: bool
+    axes: tuple[AxisChange, ...]
+    parameters: tuple[ParameterChange, ...]
+    payload: PayloadTrend
+    prediction: Prediction
+    doubts: tuple[str, ...]
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything is told to have changed."""
+        return self.friction_changed or self.load_changed
+
+    @property
+    def friction_changed(self) -> bool:
+        """Whether friction of any axis is."""
+        return any(any(axis.changed) for axis in self.axes)
+
+    @property
+    def load_changed(self) -> bool:
+        """Whether what the arm carries, or its inertial parameters, are."""
+        return any(self.payload.changed) or any(self.payload.other)
+
+
+def compare_campaigns(gathered: Gathered) -> Comparison:
+    """Compare the campaigns of one arm with the first of them."""
+    model, campaigns = gathered.arm.cell.model, gathered.campaigns
+    broken = tuple(f"{one.path} could not be used: {one.reason}" for one in gathered.broken)
+    own = tuple(f"{_named(one)}: {doubt}" for one in campaigns for doubt in one.doubts)
+    return Comparison(
+        arm=gathered.arm.name,
+        joint_names=model.joint_names,
+        campaigns=campaigns,
+        dated=gathered.dated,
+        simulated=gathered.simulated,
+        axes=_axes(model, gathered),
+        parameters=_parameters(model, gathered),
+        payload=payload_trend(model, campaigns, _SHARE),
+        prediction=_prediction(campaigns, model.n_joints),
+        doubts=(*broken, *_few(gathered), *_other_motion(model, campaigns), *own),
+    )
+
+
+def _axes(model: RobotModel, gathered: Gathered) -> tuple[AxisChange, ...]:
+    campaigns, repetitions = gathered.campaigns, gathered.repetitions
+    speed = _typical_speed(model, campaigns)
+    weights = friction_weights(model, speed)
+    pooled = [friction_of(one.values, _covariance(one), weights) for one in campaigns]
+    single = [_per_repetition(own, weights) for own in repetitions]
+    rows = [
+        tuple(
+            known(
+                value[j], std[j] ** 2 if np.isfinite(std[j]) else np.inf, freedom_of(one), rep[:, j]
+            )
+            for one, (value, std), rep in zip(campaigns, pooled, single, strict=True)
+        )
+        for j in range(model.n_joints)
+    ]
+    apart = [_differences(row) for row in rows]
+    adjusted = holm(np.array([[np.nan if d is None else d.p_value for d in row] for row in apart]))
+    tests = int(np.isfinite(adjusted).sum())
+    found = []
+    for j, joint in enumerate(model.joint_names):
+        turns, size = bool(model.chain.revolute[j]), abs(rows[j][0].value)
+        least = LEAST_FRICTION * size
+        # What Holm's procedure asks of the first of all tests.
+        reach = np.array(
+            [np.nan if d is None else d.half(_SHARE / max(1, tests)) for d in apart[j]]
+        )
+        found.append(
+            AxisChange(
+                joint=joint,
+                unit="N·m" if turns else "N",
+                speed=float(speed[j]),
+                speed_unit="rad/s" if turns else "m/s",
+                known=rows[j],
+                repetitions=tuple(rep[:, j] for rep in single),
+                differences=apart[j],
+                p_values=adjusted[j],
+                changed=tuple(
+                    d is not None and bool(p < _SHARE and abs(d.value) >= least)
+                    for d, p in zip(apart[j], adjusted[j], strict=True)
+                ),
+                smallest=np.maximum(reach, least) / (size or np.nan),
+            )
+        )
+    return tuple(found)
+
+
+def _parameters(model: RobotModel, gathered: Gathered) -> tuple[ParameterChange, ...]:
+    campaigns = gathered.campaigns
+    single = [np.array([one.values for one in own]) for own in gathered.repetitions]
+    unknown = [np.array([~np.isfinite(one.std) for one in own]) for own in gathered.repetitions]
+    single = [np.where(lost, np.nan, values) for values, lost in zip(single, unknown, strict=True)]
+    rows = [
+        tuple(
+            known(float(one.values[k]), float(one.std[k]) ** 2, freedom_of(one), own[:, k])
+            for one, own in zip(campaigns, single, strict=True)
+        )
+        for k in range(model.n_parameters)
+    ]
+    apart = [_differences(row) for row in rows]
+    adjusted = holm(np.array([[np.nan if d is None else d.p_value for d in row] for row in apart]))
+    return tuple(
+        ParameterChange(
+            name=model.parameter_names[k],
+            unit=model.units[k],
+            is_friction=k >= model.base.rank,
+            known=rows[k],
+            differences=apart[k],
+            p_values=adjusted[k],
+        )
+        for k in range(model.n_parameters)
+    )
+
+
+def _differences(row: Sequence[Known]) -> tuple[Difference | None, ...]:
+    return (None, *(difference(row[0], one) for one in row[1:]))
+
+
+def _per_repetition(own: Sequence[LevelEstimate], weights: Array) -> Array:
+    """Friction of each axis by each repetition (m, n)."""
+    return np.array(
+        [friction_of(one.values, np.diag(one.std**2), weights)[0] for one in own]
+    ).reshape(len(own), len(weights))
+
+
+def _covariance(level: LevelEstimate) -> Array:
+    return np.diag(level.std**2) if level.covariance is None else level.covariance
+
+
+def _typical_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Array:
+    """One speed for each axis (n,), the median of what the campaigns had; NaN if none has one."""
+    speeds = np.array([one.speed_rms for one in campaigns if one.speed_rms is not None])
+    found = np.full(model.n_joints, np.nan)
+    for j in range(model.n_joints):
+        own = speeds[:, j][np.isfinite(speeds[:, j])] if len(speeds) else speeds
+        if len(own):
+            found[j] = np.median(own)
+    return found
+
+
+def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction:
+    count = len(campaigns)
+    overall = np.full((count, count), np.nan)
+    joints = np.full((count, count, n_joints), np.nan)
+    for column, motion in enumerate(campaigns):
+        if motion.unseen is None:
+            continue
+        rows = motion.unseen.samples
+        for row, one in enumerate(campaigns):
+            if not np.isfinite(one.std).all():
+                continue  # what it cannot know may be needed there
+            left, torque = errors(motion.unseen, one.values)
+            joints[row, column] = left / np.where(torque > 0.0, torque, np.nan)
+            overall[row, column] = np.sqrt(
+                np.nansum(rows * left**2) / max(float(np.nansum(rows * torque**2)), 1e-300)
+            )
+    return Prediction(overall, joints)
+
+
+def _few(gathered: Gathered) -> list[str]:
+    """Where single repetitions cannot say what repetitions differ by."""
+    single = [
+        _named(one)
+        for one, own in zip(gathered.campaigns, gathered.repetitions, strict=True)
+        if len(own) < 2
+    ]
+    if not single:
+        return []
+    return [
+        f"{', '.join(single)}: one repetition, so what repetitions differ by is not known, and "
+        "only noise is allowed for"
+    ]
+
+
+def _other_motion(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> list[str]:
+    first = campaigns[0].speed_rms
+    found = []
+    for one in campaigns[1:]:
+        if first is None or one.speed_rms is None:
+            continue
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = np.exp(np.abs(np.log(one.speed_rms / first)))
+        fast = [name for name, r in zip(model.joint_names, ratio, strict=True) if r > OTHER_SPEED]
+        if fast:
+            found.append(
+                f"{_named(one)} moved differently from {_named(campaigns[0])} (typical speed of "
+                f"{', '.join(fast)}): what the model leaves out can then look like a change"
+            )
+    return found
+
+
+def _named(level: LevelEstimate) -> str:
+    return level.campaign.rstrip("/").rsplit("/", 1)[-1]

@@ -1,0 +1,144 @@
+"""Campaigns to compare, from their archives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hil.archive import open_archive
+from hil.batch import run
+from hil.batch.factors import local_file
+from hil.batch.types import Arm, BatchResult, Broken, LevelEstimate
+from hil.batch.workers import Workers
+from hil.errors import InputError
+from hil.progress import Reporter
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Campaigns of one arm.
+
+    Attributes:
+        arm: whose they are.
+        campaigns: in order of time; in the order given where not all have one.
+        repetitions: of each campaign, in order.
+        dated: whether the order is that of time.
+        broken: what could not be used.
+        simulated: whether no robot moved.
+    """
+
+    arm: Arm
+    campaigns: tuple[LevelEstimate, ...]
+    repetitions: tuple[tuple[LevelEstimate, ...], ...]
+    dated: bool
+    broken: tuple[Broken, ...]
+    simulated: bool = False
+
+
+def gather(
+    places: Sequence[str], workers: Workers, reporter: Reporter, plan: run.Plan | None = None
+) -> Gathered:
+    """Identify the campaigns below some places, and check that they can be compared.
+
+    Args:
+        places: campaign folders, or folders with campaigns below; the `results.json` of a campaign
+            stands for its folder.
+        workers: read the archives.
+        reporter: told of the progress.
+        plan: how to identify.
+
+    Raises:
+        InputError: there is one campaign only, or campaigns are of different arms.
+    """
+    roots = [_folder(place) for place in places]
+    result = run.reidentify(roots, plan or run.Plan(), workers, reporter)
+    _require_one_arm(result)
+    campaigns = list(result.campaigns)
+    if len(campaigns) < 2:
+        broken = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
+        only = campaigns[0].campaign if campaigns else None
+        raise InputError(
+            only,
+            f"is the only campaign that can be estimated{broken}",
+            remedy="name two campaigns or more of one arm",
+        )
+    dated = all(one.when for one in campaigns)
+    campaigns.sort(key=_in_order(roots))
+    if dated:
+        campaigns.sort(key=lambda one: one.when)
+    return Gathered(
+        arm=result.arms[campaigns[0].arm],
+        campaigns=tuple(campaigns),
+        repetitions=tuple(
+            tuple(
+                rep
+                for rep in result.repetitions
+                if (rep.campaign, rep.setup) == (one.campaign, one.setup)
+            )
+            for one in campaigns
+        ),
+        dated=dated,
+        broken=result.broken,
+        simulated=_simulated(result.repetitions[0]),
+    )
+
+
+def _simulated(repetition: LevelEstimate) -> bool:
+    """Of one archive: simulations and recordings are never of one arm."""
+    with local_file(repetition.archive) as path:
+        return open_archive(path, fields=()).metadata.get("simulated") == "yes"
+
+
+def _folder(place: str) -> str:
+    if "://" in place or Path(place).name != "results.json":
+        return place
+    return str(Path(place).parent)
+
+
+def _in_order(roots: Sequence[str]) -> Callable[[LevelEstimate], tuple[int, str]]:
+    """Sorts campaigns as their places were named."""
+    absolute = [root if "://" in root else Path(root).resolve().as_posix() for root in roots]
+
+    def key(one: LevelEstimate) -> tuple[int, str]:
+        own = one.campaign if "://" in one.campaign else Path(one.campaign).resolve().as_posix()
+        found = [k for k, root in enumerate(absolute) if f"{own}/".startswith(f"{root}/")]
+        return (found[0] if found else len(absolute), own)
+
+    return key
+
+
+def _require_one_arm(result: BatchResult) -> None:
+    """Friction and mass of another arm are another arm's.
+
+    Raises:
+        InputError: names two campaigns and what their arms differ in.
+    """
+    first = result.campaigns[0] if result.campaigns else None
+    for one in result.campaigns:
+        if first is not None and one.arm != first.arm:
+            here, there = result.arms[one.arm], result.arms[first.arm]
+            raise InputError(
+                one.campaign,
+                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): "
+                f"{_apart(here, there)}",
+                remedy="compare campaigns of one arm",
+            )
+
+
+def _apart(one: Arm, other: Arm) -> str:
+    """What two arms differ in, in words."""
+    here, there = one.cell.file, other.cell.file
+    robots = (table.robot.model_dump(exclude={"payload"}) for table in (here, there))
+    differ = [
+        words
+        for words, apart in (
+            ("robot.urdf", one.cell.urdf != other.cell.urdf),
+            ("[robot]", next(robots) != next(robots)),
+            ("[drive_train]", here.drive_train != there.drive_train),
+        )
+        if apart
+    ]
+    if not differ:
+        return "one of them is a simulation, or their controllers state other drives"
+    return f"they differ in {' and '.join(differ)}"

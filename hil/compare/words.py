@@ -1,0 +1,170 @@
+"""What a comparison means, in plain words: the first thing a reader sees."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from hil.batch.chart import FEWEST
+from hil.batch.trend import ArmTrend
+from hil.batch.trend_words import campaign_name, payload_findings
+
+from .comparison import AxisChange, Comparison
+
+_PREDICTS_WORSE: Final = 1.1
+"""Ratio of prediction errors from which a model is said to predict worse."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """One thing to know.
+
+    Attributes:
+        level: "changed", or "same" for what did not, or could not be told.
+        words: a sentence.
+        next_step: what to do about it; "" for nothing.
+    """
+
+    level: Literal["changed", "same"]
+    words: str
+    next_step: str = ""
+
+
+def names(found: Comparison) -> list[str]:
+    """What each campaign is called: the last part of its folder, and its day."""
+    arm = _as_history(found)
+    return [campaign_name(arm, k) for k in range(len(found.campaigns))]
+
+
+def verdict(found: Comparison) -> str:
+    """One line."""
+    axes = [axis.joint for axis in found.axes if any(axis.changed)]
+    parts = []
+    if axes:
+        parts.append(f"friction of {_listed(axes)}")
+    if any(found.payload.changed):
+        parts.append("what the arm carries")
+    if any(found.payload.other):
+        parts.append("inertial parameters")
+    if not parts:
+        return "No change can be told"
+    return f"Changed: {_listed(parts)}"
+
+
+def told(found: Comparison) -> list[Told]:
+    """Everything in sentences, what changed first; never empty."""
+    called = names(found)
+    every = [
+        Told("changed", _axis_words(axis, k, called), _axis_step(axis, k))
+        for axis in found.axes
+        for k in range(1, len(called))
+        if axis.changed[k]
+    ]
+    for finding in payload_findings(_as_history(found)):
+        level: Literal["changed", "same"] = "same" if finding.level == "quiet" else "changed"
+        every.append(Told(level, finding.words, finding.next_step))
+    every += _unchanged(found)
+    every += _predictions(found, called)
+    every.sort(key=lambda one: one.level)  # stable: "changed" comes first
+    return every
+
+
+def caveat(found: Comparison) -> str:
+    """What few campaigns cannot show."""
+    count = len(found.campaigns)
+    text = (
+        f"{count} campaigns do not show how much this arm differs from day to day without "
+        "anything having happened to it: a cold arm has tens of per cent more friction. Compare "
+        "campaigns of an arm that was equally warm."
+    )
+    if count > FEWEST:
+        text += " `hil reidentify` on the same folders judges each by the scatter of those before."
+    return text
+
+
+def _axis_words(axis: AxisChange, k: int, called: list[str]) -> str:
+    change, low, high = axis.relative(k)
+    at = f" at {axis.speed:.2g} {axis.speed_unit}" if math.isfinite(axis.speed) else ""
+    return (
+        f"{axis.joint}: friction{at} is {100.0 * abs(change):.0f} % "
+        f"{'higher' if change > 0.0 else 'lower'} in {called[k]} than in {called[0]}, "
+        f"{axis.known[k].value:.3g} against {axis.known[0].value:.3g} {axis.unit} "
+        f"(95 %: {100.0 * low:+.1f} to {100.0 * high:+.1f} %)."
+    )
+
+
+def _axis_step(axis: AxisChange, k: int) -> str:
+    if axis.relative(k)[0] > 0.0:
+        return "Check this axis' gear, brake and lubrication; was it colder?"
+    return "Was it warmer, or has gear or lubricant been changed?"
+
+
+def _unchanged(found: Comparison) -> list[Told]:
+    same = [axis for axis in found.axes if not any(axis.changed)]
+    judged = [axis for axis in same if np.isfinite(axis.p_values).any()]
+    silent = [axis.joint for axis in same if not np.isfinite(axis.p_values).any()]
+    sentences = []
+    if judged:
+        worst = max(judged, key=lambda axis: float(np.nanmax(axis.smallest)))
+        axes = _listed([axis.joint for axis in judged])
+        sentences.append(
+            Told(
+                "same",
+                f"Friction of {axes} has not changed, as far as can be told; a change by "
+                f"{100.0 * float(np.nanmax(worst.smallest)):.0f} % would have been told of each"
+                + (f" (least well known: {worst.joint})." if len(judged) > 1 else "."),
+            )
+        )
+    if silent:
+        sentences.append(Told("same", f"Friction of {_listed(silent)} is not determined."))
+    if found.payload.untested:
+        words = f"Whether it carries the same was not tested: {found.payload.untested}."
+        sentences.append(Told("same", words))
+    elif not found.load_changed:
+        sentences.append(Told("same", "What it carries has not changed, as far as can be told."))
+    return sentences
+
+
+def _predictions(found: Comparison, called: list[str]) -> list[Told]:
+    """How the first model does on the motions of the others, beside their own models."""
+    sentences = []
+    for k in range(1, len(called)):
+        own, first = found.prediction.overall[k, k], found.prediction.overall[0, k]
+        if not (np.isfinite(own) and np.isfinite(first) and own > 0.0):
+            continue
+        ratio = first / own
+        how = (
+            f"with {ratio:.2g} times the error of that campaign's own model"
+            if ratio > _PREDICTS_WORSE
+            else "as well as that campaign's own model"
+        )
+        sentences.append(
+            Told(
+                "same",
+                f"The model of {called[0]} predicts the validation motions of {called[k]} "
+                f"{how}: {100.0 * first:.2g} % against {100.0 * own:.2g} % of the torque.",
+            )
+        )
+    return sentences
+
+
+def _as_history(found: Comparison) -> ArmTrend:
+    """The campaigns as sentences on payloads want them."""
+    return ArmTrend(
+        name=found.arm,
+        campaigns=tuple(one.campaign for one in found.campaigns),
+        when=tuple(one.when for one in found.campaigns),
+        time=np.arange(float(len(found.campaigns))),
+        dated=found.dated,
+        axes=(),
+        parameters=(),
+        payload=found.payload,
+        setups=tuple(one.setup for one in found.campaigns),
+    )
+
+
+def _listed(words: list[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

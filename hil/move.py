@@ -1,0 +1,224 @@
+"""One straight way to a posture: planned from where the arm stands, checked, sent, archived."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.events import MotionEnded
+from hil.archive import ArchiveSpec
+from hil.campaign.errors import MotionRefusedError
+from hil.campaign.motion_link import MotionLink
+from hil.campaign.motion_watch import MotionWatch, unwatched_motion
+from hil.campaign.plan import moves_to_dict
+from hil.campaign.stop import Stop
+from hil.cell import AngleFrame, Cell
+from hil.errors import InputError
+from hil.motion_checks import MotionChecks
+from hil.recording import kind_entry, origin_of
+from planner import Move, PiecewiseCubic, PlanFile, TrajectoryPlayer, in_child, plan_moves
+from planner.errors import PlannerError
+
+Array = NDArray[np.float64]
+
+THERE = 1e-4
+"""rad; an arm that is so near to a posture is there."""
+START_TOLERANCE = 1e-3
+"""rad by which the arm may have moved between the planning of the way and its beginning."""
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A way that passed every check.
+
+    Attributes:
+        start: (n,) rad, where the arm stood when it was planned.
+        target: (n,) rad.
+        trajectory: the motion.
+        moves: what it was planned from.
+        speed: fraction of the joints' speeds.
+        not_checked: what the check of contacts leaves out, in words; "" for nothing.
+    """
+
+    start: Array
+    target: Array
+    trajectory: PiecewiseCubic
+    moves: PlanFile
+    speed: float
+    not_checked: str = ""
+
+    @property
+    def duration(self) -> float:
+        """How long it takes at full speed [s]."""
+        return self.trajectory.duration
+
+
+def posture(cell: Cell, text: str, excitation_start: Array | None = None) -> Array:
+    """The posture (n,) [rad, URDF angles] that a word or a list of degrees names.
+
+    Args:
+        cell: whose arm.
+        text: "home"; "start": where the excitation begins, home without one; or degrees in the
+            frame of the cell's [limits], apart by commas or blanks.
+        excitation_start: (n,) rad, of a campaign.
+
+    Raises:
+        InputError: it names no posture.
+    """
+    if text == "home" or (text == "start" and excitation_start is None):
+        return cell.home
+    if text == "start" and excitation_start is not None:
+        return excitation_start
+    parts = text.replace(",", " ").split()
+    try:
+        degrees = np.array([float(part) for part in parts])
+    except ValueError:
+        degrees = np.array([])
+    n = len(cell.joint_names)
+    if len(degrees) != n or not np.isfinite(degrees).all():
+        raise InputError(
+            None,
+            f"{text!r} is no posture",
+            field="--to",
+            remedy=f"give start, home, or {n} angles in degrees apart by commas",
+        )
+    return AngleFrame.of(cell).urdf(degrees)
+
+
+def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
+    """`start` (n,) [rad] with one joint further by `degrees` of the frame of [limits].
+
+    Args:
+        cell: whose arm.
+        start: where it stands.
+        joint: its name, or its number from 1.
+        degrees: how far.
+
+    Raises:
+        InputError: there is no such joint.
+    """
+    names = cell.joint_names
+    numbers = {str(number): index for index, number in enumerate(range(1, len(names) + 1))}
+    index = numbers.get(joint, names.index(joint) if joint in names else None)
+    if index is None:
+        raise InputError(
+            None,
+            f"{joint!r} is no joint",
+            field="--joint",
+            remedy=f"name one of {', '.join(names)}",
+        )
+    target = start.copy()
+    target[index] += np.radians(degrees) * AngleFrame.of(cell).sign[index]
+    return target
+
+
+def straight_way(
+    cell: Cell,
+    start: Array,
+    target: Array,
+    *,
+    speed: float | None = None,
+    checks: MotionChecks | None = None,
+) -> Way:
+    """Plan the straight way in joint space between two postures, and check it.
+
+    Args:
+        cell: limits, workspace and nominal model.
+        start: (n,) rad.
+        target: (n,) rad.
+        speed: fraction of the joints' speeds; the cell's `approach_speed` if left out.
+        checks: those of the cell, where they are at hand.
+
+    Raises:
+        MotionRefusedError: it breaks a limit, touches something or needs too much current.
+    """
+    checks = checks or MotionChecks.of(cell)
+    speed = cell.campaign.approach_speed if speed is None else speed
+    outside = _outside(cell, target)
+    if outside is not None:
+        raise MotionRefusedError("the way", outside, "name a posture within [limits]")
+    try:
+        motion = in_child(plan_moves, start, (Move(target, speed=speed),), cell.joint_limits)
+    except PlannerError as error:
+        raise MotionRefusedError("the way", str(error), "jog the arm to within [limits]") from error
+    problem = checks.refusal(motion.trajectory)
+    if problem is not None:
+        raise MotionRefusedError("the way", problem, "go by way of another posture, or jog the arm")
+    moves = PlanFile.of(motion, cell.joint_names)
+    return Way(start, target, motion.trajectory, moves, speed, checks.not_checked or "")
+
+
+def send(
+    way: Way,
+    cell: Cell,
+    link: MotionLink,
+    path: Path,
+    *,
+    stop: Stop,
+    watch: MotionWatch = unwatched_motion,
+    durable: bool = True,
+) -> MotionEnded:
+    """Run a way on a connected link and archive every cycle of it.
+
+    Args:
+        way: what passed its checks.
+        cell: travels in the archive.
+        link: connected.
+        path: of the archive, which must not exist.
+        stop: brings the arm to rest on the way.
+        watch: sees the motion, and may slow and hold it.
+        durable: wait at each flush until the disk has the data.
+
+    Raises:
+        ControllerFault: it was not accepted (nothing moved), or the link broke.
+        ArchiveWriteError: the archive cannot be written; the arm was stopped.
+    """
+    bounds = cell.file.bounds
+    player = TrajectoryPlayer(
+        way.trajectory,
+        cell.period,
+        cell.joint_limits,
+        override_acceleration=bounds.override.acceleration,
+        override_jerk=bounds.override.jerk,
+        stop_acceleration=bounds.stop.acceleration,
+        stop_jerk=bounds.stop.jerk,
+        start_tolerance=START_TOLERANCE,
+    )
+    spec = ArchiveSpec(
+        path,
+        joint_names=cell.joint_names,
+        period=cell.period,
+        metadata={
+            "cell": cell.name,
+            **kind_entry(path, "move"),
+            **origin_of(cell, only_simulated=link.only_simulated),
+        },
+        attachments={
+            "cell.toml": cell.text.encode(),
+            "robot.urdf": cell.urdf.encode(),
+            "drive_train.json": cell.drive_table.model_dump_json().encode(),
+            "plan.json": json.dumps(
+                {"trajectory": way.trajectory.to_dict(), **moves_to_dict(way.moves)}
+            ).encode(),
+        },
+        durable=durable,
+    )
+    return link.run(player, spec, stop, watch=watch)
+
+
+def _outside(cell: Cell, target: Array) -> str | None:
+    """Which joint of a posture is beyond its limits, in words."""
+    limits, frame = cell.joint_limits, AngleFrame.of(cell)
+    beyond = np.flatnonzero((target < limits.lower) | (target > limits.upper))
+    if not len(beyond):
+        return None
+    joint = int(beyond[0])
+    ends = np.sort([frame.shown(limits.lower)[joint], frame.shown(limits.upper)[joint]])
+    return (
+        f"{cell.joint_names[joint]} would go to {frame.shown(target)[joint]:.6g}°, its limits are "
+        f"{ends[0]:.6g}° and {ends[1]:.6g}° ({frame.whose})"
+    )

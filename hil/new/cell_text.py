@@ -1,0 +1,244 @@
+"""The text of a new cell file: what is known is written, what is not is `"?"`."""
+
+from __future__ import annotations
+
+import os
+import re
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from drivers.drive_train import WRIST_AXES
+from hil.cell.unknown import UNKNOWN, WHERE
+from hil.cell.urdf import urdf_limits
+from hil.errors import InputError
+from identification.errors import ModelError
+from identification.kinematics import Chain, chain_from_urdf
+from planner.toml_value import toml_key, toml_value
+
+from .fixing import with_fixed
+from .known import Known, from_urdf
+
+_ONE_FOR_ALL: Final = frozenset(
+    (
+        "cell.urdf", "controller.host", "controller.cycle_ms", "workspace.floor", "workspace.walls",
+        "drive_train.k54", "drive_train.k64", "drive_train.k65",
+        "drive_train.encoder_counts_per_revolution",
+    )
+)  # fmt: skip
+"""Fields without a list that nobody may have said anything of."""
+_ASSUMED: Final = ("nominal.uncertainty", "controller.current_delay_cycles")
+"""What is written though nobody said so."""
+_MESH: Final = re.compile(r"""filename\s*=\s*["'](package://[^"']+)["']""")
+_COLLISION: Final = re.compile(r"<collision\b.*?</collision>", re.DOTALL)
+_ROUND: Final = 3
+
+
+@dataclass(frozen=True)
+class NewCell:
+    """A cell that is to be written.
+
+    Attributes:
+        name: of the cell.
+        joint_names: those that move, in the order of all lists.
+        urdf: its text, None where the file that was named is used as it is.
+        urdf_path: of the URDF that was read.
+        collision: the collision shapes' mesh paths; None where the URDF has no shapes at all.
+        known: what is known of it.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    urdf: str | None
+    urdf_path: Path
+    collision: tuple[str, ...] | None
+    known: Known
+
+    def text(self, path: Path) -> tuple[str, tuple[str, ...]]:
+        """The cell file as it would stand at `path`, and the fields that are unknown in it."""
+        return _Writing(self, path.resolve()).written()
+
+    def with_known(self, known: Known) -> NewCell:
+        """The same arm, with other things known of it."""
+        return replace(self, known=known)
+
+    @staticmethod
+    def urdf_beside(path: Path) -> Path:
+        """Where the URDF is written, if it has to be: beside the cell file."""
+        return path.with_suffix(".urdf")
+
+
+def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
+    """What a URDF alone says of a cell.
+
+    Joints that slide cannot be moved by this software: they are fixed at zero (the nearest
+    position in their range), and a note says so.
+
+    Args:
+        path: of the URDF.
+        fixed: positions [rad or m] of joints that are to be fixed, by name.
+
+    Raises:
+        InputError: it cannot be read, or is no URDF of an open chain.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise InputError(path, f"cannot be read ({why})", remedy="name a URDF") from error
+    chain = _chain(path, text)
+    unknown = sorted(set(fixed) - set(chain.joint_names))
+    if unknown:
+        raise InputError(
+            path,
+            f"has no moving joint {unknown[0]}",
+            remedy=f"it has {', '.join(chain.joint_names)}",
+        )
+    sliding = [
+        name
+        for name, turns in zip(chain.joint_names, chain.revolute, strict=True)
+        if not turns and name not in fixed
+    ]
+    positions = {**_nearest_to_zero(text, sliding), **fixed}
+    notes = tuple(
+        f"{name} slides, and is fixed at {positions[name]:g} m in the cell's copy of the URDF; "
+        f"--fix {name}=… for another position"
+        for name in sliding
+    )
+    used = with_fixed(text, positions) if positions else text
+    moving = _chain(path, used).joint_names
+    shapes = _COLLISION.findall(text)
+    meshes = sorted({mesh for shape in shapes for mesh in _MESH.findall(shape)})
+    if not shapes:
+        notes += (
+            "the URDF has no <collision> shapes: add some (boxes, cylinders and spheres will do) "
+            "before the arm is moved",
+        )
+    return NewCell(
+        name=_robot_name(used) or path.stem,
+        joint_names=moving,
+        urdf=used if positions else None,
+        urdf_path=path,
+        collision=tuple(meshes) if shapes else None,
+        known=from_urdf(used, moving) | Known(notes=notes),
+    )
+
+
+def _chain(path: Path, urdf: str) -> Chain:
+    try:
+        return chain_from_urdf(urdf)
+    except ModelError as error:
+        raise InputError(path, str(error), remedy="correct the URDF") from error
+
+
+def _nearest_to_zero(urdf: str, names: list[str]) -> dict[str, float]:
+    limits = urdf_limits(urdf, names) if names else None
+    return {
+        name: float(min(max(0.0, limits.lower[k]), limits.upper[k]))
+        for k, name in enumerate(names)
+        if limits is not None
+    }
+
+
+def _robot_name(urdf: str) -> str:
+    found = re.search(r"<robot\b[^>]*\bname\s*=\s*[\"']([^\"']*)[\"']", urdf)
+    return found[1].strip()[:80] if found else ""
+
+
+class _Writing:
+    """Fills the template for one place of the file."""
+
+    def __init__(self, new: NewCell, path: Path) -> None:
+        self._new, self._folder, self._path = new, path.parent, path
+        self._values, self._origin = dict(new.known.values), new.known.origin
+        self._written: set[str] = set()
+        self._unknown: list[str] = []
+
+    def written(self) -> tuple[str, tuple[str, ...]]:
+        new = self._new
+        tables = {name.partition(".")[0] for name in self._values}
+        own = {"cell", "robot", "limits", "campaign", "workspace", "nominal", "drive_train"}
+        urdf = new.urdf_beside(self._path) if new.urdf is not None else new.urdf_path.resolve()
+        environment = Environment(
+            loader=PackageLoader("hil.new", "."),
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+            autoescape=False,  # a TOML file
+            keep_trailing_newline=True,
+        )
+        text = environment.get_template("cell.toml.j2").render(
+            name=new.name,
+            sources=self._sources(),
+            joints=", ".join(f"{k} {name}" for k, name in enumerate(new.joint_names, 1)),
+            urdf=os.path.relpath(urdf, self._folder),
+            mesh_folders=self._mesh_folders(),
+            assumed=[name for name in _ASSUMED if name not in self._values],
+            suggested=self._suggested(),
+            wrist=UNKNOWN if len(new.joint_names) >= WRIST_AXES else 0.0,
+            others=sorted(tables - own - {"controller"}),
+            line=self._line,
+            rest=self._rest,
+        )
+        return text.rstrip("\n") + "\n", tuple(self._unknown)
+
+    def _sources(self) -> str:
+        origins = list(dict.fromkeys(self._origin.values()))
+        return f"Its figures are {', '.join(origins)}." if origins else ""
+
+    def _line(self, name: str, default: Any = None) -> str:
+        """One field: what is known, else the default, else `"?"`."""
+        self._written.add(name)
+        key = name.partition(".")[2]
+        value = self._values.get(name, default)
+        if value is None:
+            alone = name in _ONE_FOR_ALL
+            value = UNKNOWN if alone else [UNKNOWN] * len(self._new.joint_names)
+        if value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
+            self._unknown.append(name)
+            where = textwrap.fill(
+                WHERE.get(name, ""), 96, initial_indent="# -> ", subsequent_indent="#    "
+            )
+            key = f"{where}\n{key}" if where else key
+        origin = f"  # {self._origin[name]}" if name in self._origin else ""
+        return f"{key} = {toml_value(value)}{origin}"
+
+    def _rest(self, table: str) -> str:
+        """Fields of a table that were said somewhere and have no line of their own."""
+        names = [
+            name
+            for name in self._values
+            if name.startswith(f"{table}.") and name not in self._written
+        ]
+        lines = "\n".join(
+            f"{toml_key(name.partition('.')[2])} = {toml_value(self._values[name])}"
+            for name in names
+        )
+        return f"{lines}\n" if lines else ""
+
+    def _mesh_folders(self) -> list[str] | str | None:
+        """Folders in which the paths of collision meshes begin; None where none is needed."""
+        if not self._new.collision:
+            return None
+        places = [*self._new.urdf_path.resolve().parents]
+        folders: dict[str, None] = {}
+        for mesh in self._new.collision:
+            relative = mesh.removeprefix("package://")
+            found = next((place for place in places if (place / relative).is_file()), None)
+            if found is None:
+                return [UNKNOWN]
+            folders[os.path.relpath(found, self._folder)] = None
+        return list(folders)
+
+    def _suggested(self) -> list[str] | None:
+        """Lines of acceleration and jerk to begin with, where every speed is known."""
+        speeds = self._values.get("limits.velocity_deg", [UNKNOWN])
+        if "limits.jerk_deg" in self._values or UNKNOWN in speeds:
+            return None
+        acceleration = [round(speed / 0.3, _ROUND) for speed in speeds]
+        jerk = [round(speed / 0.03, _ROUND) for speed in speeds]
+        return [f"acceleration_deg = {toml_value(acceleration)}", f"jerk_deg = {toml_value(jerk)}"]

@@ -1,0 +1,181 @@
+"""What is known of a cell before anybody has filled in anything, and who says so."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from os import PathLike
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drivers.drive_train import WRIST_AXES
+from drivers.packets import InitPacket
+from hil.archive import open_archive
+from hil.cell.unknown import UNKNOWN
+from hil.cell.urdf import urdf_limits
+from hil.errors import ArchiveError
+
+_DECIMALS: Final = 3
+"""Of degrees: rounding stays below what a cell may exceed its URDF's limits by."""
+_CYCLES: Final = (1, 2)
+
+
+@dataclass(frozen=True)
+class Known:
+    """Figures of a cell file by dotted field, and the words that say where they come from.
+
+    Attributes:
+        values: numbers, lists with an entry per joint (`"?"` where one is not known), words.
+        origin: of each of these fields, such as "from the URDF".
+        notes: what a person should be told.
+    """
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    origin: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def said_by(cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()) -> Known:
+        """Figures that all have one origin; a field of which nothing is known is left out."""
+        known = {name: value for name, value in values.items() if not _empty(value)}
+        return cls(known, dict.fromkeys(known, origin), tuple(notes))
+
+    def without(self, table: str) -> Known:
+        """The same without the figures of one table."""
+        kept = {k: v for k, v in self.values.items() if not k.startswith(f"{table}.")}
+        return replace(self, values=kept, origin={k: self.origin[k] for k in kept})
+
+    def __or__(self, other: Known) -> Known:
+        """Both; where they differ, `other` counts."""
+        return Known(
+            {**self.values, **other.values},
+            {**self.origin, **other.origin},
+            (*self.notes, *other.notes),
+        )
+
+
+def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
+    """Limits that a URDF states; angles in degrees, in its own frame.
+
+    A joint without a stated range or speed gets `"?"` there. Torques are taken only if every joint
+    has one: a list of torque limits has no gaps.
+    """
+    limits = urdf_limits(urdf, joint_names)
+    nowhere = limits.lower >= limits.upper
+    lower = np.where(nowhere, -math.inf, limits.lower)
+    upper = np.where(nowhere, math.inf, limits.upper)
+    efforts = limits.effort.tolist()
+    values: dict[str, Any] = {
+        "limits.frame": "urdf",
+        "limits.lower_deg": _degrees(lower),
+        "limits.upper_deg": _degrees(upper),
+        "limits.velocity_deg": _degrees(limits.velocity),
+    }
+    if all(0.0 < effort < math.inf for effort in efforts):
+        values["limits.torque"] = efforts
+    return Known.said_by("from the URDF", values)
+
+
+def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
+    """What a controller's init packet says of the first `n_joints` axes of an arm (from 1).
+
+    What is no number, or 0 where it cannot be, is left unknown.
+    """
+    row, n = arm - 1, n_joints
+    wrist = dict(zip(("k54", "k64", "k65"), init.wrist_coupling(arm), strict=True))
+    values: dict[str, Any] = {
+        "drive_train.gear_ratio": _wire(init.gear_ratio[row, :n], zero=False),
+        "drive_train.calibration": _wire(init.calibration[row, :n]),
+        "drive_train.current_limit": _wire(init.current_limit[row, :n], positive=True),
+        "drive_train.following_error": _wire(init.following_error[row, :n], positive=True),
+        **{f"drive_train.{k}": _wire([v])[0] for k, v in wrist.items() if n >= WRIST_AXES},
+        "controller.arm": arm,
+    }
+    notes = []
+    if init.sample_time in _CYCLES:
+        values["controller.cycle_ms"] = init.sample_time
+    else:
+        notes.append(
+            f"the controller's cycle is {init.sample_time} ms; this software knows 1 and 2"
+        )
+    opened = {axis.axis for axis in init.open_axes() if axis.arm == arm}
+    missing = [str(axis + 1) for axis in range(n) if axis not in opened]
+    if missing:
+        notes.append(
+            f"axes {', '.join(missing)} of arm {arm} are not open in the controller; a campaign "
+            "needs all of the arm's"
+        )
+    version = ".".join(map(str, init.version))
+    return Known.said_by(f"from the init packet (C4G {version})", values, notes)
+
+
+def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known:
+    """What an archive's own cell and init packet say.
+
+    Raises:
+        ArchiveError: it cannot be read, is of another arm, or carries neither.
+    """
+    archive = open_archive(path, fields=())
+    if archive.joint_names != tuple(joint_names):
+        raise ArchiveError(
+            archive.path,
+            f"is of an arm with the joints {', '.join(archive.joint_names)}",
+            remedy=f"those of the URDF are {', '.join(joint_names)}",
+        )
+    known = Known()
+    text = archive.attachments.get("cell.toml")
+    if text is not None:
+        values = _flat(tomllib.loads(text.decode("utf-8")))
+        for name in ("cell.urdf", "cell.mesh_folders"):  # of the computer it was recorded on
+            values.pop(name, None)
+        known = Known.said_by(f"from {archive.path.name}", values)
+    packet = archive.attachments.get("init_packet.bin")
+    if packet is not None:
+        arm = known.values.get("controller.arm", 1)
+        known |= from_init(InitPacket.decode(packet), len(joint_names), arm)
+    if not known.values:
+        raise ArchiveError(
+            archive.path,
+            "carries neither a cell nor an init packet",
+            remedy="name one that hil recorded",
+        )
+    if archive.metadata.get("simulated") == "yes":
+        note = f"{archive.path.name} was recorded from a simulated controller"
+        known |= Known(notes=(note,))
+    return known
+
+
+def _flat(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """`{"table": {"key": value}}` as `{"table.key": value}`; tables within tables stay."""
+    return {
+        f"{table}.{key}": value
+        for table, entries in tables.items()
+        for key, value in entries.items()
+    }
+
+
+def _degrees(radians: ArrayLike) -> list[float | str]:
+    return [
+        round(float(value), _DECIMALS) + 0.0 if math.isfinite(value) else UNKNOWN
+        for value in np.degrees(radians)
+    ]
+
+
+def _wire(values: ArrayLike, *, zero: bool = True, positive: bool = False) -> list[float | str]:
+    """float32 figures as short as they can be written."""
+    return [
+        float(str(value))
+        if math.isfinite(value) and (zero or value != 0.0) and not (positive and value <= 0.0)
+        else UNKNOWN
+        for value in np.asarray(values, dtype=np.float32)
+    ]
+
+
+def _empty(value: Any) -> bool:
+    return value == UNKNOWN or (
+        isinstance(value, list) and bool(value) and all(entry == UNKNOWN for entry in value)
+    )

@@ -1,0 +1,84 @@
+"""What an identification leaves in a folder: exports, results, the report and its series."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import asdict
+from io import BytesIO
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from hil.errors import InputError
+from hil.files import write_together
+from hil.identify import Identification
+from hil.identify.exports import exports_of, provenance_of
+from hil.progress import Reporter
+from hil.report import ReportSeries, report_bytes
+from hil.results import Results
+
+RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
+_NAME: Final = "example_archive"
+
+
+def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
+    """Write files for other tools, `results.json` and the page, or nothing; say where they are.
+
+    Raises:
+        OutputError: the folder cannot be written to; nothing in it was changed.
+    """
+    consistency, essential = found.consistency, found.essential
+    exports = exports_of(
+        found.cell,
+        found.estimate.pooled,
+        consistency if isinstance(consistency, str) else consistency.consistent,
+        essential=None if isinstance(essential, str) else essential.elimination.estimate.names,
+        provenance=provenance_of(found.results, found.paths),
+    )
+    results = found.results.model_copy(update={"exports": exports.result})
+    files = {
+        **exports.contents,
+        RESULTS: results.to_json(),
+        SERIES: _series_bytes(found.series),
+        REPORT: report_bytes(results, found.series),
+    }
+    write_together(folder, files)
+    for name, why in exports.withheld.items():
+        reporter.say(f"{name} was not written: {why}")
+    reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.written)}")
+    reporter.say(f"report: {folder / REPORT}")
+    return results
+
+
+def rewrite_report(folder: Path) -> Results:
+    """Make the page anew from the results and series that lie in a folder.
+
+    Raises:
+        InputError: they are not there, or cannot be read.
+        OutputError: the folder cannot be written to.
+    """
+    results = Results.load(folder / RESULTS)
+    page = report_bytes(results, _load_series(folder / SERIES))
+    write_together(folder, {REPORT: page})
+    return results
+
+
+def _series_bytes(series: ReportSeries) -> bytes:
+    """The series behind the figures as a `.npz` file."""
+    content = BytesIO()
+    np.savez_compressed(content, **asdict(series))
+    return content.getvalue()
+
+
+def _load_series(path: Path) -> ReportSeries:
+    try:
+        with np.load(path) as found:
+            arrays = {name: found[name] for name in found.files}
+        return ReportSeries(**(arrays | {_NAME: str(arrays[_NAME])}))
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise InputError(
+            path,
+            f"does not hold the series of a report ({error})",
+            remedy="identify again from the archives (`hil identify`)",
+        ) from error

@@ -1,0 +1,363 @@
+"""What is drawn of an archive: its quantities joint by joint, thinned without losing a peak.
+
+A long archive is read window by window, so that memory does not grow with its length.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.packets import DRIVE_ON
+from drivers.states import State
+from hil.archive import Archive, open_archive
+from hil.archive.overview import Overview, overview
+from hil.cell import AngleFrame, Cell
+from hil.errors import ArchiveError, HilError, InputError
+from hil.plots import style
+from hil.report.figures.canvas import thinned
+from identification.errors import ModelError
+from identification.kinematics import chain_from_urdf
+
+Array = NDArray[np.float64]
+
+_WINDOW: Final = 60.0
+"""s of an archive that are in memory at a time."""
+_BINS: Final = 600
+"""Stretches of the whole time of which the lowest and the highest sample are drawn."""
+_LEAP: Final = 10.0
+"""Samples left out, by which a line is broken."""
+_FIELDS: Final = (
+    "position", "velocity", "torque", "target_current", "motor_current", "target_position",
+    "state", "status", "gap",
+)  # fmt: skip
+_TURN: Final = 2.0 * np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One quantity of one joint.
+
+    Attributes:
+        time: (k,) s since the archive's first sample; NaN where the line is broken.
+        value: (k,) in the unit that is shown.
+        low: lower limit, None where none is known.
+        high: upper limit, likewise.
+    """
+
+    time: Array
+    value: Array
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def peak_share(self) -> float | None:
+        """Largest magnitude as a share of a limit that is the same both ways; None without one."""
+        if self.high is None or self.low is None or self.low != -self.high or not self.value.size:
+            return None
+        peak = np.nanmax(np.abs(self.value), initial=0.0)
+        return float(peak / self.high)
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """One column of the picture: a quantity of every joint shown."""
+
+    title: str
+    colour: str
+    traces: tuple[Trace, ...]
+    limits_shown: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ArchiveView:
+    """What the picture of an archive shows.
+
+    Attributes:
+        facts: what `hil archive info` tells.
+        joint_names: those shown.
+        start: s since the first sample.
+        stop: s, likewise.
+        quantities: as far as the archive has them.
+        states: (from [s], to [s], name) of the session; none in an imported recording.
+        events: (s, name, text, whether it is a warning or worse) within the time shown.
+        gaps: s at which packets were missed.
+        angles: whose angles, in words.
+    """
+
+    facts: Overview
+    joint_names: tuple[str, ...]
+    start: float
+    stop: float
+    quantities: tuple[Quantity, ...]
+    states: tuple[tuple[float, float, str], ...] = ()
+    events: tuple[tuple[float, str, str, bool], ...] = ()
+    gaps: Array = field(default_factory=lambda: np.zeros(0))
+    angles: str = ""
+
+
+def view_of(
+    path: Path,
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    joints: Sequence[str] = (),
+) -> ArchiveView:
+    """Read what is drawn of an archive.
+
+    Args:
+        path: of the archive.
+        start: s since its first sample; the beginning if left out.
+        stop: s, likewise; the end.
+        joints: names or numbers from 1 of the joints wanted; all if empty.
+
+    Raises:
+        ArchiveError: it cannot be read, or holds no sample in that time.
+        InputError: there is no such joint.
+    """
+    head = open_archive(path, fields=())
+    stamp = head.columns["stamp"]
+    if not len(stamp):
+        raise ArchiveError(path, "holds no sample", remedy="name another archive")
+    origin, last = float(stamp[0]) * 1e-9, float(stamp[-1] - stamp[0]) * 1e-9
+    begin = 0.0 if start is None else max(start, 0.0)
+    end = last if stop is None else min(stop, last)
+    if not begin <= end:
+        raise ArchiveError(
+            path,
+            f"lasts {last:.6g} s; nothing lies in the time asked for",
+            remedy="correct --start and --stop",
+        )
+    shown = _wanted(head.joint_names, joints)
+    scales = _Scales.of(head)
+    collected = _Collected(shown, end - begin)
+    for archive in _windows(path, origin, begin, end):
+        collected.take(archive, scales, origin)
+    events = tuple(
+        (event.time - origin, event.name, event.text, event.level >= 30)
+        for event in head.events
+        if begin <= event.time - origin <= end
+    )
+    return ArchiveView(
+        facts=overview(path),
+        joint_names=tuple(_row_name(head.joint_names[j], scales.slides[j]) for j in shown),
+        start=begin,
+        stop=end,
+        quantities=collected.quantities(scales),
+        states=tuple(collected.states),
+        events=events,
+        gaps=np.array(collected.gaps),
+        angles=scales.whose,
+    )
+
+
+def _windows(path: Path, origin: float, begin: float, end: float) -> Iterator[Archive]:
+    count = max(1, round((end - begin) / _WINDOW))
+    edges = np.linspace(origin + begin, origin + end, count + 1)
+    edges[-1] += 1e-6  # the last sample too
+    for a, b in pairwise(edges):
+        yield open_archive(path, fields=_FIELDS, start=float(a), stop=float(b))
+
+
+def _wanted(names: Sequence[str], joints: Sequence[str]) -> list[int]:
+    numbers = {str(number): index for index, number in enumerate(range(1, len(names) + 1))}
+    known = numbers | {name: index for index, name in enumerate(names)}
+    for joint in joints:
+        if joint not in known:
+            raise InputError(
+                None,
+                f"{joint!r} is no joint",
+                field="--joint",
+                remedy=f"name one of {', '.join(names)}",
+            )
+    return sorted({known[joint] for joint in joints}) or list(range(len(names)))
+
+
+def _row_name(name: str, slides: bool) -> str:
+    return f"{name} [mm]" if slides else name
+
+
+@dataclass(frozen=True, eq=False)
+class _Scales:
+    """From SI to what is shown, and the limits, as far as the archive's cell tells them."""
+
+    sign: Array
+    offset: Array
+    slides: NDArray[np.bool_]
+    whose: str
+    motor_from_joint: Array | None
+    limits: Mapping[str, tuple[Array, Array]]
+
+    @classmethod
+    def of(cls, archive: Archive) -> _Scales:
+        n = len(archive.joint_names)
+        cell = _cell(archive)
+        slides = _slides(archive, n)
+        frame = AngleFrame("urdf", np.ones(n), np.zeros(n))
+        limits: dict[str, tuple[Array, Array]] = {}
+        if cell is not None and cell.file.limits is not None:
+            frame = AngleFrame.of(cell)
+            bounds = cell.joint_limits
+            ends = np.sort([frame.shown(bounds.lower), frame.shown(bounds.upper)], axis=0)
+            limits["position"] = (ends[0], ends[1])
+            limits["velocity"] = _both(np.degrees(bounds.velocity))
+            if cell.torque_limit is not None:
+                limits["torque"] = _both(cell.torque_limit)
+        table = json.loads(archive.attachments.get("drive_train.json", b"{}"))
+        for name, key in (("current", "current_limit"), ("following", "following_error")):
+            if len(table.get(key, ())) == n:
+                limits[name] = _both(np.array(table[key], dtype=np.float64))
+        motors = None
+        if cell is not None and cell.file.drive_train is not None:
+            motors = cell.drive_train.motor_from_joint
+        return cls(frame.sign, frame.offset, slides, frame.whose, motors, limits)
+
+    def limit(self, name: str, joint: int) -> tuple[float | None, float | None]:
+        if name not in self.limits:
+            return None, None
+        low, high = self.limits[name]
+        return float(low[joint]), float(high[joint])
+
+    def position(self, q: Array) -> Array:
+        shown = np.degrees(q * self.sign + self.offset)
+        return np.where(self.slides, 1e3 * q, shown)
+
+    def rate(self, rate: Array) -> Array:
+        return np.where(self.slides, 1e3 * rate, np.degrees(rate * self.sign))
+
+    def following(self, error: Array) -> Array:
+        """Motor revolutions where the drive train is known, else as positions."""
+        if self.motor_from_joint is None:
+            return self.rate(error)
+        return np.asarray(error @ self.motor_from_joint.T / _TURN)
+
+
+def _both(limit: Array) -> tuple[Array, Array]:
+    return -limit, limit
+
+
+def _cell(archive: Archive) -> Cell | None:
+    """The cell that travels in an archive; None where there is none that can still be used."""
+    attached = archive.attachments
+    if "cell.toml" not in attached or "robot.urdf" not in attached:
+        return None
+    try:
+        cell = Cell.from_texts(
+            attached["cell.toml"].decode(), attached["robot.urdf"].decode(), archive.path
+        )
+    except (HilError, UnicodeDecodeError):
+        return None
+    return cell if cell.joint_names == archive.joint_names else None
+
+
+def _slides(archive: Archive, n: int) -> NDArray[np.bool_]:
+    try:
+        chain = chain_from_urdf(archive.attachments["robot.urdf"].decode())
+    except (KeyError, UnicodeDecodeError, ModelError):
+        return np.zeros(n, dtype=np.bool_)
+    turns = dict(zip(chain.joint_names, chain.revolute, strict=True))
+    return np.array([not turns.get(name, True) for name in archive.joint_names])
+
+
+class _Collected:
+    """Thinned lines, grown window by window."""
+
+    def __init__(self, joints: Sequence[int], duration: float) -> None:
+        self.states: list[tuple[float, float, str]] = []
+        self.gaps: list[float] = []
+        self._joints = list(joints)
+        self._duration = max(duration, 1e-9)
+        self._lines: dict[str, list[tuple[list[Array], list[Array]]]] = {}
+
+    def take(self, archive: Archive, scales: _Scales, origin: float) -> None:
+        columns = archive.columns
+        if not archive.n_samples:
+            return
+        time = columns["stamp"] * 1e-9 - origin
+        share = (time[-1] - time[0]) / self._duration
+        bins = max(2, round(_BINS * share))
+        leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+        for name, values in _shown(columns, scales):
+            lines = self._lines.setdefault(name, [([], []) for _ in self._joints])
+            for (times, parts), joint in zip(lines, self._joints, strict=True):
+                for t, v in _runs(time, values[:, joint], bins):
+                    if times and t[0] - times[-1][-1] > leap:
+                        times.append(np.array([np.nan]))
+                        parts.append(np.array([np.nan]))
+                    times.append(t)
+                    parts.append(v)
+        if "state" in columns:
+            self._take_states(time, columns["state"])
+            self.gaps += time[columns["gap"] > 0].tolist()
+
+    def quantities(self, scales: _Scales) -> tuple[Quantity, ...]:
+        motor = scales.motor_from_joint is not None
+        titles = {
+            "position": ("position [deg]", style.POSITION),
+            "velocity": ("speed [deg/s]", style.VELOCITY),
+            "current": ("motor current [A]", style.ACCELERATION),
+            "torque": ("torque at the joint [N·m]", "#5b3a8c"),
+            "following": (f"following error [{'motor rev' if motor else 'deg'}]", style.INK),
+        }
+        return tuple(
+            Quantity(
+                title,
+                colour,
+                tuple(
+                    Trace(*_joined(*line), *scales.limit(name, joint))
+                    for line, joint in zip(self._lines[name], self._joints, strict=True)
+                ),
+                limits_shown=name == "current",
+            )
+            for name, (title, colour) in titles.items()
+            if name in self._lines and any(times for times, _ in self._lines[name])
+        )
+
+    def _take_states(self, time: Array, state: NDArray[np.uint8]) -> None:
+        edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist()]
+        ends = [*(time[edge] for edge in edges[1:]), time[-1]]
+        for edge, until in zip(edges, ends, strict=True):
+            name = State(int(state[edge])).name.lower().replace("_", " ")
+            if self.states and self.states[-1][2] == name:
+                self.states[-1] = (self.states[-1][0], float(until), name)
+            else:
+                self.states.append((float(time[edge]), float(until), name))
+
+
+def _shown(columns: Mapping[str, NDArray[Any]], scales: _Scales) -> Iterator[tuple[str, Array]]:
+    """Quantities (m, n) of a window in the units that are shown."""
+    if "position" in columns:
+        yield "position", scales.position(columns["position"])
+    if "velocity" in columns:
+        yield "velocity", scales.rate(columns["velocity"])
+    current = columns.get("target_current", columns.get("motor_current"))
+    if current is not None:
+        yield "current", current
+    if "torque" in columns:
+        yield "torque", columns["torque"]
+    if "target_position" in columns and "position" in columns:
+        error = scales.following(columns["target_position"] - columns["position"])
+        # Before the drive is on the controller reports no target.
+        driven = columns["status"] == DRIVE_ON
+        yield "following", np.where(driven[:, np.newaxis], error, np.nan)
+
+
+def _runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]:
+    """Stretches of finite values, each thinned; `bins` are for all of them together."""
+    finite = np.isfinite(values)
+    edges = np.flatnonzero(np.diff(finite, prepend=False, append=False))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        yield thinned(time[a:b], values[a:b], max(2, round(bins * (b - a) / len(values))))
+
+
+def _joined(times: list[Array], values: list[Array]) -> tuple[Array, Array]:
+    if not times:
+        return np.zeros(0), np.zeros(0)
+    return np.concatenate(times), np.concatenate(values)

@@ -1,0 +1,92 @@
+"""The samples behind a panel, in the page, for whoever zooms into it.
+
+A figure is drawn with as many points as a screen shows; closer up a reader wants the samples. They
+go into the page as 16 bit numbers on an even grid of time, one string per line.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.report.figures.palette import CSS_VARIABLES
+
+Array = NDArray[np.float64]
+
+MOST_POINTS: Final = 3000
+"""Of a line; more than three times what a panel shows at once."""
+_STEPS: Final = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One line.
+
+    Attributes:
+        values: (m,), finite.
+        colour: of the palette.
+        width: of the line [px].
+        name: what it is, in a word.
+    """
+
+    values: Array
+    colour: str
+    width: float
+    name: str
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """Axes of a panel with time to the right.
+
+    Attributes:
+        box: left, top, width and height in the panel [px].
+        heading: what stands above: the quantity and its unit.
+        traces: its lines, the lowest first.
+    """
+
+    box: tuple[float, float, float, float]
+    heading: str
+    traces: Sequence[Trace]
+
+
+def traces_text(time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS) -> str:
+    """Plots over time (m,) [s] from zero as the page's script reads them: JSON.
+
+    Lines are resampled evenly, to at most `points`; "" where there is nothing to zoom into.
+    """
+    if time.size < 2 or not time[-1] > time[0]:
+        return ""
+    grid = np.linspace(time[0], time[-1], min(points, time.size))
+    content = {
+        "end": round(float(time[-1] - time[0]), 6),
+        "plots": [
+            {
+                "box": plot.box,
+                "heading": plot.heading,
+                "lines": [_line(np.interp(grid, time, one.values), one) for one in plot.traces],
+            }
+            for plot in plots
+        ],
+    }
+    return json.dumps(content, separators=(",", ":"), ensure_ascii=False)
+
+
+def _line(values: Array, trace: Trace) -> dict[str, str | float]:
+    low, high = float(values.min()), float(values.max())
+    step = (high - low) / _STEPS or 1.0
+    counts = np.rint((values - low) / step).astype("<u2")
+    return {
+        "name": trace.name,
+        "colour": CSS_VARIABLES[trace.colour],
+        "width": trace.width,
+        "low": float(f"{low:.7g}"),
+        "step": float(f"{step:.7g}"),
+        "data": base64.b64encode(counts.tobytes()).decode("ascii"),
+    }

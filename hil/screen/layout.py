@@ -1,0 +1,228 @@
+"""What the screen of a run looks like: a pure function of what is known and how much room there is.
+
+Eighty columns and twenty-four lines hold everything of a six-joint arm. With less room, bars get
+shorter, then go; the last events go before the drift curve, that before the joints.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from rich.text import Text
+
+from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.campaign.operator import DriftCurve, RunStatus
+
+from . import marks
+from .keys import HELP, SHORT_HELP
+
+WIDE: Final = 64
+"""Columns from which on there are bars beside the numbers."""
+STALE: Final = 1.0
+"""s without news after which the screen says so."""
+_NUMBERS: Final = 28
+"""Columns of a joint's numbers beside its name and bars."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Everything that is shown.
+
+    Attributes:
+        title: of the run.
+        joint_names: of the n joints.
+        status: where the run stands; None before the first.
+        wish: the person's.
+        stopping: whether a stop was asked for.
+        age: s since the status came.
+        said: lines that the run said, oldest first.
+        keys: whether keys are read.
+    """
+
+    title: str
+    joint_names: tuple[str, ...]
+    status: RunStatus | None = None
+    wish: Wish = field(default_factory=Wish)
+    stopping: bool = False
+    age: float = 0.0
+    said: tuple[str, ...] = ()
+    keys: bool = True
+
+
+def lines(shown: Shown, width: int, height: int) -> list[Text]:
+    """The screen, at most `height` lines of at most `width` columns."""
+    status = shown.status
+    head = [
+        _heading(shown, width),
+        _way(status, width),
+        _state(shown, width),
+        _health(shown, width),
+    ]
+    tail = [_help(shown, width)]
+    joints = [] if status is None else _joints(shown.joint_names, status.motion, width)
+    drift = [] if status is None or status.drift is None else _drift(status.drift, width)
+    news = [Text(part, style="dim") for line in _news(shown) for part in _wrapped(line, width)]
+    room = height - len(head) - len(tail)
+    body = _fitting(room, joints, drift, news)
+    drawn = [*head, *body, *[Text()] * max(0, room - len(body)), *tail][:height]
+    for line in drawn:
+        line.truncate(width, overflow="ellipsis")
+    return drawn
+
+
+def _fitting(room: int, joints: list[Text], drift: list[Text], news: list[Text]) -> list[Text]:
+    """What fits: the joints first, then the curve, then as many of the newest lines as there is."""
+    body = [Text(), *joints] if len(joints) < room else joints[:room]
+    if drift and len(body) + len(drift) + 1 <= room:
+        body += [Text(), *drift]
+    left = room - len(body) - 1
+    if left > 0 and news:
+        body += [Text(), *news[-left:]]
+    return body
+
+
+def _heading(shown: Shown, width: int) -> Text:
+    status = shown.status
+    text = Text(shown.title, style="bold")
+    if status is None:
+        return text.append("  beginning", style="dim")
+    text.append(f"  {status.phase} {status.number} of {status.total}", style="bold cyan")
+    left = f"{marks.clock(status.time_left)} left"
+    text.truncate(max(0, width - len(left) - 2), overflow="ellipsis")
+    text.append(left.rjust(width - text.cell_len))
+    return text
+
+
+def _way(status: RunStatus | None, width: int) -> Text:
+    """How far the motion is."""
+    motion = None if status is None else status.motion
+    if motion is None:
+        return Text("nothing moves", style="dim")
+    if motion.motion_time is None or not motion.duration:
+        return Text(f"{motion.state.name.lower()}, {motion.cycles} cycles")
+    done = min(1.0, motion.motion_time / motion.duration)
+    times = f" {motion.motion_time:.1f} of {motion.duration:.1f} s"
+    text = Text()
+    room = width - len(times)
+    if room >= 10:
+        filled = round(room * done)
+        text.append("━" * filled, style="cyan").append("─" * (room - filled), style="dim")
+    return text.append(times.strip() if room < 10 else times)
+
+
+def _state(shown: Shown, width: int) -> Text:
+    """Whether it moves, and how fast."""
+    status = shown.status
+    motion = None if status is None else status.motion
+    text = Text()
+    if shown.stopping:
+        text.append(" STOPPING ", style="bold red reverse").append("  ")
+    elif shown.wish.held:
+        text.append(" HELD ", style="bold yellow reverse").append("  ")
+    if shown.age > STALE and status is not None:
+        text.append(f"no news for {shown.age:.0f} s  ", style="bold red")
+    override = shown.wish.override if motion is None else motion.override
+    text.append(f"override {100.0 * override:.0f} %", style=_slower(override))
+    if motion is not None and motion.rate is not None:
+        text.append(f", now {100.0 * motion.rate:.0f} %", style="dim")
+    if motion is not None and width >= WIDE:
+        text.append(f"   {motion.state.name.lower().replace('_', ' ')}", style="dim")
+    return text
+
+
+def _health(shown: Shown, width: int) -> Text:
+    """How well the cycle is kept."""
+    status = shown.status
+    motion = None if status is None else status.motion
+    text = Text().append("cycles ", style="bold")
+    if motion is None:
+        return text.append("-", style="dim")
+    text.append(f"{motion.cycles}")
+    for count, what in (
+        (motion.missed, "missed"), (motion.late, "late"), (motion.untaken, "not taken")
+    ):  # fmt: skip
+        if count or width >= WIDE:
+            text.append(f"  {count} {what}", style="bold yellow" if count else "green")
+    latency = motion.latency
+    if latency is not None:
+        times = [marks.duration(value) for value in (latency.median, latency.p99, latency.worst)]
+        if width >= WIDE:
+            text.append(f"  {times[0]}, 99 % {times[1]}, worst {times[2]}")
+        else:
+            text.append(f"  {times[2]}")
+    return text
+
+
+def _slower(override: float) -> str:
+    return "" if override >= 1.0 else "bold yellow"
+
+
+def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> list[Text]:
+    """A line of each joint: following error and current, each against its limit."""
+    if motion is None or motion.following_error is None or motion.current is None:
+        return []
+    error_share, current_share = motion.following_share, motion.current_share
+    assert error_share is not None
+    assert current_share is not None
+    name_width = min(max(map(len, [*names, "joint"])), max(5, width // 5))
+    hot = None if motion.temperature is None else np.asarray(motion.temperature)
+    numbers = _NUMBERS + (6 if hot is not None else 0)
+    bars = max(0, (width - name_width - numbers) // 2) if width >= WIDE else 0
+    rule = Text("joint".ljust(name_width), style="bold")
+    titles = ("following error / threshold", "current / limit")
+    for title in titles if bars else ("following", "current"):
+        rule.append(f"  {title}".ljust(14 + bars))
+    drawn = [rule]
+    for index, name in enumerate(names):
+        line = Text(name[:name_width].ljust(name_width))
+        degrees = np.degrees(motion.following_error[index])
+        for value, share in (
+            (f"{degrees:8.3f}°", float(error_share[index])),
+            (f"{motion.current[index]:7.2f} A", float(current_share[index])),
+        ):
+            line.append(value).append(" ")
+            if bars:
+                line.append(marks.bar(share, bars - 1)).append(" ")
+            line.append(marks.percent(share), style=marks.colour(share))
+        if hot is not None:
+            line.append(f" {hot[index]:3.0f}°C")
+        drawn.append(line)
+    if hot is not None:
+        rule.append(" motor")
+    return drawn
+
+
+def _drift(drift: DriftCurve, width: int) -> list[Text]:
+    """Friction from motion to motion while the joints warm up."""
+    change = [float(value) for value in drift.change]
+    known = [value for value in change if np.isfinite(value)]
+    text = Text("warm-up: friction changed by ")
+    if not known:
+        return [text.append("… (one motion so far)")]
+    text.append(
+        f"{100.0 * known[-1]:.1f} %", style="green" if known[-1] < drift.threshold else "yellow"
+    )
+    text.append(f", warm below {100.0 * drift.threshold:g} %  ")
+    return [text.append(marks.curve(known, max(0, width - text.cell_len)), style="cyan")]
+
+
+def _news(shown: Shown) -> list[str]:
+    status = shown.status
+    events = () if status is None or status.motion is None else status.motion.events
+    notes = () if status is None else status.notes
+    return [*shown.said, *notes, *events]
+
+
+def _wrapped(line: str, width: int) -> list[str]:
+    return textwrap.wrap(line, max(8, width), subsequent_indent="  ") or [""]
+
+
+def _help(shown: Shown, width: int) -> Text:
+    if not shown.keys:
+        return Text("Ctrl-C stops on the path".ljust(width), style="reverse")
+    text = next((text for text in (HELP, SHORT_HELP) if len(text) <= width), "h ␣ s + - 1…0")
+    return Text(text.ljust(width), style="reverse")

@@ -1,0 +1,289 @@
+"""The person at a running campaign: shown where it stands, and heard.
+
+What is shown is drawn by a thread of its own: a terminal that takes nothing more (a connection that
+broke, a pipe that is full) delays neither the motion nor a stop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Final, Protocol
+
+from rich.console import Console, Group
+from rich.live import Live
+
+from hil.campaign.motion_watch import Wish
+from hil.campaign.operator import DryRunSummary, RunStatus
+from hil.campaign.stop import Stop
+from hil.progress import Silent, Task
+
+from . import plain
+from .acceptance import ask
+from .keys import Keyboard, after, can_read, stops
+from .layout import Shown, lines
+
+DRAWN_EVERY: Final = 0.1
+"""s between two pictures."""
+LINE_EVERY: Final = 5.0
+"""s between two lines where there is no terminal."""
+FAREWELL: Final = 0.5
+"""s that a terminal may take for the last picture."""
+NEWEST: Final = 8
+"""Of the lines said meanwhile that are shown."""
+REMEMBERED: Final = 200
+"""Lines said meanwhile that are left on the terminal at the end."""
+
+
+class Display(Protocol):
+    """Where a screen is drawn."""
+
+    def draw(self, shown: Shown) -> None:
+        """Show it."""
+        ...
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        ...
+
+
+class FullScreen:
+    """A terminal's other page, so that the shell's own lines come back at the end."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live = Live(console=console, screen=True, auto_refresh=False)
+        self._live.start()
+
+    def draw(self, shown: Shown) -> None:
+        """Show it at the size the terminal has now."""
+        width, height = self._console.size
+        self._live.update(Group(*lines(shown, width, height)), refresh=True)
+
+    def close(self) -> None:
+        """Back to the shell's page."""
+        self._live.stop()
+
+
+class PlainLines:
+    """A line now and then, and one for whatever begins.
+
+    Args:
+        console: written to.
+        unsaid: lines to be printed, taken from there.
+    """
+
+    def __init__(self, console: Console, unsaid: deque[str]) -> None:
+        self._console, self._unsaid = console, unsaid
+        self._due = 0.0
+        self._at: tuple[str, int] | None = None
+
+    def draw(self, shown: Shown) -> None:
+        """Print what is new."""
+        self._catch_up()
+        status = shown.status
+        if status is None or shown.age > LINE_EVERY:
+            return
+        at = (status.phase, status.number)
+        if at == self._at and time.monotonic() < self._due:
+            return
+        self._at, self._due = at, time.monotonic() + LINE_EVERY
+        self._console.out(plain.line(status), highlight=False)
+
+    def close(self) -> None:
+        """Print what was said last."""
+        self._catch_up()
+
+    def _catch_up(self) -> None:
+        while self._unsaid:
+            self._console.out(self._unsaid.popleft(), highlight=False)
+
+
+class Nothing:
+    """Shows nothing."""
+
+    def draw(self, shown: Shown) -> None:
+        """Show nothing."""
+
+    def close(self) -> None:
+        """Nothing is to be put back."""
+
+
+class ScreenError(RuntimeError):
+    """The screen does not show anything any more, or does not hear its keys."""
+
+
+class Screen:
+    """An `Operator` at a terminal, or a log; a `Reporter` too. A context manager.
+
+    Args:
+        joint_names: of the n joints.
+        stop: set by the keys s and q.
+        title: of the run.
+        quiet: show nothing; keys are not read either.
+        console: written to; standard output if left out.
+    """
+
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        stop: Stop,
+        *,
+        title: str = "hil",
+        quiet: bool = False,
+        console: Console | None = None,
+    ) -> None:
+        self._console = console or Console()
+        self._full = not quiet and self._console.is_terminal and not self._console.is_dumb_terminal
+        self._quiet = quiet
+        self._stop = stop
+        self._wish = Wish()
+        self._shown = Shown(title, tuple(joint_names), keys=False)
+        self._came = time.monotonic()
+        self._said: deque[str] = deque(maxlen=REMEMBERED)
+        self._undo = contextlib.ExitStack()
+        self._stuck = False
+        self._changing = threading.Lock()  # keys come in a thread of their own
+        self._slow_phase = False
+        self._keyboard: Keyboard | None = None
+        self._undrawn: Exception | None = None
+
+    def __enter__(self) -> Screen:
+        self._open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+        self._leave_what_was_said()
+
+    def show(self, status: RunStatus) -> None:
+        """Show where the run stands; returns at once.
+
+        Raises:
+            ScreenError: nothing is drawn any more.
+        """
+        self._shown, self._came = replace(self._shown, status=status), time.monotonic()
+        self._leave_dry_run(status)
+        if self._undrawn is not None:
+            raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
+
+    def wish(self) -> Wish:
+        """What the person wishes.
+
+        Raises:
+            ScreenError: keys were read, and are not any more.
+        """
+        keyboard = self._keyboard
+        if keyboard is not None and keyboard.failure is not None:
+            raise ScreenError(f"{type(keyboard.failure).__name__}: {keyboard.failure}")
+        return self._wish
+
+    def _leave_dry_run(self, status: RunStatus) -> None:
+        """What the dry run was slowed to is not meant for what comes after; a hold is."""
+        if status.phase == "dry run":
+            self._slow_phase = True
+        elif self._slow_phase and status.phase != "move":
+            self._slow_phase = False
+            with self._changing:
+                slowed = self._wish.override < 1.0
+                self._wish = replace(self._wish, override=1.0)
+            if slowed:
+                self.say("the dry run is over: the override is 100 % again")
+
+    @property
+    def can_answer(self) -> bool:
+        """Whether somebody sits at the terminal."""
+        return self._full and can_read(sys.stdin)
+
+    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+        """Ask on the terminal, on the shell's own page; False where nobody can answer."""
+        if not self.can_answer:
+            return False
+        self._undo.close()
+        try:
+            self._leave_what_was_said()
+            return not self._stuck and ask(self._console, summary, self._stop)
+        finally:
+            try:
+                self._open()
+            except Exception as error:  # the run goes on, as without a terminal
+                self._undrawn = error
+
+    def say(self, text: str) -> None:
+        """One line that stays: after the end where there is a screen meanwhile."""
+        if not self._quiet:
+            self._said.append(text)
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        """A piece of work; the screen shows it already."""
+        with Silent().task(title, total) as task:
+            yield task
+
+    def press(self, key: str) -> None:
+        """Take a key."""
+        if stops(key):
+            self._stop.requested = True
+            return
+        motion = None if self._shown.status is None else self._shown.status.motion
+        with self._changing:
+            override = self._wish.override
+            if motion is not None:
+                override = min(override, motion.override)
+            self._wish = after(self._wish, key, override)
+
+    def _open(self) -> None:
+        self._undo = contextlib.ExitStack()
+        over = threading.Event()
+        self._undrawn = self._keyboard = None
+        if self._full:
+            self._keyboard = self._undo.enter_context(Keyboard(self.press))
+        display = self._display()
+        thread = threading.Thread(
+            target=self._draw, args=(display, over), name="screen", daemon=True
+        )
+        thread.start()
+
+        def close() -> None:
+            over.set()
+            thread.join(FAREWELL)
+            self._stuck = thread.is_alive()
+
+        self._undo.callback(close)
+
+    def _display(self) -> Display:
+        if self._full:
+            return FullScreen(self._console)
+        return Nothing() if self._quiet else PlainLines(self._console, self._said)
+
+    def _draw(self, display: Display, over: threading.Event) -> None:
+        try:
+            while not over.wait(DRAWN_EVERY):
+                display.draw(self._now())
+        except Exception as error:  # it shows nothing more, and `show` says why; the run goes on
+            self._undrawn = error
+        with contextlib.suppress(Exception):
+            display.close()
+
+    def _now(self) -> Shown:
+        keyboard = self._keyboard
+        return replace(
+            self._shown,
+            wish=self._wish,
+            stopping=self._stop.requested,
+            age=time.monotonic() - self._came,
+            said=tuple(list(self._said)[-NEWEST:]),
+            keys=keyboard is not None and keyboard.attached,
+        )
+
+    def _leave_what_was_said(self) -> None:
+        """Print it on the shell's page, unless the terminal takes nothing any more."""
+        while self._full and self._said and not self._stuck:
+            with contextlib.suppress(OSError, ValueError):
+                self._console.out(self._said.popleft(), highlight=False)

@@ -1,0 +1,16 @@
+"""The paper's study: methods A and B, what they find, and what it predicts."""
+
+from .recorded import study_campaigns
+from .results import StudyResults
+from .run import run_study
+from .settings import FULL, QUICK, StudySettings, study_settings
+
+__all__ = [
+    "FULL",
+    "QUICK",
+    "StudyResults",
+    "StudySettings",
+    "run_study",
+    "study_campaigns",
+    "study_settings",
+]

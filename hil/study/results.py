@@ -1,0 +1,278 @@
+"""What a study leaves behind: `results.json`, checked on the way in and out.
+
+SI units; lists per joint follow `joint_names`, lists per parameter `parameters`. Torque errors are
+low-passed at 30 Hz unless they say otherwise.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field, ValidationError
+
+from hil.errors import InputError
+from hil.results.frozen import Frozen
+
+from .records import ExampleRecord
+from .settings import StudySettings
+
+SCHEMA_VERSION = 1
+
+
+class StudyParameter(Frozen):
+    """One parameter, and what the paper prints about it."""
+
+    name: str
+    unit: str
+    truth: float | None
+    """Planted value; only a simulated arm has one."""
+    printed_id: int | None = None
+    """Row of the paper's Table 2; null for another arm."""
+    printed_symbol: str | None = None
+    printed_factor: float = 1.0
+    """What a value is multiplied with to stand beside the print."""
+    printed_a: float | None = None
+    printed_b: float | None = None
+    printed_c: float | None = None
+
+
+class SearchResult(Frozen):
+    """One search, and the motion it found; null figures where it found none."""
+
+    key: str
+    words: str
+    chosen: bool
+    """Whether its motion was executed in full."""
+    tried: int
+    infeasible: dict[str, int]
+    log10_det: float | None
+    coupling_index: float | None
+    duration: float | None
+
+
+class MotionRow(Frozen):
+    """A row of Table 1."""
+
+    key: str
+    words: str
+    n_samples: int
+    log10_det: float
+    coupling_index: float
+    executed_log10_det: float | None = None
+    executed_coupling_index: float | None = None
+    duration: float | None = None
+    printed: bool = False
+
+
+class MethodResult(Frozen):
+    """What one excitation gave under one condition."""
+
+    key: str
+    label: str
+    repetitions: int
+    seconds: float
+    """Of motion that was fitted, all repetitions."""
+    mean: list[float]
+    """Over the repetitions' own estimates: the paper's Table 2."""
+    std: list[float]
+    """Over the repetitions, of one of them."""
+    pooled: list[float]
+    pooled_std: list[float]
+    undetermined: list[str]
+    noise_std: list[float]
+    log10_det: float
+    """Of the motion as it was executed, as the next ones."""
+    coupling_index: float
+    correlation: list[list[float]]
+    time: list[float]
+    position: list[list[float]]
+    velocity: list[list[float]]
+
+
+class CrossCell(Frozen):
+    """How well one estimate predicts the motions of one class: ||e|| / ||tau||."""
+
+    method: str
+    motion_class: str
+    median: float
+    lower: float
+    upper: float
+    """Quartiles over the motions."""
+    unfiltered_median: float
+    """Without the low-pass: the noise of the currents is in it."""
+    own_median: float | None
+    """Of ||Phi (pi - planted)|| / ||tau||, which has no noise in it; null where nothing is
+    planted, or where the arm does what the model leaves out."""
+
+
+class ComparisonResult(Frozen):
+    """Two estimates on the same motions: errors with `second` over errors with `first`."""
+
+    motion_class: str
+    joint: str | None
+    """Null for all joints together."""
+    first: str
+    second: str
+    motions: int
+    ratio: float
+    low: float
+    high: float
+    """Bootstrap interval of the ratio, 95 %."""
+    wins: int
+    """Motions that `second` predicts better."""
+    p_value: float
+    """Wilcoxon's signed-rank test, two-sided."""
+    p_corrected: float
+    """After Holm, for all comparisons of its table."""
+
+
+class ClassResult(Frozen):
+    """The motions of one class, and the errors of every estimate on each of them."""
+
+    motion_class: str
+    archives: list[str]
+    durations: list[float]
+    overall: dict[str, list[float]]
+    unfiltered: dict[str, list[float]]
+    own: dict[str, list[float]]
+    """What each estimate itself is off by, where that is known."""
+    mean_abs: dict[str, list[list[float]]]
+    """Motion by motion, each per joint, N·m: the paper's Fig. 3."""
+
+
+class ClosenessResult(Frozen):
+    """How many parameters of a group two estimates bring closer to the reference."""
+
+    group: str
+    reference: str
+    first: str
+    second: str
+    parameters: int
+    second_closer: int
+    printed_second_closer: int | None
+    """Of the paper's own columns A and B."""
+
+
+class EqualDataResult(Frozen):
+    """The first two methods with as much motion of each."""
+
+    cut: str
+    """Key of the method of which only the first repetitions are taken."""
+    name: str
+    """Of that estimate in the cross table."""
+    repetitions: int
+    seconds: float
+    other: str
+    other_seconds: float
+    comparisons: list[ComparisonResult]
+    """Class by class, in the order of the methods; corrected among themselves."""
+
+
+class ConditionResult(Frozen):
+    """Everything under one condition: with or without effects, or as recorded."""
+
+    key: str
+    words: str
+    effects: list[str]
+    methods: list[MethodResult]
+    classes: list[ClassResult]
+    cross: list[CrossCell]
+    comparisons: list[ComparisonResult]
+    own_comparisons: list[ComparisonResult]
+    """The first two, class by class, in what the estimates themselves are off by."""
+    joint_comparisons: list[ComparisonResult]
+    equal_data: EqualDataResult | None
+    """Null where both have as much motion anyway."""
+    closeness: list[ClosenessResult]
+    examples: list[ExampleRecord]
+
+
+class AblationPoint(Frozen):
+    """One setting of what is varied."""
+
+    value: float
+    label: str = ""
+    """Where the setting is no number, which `value` then only counts."""
+    method: str
+    base: bool
+    """Whether it is the setting of the study itself."""
+    repetitions: int
+    log10_det: float | None
+    coupling_index: float | None
+    duration: float | None
+    parameter_error: float | None
+    """Geometric mean over the parameters of the distance to the planted value, that of the study's
+    B being 1."""
+    error: dict[str, float]
+    """Median over the motions of each class of ||e|| / ||tau||."""
+    own: dict[str, float]
+    """The same of what the estimate itself is off by; empty where nothing is planted."""
+
+    @property
+    def name(self) -> str:
+        """The setting for people."""
+        return self.label or f"{self.value:g}"
+
+
+class AblationResult(Frozen):
+    """One thing varied, everything else kept."""
+
+    key: str
+    title: str
+    variable: str
+    words: str
+    points: list[AblationPoint]
+    comparisons: list[ComparisonResult] = Field(default_factory=list)
+    """With B, where the settings are another method's."""
+    missing: list[str]
+
+
+class Paragraph(Frozen):
+    """What the numbers say, in sentences made from them."""
+
+    key: str
+    heading: str
+    sentences: list[str]
+
+
+class StudyResults(Frozen):
+    """One study, whole."""
+
+    schema_version: int = SCHEMA_VERSION
+    name: str
+    cell: str
+    simulated: bool
+    quick: bool
+    settings: StudySettings | None
+    """Null for a study of recorded campaigns."""
+    software: dict[str, str]
+    joint_names: list[str]
+    n_base: int
+    parameters: list[StudyParameter]
+    searches: list[SearchResult]
+    table1: list[MotionRow]
+    conditions: list[ConditionResult]
+    ablations: list[AblationResult]
+    reading: list[Paragraph]
+    missing: list[str]
+    """What of the paper's study is not in this one, and why."""
+    times: dict[str, float]
+    """s that each step took when this was written; steps found done take next to nothing."""
+
+    def to_json(self) -> str:
+        """As indented JSON, the text of `results.json`."""
+        return self.model_dump_json(indent=1) + "\n"
+
+    @classmethod
+    def load(cls, path: Path) -> StudyResults:
+        """Read and check a study's `results.json`.
+
+        Raises:
+            InputError: the file is none.
+        """
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except (OSError, ValidationError) as error:
+            raise InputError(
+                path, f"is not the result of a study ({error})", remedy="run the study again"
+            ) from error

@@ -1,0 +1,1 @@
+"""Template of a study's page; a package so that it is installed with it."""

@@ -1,0 +1,24 @@
+"""For tests of programs that drive an arm: the simulated cell, its controller, and their faults.
+
+The pytest plugin (`hil.testing.plugin`) is found by pytest itself and imports nothing heavy before
+a fixture is used. The names here are what its fixtures give and are made of.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .short import run_campaign, shortened
+    from .udp import UdpController
+
+_HOME = {"UdpController": "udp", "run_campaign": "short", "shortened": "short"}
+
+__all__ = ["UdpController", "run_campaign", "shortened"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

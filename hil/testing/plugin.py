@@ -1,0 +1,113 @@
+"""The pytest plugin: fixtures of a simulated cell, down to the bytes of the controller's protocol.
+
+pytest finds it by itself once the package is installed. Nothing but pytest is imported before a
+fixture is used. `docs/testing.md` shows how to test a script of one's own with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from hil.campaign import Campaign, Link
+    from hil.cell import Cell
+    from hil.testing.udp import UdpController
+    from sim_fixtures import SimulatedController
+
+MARKER = "controller_faults"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the marker known."""
+    config.addinivalue_line(
+        "markers",
+        f"{MARKER}(*lines): what goes wrong with the simulated controller or its link, as "
+        '`hil simulate --fault` takes it: "e-stop@4000", "lose@3000x3"',
+    )
+
+
+@pytest.fixture(scope="session")
+def simulated_cell() -> Cell:
+    """The simulated COMAU NS 16 with a campaign of seconds.
+
+    Override it in your conftest.py to have all fixtures work with your own cell, which needs a
+    table [simulation].
+    """
+    from hil.cell import Cell
+    from hil.testing.short import shortened
+    from sim_fixtures.ns16 import CELL_PATH
+
+    return shortened(Cell.load(CELL_PATH))
+
+
+@pytest.fixture
+def controller_faults(request: pytest.FixtureRequest) -> tuple[str, ...]:
+    """What goes wrong, line by line: the test's `controller_faults` markers; nothing without."""
+    return tuple(line for mark in request.node.iter_markers(MARKER) for line in mark.args)
+
+
+@pytest.fixture
+def simulated_controller(
+    simulated_cell: Cell, controller_faults: tuple[str, ...]
+) -> SimulatedController:
+    """A fresh controller with its arm, in virtual time; one seed is one run."""
+    from hil.simulation import simulated_controller as made
+    from sim_fixtures.fault_script import parse_fault, split_faults
+
+    _, own = split_faults(map(parse_fault, controller_faults))
+    return made(simulated_cell, faults=own)
+
+
+@pytest.fixture
+def simulated_link(
+    simulated_cell: Cell,
+    simulated_controller: SimulatedController,
+    controller_faults: tuple[str, ...],
+) -> Link:
+    """A link to `simulated_controller`, as `Campaign.run` takes it; not yet connected."""
+    from drivers.transports import SimulatedTransport
+    from hil.campaign import Link
+    from sim_fixtures.fault_script import parse_fault, split_faults
+
+    of_link, _ = split_faults(map(parse_fault, controller_faults))
+    transport = SimulatedTransport(simulated_controller, of_link)
+    return Link.over(transport, simulated_cell, simulated_controller.finish)
+
+
+@pytest.fixture(scope="session")
+def short_campaign(tmp_path_factory: pytest.TempPathFactory, simulated_cell: Cell) -> Campaign:
+    """A finished campaign of `simulated_cell`: every archive of it is whole. Only read it."""
+    from hil.testing.short import run_campaign
+
+    return run_campaign(tmp_path_factory.mktemp("hil") / "campaign", simulated_cell)
+
+
+@pytest.fixture(scope="session")
+def identified_campaign(
+    tmp_path_factory: pytest.TempPathFactory, short_campaign: Campaign
+) -> Campaign:
+    """A copy of `short_campaign` with results, exports and report. Only read it."""
+    import shutil
+
+    from hil.campaign import Campaign
+
+    root = tmp_path_factory.mktemp("hil") / "identified"
+    shutil.copytree(short_campaign.folder.root, root)
+    campaign = Campaign.open(root)
+    campaign.identify()
+    return campaign
+
+
+@pytest.fixture
+def udp_controller(
+    tmp_path: Path, simulated_cell: Cell, controller_faults: tuple[str, ...]
+) -> Iterator[UdpController]:
+    """A simulated controller in a process of its own, over loopback UDP, in real time."""
+    from hil.testing.udp import UdpController
+
+    with UdpController.started(simulated_cell, tmp_path, faults=controller_faults) as controller:
+        yield controller

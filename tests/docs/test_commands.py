@@ -1,0 +1,185 @@
+"""Every command in README and docs is typed, or named here with the reason why not.
+
+What is not typed is read by the command line all the same, so that no option is misspelt.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from hil import Campaign
+from hil.cli import app
+from tests.docs.typed import PAGES, ROOT, commands, parse
+
+TYPED_ELSEWHERE = {
+    "bring-your-own-robot.md": "tests/hil/test_bring_your_own_robot.py",
+    "campaign.md": "tests/hil/test_campaign_day.py",
+    "first-hour.md": "tests/hil/test_first_hour.py",
+}
+"""Pages whose commands another test types, one after the other."""
+
+OTHER_PROGRAMS = {
+    "sudo": "changes the computer",
+    "ip": "network",
+    "printf": "changes the computer",
+    "echo": "changes the computer",
+    "candump": "needs a CAN bus",
+    "dask": "needs other machines; tests/hil/test_batch_dask.py starts a cluster",
+    "ssh": "needs another machine",
+    "make": "is how tests are run: its targets are looked up",
+    "pip": "network",
+    ".": "is the shell's own",
+    "cd": "is the shell's own",
+    "cp": "is the system's own",
+    "python": "stands for programs that are looked up; tests/docs/test_examples.py runs examples",
+}
+"""Programs that are not run, and why."""
+
+NOT_TYPED = {
+    "hil demo --effects": "minutes",
+    "hil demo --resume": "goes on with one that was stopped",
+    "hil demo --link udp": "minutes, in real time",
+    "hil demo --excitation": "the whole NS 16 campaign: minutes",
+    "hil demo --output runs/demo": "a campaign of the fixture stands in its place",
+    "hil design cell.toml --earlier": "a search of half a minute",
+    "hil design cell.toml --method b -o runs/b": "a search of half a minute",
+    "hil doctor cell.toml --duration 14400": "four hours",
+    "hil simulate": "waits for a PC; tests/hil/test_simulate.py runs it",
+    "hil record": "waits for a controller; tests/hil/test_record_command.py runs it",
+    "hil move": "needs a controller; tests/hil/test_move.py runs it",
+    "hil run campaigns/october --live": "needs a campaign on a real link",
+    "hil import rosbag2": "needs a recording; tests/hil/test_importers_rosbag2.py",
+    "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",
+    "hil gains empty.mcap": "typed in bring-your-own-robot.md",
+    "hil identify ur10.mcap": "needs a recording; tests/benchmarks/test_real_data.py",
+    "hil identify a.mcap b.mcap": "typed in bring-your-own-robot.md, with names of its own",
+    "hil reidentify /data": "needs other people's archives",
+    "hil reidentify s3:": "network",
+    "hil reidentify https:": "network",
+    "hil compare": "needs two campaigns; tests/hil/test_compare.py makes them",
+    "hil study": "minutes to an hour; tests/hil/test_study.py runs a short one",
+}
+"""Beginnings of commands that are read and not run, and why."""
+
+SHORTER = {
+    "design": ("--settings", "quick.toml"),
+    "doctor": ("--duration", "1"),
+}
+"""What is added so that a command takes seconds."""
+
+NOT_GOOD_EITHER = ("doctor", "identify", "run")
+"""May end with 5: this computer need not be fit, a campaign of seconds no good one."""
+
+QUICK = """method = "b"
+[search]
+population = 8
+generations = 4
+[via_points]
+n_via = 4
+fly = 0.5
+slowest = 0.8
+"""
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout with a cell of two joints and the files that pages name."""
+    for name in ("sim_fixtures", "examples"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    for name in ("cell.toml", "robot.urdf"):
+        shutil.copy(ROOT / "examples" / "two_joints" / name, tmp_path)
+    (tmp_path / "arm.urdf").symlink_to(ROOT / "examples" / "two_joints" / "robot.urdf")
+    (tmp_path / "quick.toml").write_text(QUICK)
+    (tmp_path / "points.csv").write_text("0, 20\n30, -10\n-20, 40\n0, 20\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def put_demo(workplace: Path, campaign: Campaign) -> None:
+    """Leave what `hil demo` leaves, and what pages take from there."""
+    shutil.copytree(campaign.folder.root, workplace / "runs" / "demo")
+    (workplace / "archives").symlink_to(workplace / "runs" / "demo" / "archives")
+    shutil.copy(campaign.folder.completed("excitation")[0], workplace / "a.mcap")
+
+
+def reason_not_to(words: list[str]) -> str | None:
+    """Why a command is not run."""
+    if words[0] != "hil":
+        return OTHER_PROGRAMS[words[0]]
+    line = shlex.join(words)
+    return next((why for begin, why in NOT_TYPED.items() if line.startswith(begin)), None)
+
+
+def type_page(page: Path) -> list[str]:
+    """Type what can be typed of a page; the commands that were."""
+    typed = []
+    for words in commands(page):
+        if reason_not_to(words) is not None:
+            continue
+        extra = SHORTER.get(words[1], ())
+        result = CliRunner().invoke(app, [*words[1:], *extra], env={"COLUMNS": "120"})
+        allowed = (0, 5) if words[1] in NOT_GOOD_EITHER else (0,)
+        assert result.exit_code in allowed, (words, result.output, result.exception)
+        typed.append(" ".join(words))
+    return typed
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_command_line_understands_every_command(page: Path) -> None:
+    for words in commands(page):
+        if words[0] == "hil":
+            parse(words[1:])
+        elif words[0] == "make":
+            assert f"\n{words[1]}:" in (ROOT / "Makefile").read_text()
+        elif words[:2] == ["python", "-m"]:
+            module = Path(*words[2].split("."))
+            assert any((ROOT / f).exists() for f in (module, module.with_suffix(".py"))) or (
+                words[2] == "cantools"
+            ), words
+        elif words[0] == "python" and words[1].startswith("examples/"):
+            assert (ROOT / words[1]).exists()
+
+
+def test_what_is_typed_elsewhere_is() -> None:
+    for page, test in TYPED_ELSEWHERE.items():
+        assert page in (ROOT / test).read_text(encoding="utf-8")
+    for why in [*OTHER_PROGRAMS.values(), *NOT_TYPED.values()]:
+        for test in re.findall(r"tests/\S+\.py", why):
+            assert (ROOT / test).exists(), test
+
+
+def test_no_exception_is_left_over() -> None:
+    written = [words for page in PAGES for words in commands(page)]
+    lines = [shlex.join(words) for words in written]
+    assert not [b for b in NOT_TYPED if not any(line.startswith(b) for line in lines)]
+    assert OTHER_PROGRAMS.keys() >= {words[0] for words in written} - {"hil"}
+
+
+FAST = ("connect.md", "motion.md")
+AFTER_A_DEMO = ("README.md", "design.md", "tutorial.md")
+SLOW = ("README.md", "design.md", "tutorial.md")
+
+
+@pytest.mark.parametrize(
+    "name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+)
+def test_a_page_is_typed_from_its_first_command_to_its_last(
+    workplace: Path, name: str, request: pytest.FixtureRequest
+) -> None:
+    if name in AFTER_A_DEMO:
+        put_demo(workplace, request.getfixturevalue("identified_campaign"))
+    page = next(page for page in PAGES if page.name == name)
+    assert type_page(page)
+
+
+def test_every_page_with_something_to_type_is_typed() -> None:
+    to_type = {
+        page.name for page in PAGES if any(reason_not_to(words) is None for words in commands(page))
+    }
+    assert to_type <= {*FAST, *SLOW, *TYPED_ELSEWHERE}

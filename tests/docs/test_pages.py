@@ -1,0 +1,97 @@
+"""What pages name exists; the API reference names what packages export."""
+
+from __future__ import annotations
+
+import re
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from tests.docs.typed import PAGES, ROOT
+
+NAME = re.compile(r"`((?:hil|drivers|planner|identification|sim_fixtures)(?:\.\w+)+)(?:\(\))?`")
+FILES = ("py", "toml", "urdf", "mcap", "md", "json", "html", "dbc", "csv", "dot")
+
+
+def found(name: str) -> object:
+    """The module, or what it holds.
+
+    Raises:
+        LookupError: there is no such thing.
+    """
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            thing: object = import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            if not hasattr(thing, part) and part not in getattr(thing, "__annotations__", {}):
+                raise LookupError(name)
+            thing = getattr(thing, part, None)
+        return thing
+    raise LookupError(name)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_name_of_the_packages_exists(page: Path) -> None:
+    for name in set(NAME.findall(page.read_text("utf-8"))):
+        if name.rpartition(".")[2] not in FILES:
+            found(name)
+
+
+def test_a_name_that_does_not_exist_is_found_out() -> None:
+    with pytest.raises(LookupError):
+        found("identification.no_such_thing")
+
+
+def test_the_theory_links_each_section_to_code() -> None:
+    sections = (ROOT / "docs" / "theory.md").read_text("utf-8").split("\n## ")[1:]
+    assert len(sections) == 6
+    assert all(len(NAME.findall(section)) >= 3 for section in sections)
+
+
+def test_the_theory_has_the_equations_of_the_paper() -> None:
+    text = (ROOT / "docs" / "theory.md").read_text("utf-8")
+    named = {int(n) for n in re.findall(r"eqs?\. (\d)", text)}
+    named |= {int(n) for pair in re.findall(r"eqs\. (\d) and (\d)", text) for n in pair}
+    named |= {int(n) for three in re.findall(r"eqs\. (\d), (\d), (\d)", text) for n in three}
+    assert named == set(range(1, 10))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_to_a_file_leads_to_one(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
+        if not target.startswith(("http:", "https:")):
+            assert (page.parent / target).exists(), target
+
+
+def test_every_page_is_in_the_table_of_contents() -> None:
+    docs = ROOT / "docs"
+    listed = set()
+    for page in ("index.md", "api.md"):
+        for block in re.findall(r"```{toctree}\n(.*?)```", (docs / page).read_text("utf-8"), re.S):
+            listed |= {line for line in block.splitlines() if line and line[0] != ":"}
+    assert listed == {page.stem for page in docs.glob("*.md")} - {"index"}
+
+
+def test_the_api_reference_covers_the_public_faces() -> None:
+    text = "".join(page.read_text("utf-8") for page in (ROOT / "docs").glob("api-*.md"))
+    documented = set(re.findall(r"automodule:: (\S+)", text))
+    assert documented >= {
+        "hil.cell", "hil.campaign", "hil.identify", "hil.batch.run", "hil.testing.short",
+        "drivers", "planner", "identification", "identification.excitation", "sim_fixtures",
+    }  # fmt: skip
+    for module in documented:
+        import_module(module)
+
+
+def test_the_reference_of_the_drivers_has_every_name() -> None:
+    import drivers
+
+    text = (ROOT / "docs" / "api-drivers.md").read_text("utf-8")
+    documented = re.findall(
+        r"^\.\. auto(?:class|exception|function|data):: (?:[\w.]+\.)?(\w+)$", text, re.M
+    )
+    assert sorted(documented) == sorted(drivers.__all__)

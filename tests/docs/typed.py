@@ -1,0 +1,61 @@
+"""What stands in the shell blocks of a page, and what the command line makes of it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from hil.cli import app
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+SHELL = ("", "sh", "bash", "shell", "console")
+PROGRAMS = {"hil", "make", "python", "pip", "sudo", "ip", "printf", "echo", "candump", "dask",
+            "ssh", ".", "cp", "cd"}  # fmt: skip
+_REDIRECTION = re.compile(r" > \S+$")
+_BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The commands of a page in order, split into words; output and comments are left out.
+
+    Raises:
+        AssertionError: a block mixes commands with something else.
+    """
+    found = []
+    for language, block in _BLOCK.findall(page.read_text(encoding="utf-8")):
+        if language in SHELL:
+            found += _of_block(page, block)
+    return found
+
+
+def _of_block(page: Path, block: str) -> list[list[str]]:
+    lines = [
+        line.removeprefix("$ ")
+        for line in re.sub(r"\\\n\s*", " ", block).splitlines()
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    first = [line.split()[0] in PROGRAMS for line in lines]
+    if not any(first):
+        return []  # output, or a file
+    assert all(first), f"{page.name}: not only commands in one block: {lines}"
+    return [shlex.split(_REDIRECTION.sub("", line), comments=True) for line in lines]
+
+
+def parse(arguments: Sequence[str]) -> None:
+    """Let the command line read the arguments of `hil`, and do nothing.
+
+    Raises:
+        Exception: it does not understand them.
+    """
+    command: Any = typer.main.get_command(app)
+    words = list(arguments)
+    while hasattr(command, "commands"):
+        assert words and words[0] in command.commands, f"hil {' '.join(arguments)}: no such command"
+        command = command.commands[words.pop(0)]
+    command.make_context(command.name, words)

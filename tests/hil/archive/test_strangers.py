@@ -1,0 +1,359 @@
+"""Archives that a stranger wrote: sound by their checksums, and odd or hostile all the same.
+
+Whoever opens one gets an error of ours that names file and field, or an archive that says what it
+lost; in memory that the file itself does not choose.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import tracemalloc
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+import zstandard
+from typer.testing import CliRunner
+
+import hil
+from hil.archive import container, index, open_archive, schema
+from hil.archive.cdr import LayoutError, fixed_layout
+from hil.archive.check import check_archive
+from hil.archive.container import Record
+from hil.archive.description import Description, DescriptionError
+from hil.archive.index import IndexBuilder
+from hil.archive.overview import overview
+from hil.archive.repair import repair
+from hil.cli import app
+from hil.errors import ArchiveError
+from hil.identify.sources import cell_of, gather_sources
+
+MEMORY = 60_000_000  # bytes; the small archive needs one million
+NAME = "validation_003_a1.mcap"
+READERS: dict[str, Callable[[Path], object]] = {
+    "open_archive": open_archive,
+    "a range": lambda path: open_archive(path, start=50.0, stop=50.2),
+    "open_recording": hil.open_recording,
+    "check": check_archive,
+    "info": overview,
+    "repair": lambda path: repair(path, path.with_name("repaired.mcap")),
+}
+
+
+def stranger(
+    written,
+    path: Path,
+    *,
+    metadata: Mapping[str, str] | None = None,
+    outcome: Mapping[str, str] | None = None,
+    attachments: Mapping[str, bytes] | None = None,
+    chunk: Callable[[bytes], bytes] = bytes,
+) -> Path:
+    """The small archive with other content, all checksums and the index fitting it."""
+    data, builder = bytearray(container.MAGIC), IndexBuilder()
+    given = {"hil": metadata or {}, "hil.outcome": outcome or {}}
+
+    def put(opcode: int, body: bytes) -> int:
+        data.extend(index.record(opcode, body))
+        return len(data) - len(body) - container.RECORD.size
+
+    for record in written.records:
+        if record.opcode == container.METADATA:
+            name, entries = container.metadata(record)
+            del entries["checksum"]
+            entries |= given[name]
+            whole = index.metadata(name, {**entries, "checksum": schema.checksum(entries)})
+            builder.add_metadata(len(data), len(whole), name)
+            data.extend(whole)
+        elif record.opcode == container.CHUNK:
+            plain = container.chunk_data(record, decompressor=zstandard.ZstdDecompressor())
+            plain, head = chunk(plain), container.chunk(record)
+            times = head.start_time, head.end_time
+            whole = index.chunk(plain, zstandard.compress(plain), "zstd", times)
+            body = whole[container.RECORD.size :]
+            at = put(container.CHUNK, body)
+            taken = Record(at, container.CHUNK, body, len(body))
+            data.extend(builder.add_chunk(at, len(whole), container.chunk(taken), plain))
+        elif record.opcode == container.ATTACHMENT:
+            name, content = container.attachment(record)
+            body = attachment(name, (attachments or {}).get(name, content))
+            at = put(container.ATTACHMENT, body)
+            builder.add_attachment(at, Record(at, container.ATTACHMENT, body, len(body)))
+        elif record.opcode not in (container.MESSAGE_INDEX, container.DATA_END):
+            put(record.opcode, record.body)
+    path.write_bytes(data + builder.tail(len(data)))
+    return path
+
+
+def attachment(name: str, content: bytes) -> bytes:
+    body = bytes(16) + index.text(name) + index.text("")
+    body += struct.pack("<Q", len(content)) + content
+    return body + struct.pack("<I", container.crc32(body))
+
+
+def outcomes(path: Path) -> dict[str, str]:
+    """What each way into a file says of it; other errors than ours pass through and fail."""
+    said = {}
+    for name, read in READERS.items():
+        try:
+            read(path)
+        except ArchiveError as error:
+            assert error.path is not None
+            said[name] = str(error)
+        else:
+            said[name] = ""
+        path.with_name("repaired.mcap").unlink(missing_ok=True)
+    return said
+
+
+def peak(action: Callable[[], object]) -> int:
+    tracemalloc.start()
+    try:
+        action()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_same_content_written_by_a_stranger_is_as_good(written, tmp_path):
+    path = stranger(written, tmp_path / NAME)
+    assert check_archive(path).keeps
+    assert set(outcomes(path).values()) == {""}
+
+
+DEEP = "[" * 100_000
+ODD = {
+    "joint_names": ["", "null", "{}", "[]", "[1, 2]", '["a"', '["a", "a"]', '["a", ""]', DEEP,
+                    '["\\ud800", "b"]', '["a\\u001b[31m", "b"]',
+                    json.dumps([str(i) for i in range(300)])],
+    "attachments": ["", "3", "[3]", "{}", DEEP, '["\\ud800"]'],
+    "period": ["", "yes", "null", "true", "NaN", "1e999", "0", "-0.001", "1e-300", "9" * 400, DEEP],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("field", "text"), [(f, t) for f, texts in ODD.items() for t in texts])
+def test_an_entry_that_cannot_be_used_is_named(field, text, written, tmp_path):
+    path = stranger(written, tmp_path / NAME, metadata={field: text})
+    said = outcomes(path)
+    for way in READERS.keys() - {"check"}:
+        assert f"{NAME}: {field}: " in said[way], way
+    faults = check_archive(path).faults["metadata"]
+    assert len(faults) == 1
+    assert faults[0].startswith(f"{field} ")
+    assert [file.name for file in tmp_path.iterdir()] == [NAME]
+
+
+def test_a_missing_period_is_a_fault_of_a_recorded_archive_alone():
+    entries = {"joint_names": '["a"]', "attachments": "[]"}
+    assert Description.of(entries) == Description(("a",), (), None)
+    with pytest.raises(DescriptionError, match="period is"):
+        Description.of({**entries, "period": "soon"})
+
+
+def test_the_command_line_says_it_in_a_sentence(written, tmp_path):
+    path = stranger(written, tmp_path / NAME, metadata={"joint_names": DEEP})
+    for command, status in (("info", 2), ("check", 5), ("repair", 1)):
+        result = CliRunner().invoke(app, ["archive", command, str(path)])
+        assert result.exit_code == status, command
+        assert "joint_names" in result.output
+        assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("field", "text"),
+    [
+        ("held_joints", "no"),
+        ("held_joints", "[1]"),
+        ("effects", DEEP),
+        ("motor_from_joint", "[[1, 0]]"),
+        ("motor_from_joint", '[["x", 0], [0, 1]]'),
+        ("motor_from_joint", "[[NaN, 0], [0, 1]]"),
+    ],
+)
+def test_what_identification_reads_of_the_metadata_is_checked(field, text, written, tmp_path):
+    path = stranger(written, tmp_path / NAME, metadata={field: text})
+    with pytest.raises(ArchiveError, match=f"{field}: is no JSON"):
+        hil.open_recording(path)
+
+
+@pytest.mark.parametrize("name", ["cell.toml", "robot.urdf"])
+def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
+    path = stranger(written, tmp_path / NAME, attachments={name: b"\xff\xfe"})
+    with pytest.raises(ArchiveError, match=f"{name}: is no text in UTF-8"):
+        cell_of(open_archive(path))
+    result = CliRunner().invoke(app, ["identify", str(path), "--in-sample", "-o", str(tmp_path)])
+    assert isinstance(result.exception, ArchiveError)
+    with pytest.raises(ArchiveError, match=name):
+        gather_sources([path], 0.3, in_sample=True)
+
+
+def test_joints_that_the_cycles_do_not_have_are_damage(written, tmp_path):
+    path = stranger(written, tmp_path / NAME, metadata={"joint_names": '["a", "b", "c"]'})
+    assert "not that of 3 joints" in str(open_archive(path).damage)
+    assert "holds no sample" in outcomes(path)["open_recording"]
+    assert not check_archive(path).keeps
+
+
+def test_a_second_description_is_not_believed(written, tmp_path):
+    entries = {"kind": "move", "joint_names": '["x"]', "attachments": "[]", "format_version": "1"}
+    second = index.metadata("hil", {**entries, "checksum": schema.checksum(entries)})
+    end = written.records[-1]
+    path = tmp_path / NAME
+    path.write_bytes(written.data[: end.offset] + second + written.data[end.offset :])
+    archive = open_archive(path)
+    assert archive.joint_names == ("a", "b")
+    assert "second time" in str(archive.damage)
+
+
+@pytest.mark.parametrize("losses", ["no", "[1]", DEEP])
+def test_counts_and_losses_that_are_none_stop_no_repair(losses, written, tmp_path):
+    path = stranger(
+        written,
+        tmp_path / NAME,
+        outcome={"samples": "9" * 5000, "repaired.losses": losses, "repaired.samples_lost": "٣"},
+    )
+    done = repair(path)
+    assert done.samples == 43
+    assert done.samples_lost is None
+    again = repair(done.output, done.output.with_name("again.mcap"))
+    assert again.whole
+    assert again.output.read_bytes() == done.output.read_bytes()
+    assert overview(path).samples == 43
+
+
+class TestEvents:
+    def test_data_nested_without_end_stay_text(self, written, tmp_path):
+        def nested(plain: bytes) -> bytes:
+            return plain.replace(b'{"start": 0}', b"[" * len('{"start": 0}'))
+
+        assert open_archive(stranger(written, tmp_path / NAME, chunk=nested)).events[0].data == {}
+
+    def test_texts_do_not_steer_the_terminal(self, written, tmp_path):
+        path = stranger(
+            written,
+            tmp_path / NAME,
+            metadata={"campaign": "\x1b]0;owned\x07\r<b>"},
+            chunk=lambda plain: plain.replace(b"text\n", b"\x1b[2J\n"),
+        )
+        shown = CliRunner().invoke(app, ["archive", "info", str(path)]).output
+        assert "owned" in shown
+        assert not {"\x1b", "\x07", "\r"} & set(shown)
+
+
+class TestNames:
+    def test_an_attachment_is_no_path(self, written, tmp_path):
+        """No command writes attachments under names that the archive chooses."""
+        folder = tmp_path / "folder"
+        folder.mkdir()
+        name = "../../etc/evil.toml"
+        listed = json.dumps([*sorted(written.attachments), name])
+        path = stranger(written, folder / NAME, metadata={"attachments": listed})
+        data, end = path.read_bytes(), 0
+        with path.open("rb") as stream:
+            for record in container.records(stream, len(data)):
+                end = record.offset
+        record = index.record(container.ATTACHMENT, attachment(name, b"x"))
+        path.write_bytes(data[:end] + record + data[end:])
+        assert open_archive(path).attachments[name] == b"x"
+        assert repair(path).samples == 43
+        assert "evil.toml" in CliRunner().invoke(app, ["archive", "info", str(path)]).output
+        assert {file.name for file in tmp_path.rglob("*")} == {
+            "folder", NAME, NAME.replace(".mcap", "_repaired.mcap")
+        }  # fmt: skip
+
+
+class TestSizes:
+    """Claims of gigabytes in a file of a few thousand bytes."""
+
+    def test_a_chunk_that_claims_four_gigabytes(self, written, tmp_path):
+        chunk = written.chunks[0]
+        data = bytearray(written.data)
+        struct.pack_into("<Q", data, chunk.offset + container.RECORD.size + 16, 4 << 30)
+        path = tmp_path / NAME
+        path.write_bytes(data)
+        self.assert_small(path, "claims 4294967296 bytes")
+
+    def test_a_chunk_of_zeros_that_is_as_large_as_it_says(self, written, tmp_path):
+        plain = bytes(1 << 26)
+        bomb = index.chunk(plain, zstandard.compress(plain, 19), "zstd", (0, 0))
+        assert len(bomb) < 10_000
+        at = written.chunks[0].offset
+        path = tmp_path / NAME
+        path.write_bytes(written.data[:at] + bomb * 50 + written.data[at:])
+        del plain
+        self.assert_small(path, "claims 67108864 bytes")
+
+    def test_a_frame_that_is_larger_than_its_chunk_says(self, written, tmp_path):
+        frame = zstandard.compress(bytes(1 << 27))
+        head = struct.pack("<QQQI", 0, 0, 1000, 0) + index.text("zstd")
+        bomb = index.record(container.CHUNK, head + struct.pack("<Q", len(frame)) + frame)
+        at = written.chunks[0].offset
+        path = tmp_path / NAME
+        path.write_bytes(written.data[:at] + bomb + written.data[at:])
+        self.assert_small(path, "another length than it claims")
+
+    def test_a_record_as_long_as_a_sparse_file(self, written, tmp_path):
+        at = written.chunks[0].offset
+        path = tmp_path / NAME
+        path.write_bytes(written.data[:at] + container.RECORD.pack(container.CHUNK, 1 << 40))
+        with path.open("r+b") as stream:
+            stream.truncate((1 << 40) + at + container.RECORD.size)
+        self.assert_small(path, "claims 1099511627776 bytes")
+
+    def test_a_tail_as_long_as_a_sparse_file(self, written, tmp_path):
+        path = tmp_path / NAME
+        path.write_bytes(written.data)
+        with path.open("r+b") as stream:
+            stream.truncate(1 << 26)
+        assert open_archive(path).n_samples == 43
+        assert not open_archive(path).complete
+
+    def test_an_index_that_lists_a_chunk_over_and_over(self, written, tmp_path):
+        path = self.with_entries(written, tmp_path, lambda entry: [entry] * 1000)
+        whole = open_archive(written.path, start=50.0, stop=50.2)
+        found = open_archive(path, start=50.0, stop=50.2)
+        assert found.columns["cycle"].tolist() == whole.columns["cycle"].tolist()
+        assert set(outcomes(path).values()) == {""}
+
+    @pytest.mark.parametrize("place", [(8, 1 << 62), (1 << 63, 100), ((1 << 64) - 1, 9)])
+    def test_an_index_that_points_beyond_the_world(self, place, written, tmp_path):
+        def elsewhere(entry: bytes) -> list[bytes]:
+            changed = bytearray(entry)
+            struct.pack_into("<QQ", changed, container.RECORD.size + 16, *place)
+            return [bytes(changed)]
+
+        path = self.with_entries(written, tmp_path, elsewhere)
+        assert peak(lambda: outcomes(path)) < MEMORY
+        assert open_archive(path, start=50.0, stop=50.2).n_samples == 20
+
+    @pytest.mark.parametrize("line", ["float64[999999999] x", "uint8[99999999999999999999] x",
+                                      "float64 x\nfloat64 x"])  # fmt: skip
+    def test_a_message_that_nobody_could_send(self, line):
+        with pytest.raises(LayoutError):
+            assert peak(lambda: fixed_layout(line)) < MEMORY
+
+    @staticmethod
+    def with_entries(written, folder: Path, change: Callable[[bytes], list[bytes]]) -> Path:
+        """The small archive, each chunk's entry of its index changed, checksum and all."""
+        data = written.data
+        start = struct.unpack_from("<Q", data, len(data) - len(container.MAGIC) - 20)[0]
+        body = data[start : -container.FOOTER_SIZE - len(container.MAGIC)]
+        summary = b""
+        for record in index.split(body):
+            if record[0] == container.SUMMARY_OFFSET:
+                continue
+            summary += b"".join(change(record) if record[0] == container.CHUNK_INDEX else [record])
+        summary += struct.pack("<BQQQ", container.FOOTER, 20, start, 0)
+        path = folder / NAME
+        crc = struct.pack("<I", container.crc32(summary))
+        path.write_bytes(data[:start] + summary + crc + container.MAGIC)
+        return path
+
+    @staticmethod
+    def assert_small(path: Path, reason: str) -> None:
+        said: dict[str, str] = {}
+        assert peak(lambda: said.update(outcomes(path))) < MEMORY
+        assert reason in said["open_recording"]
+        assert any(reason in fault for faults in check_archive(path).faults.values()
+                   for fault in faults)  # fmt: skip

@@ -1,0 +1,163 @@
+"""The operator's day as docs/campaign.md tells it, typed on a small simulated cell."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import hil.cli.rehearse
+import hil.cli.report
+import hil.cli.status
+from hil.campaign import Campaign, CampaignFolderError
+from hil.campaign.from_design import campaign_of_design
+from hil.cli import app
+from hil.design import DesignResult
+from tests.hil.fast_cell import fast_cell
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "campaign.md"
+QUICK = """\
+method = "b"
+[search]
+population = 8
+generations = 3
+[via_points]
+n_via = 3
+fly = 0.5
+slowest = 0.8
+"""
+
+
+def blocks(language: str) -> list[str]:
+    """Code blocks of the document in one language, "" for commands."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", DOCUMENT.read_text("utf-8"), re.M | re.S)
+
+
+def commands() -> list[list[str]]:
+    """What the document types, in order."""
+    lines = [line for block in blocks("") for line in block.splitlines()]
+    return [shlex.split(line, comments=True)[1:] for line in lines]
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What each command of the document printed; every one of them must succeed.
+
+    The search is shorter than the default one.
+    """
+    folder, said = tmp_path_factory.mktemp("day"), {}
+    fast_cell(folder)
+    (folder / "quick.toml").write_text(QUICK)
+    with pytest.MonkeyPatch.context() as here:
+        here.chdir(folder)
+        for arguments in commands():
+            more = ["--settings", "quick.toml"] if arguments[0] == "design" else []
+            result = CliRunner().invoke(app, [*arguments, *more])
+            assert result.exit_code == 0, (arguments, result.output, result.exception)
+            said[" ".join(arguments)] = result.stdout
+    return said | {"folder": str(folder)}
+
+
+def test_every_command_of_the_document_does_what_it_says(day: dict[str, str]) -> None:
+    assert "next: hil rehearse runs/mine" in day["design cell.toml -o runs/mine"]
+    assert "passed all" in day["rehearse runs/mine"]
+    assert day["run runs/mine --accept-dry-run"].rstrip().splitlines()[-1].startswith("The model")
+    assert "every step is done" in day["status runs/mine"]
+    assert day["report runs/mine"].rstrip().endswith("report.html")
+
+
+def test_status_as_json_names_every_step(day: dict[str, str]) -> None:
+    found = json.loads(day["status runs/mine --json"])
+    assert [(step["name"], step["state"]) for step in found["steps"]] == [
+        (name, "done")
+        for name in (
+            *("design", "rehearse", "dry run", "warm-up"),
+            *("repetitions", "validation", "identify", "report"),
+        )
+    ]
+    assert found["complete"] and found["next_command"] == "" and found["notes"] == []
+
+
+def test_the_python_of_the_document_runs_too(
+    day: dict[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(day["folder"])
+    (code,) = blocks("python")
+    exec(compile(code, str(DOCUMENT), "exec"), {})
+    assert "report done" in capsys.readouterr().out
+
+
+def test_nothing_whole_is_done_again(day: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(day["folder"])
+    campaign = Campaign.open(Path("runs/mine"))
+    before = campaign.folder.manifest()
+    result = campaign.run()
+    assert result.archives == () and result.complete
+    assert campaign.folder.manifest() == before
+
+
+def test_status_names_what_is_torn_rejected_and_next(
+    day: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(day["folder"])
+    done = Campaign.open(Path("runs/mine"))
+    campaign = Campaign.create(tmp_path / "two words", done.cell, done.plan)
+    status = campaign.status()
+    assert status.next_command == f"hil rehearse '{tmp_path}/two words'"
+    assert [step.state for step in status.steps[:3]] == ["done", "next", "blocked"]
+    folder = campaign.folder
+    for name in ("excitation_000_a1.mcap", "excitation_001_a1.mcap"):
+        (folder.archives / name).write_bytes(b"torn")
+    folder.add("excitation_000_a1.mcap", "rejected", "a jam")
+    with folder.locked():
+        notes = campaign.status().notes
+    assert notes == (
+        "a run or a rehearsal is at work on it now",
+        "excitation_001_a1.mcap is torn or was never entered; its motion is run again",
+        "excitation_000_a1.mcap is rejected: a jam",
+    )
+
+
+def test_a_design_replaces_its_own_campaign_and_never_a_recorded_one(
+    day: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(day["folder"])
+    mine = Path("runs/mine")
+    arguments = ["design", "cell.toml", "-o", str(mine), "--settings", "quick.toml", "--force"]
+    refused = CliRunner().invoke(app, arguments)
+    assert isinstance(refused.exception, CampaignFolderError)
+    assert "holds a campaign with recordings" in str(refused.exception)
+
+    cell, excitation = fast_cell(tmp_path), DesignResult.load(mine).excitation
+    root = tmp_path / "made"
+    first = campaign_of_design(root, cell, excitation)
+    sealed = (root / "manifest.json").stat().st_mtime_ns
+    campaign_of_design(root, cell, excitation)
+    assert (root / "manifest.json").stat().st_mtime_ns == sealed
+    other = fast_cell(tmp_path, validation_runs=2)
+    second = campaign_of_design(root, other, excitation)
+    assert (len(first.plan.validation), len(second.plan.validation)) == (1, 2)
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "cell.toml").write_text("somebody's")
+    with pytest.raises(CampaignFolderError, match="is not empty"):
+        campaign_of_design(tmp_path / "own", cell, excitation)
+
+
+@pytest.mark.parametrize("module", [hil.cli.rehearse, hil.cli.status, hil.cli.report])
+def test_a_command_is_a_thin_shell_over_the_campaign(module: object) -> None:
+    """Of everything in `hil.campaign`, commands touch the campaign and what it returns."""
+    tree = ast.parse(inspect.getsource(module))  # type: ignore[arg-type]
+    imported = {
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("hil.campaign")
+        for alias in node.names
+    }
+    assert imported <= {"Campaign", "CampaignStatus", "Rehearsal", "stop_on_interrupt"}
+    assert "Campaign" in imported

@@ -1,0 +1,244 @@
+"""Campaigns compared: planted changes are found, and nothing else; strangers are refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from hil.batch.local import LocalWorkers
+from hil.batch.types import Arm, LevelEstimate
+from hil.campaign import Campaign, CampaignPlan
+from hil.campaign.quick_design import design
+from hil.cell import Cell
+from hil.cli import app
+from hil.compare import Comparison, compare_campaigns, gather
+from hil.compare.gather import Gathered
+from hil.compare.record import to_dict
+from hil.compare.spread import difference, effective_count, holm, known
+from hil.compare.words import names, told, verdict
+from hil.errors import InputError
+from hil.identify import identify_campaign
+from hil.progress import Silent
+from hil.report.comparison import render_comparison
+
+from . import arm_histories
+from .arm_histories import FRICTION, Condition, Load
+from .fast_cell import fast_cell
+from .test_report import HOSTILE, Page
+
+Array = NDArray[np.float64]
+
+PLANTED = 1.3
+"""Factor on the shoulder's friction in the second campaign."""
+SIMULATED = "coulomb = [6.0, 3.0]\nviscous = [3.0, 1.5]\nthird"
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Two campaigns of one arm, the second with more friction, and one of another arm."""
+    root = tmp_path_factory.mktemp("compared")
+    usual = fast_cell(root, repetitions=3)
+    plan = design(usual, Silent())
+    changed = f"coulomb = [{6.0 * PLANTED}, 3.0]\nviscous = [{3.0 * PLANTED}, 1.5]\nthird"
+    stiff = usual.text.replace(SIMULATED, changed).replace("seed = 3", "seed = 4")
+    other = usual.text.replace("gear_ratio = [100.0", "gear_ratio = [110.0")
+    assert stiff != usual.text != other
+    return {
+        name: ran(root / name, Cell.from_texts(text, usual.urdf, usual.path), plan)
+        for name, text in (("march", usual.text), ("june", stiff), ("stranger", other))
+    }
+
+
+def ran(folder: Path, cell: Cell, plan: CampaignPlan) -> Path:
+    Campaign.create(folder, cell, plan).run(unrehearsed=True, durable=False)
+    return folder
+
+
+def compared(*places: Path) -> Comparison:
+    with LocalWorkers(1) as workers:
+        return compare_campaigns(gather([str(p) for p in places], workers, Silent()))
+
+
+@pytest.fixture(scope="module")
+def comparison(folders: dict[str, Path]) -> Comparison:
+    return compared(folders["march"], folders["june"])
+
+
+def test_planted_friction_is_found_on_its_axis_and_nowhere_else(comparison: Comparison) -> None:
+    shoulder, elbow = comparison.axes
+    assert shoulder.changed == (False, True) and elbow.changed == (False, False)
+    change, low, high = shoulder.relative(1)
+    assert low < PLANTED - 1.0 < high
+    assert change == pytest.approx(PLANTED - 1.0, abs=0.02)
+    assert not comparison.load_changed
+    assert verdict(comparison) == "Changed: friction of shoulder"
+    first = told(comparison)[0].words
+    assert "shoulder" in first and "30 % higher in june than in march" in first
+
+
+def test_the_other_way_round_the_change_has_the_other_sign(folders: dict[str, Path]) -> None:
+    back = compared(folders["june"] / "results.json", folders["march"])
+    assert names(back) == ["june", "march"]
+    assert back.axes[0].relative(1)[0] == pytest.approx(1.0 / PLANTED - 1.0, abs=0.02)
+
+
+def test_each_model_is_tried_on_the_motions_of_the_other(
+    comparison: Comparison, folders: dict[str, Path]
+) -> None:
+    overall = comparison.prediction.overall
+    assert overall[0, 1] > 2.0 * overall[1, 1] and overall[1, 0] > 2.0 * overall[0, 0]
+    alone = identify_campaign(folders["march"], Silent()).results
+    # There over rows in which any joint moves, here over those in which the joint itself does.
+    assert overall[0, 0] == pytest.approx(alone.validation[0].overall_relative_error, rel=0.15)
+
+
+def test_a_script_gets_numbers_and_an_exit_status_if_it_wants_one(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    pair = [str(folders["march"]), str(folders["june"])]
+    page = tmp_path / "pages" / "compare.html"
+    done = CliRunner().invoke(app, ["compare", *pair, "--json", "-o", str(page)])
+    assert done.exit_code == 0
+    found = json.loads(done.stdout)
+    assert found["simulated"] and found["changed"] and found["axes"][0]["changed"] == [False, True]
+    assert [one["name"] for one in found["campaigns"]] == ["march", "june"]
+    text = Page(page.read_text("utf-8")).text
+    assert text.index("Changed: friction of shoulder") < text.index("SIMULATED")
+    done = CliRunner().invoke(app, ["compare", *pair, "--quiet", "--fail-on-change"])
+    assert (done.exit_code, done.stdout) == (5, "Changed: friction of shoulder.\n")
+
+
+def test_different_arms_are_refused_with_what_they_differ_in(folders: dict[str, Path]) -> None:
+    with pytest.raises(InputError, match=r"stranger.*another arm.*march.*\[drive_train\]"):
+        compared(folders["march"], folders["stranger"])
+
+
+def test_one_campaign_is_nothing_to_compare(folders: dict[str, Path]) -> None:
+    with pytest.raises(InputError, match=r"march.*only campaign.*name two"):
+        compared(folders["march"], folders["march"])
+
+
+# From here on campaigns are made in memory.
+
+
+def in_memory(
+    conditions: Sequence[Condition], repetitions: Callable[[LevelEstimate], Array] | None = None
+) -> Comparison:
+    random = np.random.default_rng(11)
+    levels = [arm_histories.campaign(one, k, random) for k, one in enumerate(conditions)]
+    single = [
+        tuple(
+            replace(level, level="repetition", values=values)
+            for values in (repetitions(level) if repetitions else [level.values] * 2)
+        )
+        for level in levels
+    ]
+    arm = Arm("digest", arm_histories.cell())
+    return compare_campaigns(Gathered(arm, tuple(levels), tuple(single), True, ()))
+
+
+def test_a_payload_that_nobody_stated_is_weighed() -> None:
+    found = in_memory([Condition(), Condition(load=Load(3.0))])
+    assert found.load_changed and not found.friction_changed
+    assert found.payload.mass[1] == pytest.approx(3.0, abs=3.0 * found.payload.mass_std[1])
+    assert verdict(found) == "Changed: what the arm carries"
+
+
+def test_where_repetitions_differ_much_a_small_change_is_not_told() -> None:
+    def scattered(level: LevelEstimate) -> Array:
+        random = np.random.default_rng(len(level.when) + int(level.campaign[-2:]))
+        factor = np.ones((4, len(level.values)))
+        factor[:, -FRICTION.size :] += 0.2 * random.standard_normal((4, 1))
+        return factor * level.values
+
+    raised = FRICTION.copy()
+    raised[:, 3] *= 1.15
+    more = [Condition(), Condition(friction=raised)]
+    certain, uncertain = in_memory(more), in_memory(more, scattered)
+    assert [axis.changed[1] for axis in certain.axes] == [j == 3 for j in range(6)]
+    assert not uncertain.changed
+    assert uncertain.axes[3].smallest[1] > 0.15 > certain.axes[3].smallest[1]
+
+
+def test_a_page_of_hostile_names_is_inert() -> None:
+    found = in_memory([Condition(), Condition(friction=1.3 * FRICTION)])
+    spoilt = replace(
+        found,
+        arm=found.arm + HOSTILE,
+        campaigns=tuple(
+            replace(c, campaign=c.campaign + HOSTILE, setup=HOSTILE, when="")
+            for c in found.campaigns
+        ),
+        dated=False,
+        axes=tuple(replace(axis, joint=axis.joint + HOSTILE) for axis in found.axes),
+        parameters=tuple(replace(p, name=p.name + HOSTILE) for p in found.parameters),
+        doubts=(HOSTILE,),
+    )
+    page = Page(render_comparison(spoilt))
+    assert [tag for tag, _ in page.tags if tag in {"script", "img"}] == ["script"]
+    assert not [name for _, a in page.tags for name in a if name.startswith("on")]
+    json.dumps(to_dict(spoilt), allow_nan=False)
+
+
+def test_what_cannot_be_known_is_not_judged() -> None:
+    found = in_memory([Condition(), Condition()])
+    unknown = replace(
+        found.campaigns[1], std=np.full_like(found.campaigns[1].std, np.inf), covariance=None
+    )
+    arm = Arm("digest", arm_histories.cell())
+    levels = (found.campaigns[0], unknown)
+    again = compare_campaigns(Gathered(arm, levels, ((levels[0],), (levels[1],)), True, ()))
+    assert not again.changed
+    assert any("is not determined" in one.words for one in told(again))
+    assert any("one repetition" in doubt for doubt in again.doubts)
+    Page(render_comparison(again))
+
+
+# The statistics by themselves.
+
+
+def test_the_larger_of_two_variances_counts() -> None:
+    apart = np.array([9.0, 10.0, 11.0])
+    assert known(10.0, 0.01, 30.0, apart).variance == pytest.approx(1.0)
+    assert known(10.0, 4.0, 30.0, apart) == known(10.0, 4.0, 30.0, apart[:1])
+    assert np.isnan(known(10.0, np.inf, 30.0, apart).value)
+
+
+def test_repetitions_that_drift_are_worth_few() -> None:
+    drifting = np.linspace(0.0, 1.0, 30)
+    assert effective_count(drifting) < 3.0
+    random = np.random.default_rng(0)
+    white = [effective_count(random.standard_normal(30)) for _ in range(200)]
+    assert np.median(white) > 24.0
+    assert effective_count(np.ones(30)) == 30.0
+    assert effective_count(drifting[:3]) == 1.0  # nobody can tell
+
+
+@pytest.mark.parametrize(("count", "memory"), [(2, 0.0), (5, 0.7), (30, 0.0), (30, 0.7)])
+def test_of_two_alike_campaigns_few_are_said_to_differ(count: int, memory: float) -> None:
+    """At a level of 5 %, whether or not repetitions remember the one before."""
+    random = np.random.default_rng(count)
+
+    def one() -> Array:
+        found = [random.standard_normal()]
+        for shock in random.standard_normal(count - 1):
+            found.append(memory * found[-1] + np.sqrt(1.0 - memory**2) * shock)
+        return np.array(found)
+
+    p = [
+        difference(*(known(own.mean(), 0.0, 30.0, own) for own in (one(), one()))).p_value
+        for _ in range(2000)
+    ]
+    assert np.mean(np.array(p) < 0.05) < 0.09
+
+
+def test_holms_adjustment_is_that_of_the_book() -> None:
+    found = holm(np.array([[np.nan, 0.01], [0.04, 0.03]]))
+    np.testing.assert_allclose(found, [[np.nan, 0.03], [0.06, 0.06]])

@@ -1,0 +1,103 @@
+"""How a campaign was run, as its folder tells it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from hil.campaign import Campaign
+from hil.campaign.conduct import conduct_of
+from hil.campaign.dry_run import Acceptance, DryRun
+from hil.campaign.folder import CampaignFolder
+from hil.campaign.warmup import WarmMotion, WarmUp
+from hil.identify import identify_campaign
+from hil.progress import Silent
+
+from .fast_cell import fast_campaign, fast_cell, pass_rehearsal
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """A campaign without rehearsal and dry run, as a simulated arm allows."""
+    folder = tmp_path_factory.mktemp("conduct")
+    cell = fast_cell(folder, repetitions=2)
+    campaign = fast_campaign(folder / "campaign", cell, rehearsed=False)
+    campaign.run(unrehearsed=True, durable=False)
+    return campaign
+
+
+@pytest.fixture
+def folder(ran: Campaign, tmp_path: Path) -> CampaignFolder:
+    """A copy of it, to be changed."""
+    shutil.copytree(ran.folder.root, tmp_path / "campaign")
+    return CampaignFolder(tmp_path / "campaign")
+
+
+def test_every_archive_is_told_with_its_cycles(ran: Campaign) -> None:
+    found = conduct_of(ran.folder)
+    assert [one.archive for one in found.recorded] == [e.name for e in ran.folder.manifest()]
+    for one in found.recorded:
+        assert one.cycles > 0 and one.outcome == "completed" and one.when is None
+        assert one.seconds == pytest.approx((one.cycles - 1) * ran.cell.period, abs=1e-6)
+        assert (one.missed, one.late, one.lost, one.why) == (0, 0, 0, "")
+    assert found.warm_up is None
+
+
+def test_what_was_left_out_is_said(ran: Campaign) -> None:
+    steps = {one.step: one for one in conduct_of(ran.folder).steps}
+    assert not steps["rehearsal"].done and steps["rehearsal"].words == "none on record"
+    assert not steps["dry run"].done
+    assert steps["repetitions"].words.startswith("2 whole")
+
+
+def test_rehearsal_dry_run_warm_up_and_rejections_are_told(folder: CampaignFolder) -> None:
+    pass_rehearsal(folder)
+    DryRun(
+        folder.plan_hash, 0.2, ("dryrun_000_a1.mcap",), 9.0, True, ("shoulder", "elbow"),
+        (0.3, 0.12), (0.01, 0.02), 1, 2, Acceptance("ada", "2026-03-01"),
+    ).save(folder.dry_run)  # fmt: skip
+    motions = tuple(WarmMotion(f"w{k}", (10.0 - k, None)) for k in range(3))
+    warm = WarmUp(folder.plan_hash, ("shoulder", "elbow"), 0.002, motions, "not warm")
+    warm.save(folder.warmup)
+    name = "excitation_001_a9.mcap"
+    shutil.copy(folder.archives / "excitation_001_a1.mcap", folder.archives / name)
+    folder.add(name, "rejected", "it was held")
+    found = conduct_of(folder)
+    steps = {one.step: one for one in found.steps}
+    assert steps["rehearsal"].done
+    assert "accepted by ada at 2026-03-01" in steps["dry run"].words
+    assert "shoulder 30%, elbow 12%" in steps["dry run"].details[0]
+    assert not steps["warm-up"].done and steps["warm-up"].words == "not warm after 3 motions"
+    assert "1 rejected" in steps["repetitions"].words
+    assert found.warm_up is not None
+    assert found.warm_up.friction == [[10.0, None], [9.0, None], [8.0, None]]
+    assert found.warm_up.change[0] is None
+    assert found.warm_up.change[1] == pytest.approx(1.0 / 9.5)
+    assert (found.recorded[-1].outcome, found.recorded[-1].why) == ("rejected", "it was held")
+
+
+def test_what_is_of_another_plan_does_not_count(folder: CampaignFolder) -> None:
+    pass_rehearsal(folder)
+    folder.cell.write_text(folder.cell.read_text() + "\n# another\n")
+    (step,) = (one for one in conduct_of(folder).steps if one.step == "rehearsal")
+    assert not step.done and "another cell, URDF or plan" in step.words
+
+
+def test_what_cannot_be_read_is_told_and_stops_nothing(folder: CampaignFolder) -> None:
+    for path in (folder.rehearsal, folder.dry_run, folder.warmup):
+        path.write_text("{")
+    gone = folder.manifest()[-1]
+    (folder.archives / gone.name).unlink()
+    found = conduct_of(folder)
+    assert all(not one.done for one in found.steps[:3])
+    assert ["cannot be read" in found.steps[0].words, "damaged" in found.steps[1].words] == [
+        True
+    ] * 2
+    assert gone.name not in {one.archive for one in found.recorded}
+
+
+def test_identify_puts_it_into_the_results(ran: Campaign) -> None:
+    found = identify_campaign(ran.folder.root, Silent())
+    assert found.results.conduct == conduct_of(ran.folder)

@@ -1,0 +1,179 @@
+"""The live view, seen by a WebSocket client that knows nothing of the library that serves it.
+
+Protocol: https://github.com/foxglove/ws-protocol, as `foxglove.sdk.v1` has it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.drive_train import DriveTrain
+from drivers.events import GapSeen
+from drivers.record import cycle_dtype
+from hil.archive.commands import Serve
+from hil.archive.live_view import LiveView, LiveViewError
+
+pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
+pytest.importorskip("websockets", reason="websockets is not installed")
+
+from hil.archive import live
+from tests.hil.live_viewer import SUBPROTOCOL, Viewer
+
+NAMES = ("shoulder", "elbow")
+PERIOD = 0.001
+
+
+def drives() -> DriveTrain:
+    ones = np.ones(2)
+    return DriveTrain(
+        gear_ratio=np.array([100.0, -50.0]),
+        calibration=0.0 * ones,
+        joint_sign=ones,
+        joint_offset=0.0 * ones,
+        torque_constant=np.array([0.5, 0.25]),
+        current_limit=20.0 * ones,
+    )
+
+
+def records(first: int, count: int) -> np.ndarray[Any, np.dtype[np.void]]:
+    rows = np.zeros(count, cycle_dtype(2))
+    rows["cycle"] = np.arange(first, first + count)
+    rows["position"] = rows["cycle"][:, None] * [1e-3, -1e-3]
+    rows["target_current"] = [2.0, 4.0]
+    return rows
+
+
+@contextmanager
+def served(rate: float = 50.0) -> Iterator[live.LivePublisher]:
+    publisher = live.LivePublisher(Serve(1, LiveView(port=0, rate=rate), NAMES, PERIOD, drives()))
+    try:
+        yield publisher
+    finally:
+        publisher.close()
+
+
+def test_a_viewer_is_told_the_channels_and_schemas_of_an_archive() -> None:
+    with served() as publisher, Viewer(publisher.port) as viewer:
+        assert viewer.socket.subprotocol == SUBPROTOCOL
+        assert viewer.info["capabilities"] == []  # nobody can send anything from there
+        assert set(viewer.channels) == {
+            "/hil/cycle", "/joint_states", "/joint_states_commanded", "/hil/events"
+        }  # fmt: skip
+        for channel in viewer.channels.values():
+            assert channel["encoding"] == "cdr"
+            assert channel["schemaEncoding"] == "ros2msg"
+        assert viewer.channels["/joint_states"]["schemaName"] == "sensor_msgs/msg/JointState"
+
+
+def test_it_gets_what_was_measured_at_the_rate_asked_for() -> None:
+    with served(rate=100.0) as publisher, Viewer(publisher.port) as viewer:
+        viewer.subscribe("/joint_states")
+        seen: list[tuple[int, Any]] = []
+        first = 0
+        while len(seen) < 20:  # the subscription takes its time; what came before is not sent
+            publisher.publish(records(first, 20), ())
+            first += 20
+            try:
+                while True:
+                    topic, log_time, message = viewer.message(timeout=0.05)
+                    assert topic == "/joint_states"
+                    seen.append((log_time, message))
+            except TimeoutError:
+                assert first < 2000, "nothing came"
+        for _, message in seen:
+            assert list(message.name) == list(NAMES)
+            cycle = round(message.position[0] * 1e3)
+            assert cycle % 10 == 0
+            np.testing.assert_allclose(message.position, [cycle * 1e-3, -cycle * 1e-3])
+            # torque = current * torque constant * gear ratio, by hand
+            np.testing.assert_allclose(message.effort, [2.0 * 0.5 * 100, 4.0 * 0.25 * -50])
+            assert message.header.stamp.sec * 1000 + message.header.stamp.nanosec // 10**6 == cycle
+        steps = np.diff([log_time for log_time, _ in seen])
+        np.testing.assert_array_equal(steps, 10_000_000)
+        assert abs(seen[-1][0] - time.time_ns()) < 5e9
+
+
+def test_events_come_all_of_them() -> None:
+    with served() as publisher, Viewer(publisher.port) as viewer:
+        viewer.subscribe("/hil/events")
+        for _ in range(100):
+            publisher.publish(records(0, 0), (GapSeen(3, 1000),))
+            try:
+                _, _, message = viewer.message(timeout=0.05)
+            except TimeoutError:
+                continue
+            assert message.name == "GapSeen"
+            assert message.msg == "3 packets missed before cycle 1000"
+            assert message.level == 30
+            assert message.stamp.sec == 1
+            return
+        pytest.fail("no event came")
+
+
+def test_a_viewer_that_reads_nothing_holds_nobody_up() -> None:
+    """Ten times as much as waits for one client: what was recorded is left behind, not waited for.
+
+    Meanwhile another viewer sees the newest.
+    """
+    with served(rate=1000.0) as publisher, Viewer(publisher.port) as dead:
+        dead.subscribe("/hil/cycle", "/joint_states", "/joint_states_commanded")
+        with Viewer(publisher.port) as viewer:
+            viewer.subscribe("/joint_states")
+            slowest, first = 0.0, 0
+            until = time.monotonic() + 0.8
+            while time.monotonic() < until:
+                began = time.perf_counter()
+                publisher.publish(records(first, 100), ())
+                slowest = max(slowest, time.perf_counter() - began)
+                first += 100
+                time.sleep(0.01)
+            assert first > 10 * live.BACKLOG
+            assert slowest < 0.05
+            assert len(publisher._waiting) <= live.QUEUE
+            _, _, newest = viewer.last_message(silence=0.5)
+            assert round(newest.position[0] * 1e3) == first - 1
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [
+        ("9000", "127.0.0.1", 9000),
+        ("0.0.0.0:8765", "0.0.0.0", 8765),
+        ("localhost:1", "localhost", 1),
+        ("[::1]:8765", "::1", 8765),
+    ],
+)
+def test_an_address_is_host_and_port_or_a_port_on_this_computer(
+    text: str, host: str, port: int
+) -> None:
+    view = LiveView.parse(text)
+    assert (view.host, view.port) == (host, port)
+
+
+@pytest.mark.parametrize("text", ["", "localhost", "a b:1", "a:99999", "::1", "ws://a:1", "a:-1"])
+def test_what_is_no_address_is_refused(text: str) -> None:
+    with pytest.raises(LiveViewError, match=r"HOST:PORT; e\.g\. 127\.0\.0\.1:8765"):
+        LiveView.parse(text)
+
+
+def test_a_port_that_is_taken_is_told() -> None:
+    with served() as publisher, pytest.raises(LiveViewError, match="in use"):
+        live.LivePublisher(Serve(1, LiveView(port=publisher.port), NAMES, PERIOD, drives()))
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "foxglove", None)
+    with pytest.raises(LiveViewError, match=r"hil\[live\]"):
+        live.LivePublisher(Serve(1, LiveView(port=0), NAMES, PERIOD, drives()))
+
+
+def test_unless_told_otherwise_only_this_computer_can_look() -> None:
+    assert LiveView().host == "127.0.0.1"
+    assert Path(live.__file__).exists()

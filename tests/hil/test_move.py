@@ -1,0 +1,216 @@
+"""`hil move`: a checked straight way, confirmed, archived, and stopped on its path."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hil.archive import open_archive
+from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
+from hil.cell import Cell
+from hil.cli import app
+from hil.demo_link import LOOPBACK
+from hil.errors import InputError, UnsafeError
+from hil.move import posture, straight_way, turned
+from hil.testing import UdpController
+from sim_fixtures.ns16 import CELL_PATH
+
+
+@pytest.fixture(scope="module")
+def ns16() -> Cell:
+    return Cell.load(CELL_PATH)
+
+
+def ran(*arguments: str) -> dict[str, object]:
+    result = CliRunner().invoke(app, ["move", *arguments, "--json"], catch_exceptions=False)
+    assert result.exit_code == 0
+    summary: dict[str, object] = json.loads(result.stdout.splitlines()[-1])
+    return summary
+
+
+def test_the_arm_goes_home_and_every_cycle_is_archived(ns16: Cell, tmp_path: Path) -> None:
+    summary = ran(str(CELL_PATH), "--to", "start", "-o", str(tmp_path))
+    archive = open_archive(str(summary["archive"]))
+    assert archive.complete
+    assert archive.kind == "move"
+    assert archive.metadata["simulated"] == "yes"
+    position = archive.columns["position"]
+    np.testing.assert_allclose(position[0], ns16.initial, atol=1e-3)
+    assert np.all(np.diff(archive.columns["cycle"]) == 1)
+    # Straight in joint space: each joint is the same share of its way on.
+    moved = archive.columns["commanded_position"]
+    sent = moved[np.isfinite(moved).all(axis=1)]
+    np.testing.assert_allclose(sent[-1], ns16.home, atol=1e-12)
+    share = (sent - ns16.initial) / (ns16.home - ns16.initial)
+    assert np.ptp(share, axis=1).max() < 1e-3
+    speed = np.abs(archive.columns["velocity"]).max(axis=0)
+    assert np.all(speed <= 1.1 * ns16.campaign.approach_speed * ns16.joint_limits.velocity)
+
+
+def test_one_joint_turns_by_so_many_degrees_of_the_teach_pendant(
+    ns16: Cell, tmp_path: Path
+) -> None:
+    out = str(tmp_path / "one.mcap")
+    summary = ran(str(CELL_PATH), "--joint", "joint_3", "--by", "5", "--speed", "5", "-o", out)
+    archive = open_archive(out)
+    pendant = np.degrees(ns16.controller_angles(archive.columns["position"][[0, -1]]))
+    np.testing.assert_allclose(pendant[1] - pendant[0], [0, 0, 5, 0, 0, 0], atol=0.05)
+    assert summary["outcome"] == "completed"
+
+
+def test_a_campaign_keeps_its_moves_and_knows_its_start(campaign: Campaign, tmp_path: Path) -> None:
+    root = tmp_path / "campaign"
+    shutil.copytree(campaign.folder.root, root)
+    before = Campaign.open(root)
+    names = {entry.name for entry in before.folder.manifest()}
+    ran(str(root), "--to", "start")
+    after = Campaign.open(root)
+    (new,) = {entry.name for entry in after.folder.manifest()} - names
+    archive = open_archive(after.folder.archives / new)
+    start = after.plan.excitation.trajectory.sample(np.array([0.0]))[0][0]
+    sent = archive.columns["commanded_position"]
+    np.testing.assert_allclose(sent[np.isfinite(sent).all(axis=1)][-1], start, atol=1e-12)
+    after.folder.require_unchanged()
+
+
+def test_where_the_arm_is_already_nothing_is_sent(tmp_path: Path) -> None:
+    there = "10,-15,-100,20,60,-30"  # initial_deg of the cell
+    assert ran(str(CELL_PATH), "--to", there, "-o", str(tmp_path))["outcome"] == "there"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("0,0,-90,0,130,0", r"joint_5 would go to 130°, its limits are -120° and 120°"),
+        ("0,95,-170,0,60,0", r"collision of link_1 and link_6"),
+    ],
+)
+def test_a_way_that_may_not_be_gone_is_refused_before_anything_is_sent(
+    target: str, reason: str, ns16: Cell
+) -> None:
+    with pytest.raises(MotionRefusedError, match=reason):
+        straight_way(ns16, ns16.initial, posture(ns16, target))
+
+
+def test_the_way_itself_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
+    """Between two free postures a wall stands in the way."""
+    text = ns16.text.replace(
+        "walls = []", "walls = [{ lower = [0.9, -0.1, 0.0], upper = [1.6, 0.1, 1.8] }]"
+    )
+    walled = Cell.from_texts(text, ns16.urdf, ns16.path)
+    left, right = posture(walled, "60,20,-80,0,30,0"), posture(walled, "-60,20,-80,0,30,0")
+    straight_way(ns16, left, right)  # free without the wall
+    for end in (left, right):
+        straight_way(walled, end, turned(walled, end, "6", 10.0))
+    with pytest.raises(MotionRefusedError, match="and box 0"):
+        straight_way(walled, left, right)
+
+
+@pytest.mark.parametrize("text", ["there", "1,2,3", "1,2,3,4,5,nan"])
+def test_what_is_no_posture_is_refused(text: str, ns16: Cell) -> None:
+    with pytest.raises(InputError, match="6 angles in degrees"):
+        posture(ns16, text)
+
+
+@pytest.mark.parametrize("arguments", [[], ["--to", "home", "--joint", "1"], ["--joint", "1"]])
+def test_one_target_is_asked_for(arguments: list[str]) -> None:
+    result = CliRunner().invoke(app, ["move", str(CELL_PATH), *arguments])
+    assert isinstance(result.exception, InputError)
+
+
+def test_a_real_controller_is_not_driven_unless_a_person_confirms(
+    ns16: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its link is told that the far end might be one; the far end is still simulated."""
+    with UdpController.started(ns16, tmp_path) as controller:
+        monkeypatch.setattr("hil.campaign.live_link.stays_here", lambda _: False)
+        arguments = ["move", str(controller.cell_path), "--to", "home", "-o", str(tmp_path / "m")]
+        result = CliRunner().invoke(app, arguments)
+        assert isinstance(result.exception, UnsafeError)
+        assert "nobody is here to confirm" in str(result.exception)
+        result = CliRunner().invoke(app, [*arguments, "--yes", "--speed", "100"])
+        assert isinstance(result.exception, UnsafeError)
+        assert "faster than the cell's approach_speed" in str(result.exception)
+    assert not (tmp_path / "m").exists()  # nothing moves without an archive
+
+
+def test_nothing_is_connected_while_a_run_is_at_work_on_the_campaign(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "campaign"
+    shutil.copytree(campaign.folder.root, root)
+    connected: list[object] = []
+    monkeypatch.setattr("hil.cli.move.cell_link", lambda *a, **_: connected.append(a))
+    with Campaign.open(root).folder.locked():
+        result = CliRunner().invoke(app, ["move", str(root), "--to", "start", "--json"])
+    assert isinstance(result.exception, CampaignFolderError)
+    assert not connected
+
+
+def moving(controller: UdpController, output: Path, *options: str) -> list[str]:
+    return [
+        sys.executable, "-m", "hil", "move", str(controller.cell_path), "--to", "home",
+        "--speed", "5", "-o", str(output), *options,
+    ]  # fmt: skip
+
+
+def test_over_udp_ctrl_c_brings_the_arm_to_rest_on_its_way(ns16: Cell, tmp_path: Path) -> None:
+    output = tmp_path / "move.mcap"
+    with UdpController.started(ns16, tmp_path) as controller:
+        assert controller.host == LOOPBACK
+        process = subprocess.Popen(
+            moving(controller, output), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        deadline = time.monotonic() + 60.0
+        while time.monotonic() < deadline and not (output.exists() and output.stat().st_size > 4e4):
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    archive = open_archive(output)
+    assert archive.complete
+    assert archive.outcome is not None
+    assert archive.outcome["outcome"] == "stopped"
+    sent = archive.columns["commanded_position"]
+    sent = sent[np.isfinite(sent).all(axis=1)]
+    share = (sent - ns16.initial) / (ns16.home - ns16.initial)
+    assert 0.0 < share[-1, 0] < 0.99  # it stopped on the way
+    assert np.ptp(share, axis=1).max() < 1e-3  # and never left it
+
+
+def test_on_a_terminal_the_way_is_shown_and_no_means_no(tmp_path: Path) -> None:
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hil", "move", str(CELL_PATH), "--to", "home", "-o", str(tmp_path)],
+        stdin=slave, stdout=slave, stderr=slave, close_fds=True,
+    )  # fmt: skip
+    os.close(slave)
+    said, answered = b"", False
+    while True:
+        try:
+            part = os.read(master, 4096)
+        except OSError:  # the terminal's other end is closed
+            break
+        said += part
+        if not answered and b"[y/N]" in said:
+            os.write(master, b"n\n")
+            answered = True
+    os.close(master)
+    assert process.wait(30) == 130
+    text = said.decode()
+    assert "joint_5" in text
+    assert "peak speed" in text
+    assert "nothing was sent" in text
+    assert not list(tmp_path.iterdir())

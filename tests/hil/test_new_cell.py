@@ -1,0 +1,264 @@
+"""`hil new`: a cell file in which every figure is known, or named as missing."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from typer.testing import CliRunner
+
+from drivers.announced import compare
+from drivers.packets import InitPacket
+from drivers.transports.udp import UdpSpec
+from hil.campaign import Campaign, CampaignPlan, Stop, design
+from hil.cell import Cell
+from hil.cell.unknown import UnknownFieldsError
+from hil.cell.urdf import urdf_limits
+from hil.cli import app
+from hil.demo_link import SIMULATE, free_port
+from hil.errors import ArchiveError, ControllerFault, InputError
+from hil.new.controller import _nothing_moves
+from hil.new.fixing import with_fixed
+from hil.progress import Silent
+from hil.simulation import simulated_link
+from hil.testing import shortened
+from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
+from tests.hil.new_cells import TWO_JOINTS, described_robot, filled_in
+
+UR10 = "ur_description/urdf/ur10_robot.urdf"
+PANDA = "panda_description/urdf/panda.urdf"
+ON_THE_WIRE = (
+    "gear_ratio", "calibration", "k54", "k64", "k65", "current_limit", "following_error"
+)  # fmt: skip
+
+
+def new(urdf: Path, output: Path, *options: str) -> dict[str, list[str]]:
+    """What `hil new` says it wrote."""
+    arguments = ["new", "--urdf", str(urdf), "-o", str(output), "--json", *options]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    summary: dict[str, list[str]] = json.loads(result.stdout.splitlines()[-1])
+    return summary
+
+
+@pytest.fixture
+def two_joints(tmp_path: Path) -> Path:
+    path = tmp_path / "two.urdf"
+    path.write_text(TWO_JOINTS)
+    return path
+
+
+def test_limits_come_from_the_urdf_and_what_it_does_not_state_is_unknown(
+    two_joints: Path, tmp_path: Path
+) -> None:
+    summary = new(two_joints, tmp_path / "cell.toml")
+    limits = tomllib.loads((tmp_path / "cell.toml").read_text())["limits"]
+    assert limits["frame"] == "urdf"
+    assert limits["lower_deg"] == [pytest.approx(-np.degrees(2.0), abs=1e-3), "?"]
+    assert limits["velocity_deg"] == [pytest.approx(np.degrees(2.5), abs=1e-3), "?"]
+    assert limits["torque"] == [150.0, 60.0]
+    assert limits["acceleration_deg"] == limits["jerk_deg"] == ["?", "?"]
+    assert {"limits.lower_deg", "limits.jerk_deg", "workspace.walls"} <= set(summary["unknown"])
+
+
+def test_a_file_that_is_not_filled_in_is_refused_by_the_names_of_all_that_is_missing(
+    two_joints: Path, tmp_path: Path
+) -> None:
+    summary = new(two_joints, tmp_path / "cell.toml")
+    with pytest.raises(UnknownFieldsError) as refused:
+        Cell.load(tmp_path / "cell.toml")
+    named = [field.partition(" ")[0] for field in refused.value.fields]
+    assert sorted(named) == sorted(summary["unknown"])
+    text = str(refused.value)
+    assert "limits.lower_deg (entry 2): lower position limits in degrees" in text
+    assert "jog each joint" in text
+    assert "init packet" in text
+
+
+def test_one_question_mark_in_any_list_is_found(tmp_path: Path) -> None:
+    cell = Cell.load(CELL_PATH)
+    text = cell.text.replace("jerk_deg = [5166.67, 5166.67", 'jerk_deg = [5166.67, "?"')
+    with pytest.raises(UnknownFieldsError, match=r"one field still unknown.*\n.*\(entry 2\)"):
+        Cell.from_texts(text, cell.urdf, tmp_path / "cell.toml")
+
+
+@pytest.mark.parametrize(
+    ("robot", "home"),
+    [
+        ("two", [10.0, 20.0]),
+        (UR10, [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]),
+        (PANDA, [0.0, -30.0, 0.0, -120.0, 0.0, 90.0, 0.0]),
+    ],
+)
+def test_a_filled_in_cell_runs_a_campaign(
+    robot: str, home: list[float], two_joints: Path, tmp_path: Path
+) -> None:
+    """Of arms with two, six and seven joints; every motion of it passes its checks."""
+    urdf = two_joints if robot == "two" else described_robot(robot)
+    path = tmp_path / "cell" / "cell.toml"
+    summary = new(urdf, path)
+    near = {
+        "limits__lower_deg": [angle - 50.0 for angle in home],
+        "limits__upper_deg": [angle + 40.0 for angle in home],
+    }
+    text = filled_in(
+        path, len(home), campaign__home_deg=home, workspace__margin=0.002, limits__torque=[], **near
+    )
+    path.write_text(text)
+    cell = shortened(Cell.load(path))
+    assert list(cell.joint_names) == summary["joints"]
+    allowed = urdf_limits(cell.urdf, cell.joint_names)
+    assert np.all(cell.joint_limits.velocity <= allowed.velocity * (1.0 + 1e-5))
+    shaken = home_and_back(cell)
+    campaign = Campaign.create(tmp_path / "campaign", cell, shaken)
+    campaign.run(simulated_link(cell), Stop(), Silent(), durable=False, unrehearsed=True)
+    assert len(campaign.folder.completed("excitation")) == 2
+
+
+def home_and_back(cell: Cell) -> CampaignPlan:
+    """A small excitation of every joint about home."""
+    plan = design(cell, Silent())
+    return CampaignPlan(plan.excitation, validation=plan.validation[:1])
+
+
+def test_joints_that_slide_are_fixed_and_it_is_said(tmp_path: Path) -> None:
+    urdf = described_robot(PANDA)
+    summary = new(urdf, tmp_path / "panda.toml", "--fix", "panda_finger_joint1=0.02")
+    assert len(summary["joints"]) == 7
+    (note,) = summary["notes"]
+    assert "panda_finger_joint2 slides, and is fixed at 0 m" in note
+    assert (tmp_path / "panda.urdf").exists()
+
+
+@pytest.mark.parametrize("joint", ["panda_finger_joint1", "panda_joint4"])
+def test_a_fixed_joint_leaves_the_dynamics_of_one_that_is_held(joint: str) -> None:
+    """Against pinocchio's own reduction of the whole model."""
+    urdf = described_robot(PANDA).read_text()
+    held = 0.021
+    model = pin.buildModelFromXML(urdf)
+    posture = pin.neutral(model)
+    posture[model.joints[model.getJointId(joint)].idx_q] = held
+    reduced = pin.buildReducedModel(model, [model.getJointId(joint)], posture)
+    fixed = pin.buildModelFromXML(with_fixed(urdf, {joint: held}))
+    rng = np.random.default_rng(3)
+    q, qd, qdd = rng.uniform(-0.5, 0.5, (3, fixed.nq))
+    ours = pin.rnea(fixed, fixed.createData(), q, qd, qdd)
+    theirs = pin.rnea(reduced, reduced.createData(), q, qd, qdd)
+    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+
+
+def test_an_archive_gives_all_that_its_own_cell_and_controller_said(
+    campaign: Campaign, tmp_path: Path
+) -> None:
+    archive = campaign.folder.completed("excitation")[0]
+    summary = new(URDF_PATH, tmp_path / "cell.toml", "--from-archive", str(archive))
+    assert summary["unknown"] == []
+    assert any("simulated" in note for note in summary["notes"])
+    found, original = Cell.load(tmp_path / "cell.toml"), campaign.cell
+    assert found.file.drive_train == original.file.drive_train
+    assert found.file.limits == original.file.limits
+    assert found.file.simulation == original.file.simulation
+    np.testing.assert_array_equal(found.home, original.home)
+
+
+def test_an_archive_of_another_arm_is_refused(
+    campaign: Campaign, two_joints: Path, tmp_path: Path
+) -> None:
+    archive = campaign.folder.completed("excitation")[0]
+    arguments = ["new", "--urdf", str(two_joints), "-o", str(tmp_path / "c.toml")]
+    result = CliRunner().invoke(app, [*arguments, "--from-archive", str(archive)])
+    assert isinstance(result.exception, ArchiveError)
+    assert "those of the URDF are hip, knee" in str(result.exception)
+    assert not (tmp_path / "c.toml").exists()
+
+
+def test_a_controller_is_asked_over_udp(tmp_path: Path) -> None:
+    port = free_port()
+    simulator = subprocess.Popen(
+        [*SIMULATE, str(CELL_PATH), "--udp", f"127.0.0.1:{port}", "--json", "--duration", "60"],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    try:
+        summary = new(
+            URDF_PATH, tmp_path / "cell.toml",
+            "--from-controller", f"127.0.0.1:{port}", "--bind", "127.0.0.1", "--wait", "60",
+        )  # fmt: skip
+    finally:
+        simulator.terminate()
+        said = simulator.communicate(timeout=60)[0]
+    written = tomllib.loads((tmp_path / "cell.toml").read_text())
+    truth = tomllib.loads(CELL_PATH.read_text())
+    for name in ON_THE_WIRE:
+        assert written["drive_train"][name] == truth["drive_train"][name], name
+    assert written["controller"]["cycle_ms"] == truth["controller"]["cycle_ms"]
+    assert (written["controller"]["host"], written["controller"]["port"]) == ("127.0.0.1", port)
+    assert "drive_train.joint_sign" in summary["unknown"]  # which no packet tells
+    assert json.loads(said.splitlines()[-1])["rejected"] == 0  # every answer was a good one
+
+
+def test_whoever_asks_a_controller_cannot_move_it() -> None:
+    """Any drive train but the placeholder makes the session unusable, and no archive is there."""
+    settings = _nothing_moves(UdpSpec("127.0.0.1", 1, "127.0.0.1"), 6, 1)
+    drives = Cell.load(CELL_PATH).drive_train
+    init = InitPacket.build(
+        6, 2, {"gear_ratio": drives.gear_ratio, "calibration": drives.calibration}
+    )
+    found = compare(settings.drive_train, settings.period, init, 1, accept=False)
+    assert found.unusable is not None
+    assert settings.needs_archive
+
+
+def test_a_controller_that_does_not_come_leaves_no_file(tmp_path: Path) -> None:
+    result = CliRunner().invoke(
+        app,
+        ["new", "--urdf", str(URDF_PATH), "-o", str(tmp_path / "c.toml"), "--wait", "0.2",
+         "--from-controller", f"127.0.0.1:{free_port()}", "--bind", "127.0.0.1"],
+    )  # fmt: skip
+    assert isinstance(result.exception, ControllerFault)
+    assert "start this command first" in str(result.exception)
+    assert not (tmp_path / "c.toml").exists()
+
+
+def test_nothing_is_overwritten_unless_asked_for(two_joints: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text("mine")
+    arguments = ["new", "--urdf", str(two_joints), "-o", str(path)]
+    assert isinstance(CliRunner().invoke(app, arguments).exception, InputError)
+    assert path.read_text() == "mine"
+    assert CliRunner().invoke(app, [*arguments, "--force"]).exit_code == 0
+    assert path.read_text() != "mine"
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--fix", "elbow"], "has no moving joint elbow; it has hip, knee"),
+        (["--fix", "hip=high"], "'hip=high' is no JOINT=POSITION"),
+        (["--from-controller", "a:b"], "is no HOST or HOST:PORT"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_in_a_sentence(
+    options: list[str], sentence: str, two_joints: Path, tmp_path: Path
+) -> None:
+    arguments = ["new", "--urdf", str(two_joints), "-o", str(tmp_path / "c.toml"), *options]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, InputError)
+    assert sentence in str(result.exception)
+
+
+def test_the_command_prints_one_sentence_for_a_file_that_is_no_urdf(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text("<robot/>")
+    done = subprocess.run(
+        [sys.executable, "-m", "hil", "new", "--urdf", str(tmp_path / "arm.urdf"), "-o",
+         str(tmp_path / "c.toml")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith(f"error: {tmp_path / 'arm.urdf'}: ")
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,135 @@
+"""`hil plot`: what is in an archive, with every peak, without a display."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hil.archive import Samples, open_archive, write_samples
+from hil.campaign import Campaign
+from hil.cli import app
+from hil.errors import ArchiveError, InputError
+from hil.plots.archive_view import view_of
+
+
+@pytest.fixture
+def excitation(campaign: Campaign) -> Path:
+    return campaign.folder.completed("excitation")[0]
+
+
+def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
+    excitation: Path, campaign: Campaign
+) -> None:
+    view, columns = view_of(excitation), open_archive(excitation).columns
+    titles = [quantity.title.partition(" [")[0] for quantity in view.quantities]
+    assert titles == [
+        "position", "speed", "motor current", "torque at the joint", "following error"
+    ]  # fmt: skip
+    current = view.quantities[2]
+    for joint, trace in enumerate(current.traces):
+        # Thinned to a fraction, but the largest and the smallest sample are there.
+        assert trace.value.size < 0.5 * len(columns["stamp"])
+        assert trace.value.max() == columns["target_current"][:, joint].max()
+        assert trace.value.min() == columns["target_current"][:, joint].min()
+        assert trace.high == campaign.cell.drive_table.current_limit[joint]
+    pendant = np.degrees(campaign.cell.controller_angles(columns["position"]))
+    assert view.quantities[0].traces[1].value.max() == pytest.approx(pendant[:, 1].max())
+    assert view.angles == "teach pendant angles"
+    assert [name for _, _, name in view.states] == [
+        "closed", "opening", "open", "exiting", "closed"
+    ]  # fmt: skip
+    assert any(name == "MotionEnded" for _, name, _, _ in view.events)
+
+
+def test_following_errors_are_those_of_the_motors(excitation: Path, campaign: Campaign) -> None:
+    """In the unit of the controller's thresholds, by the drive train's own conversion."""
+    columns, drives = open_archive(excitation).columns, campaign.cell.drive_train
+    error = drives.motor_revolutions(columns["target_position"]) - drives.motor_revolutions(
+        columns["position"]
+    )
+    traces = view_of(excitation).quantities[4].traces
+    for joint, trace in enumerate(traces):
+        assert np.nanmax(np.abs(trace.value)) == pytest.approx(np.abs(error[:, joint]).max())
+
+
+def test_one_sample_of_a_long_recording_is_not_lost(tmp_path: Path) -> None:
+    """Six minutes at 500 Hz, in windows, with one spike and one stretch that was not recorded."""
+    time = np.arange(0.0, 360.0, 0.002)
+    time = time[(time < 100.0) | (time > 140.0)]
+    position = 0.1 * np.sin(time)[:, np.newaxis]
+    spike = np.zeros_like(position)
+    spike[123_457] = 77.0
+    path = tmp_path / "long.mcap"
+    write_samples(
+        path,
+        Samples(np.rint(time * 1e9).astype(np.int64), position, torque=spike),
+        joint_names=("only",),
+        metadata={},
+        attachments={},
+    )
+    view = view_of(path)
+    (trace,) = view.quantities[-1].traces
+    assert trace.value.size < 5000
+    at = trace.time[np.nanargmax(trace.value)]
+    assert np.nanmax(trace.value) == 77.0
+    assert at == pytest.approx(time[123_457], abs=1e-6)
+    (broken,) = np.flatnonzero(np.isnan(trace.time))
+    assert trace.time[broken - 1] == pytest.approx(100.0, abs=0.01)
+    assert trace.time[broken + 1] == pytest.approx(140.0, abs=0.01)
+    assert view_of(path, start=200.0, stop=201.0).quantities[0].traces[0].value.size == 501
+
+
+def test_a_part_of_the_time_and_some_joints(excitation: Path) -> None:
+    view = view_of(excitation, start=1.0, stop=2.0, joints=("2", "joint_5"))
+    assert view.joint_names == ("joint_2", "joint_5")
+    for quantity in view.quantities:
+        for trace in quantity.traces:
+            assert np.nanmin(trace.time) >= 1.0 - 1e-9
+            assert np.nanmax(trace.time) <= 2.0 + 1e-9
+    with pytest.raises(InputError, match="name one of joint_1"):
+        view_of(excitation, joints=("7",))
+    with pytest.raises(ArchiveError, match="nothing lies in the time asked for"):
+        view_of(excitation, start=1e4)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.svg", "a.pdf", "a.html"])
+def test_a_picture_without_a_display(excitation: Path, name: str, tmp_path: Path) -> None:
+    environment = {key: value for key, value in os.environ.items() if "DISPLAY" not in key}
+    done = subprocess.run(
+        [sys.executable, "-m", "hil", "plot", str(excitation), "-o", name, "--joint", "1"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{name}: excitation 0, attempt 1")
+    content = (tmp_path / name).read_bytes()
+    head = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF", "html": b"<!doctype html>"}
+    assert content.startswith(head[name.partition(".")[2]])
+    if name == "a.html":
+        assert b"http://" not in content.replace(b"http://www.w3.org", b"")
+        assert b"MotionEnded" in content
+
+
+def test_the_shares_of_limits_are_told_to_a_script(excitation: Path, tmp_path: Path) -> None:
+    target = tmp_path / "x.png"
+    result = CliRunner().invoke(app, ["plot", str(excitation), "-o", str(target), "--json"])
+    assert result.exit_code == 0
+    summary = json.loads(result.stdout)
+    assert summary["picture"] == str(target)
+    shares = summary["peak_share_of_limit"]["motor current [A]"]
+    assert set(shares) == {f"joint_{k}" for k in range(1, 7)}
+    assert all(0.0 < share < 1.0 for share in shares.values())
+
+
+def test_what_is_no_archive_or_no_format_is_refused(excitation: Path, tmp_path: Path) -> None:
+    (tmp_path / "no.mcap").write_bytes(b"no")
+    result = CliRunner().invoke(app, ["plot", str(tmp_path / "no.mcap")])
+    assert isinstance(result.exception, ArchiveError)
+    result = CliRunner().invoke(app, ["plot", str(excitation), "-o", str(tmp_path / "x.gif")])
+    assert isinstance(result.exception, InputError)

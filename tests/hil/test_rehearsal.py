@@ -1,0 +1,268 @@
+"""A rehearsal: what passes it, what must not, and what becomes of it afterwards."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from drivers.drive_train import DriveTrain
+from hil.archive import open_archive
+from hil.campaign import Campaign, CampaignFolderError, NotRehearsedError, Stop
+from hil.campaign.folder import CampaignFolder
+from hil.campaign.gates import require_rehearsed
+from hil.campaign.rehearsal import Rehearsal
+from hil.campaign.rehearsal_twin import SPREAD, Twin
+from hil.cell import Cell
+from hil.cli import app
+from hil.errors import OperatorStopError
+from hil.identify import identify_campaign
+from hil.progress import Silent, Task
+from hil.simulation import simulated_drive
+from planner import Move, plan_moves
+from tests.hil.fast_cell import CELL, URDF, fast_campaign, fast_cell
+
+Array = NDArray[np.float64]
+GEARS = """
+[simulation.drive_train]
+gear_ratio = [100.0, -80.0]
+joint_sign = [1, -1]
+joint_offset_deg = [0.0, 10.0]
+"""
+
+
+def cell_of(folder: Path, text: str, urdf: str = URDF) -> Cell:
+    (folder / "fast.urdf").write_text(urdf)
+    (folder / "cell.toml").write_text(text)
+    return Cell.load(folder / "cell.toml")
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """A campaign that was rehearsed; tests only read it."""
+    folder = tmp_path_factory.mktemp("designed")
+    campaign = fast_campaign(folder / "campaign", fast_cell(folder), rehearsed=False)
+    campaign.rehearse()
+    return campaign
+
+
+def values(found: Rehearsal) -> dict[str, float | None]:
+    return {one.name: one.value for one in found.criteria}
+
+
+def failed(found: Rehearsal) -> set[str]:
+    return {one.name for one in found.criteria if not one.passed}
+
+
+def test_a_good_plan_on_a_right_cell_passes_every_criterion(designed: Campaign) -> None:
+    found = Rehearsal.load(designed.folder)
+    assert found is not None and found.passed and not found.failures
+    assert found.plan_hash == designed.folder.plan_hash
+    assert [one.name for one in found.criteria] == [
+        "motions (as modelled)",
+        "current (as modelled)",
+        "excitation",
+        "parameters",
+        "unseen motion",
+        "motions (with what the model leaves out)",
+        "current (with what the model leaves out)",
+    ]
+    require_rehearsed(designed.folder)
+
+
+def test_exactly_the_plan_is_run_noisy_and_with_a_faulty_link(designed: Campaign) -> None:
+    twin = Campaign.open(designed.folder.rehearsed / "plain")
+    assert twin.plan.to_text() == designed.plan.to_text()
+    assert len(twin.folder.completed("excitation")) == 3
+    assert len(twin.folder.completed("validation")) == len(designed.plan.validation)
+    archives = [open_archive(twin.folder.archives / e.name) for e in twin.folder.manifest()]
+    assert all(archive.metadata["rehearsal"] == "yes" for archive in archives)
+    assert sum(int(archive.columns["gap"].sum()) for archive in archives) > 0
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_is_planted_lies_within_a_tenth_of_the_nominal_and_is_not_the_nominal(
+    designed: Campaign, seed: int
+) -> None:
+    twin = Twin.of(designed.cell, seed=seed, repetitions=3)
+    nominal = designed.cell.nominal_values()
+    known = nominal != 0.0
+    apart = np.abs(twin.truth[known] / nominal[known] - 1.0)
+    # Each base parameter of this arm is a sum of figures of one sign, or of one figure.
+    assert np.all(apart <= SPREAD + 1e-12)
+    assert np.all(apart > 0.0)
+    assert np.all(twin.truth[~known] == 0.0)
+    other = Twin.of(designed.cell, seed=seed + 10, repetitions=3)
+    assert not np.array_equal(other.truth, twin.truth)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ("joint_sign = [1, -1]", "joint_sign = [-1, -1]"),
+        ("gear_ratio = [100.0, -80.0]", "gear_ratio = [-100.0, -80.0]"),
+        ("gear_ratio = [100.0, -80.0]", "gear_ratio = [100.0, 80.0]"),
+    ],
+)
+def test_a_wrong_sign_in_the_cell_file_fails(
+    tmp_path: Path, designed: Campaign, right: str, wrong: str
+) -> None:
+    cell = cell_of(tmp_path, CELL.replace(right, wrong, 1) + GEARS)
+    found = Campaign.create(tmp_path / "campaign", cell, designed.plan).rehearse()
+    assert not found.passed
+    assert failed(found)
+    with pytest.raises(NotRehearsedError, match="failed its rehearsal"):
+        require_rehearsed(CampaignFolder(tmp_path / "campaign"))
+
+
+def test_a_robot_whose_drive_train_is_another_fails(tmp_path: Path, designed: Campaign) -> None:
+    """Also where the cell file does not say so, and the caller does."""
+    swapped = replace(simulated_drive(designed.cell), torque_constant=(0.4, 0.5))
+    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
+    found = campaign.rehearse(drive=swapped)
+    assert "parameters" in failed(found)
+
+
+def test_torques_of_the_wrong_sign_on_our_side_fail(
+    tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The simulated arm shares no conversion with the PC, so that a sign cannot cancel."""
+    honest = DriveTrain.joint_torque
+
+    def turned(drives: DriveTrain, current: Array) -> Array:
+        return np.asarray(honest(drives, current) * [1.0, -1.0])
+
+    monkeypatch.setattr(DriveTrain, "joint_torque", turned)
+    found = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan).rehearse()
+    assert "parameters" in failed(found)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "speed"),
+    [((1.0, 1.0), 0.02), ((0.0, 40.0), 1.0)],
+    ids=["tiny and slow", "one joint only"],
+)
+def test_a_poor_excitation_fails(
+    tmp_path: Path, designed: Campaign, degrees: tuple[float, float], speed: float
+) -> None:
+    cell, home = designed.cell, designed.cell.home
+    ways = (Move(home + np.radians(degrees), speed=speed), Move(home, speed=speed))
+    motion = plan_moves(home, ways, cell.joint_limits)
+    excitation = replace(designed.plan.excitation, trajectory=motion.trajectory)
+    plan = replace(designed.plan, excitation=excitation, moves=None)
+    found = Campaign.create(tmp_path / "campaign", cell, plan).rehearse()
+    assert failed(found) & {"excitation", "unseen motion"}, values(found)
+
+
+def test_motors_that_are_nearly_too_weak_fail(tmp_path: Path, designed: Campaign) -> None:
+    good = Rehearsal.load(designed.folder)
+    assert good is not None
+    share = values(good)["current (as modelled)"]
+    assert share is not None
+    limits = [20.0 * share / 0.85, 12.0]
+    cell = cell_of(
+        tmp_path, CELL.replace("current_limit = [20.0, 12.0]", f"current_limit = {limits}")
+    )
+    found = Campaign.create(tmp_path / "campaign", cell, designed.plan).rehearse()
+    assert failed(found) == {"current (as modelled)"}, found.failures
+
+
+def test_a_cell_of_hardware_without_a_simulation_is_rehearsed_from_its_nominal_figures(
+    tmp_path: Path, designed: Campaign
+) -> None:
+    text = CELL[: CELL.index("[simulation]")].replace('"simulated"', '"udp"')
+    campaign = Campaign.create(tmp_path / "campaign", cell_of(tmp_path, text), designed.plan)
+    found = campaign.rehearse()
+    assert found.passed, found.failures
+    assert any("trembles" in sentence for sentence in found.assumed)
+    assert any("joint_sign" in sentence for sentence in found.not_seen)
+    assert campaign.cell.controller.transport == "udp"
+
+
+def test_what_was_planted_stands_in_the_archives_and_in_a_report_of_them(
+    designed: Campaign,
+) -> None:
+    found = identify_campaign(designed.folder.rehearsed / "plain", Silent())
+    twin = Twin.of(designed.cell, seed=1, repetitions=3)
+    truths = [one.truth for one in found.results.parameters]
+    assert truths == twin.truth.tolist()
+
+
+def test_a_change_of_cell_or_plan_takes_the_rehearsal_away(
+    tmp_path: Path, designed: Campaign
+) -> None:
+    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
+    text = Rehearsal.load(designed.folder)
+    assert text is not None
+    text.model_copy(update={"plan_hash": campaign.folder.plan_hash}).save(campaign.folder.rehearsal)
+    require_rehearsed(campaign.folder)
+    cell = campaign.folder.cell
+    cell.write_text(cell.read_text().replace("coulomb = [6.0, 3.0]", "coulomb = [6.0, 3.5]", 1))
+    with pytest.raises(NotRehearsedError, match="another cell, URDF or plan"):
+        require_rehearsed(campaign.folder)
+    with pytest.raises(CampaignFolderError, match=r"cell\.toml is not the one.*hil rehearse"):
+        campaign.run()
+    step = Campaign.open(campaign.folder.root).status().steps[1]
+    assert (step.name, step.state) == ("rehearse", "next")
+    assert "another cell, URDF or plan" in step.sentence
+
+
+class StopsAfter:
+    """A reporter that asks for a stop as soon as something was recorded."""
+
+    def __init__(self, stop: Stop) -> None:
+        self.stop, self.said = stop, list[str]()
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        stop = self.stop
+
+        class Stopping:
+            def advance(self, units: float, note: str = "") -> None:
+                stop.requested = True
+
+        yield Stopping()
+
+
+def test_a_rehearsal_that_was_stopped_goes_on_and_one_that_passed_is_kept(
+    tmp_path: Path, designed: Campaign
+) -> None:
+    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
+    stop = Stop()
+    with pytest.raises(OperatorStopError, match="rehearse again to go on"):
+        campaign.rehearse(stop=stop, reporter=StopsAfter(stop))
+    assert Rehearsal.load(campaign.folder) is None
+    plain = CampaignFolder(campaign.folder.rehearsed / "plain")
+    before = {entry.name: entry.sha256 for entry in plain.manifest()}
+    assert before
+    assert campaign.rehearse().passed
+    after = {entry.name: entry.sha256 for entry in plain.manifest()}
+    assert before.items() <= after.items()
+    written = campaign.folder.rehearsal.stat().st_mtime_ns
+    assert campaign.rehearse().passed
+    assert campaign.folder.rehearsal.stat().st_mtime_ns == written
+
+
+def test_the_command_is_the_method_with_exit_codes(designed: Campaign, tmp_path: Path) -> None:
+    runner = CliRunner()
+    good = runner.invoke(app, ["rehearse", str(designed.folder.root), "--json"])
+    assert good.exit_code == 0
+    stored = Rehearsal.load(designed.folder)
+    assert Rehearsal.model_validate_json(good.stdout) == stored
+    cell = cell_of(tmp_path, CELL.replace("gear_ratio = [100.0", "gear_ratio = [-100.0") + GEARS)
+    Campaign.create(tmp_path / "campaign", cell, designed.plan)
+    bad = runner.invoke(app, ["rehearse", str(tmp_path / "campaign"), "--json"])
+    assert bad.exit_code == 5
+    said = json.loads(bad.stdout)
+    assert not said["passed"]
+    assert "gear ratio" in said["criteria"][0]["sentence"]

@@ -1,0 +1,570 @@
+"""What a run does not take for granted: files that were edited, copied, torn or half written."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+import hil.files
+from drivers.transports import SimulatedTransport
+from hil.archive import open_archive
+from hil.batch.cache import Where
+from hil.batch.discovery import discover
+from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError, quality_entry
+from hil.campaign.dry_run import OVERRIDE, DryRun
+from hil.campaign.errors import DryRunError, RepetitionsRejectedError
+from hil.campaign.execution_result import RunResult
+from hil.campaign.folder import LOCK, CampaignFolder
+from hil.campaign.gates import require_rehearsed
+from hil.campaign.motion_watch import Wish
+from hil.campaign.operator import DryRunSummary, RunStatus
+from hil.campaign.rehearsal import Rehearsal
+from hil.campaign.stop import Stop
+from hil.campaign.warmup import COLD_AFTER, WarmUp
+from hil.cell import Cell
+from hil.cell.text import replaced_value
+from hil.cli import app
+from hil.errors import OperatorStopError, OutputError
+from hil.identify.sources import gather_sources
+from hil.motion_checks import MotionChecks
+from hil.progress import Silent
+from hil.simulation import simulated_controller, simulated_drive, simulated_link
+from sim_fixtures.controller_faults import Faultable
+from tests.hil.batch_workers import Here
+from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+
+Array = NDArray[np.float64]
+Make = Callable[..., Campaign]
+
+
+class Person:
+    """Somebody who accepts the dry run, with a wish for each status."""
+
+    can_answer = True
+
+    def __init__(self, wishes: Callable[[RunStatus], Wish] = lambda _: Wish()) -> None:
+        self.wishes = wishes
+        self.status: RunStatus | None = None
+
+    def show(self, status: RunStatus) -> None:
+        self.status = status
+
+    def wish(self) -> Wish:
+        return Wish() if self.status is None else self.wishes(self.status)
+
+    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+        del summary
+        return True
+
+
+class Real:
+    """A link in virtual time that says of itself that it leads to a real arm."""
+
+    only_simulated = False
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._link, name)
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """The plan that all campaigns here run."""
+    folder = tmp_path_factory.mktemp("designed")
+    return fast_campaign(folder / "campaign", fast_cell(folder))
+
+
+@pytest.fixture
+def make(tmp_path: Path, designed: Campaign) -> Make:
+    """A rehearsed campaign of a few seconds; of a real arm where that is wanted."""
+
+    def made(name: str = "campaign", *, real: bool = False, **settings: float) -> Campaign:
+        cell = fast_cell(tmp_path, **{"repetitions": 1, **settings})
+        if real:
+            text = cell.with_link(transport="udp", host="192.0.2.7").text
+            cell = Cell.from_texts(text, cell.urdf, cell.path)
+        campaign = Campaign.create(tmp_path / name, cell, designed.plan)
+        pass_rehearsal(campaign.folder)
+        return campaign
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def dry(tmp_path_factory: pytest.TempPathFactory, designed: Campaign) -> Campaign:
+    """A campaign whose dry run is done and accepted, and nothing more; tests copy it."""
+    folder = tmp_path_factory.mktemp("dry")
+    cell = fast_cell(folder, repetitions=1)
+    campaign = Campaign.create(folder / "campaign", cell, designed.plan)
+    pass_rehearsal(campaign.folder)
+    campaign.run(dry_run_only=True, operator=Person())
+    return campaign
+
+
+def copied(campaign: Campaign, to: Path) -> Campaign:
+    shutil.copytree(campaign.folder.root, to)
+    return Campaign.open(to)
+
+
+def kinds(result: RunResult) -> list[str]:
+    return [name.split("_")[0] for name in result.archives]
+
+
+# --- exactly what was looked at is what is sent
+
+
+def test_a_cell_that_is_edited_while_it_is_rehearsed_is_not_rehearsed(
+    tmp_path: Path, designed: Campaign
+) -> None:
+    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
+    path = campaign.folder.cell
+
+    class Editing(Silent):
+        def say(self, text: str) -> None:
+            if "as modelled" in text:
+                edited = path.read_text().replace("standstill_s = 0.3", "standstill_s = 0.7")
+                path.write_text(edited)
+
+    with pytest.raises(CampaignFolderError, match=r"cell\.toml was changed after it was read"):
+        campaign.rehearse(reporter=Editing())
+    assert Rehearsal.load(campaign.folder) is None
+
+
+def test_motions_of_a_campaign_in_memory_are_not_sent_once_the_folder_holds_others(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    mine = copied(dry, tmp_path / "campaign")
+    text = mine.folder.cell.read_text().replace("standstill_s = 0.3", "standstill_s = 0.7")
+    mine.folder.cell.write_text(text)
+    mine.folder.seal()
+    pass_rehearsal(mine.folder)
+    with pytest.raises(CampaignFolderError, match=r"cell\.toml was changed after it was read"):
+        mine.run(accept_dry_run=True)
+    assert not list(mine.folder.archives.glob("excitation*"))
+
+
+def test_a_link_to_another_arm_is_refused_and_one_to_the_same_elsewhere_is_not(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    text = replaced_value(campaign.cell.text, "limits", "velocity_deg", "[300.0, 300.0]")
+    other = Cell.from_texts(text, campaign.cell.urdf, campaign.cell.path)
+    with pytest.raises(CampaignFolderError, match=r"opened with another cell \(\[limits\]"):
+        campaign.run(simulated_link(other))
+    there = Cell.from_texts(
+        replaced_value(campaign.cell.text, "controller", "port", 4711),
+        campaign.cell.urdf,
+        campaign.cell.path,
+    )
+    assert campaign.run(simulated_link(there)).complete
+
+
+def test_a_mesh_belongs_to_what_was_rehearsed(tmp_path: Path) -> None:
+    folder = CampaignFolder(tmp_path)
+    folder.cell.write_text('[cell]\nname = "a"\nmesh_folders = ["meshes"]\n')
+    folder.urdf.write_text(
+        '<robot name="a"><link name="b"><collision><geometry>'
+        '<mesh filename="package://arm/link.stl"/></geometry></collision></link></robot>'
+    )
+    mesh = tmp_path / "meshes" / "arm" / "link.stl"
+    mesh.parent.mkdir(parents=True)
+    mesh.write_bytes(b"a cube")
+    folder.seal()
+    before = folder.plan_hash
+    mesh.write_bytes(b"a larger cube")
+    assert folder.plan_hash != before
+    with pytest.raises(CampaignFolderError, match=r"mesh package://arm/link\.stl is not the one"):
+        folder.require_unchanged()
+    # On another computer, which reads what was recorded, the mesh need not be there.
+    mesh.unlink()
+    assert folder.plan_hash == before
+
+
+# --- gates
+
+
+def test_a_dry_run_of_a_simulated_arm_opens_no_gate_to_a_real_one_however_it_came_there(
+    make: Make,
+) -> None:
+    did = make("did", real=True)
+    did.run(
+        simulated_link(did.cell, instead_of_hardware=True), dry_run_only=True, operator=Person()
+    )
+    found = DryRun.load(did.folder)
+    assert found is not None
+    for name, edited in (("copied", found), ("edited", replace(found, simulated=False))):
+        mine = make(name, real=True)
+        edited.accepted_now().save(mine.folder.dry_run)
+        with pytest.raises(DryRunError, match="was not done"):
+            mine.run(Real(simulated_link(mine.cell, instead_of_hardware=True)))
+        step = mine.status().steps[2]
+        assert (step.name, step.state) == ("dry run", "next")
+        assert "does not count" in step.sentence
+        assert not list(mine.folder.archives.iterdir())
+
+
+def test_a_dry_run_whose_archives_are_gone_or_that_is_of_an_older_version_does_not_count(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    gone = copied(dry, tmp_path / "gone")
+    next(gone.folder.archives.glob("dryrun*")).unlink()
+    with pytest.raises(DryRunError, match="was not done"):
+        gone.run()
+    old = copied(dry, tmp_path / "old")
+    text = old.folder.dry_run.read_text().replace('"format_version": 2', '"format_version": 1')
+    old.folder.dry_run.write_text(text)
+    with pytest.raises(CampaignFolderError, match="format version 1"):
+        old.run()
+
+
+def peak_speed(campaign: Campaign, name: str) -> Array:
+    """Of a motion, as a share of the joints' speed limits (n,)."""
+    commanded = open_archive(campaign.folder.archives / name).columns["commanded_position"]
+    commanded = commanded[~np.isnan(commanded).any(axis=1)]
+    speed = np.abs(np.diff(commanded, axis=0)).max(axis=0) / campaign.cell.period
+    return np.asarray(speed / campaign.cell.joint_limits.velocity)
+
+
+def test_a_way_that_nobody_has_watched_is_gone_no_faster_than_a_dry_run(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    """The arm was jogged elsewhere since; `approach_speed` of this cell is full speed."""
+    campaign = copied(dry, tmp_path / "campaign")
+    text = replaced_value(campaign.cell.text, "simulation", "initial_deg", "[70.0, -70.0]")
+    elsewhere = Cell.from_texts(text, campaign.cell.urdf, campaign.cell.path)
+    result = campaign.run(simulated_link(elsewhere))
+    ways = [name for name in result.archives if name.startswith("move")]
+    assert len(ways) >= 2
+    for name in ways:
+        assert peak_speed(campaign, name).max() <= OVERRIDE * 1.001
+
+
+def test_the_controllers_own_figures_do_not_replace_those_that_were_checked(
+    tmp_path: Path, designed: Campaign
+) -> None:
+    gears = replaced_value(designed.cell.text, "drive_train", "gear_ratio", "[101.0, -80.0]")
+    wrong = Cell.from_texts(gears, designed.cell.urdf, designed.cell.path)
+    campaign = Campaign.create(tmp_path / "campaign", wrong, designed.plan)
+    pass_rehearsal(campaign.folder)
+    controller = simulated_controller(designed.cell)
+    link = Link.over(
+        SimulatedTransport(controller), campaign.cell, controller.finish, accept_init=True
+    )
+    with pytest.raises(NotRehearsedError, match=r"this link uses the controller's .*rehearse"):
+        campaign.run(link, accept_dry_run=True)
+    assert not list(campaign.folder.archives.iterdir())
+    flag = CliRunner().invoke(app, ["run", str(campaign.folder.root), "--accept-init"])
+    assert flag.exit_code == 2
+
+
+def test_what_a_warm_up_sends_is_checked_in_the_run_that_sends_it(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = make(warmup_drift=0.9, warmup_least=3, warmup_most=3)
+    campaign.run(unrehearsed=True)
+    next(campaign.folder.archives.glob("validation*")).unlink()
+    campaign.folder.warmup.unlink()
+    checked: list[object] = []
+    refusal = MotionChecks.refusal
+
+    def spied(checks: MotionChecks, motion: Any) -> str | None:
+        checked.append(motion)
+        return refusal(checks, motion)
+
+    monkeypatch.setattr(MotionChecks, "refusal", spied)
+    assert "warmup" in kinds(campaign.run(unrehearsed=True))
+    assert any(motion is campaign.plan.excitation.trajectory for motion in checked)
+
+
+def test_a_rehearsal_on_other_gears_than_the_cell_files_opens_no_gate(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = make()
+    campaign.folder.rehearsal.unlink()
+    stop = Stop()
+
+    class Stopping(Silent):
+        def say(self, text: str) -> None:
+            stop.requested = stop.requested or "what the model leaves out" in text
+
+    drive = simulated_drive(campaign.cell)
+    with pytest.raises(OperatorStopError):
+        campaign.rehearse(drive=drive, stop=stop, reporter=Stopping())
+    found = campaign.folder.rehearsed.rglob("manifest.json")
+    assert {path.parent.parent.name for path in found} == {"other_drive"}, "never gone on with"
+
+    from hil.campaign import rehearsal_run
+
+    passed = make("passed")
+    good = Rehearsal.load(passed.folder)
+    monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: good)
+    assert campaign.rehearse(drive=drive) is good
+    assert Rehearsal.load(campaign.folder) is None
+
+
+def without_last(content: dict[str, Any]) -> None:
+    content["criteria"].pop()
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda content: content.update(passed="yes"),
+        lambda content: content.update(criteria=[]),
+        lambda content: content["criteria"][2].update(passed=False),
+        lambda content: content.update(format_version=7),
+        without_last,
+    ],
+)
+def test_a_rehearsal_passed_only_if_each_of_its_criteria_did(
+    tmp_path: Path, dry: Campaign, edit: Callable[[dict[str, Any]], None]
+) -> None:
+    folder = CampaignFolder(tmp_path)
+    content = json.loads(dry.folder.rehearsal.read_text())
+    content["plan_hash"] = folder.plan_hash
+    folder.rehearsal.write_text(json.dumps(content))
+    require_rehearsed(folder)
+    edit(content)
+    folder.rehearsal.write_text(json.dumps(content))
+    with pytest.raises(CampaignFolderError, match=r"rehearsal\.json cannot be read"):
+        require_rehearsed(folder)
+
+
+def test_one_damaged_archive_is_left_out_and_its_motion_made_again(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    first = campaign.folder.archives / campaign.folder.manifest()[0].name
+    first.write_bytes(first.read_bytes()[:50])
+    assert campaign.run().complete
+
+
+# --- quality
+
+
+class Killed(BaseException):
+    """A run dies."""
+
+
+def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
+    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = make(repetitions=2)
+
+    def slow_second(status: RunStatus) -> Wish:
+        return Wish(0.5 if (status.phase, status.number) == ("repetition", 2) else 1.0)
+
+    def dies(*_: object) -> None:
+        raise Killed
+
+    monkeypatch.setattr(quality_entry, "amend_outcome", dies)
+    with suppress(Killed):
+        campaign.run(operator=Person(slow_second), unrehearsed=True)
+    monkeypatch.undo()
+    slowed = campaign.folder.archives / "excitation_001_a1.mcap"
+    assert (open_archive(slowed, fields=()).outcome or {})["outcome"] == "completed"
+    found = discover([str(campaign.folder.root)], Where(str(tmp_path / "cache")), Here())
+    assert slowed.as_posix() not in {ref.location for ref in found.refs}
+    (told,) = (one for one in found.skipped if one.path == slowed.as_posix())
+    assert "not named in its campaign's manifest.json" in told.reason
+    good = campaign.folder.completed("excitation")
+    doubts = gather_sources([*good, slowed], 0.5).doubts
+    assert any(doubt.startswith(f"{slowed.name} is not named") for doubt in doubts)
+    again = campaign.run(unrehearsed=True)
+    assert again.repetitions == (2, 2)
+    assert [one.archive for one in again.rejected] == [slowed.name], "judged by the next run"
+
+
+class Push:
+    """Somebody leans against the upper arm for 0.1 s."""
+
+    def __init__(self, cycle: int) -> None:
+        self.cycle = cycle
+
+    def inflict(self, on: Faultable) -> None:
+        on.suffer("load", 1, 0.15, 50)
+
+
+def test_a_first_repetition_that_was_touched_does_not_spoil_all_others(
+    tmp_path: Path, make: Make
+) -> None:
+    first = open_archive(
+        finished(make("undisturbed")).folder.archives / "excitation_000_a1.mcap", fields=["cycle"]
+    )
+    middle = int(np.mean(first.columns["cycle"][[0, -1]]))
+    campaign = make(repetitions=3)
+    faults: list[Any] = [Push(middle)]
+    controller = simulated_controller(campaign.cell, faults=faults)
+    link = Link.over(SimulatedTransport(controller), campaign.cell, controller.finish)
+    result = campaign.run(link, unrehearsed=True, durable=False)
+    assert result.complete
+    assert [one.archive for one in result.rejected] == [
+        "excitation_001_a1.mcap", "excitation_000_a1.mcap"
+    ]  # fmt: skip
+    assert "agree with each other, and not with this one" in result.rejected[1].reason
+    good = [path.name for path in campaign.folder.completed("excitation")]
+    assert good == ["excitation_000_a2.mcap", "excitation_001_a2.mcap", "excitation_002_a1.mcap"]
+    touched = open_archive(campaign.folder.archives / "excitation_000_a1.mcap")
+    assert (touched.outcome or {})["outcome"] == "rejected"
+    assert not campaign.folder.damaged()
+
+
+def finished(campaign: Campaign) -> Campaign:
+    campaign.run(unrehearsed=True, durable=False)
+    return campaign
+
+
+def slowed_once(phase: str) -> Person:
+    """Somebody who slows motions of a kind until one is rejected for it."""
+
+    def wishes(status: RunStatus) -> Wish:
+        told = any("rejected" in note for note in status.notes)
+        return Wish(0.5 if status.phase == phase and not told else 1.0)
+
+    return Person(wishes)
+
+
+def test_a_repetition_that_somebody_slowed_is_no_attempt_while_he_has_let_go(make: Make) -> None:
+    campaign = make(bad_repetitions=0)
+    result = campaign.run(operator=slowed_once("repetition"), unrehearsed=True)
+    assert result.complete
+    assert len(result.rejected) == 1
+    kept = make("kept", bad_repetitions=0)
+    with pytest.raises(RepetitionsRejectedError, match="of no use 1 times"):
+        kept.run(operator=Person(lambda status: Wish(0.5)), unrehearsed=True)
+
+
+# --- warm-up
+
+
+def rested(campaign: Campaign, seconds: float) -> None:
+    """The arm moved last so many seconds ago."""
+    found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
+    assert found is not None
+    replace(found, moved_at=time.time() - seconds).save(campaign.folder.warmup)
+
+
+def test_warmth_is_told_by_what_was_written_down_and_not_by_the_times_of_files(make: Make) -> None:
+    campaign = make(warmup_drift=0.9, warmup_least=3, warmup_most=3)
+    campaign.run(unrehearsed=True)
+
+    def again(file_times: float) -> list[str]:
+        next(campaign.folder.archives.glob("validation*")).unlink()
+        for path in campaign.folder.archives.iterdir():
+            os.utime(path, (file_times, file_times))
+        return kinds(campaign.run(unrehearsed=True))
+
+    assert "warmup" not in again(time.time() - 10.0 * COLD_AFTER), "it moved a moment ago"
+    rested(campaign, -3600.0)
+    assert "warmup" in again(time.time()), "a clock was put back"
+
+
+def test_a_warm_up_motion_that_was_slowed_tells_nothing_of_friction(make: Make) -> None:
+    campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=3)
+    result = campaign.run(operator=slowed_once("warm-up"), unrehearsed=True)
+    assert [one.archive for one in result.rejected] == ["warmup_000_a1.mcap"]
+    found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
+    assert found is not None
+    assert [one.archive for one in found.motions] == [
+        "warmup_000_a2.mcap", "warmup_001_a1.mcap", "warmup_002_a1.mcap"
+    ]  # fmt: skip
+    assert any("not warm" in note for note in result.notes)
+
+
+def test_a_warm_up_motion_whose_run_was_killed_before_it_was_noted_is_not_made_again(
+    make: Make,
+) -> None:
+    campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=3)
+    campaign.run(unrehearsed=True)
+    found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
+    assert found is not None
+    entries = json.loads((campaign.folder.root / "manifest.json").read_text())
+    later = ("warmup_002", "standstill", "excitation", "validation", "move_001")
+    entries["archives"] = [e for e in entries["archives"] if not e["name"].startswith(later)]
+    (campaign.folder.root / "manifest.json").write_text(json.dumps(entries))
+    for path in campaign.folder.archives.glob("*"):
+        if path.name.startswith(later[1:]):
+            path.unlink()
+    replace(found, motions=found.motions[:2], outcome="going on").save(campaign.folder.warmup)
+    result = campaign.run(unrehearsed=True)
+    assert result.adopted == ("warmup_002_a1.mcap",)
+    assert "warmup" not in kinds(result)
+    assert result.warm_up == "not warm"
+
+
+# --- folder, disk, and the person who stops
+
+
+def test_whoever_looks_whether_a_run_is_at_work_keeps_none_out(tmp_path: Path) -> None:
+    folder = CampaignFolder(tmp_path)
+    lock = os.open(tmp_path / LOCK, os.O_RDWR | os.O_CREAT)
+    fcntl.flock(lock, fcntl.LOCK_SH)
+    assert not folder.busy
+    threading.Timer(0.1, os.close, [lock]).start()
+    with folder.locked():
+        assert folder.busy
+
+
+@pytest.mark.parametrize("name", ["dry_run.json", "warmup.json"])
+def test_a_disk_that_refuses_is_told_and_gone_on_with(
+    make: Make, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    drift = 1e-9 if name == "warmup.json" else 0.0
+    campaign = make(warmup_drift=drift, warmup_least=3, warmup_most=3)
+    write = hil.files._write_through
+
+    def full(path: Path, content: str | bytes) -> None:
+        if path.name.startswith(name):
+            raise OSError(28, "No space left on device")
+        write(path, content)
+
+    monkeypatch.setattr(hil.files, "_write_through", full)
+    with pytest.raises(OutputError, match=rf"{name} cannot be written \(No space left"):
+        campaign.run(accept_dry_run=True)
+    monkeypatch.undo()
+    again = campaign.run(accept_dry_run=True)
+    assert again.complete
+    assert "dryrun" not in kinds(again)
+
+
+def test_a_stop_instead_of_an_answer_is_a_stop(tmp_path: Path, dry: Campaign) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    found = DryRun.load(campaign.folder)
+    assert found is not None
+    replace(found, accepted=None).save(campaign.folder.dry_run)
+    stop = Stop()
+
+    class Leaves(Person):
+        def accept_dry_run(self, summary: DryRunSummary) -> bool:
+            stop.requested = True
+            return False
+
+    with pytest.raises(OperatorStopError, match="is not accepted") as stopped:
+        campaign.run(operator=Leaves(), stop=stop)
+    assert stopped.value.exit_code == 130
+
+
+def test_recordings_of_a_real_arm_without_a_dry_run_are_not_told_to_be_in_order(
+    make: Make,
+) -> None:
+    campaign = make(real=True)
+    link = simulated_link(campaign.cell, instead_of_hardware=True)
+    campaign.run(link, unrehearsed=True)
+    step = campaign.status().steps[2]
+    assert (step.name, step.state) == ("dry run", "next")

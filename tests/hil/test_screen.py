@@ -1,0 +1,496 @@
+"""The screen of a run: what it shows at any size, and what keys of a real terminal do."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import pty
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console, Group
+
+from drivers.states import State
+from hil.campaign.motion_watch import Latency, MotionProgress, Wish
+from hil.campaign.operator import DriftCurve, RunStatus
+from hil.campaign.stop import Stop
+from hil.screen import Screen, marks, plain
+from hil.screen.keys import Keyboard, after, single_keys, typed
+from hil.screen.layout import Shown, lines
+from hil.screen.screen import ScreenError
+
+RIG = Path(__file__).with_name("screen_rig.py")
+NAMES = tuple(f"joint_{number}" for number in range(1, 7))
+
+
+def status(**changes: Any) -> RunStatus:
+    """A repetition in the middle, with something of everything."""
+    motion = {
+        "motion_time": 6.2, "duration": 18.6, "cycles": 123456, "missed": 2, "late": 1,
+        "untaken": 0, "state": State.OPEN, "position": np.zeros(6),
+        "following_error": np.radians([0.0, 0.15, -0.2, 0.01, -0.02, 1.01]),
+        "following_share": np.array([0.0, 0.31, 0.85, 0.02, 0.04, 1.3]),
+        "current": np.array([2.3, -7.1, 5.0, 0.2, -0.3, 1.1]),
+        "current_share": np.array([0.11, 0.72, 0.88, 0.02, 0.05, 0.3]),
+        "override": 0.8, "rate": 0.75, "latency": Latency(41e-6, 87e-6, 340e-6),
+        "events": ("first set-point in cycle 15211", "2 packets missed before cycle 16002"),
+    }  # fmt: skip
+    drift = DriftCurve(
+        NAMES, np.ones((5, 6)), np.array([np.nan, 0.09, 0.06, 0.03, 0.017]), threshold=0.02
+    )
+    return RunStatus(
+        "repetition", 7, 30, 1145.0, MotionProgress(**(motion | changes)), drift,
+        ("repetition 5 rejected: its current differs from the others'",),
+    )  # fmt: skip
+
+
+def drawn(width: int, height: int, shown: Shown | None = None) -> list[str]:
+    if shown is None:
+        shown = Shown("ns16-october", NAMES, status(), Wish(0.8))
+    console = Console(width=width, height=height, file=StringIO(), color_system=None)
+    with console.capture() as capture:
+        console.print(Group(*lines(shown, width, height)))
+    return capture.get().splitlines()
+
+
+# --- what is shown ---------------------------------------------------------------------------
+
+
+def test_eighty_by_twenty_four_hold_everything() -> None:
+    screen = drawn(80, 24)
+    assert len(screen) == 24
+    text = "\n".join(screen)
+    for words in (
+        "ns16-october", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
+        "override 80 %", "now 75 %", "123456", "2 missed", "1 late", "0 not taken",
+        "41 µs, 99 % 87 µs, worst 340 µs", "friction changed by 1.7 %", "warm below 2 %",
+        "repetition 5 rejected: its current differs", "2 packets missed before cycle 16002",
+        "h hold", "space resume", "s stop", "+ - override",
+    ):  # fmt: skip
+        assert words in text
+    (second,) = [line for line in screen if line.startswith("joint_2")]
+    assert second.split()[1] == "0.150°"
+    assert "31%" in second and "-7.10 A" in second and "72%" in second
+    bars = [second.count(mark) for mark in "█·"]
+    assert all(bars)
+
+
+@pytest.mark.parametrize("width", [20, 40, 48, 63, 64, 79, 80, 132, 300])
+@pytest.mark.parametrize("height", [3, 8, 12, 24, 60])
+def test_at_any_size_nothing_is_wider_or_higher_than_the_terminal(width: int, height: int) -> None:
+    hot = status(temperature=np.full(6, 41.0))
+    nothing = status(following_error=None, following_share=None, current=None, current_share=None)
+    between = RunStatus("move", 1, 3, 1.0)
+    for at in (hot, nothing, between, None):
+        screen = drawn(width, height, Shown("a title that is long " * 4, NAMES, at, stopping=True))
+        assert len(screen) <= height
+        assert max(map(len, screen)) <= width
+
+
+def test_stop_hold_and_silence_are_said() -> None:
+    at = status()
+    assert "HELD" in drawn(80, 24, Shown("x", NAMES, at, Wish(held=True)))[2]
+    assert "STOPPING" in drawn(80, 24, Shown("x", NAMES, at, stopping=True))[2]
+    assert "no news for 3 s" in drawn(80, 24, Shown("x", NAMES, at, age=3.2))[2]
+
+
+def test_a_temperature_is_shown_if_there_is_one() -> None:
+    hot = status(temperature=np.array([41.0, 42.0, 43.0, 44.0, 45.0, 46.0]))
+    assert any("43°C" in line for line in drawn(80, 24, Shown("x", NAMES, hot)))
+    assert not any("°C" in line for line in drawn(80, 24))
+
+
+def test_a_bar_is_as_long_as_its_share() -> None:
+    assert marks.bar(0.5, 10).plain == "█████·····"
+    assert marks.bar(0.0, 4).plain == "····"
+    assert marks.bar(1.0, 4).plain == "████"
+    assert marks.bar(1.01, 4).plain == "███▶"
+    assert marks.bar(float("nan"), 4).plain == "?   "
+    assert [marks.percent(share) for share in (0.004, 0.0994, 0.0996, 0.5, 1.3)] == [
+        "0.4%", "9.9%", " 10%", " 50%", "130%",
+    ]  # fmt: skip
+    assert marks.curve([0.0, 1.0, 2.0, float("nan"), 4.0], 3) == "▃▅█"
+
+
+def test_a_plain_line_says_the_same() -> None:
+    line = plain.line(status())
+    for words in (
+        "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
+        "following error 130 % of its limit", "current 88 % of its limit", "19:05 left",
+    ):  # fmt: skip
+        assert words in line
+
+
+# --- keys ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("keys", "override", "held"),
+    [
+        ("h", 1.0, True), ("hr", 1.0, False), ("h ", 1.0, False), ("-", 0.9, False),
+        ("---", 0.7, False), ("-+", 1.0, False), ("+", 1.0, False), ("3", 0.3, False),
+        ("1-", 0.1, False), ("10", 1.0, False), ("5h", 0.5, True), ("x", 1.0, False),
+    ],
+)  # fmt: skip
+def test_what_keys_mean(keys: str, override: float, held: bool) -> None:
+    wish = Wish()
+    for key in keys:
+        wish = after(wish, key, wish.override)
+    assert wish.override == pytest.approx(override)
+    assert wish.held is held
+
+
+def test_arrows_mean_nothing_and_a_paste_makes_nothing_faster() -> None:
+    assert typed("\x1b[A\x1b[1;5C\x1bOP\x1b[1;") == ""
+    assert typed("\x1b[15~-") == "-"
+    assert typed("0000000") == ""
+    assert typed("ssh host 1") == "ssh" + "hs"
+
+
+@pytest.mark.parametrize(
+    ("sent", "means"),
+    [
+        ("\x1bs", "stop"), ("\x1bh", "hold"), ("\x1b", "hold"), ("\x1b ", "hold"),
+        ("\x1b3", "hold"),
+        ("\x1b\x1b[A", "hold"), ("\x1b\x1bs", "stop"), ("\x1b[A\x1bs", "stop"),
+    ],
+)  # fmt: skip
+def test_escape_holds_and_takes_nothing_away_from_what_comes_with_it(sent: str, means: str) -> None:
+    screen = Screen(NAMES, stop := Stop(), quiet=True)
+    for key in typed(sent):
+        screen.press(key)
+    assert stop.requested is (means == "stop")
+    assert screen.wish().held or stop.requested
+    assert screen.wish().override == 1.0
+
+
+def test_the_override_of_a_dry_run_ends_with_it_and_a_hold_does_not() -> None:
+    screen = Screen(NAMES, Stop(), quiet=True)
+    for phase in ("dry run", "move"):
+        screen.show(RunStatus(phase, 1, 1, 1.0))
+        screen.press("1")
+        screen.press("h")
+    assert screen.wish() == Wish(0.1, held=True)
+    screen.show(RunStatus("warm-up", 1, 1, 1.0))
+    assert screen.wish() == Wish(1.0, held=True)
+    screen.press("5")
+    screen.show(RunStatus("repetition", 1, 4, 1.0))
+    assert screen.wish().override == 0.5
+
+
+def test_the_override_of_a_dry_run_is_lowered_from_what_it_is() -> None:
+    """What goes on at 20 % by order of the run goes on at 10 % after one key, not at 90 %."""
+    screen = Screen(NAMES, Stop(), quiet=True)
+    screen.show(status(override=0.2))
+    screen.press("-")
+    assert screen.wish().override == pytest.approx(0.1)
+
+
+# --- a real terminal -------------------------------------------------------------------------
+
+
+class Terminal:
+    """The far end of a terminal on which `screen_rig.py` runs in the foreground."""
+
+    def __init__(self, told: Path, ending: str) -> None:
+        self.told = told
+        self.near, self.far = pty.openpty()
+        self.resize(80, 24)
+        self.before = termios.tcgetattr(self.far)
+        self.seen = b""
+        self.reads = True
+        self.process = subprocess.Popen(
+            [sys.executable, str(RIG), str(told), ending],
+            stdin=self.far, stdout=self.far, stderr=self.far,
+            preexec_fn=self._take_terminal,
+            env={**os.environ, "TERM": "xterm-256color", "PYTHONPATH": os.pathsep.join(sys.path)},
+        )  # fmt: skip
+
+    def _take_terminal(self) -> None:
+        os.setsid()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    def resize(self, columns: int, rows: int) -> None:
+        fcntl.ioctl(self.near, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+
+    def look(self, timeout: float = 0.05) -> None:
+        """Take what was written, as a terminal does all the time."""
+        if select.select([self.near], [], [], timeout)[0]:
+            with contextlib.suppress(OSError):
+                self.seen += os.read(self.near, 65536)
+
+    def await_seen(self, words: bytes, timeout: float = 30.0) -> None:
+        until = time.monotonic() + timeout
+        while words not in self.seen:
+            assert time.monotonic() < until, self.seen[-2000:]
+            self.look()
+
+    def await_told(self, **expected: object) -> None:
+        """Wait until the last thing that the program was told is this."""
+        until = time.monotonic() + 30.0
+        while not self.said() or self.said()[-1] != expected:
+            assert time.monotonic() < until, self.said()
+            self.look()
+
+    def await_said(self, count: int) -> None:
+        until = time.monotonic() + 20.0
+        while len(self.said()) < count:
+            assert time.monotonic() < until, self.said()
+            self.look()
+
+    def said(self) -> list[dict[str, object]]:
+        if not self.told.exists():
+            return []
+        return [json.loads(line) for line in self.told.read_text().splitlines()]
+
+    def press(self, keys: str) -> None:
+        os.write(self.near, keys.encode())
+
+    def end(self, timeout: float = 10.0) -> int:
+        until = time.monotonic() + timeout
+        while self.process.poll() is None and time.monotonic() < until:
+            if self.reads:
+                self.look()
+            else:
+                time.sleep(0.05)
+        assert self.process.returncode is not None, "it did not end"
+        if self.reads:
+            self.look(0.2)
+        return self.process.returncode
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        os.close(self.near)
+        os.close(self.far)
+
+
+@contextlib.contextmanager
+def terminal(folder: Path, ending: str = "return") -> Iterator[Terminal]:
+    end = Terminal(folder / "told", ending)
+    try:
+        yield end
+    finally:
+        end.close()
+
+
+ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
+
+
+def test_keys_arrive_as_wishes_and_the_screen_survives_a_resize(tmp_path: Path) -> None:
+    with terminal(tmp_path) as end:
+        end.await_told(override=1.0, held=False)
+        end.await_seen(b"repetition 3 of 30")
+        assert ENTER in end.seen
+        end.press("h")
+        end.await_told(override=1.0, held=True)
+        end.await_seen(b"HELD")
+        end.press(" ")
+        end.await_told(override=1.0, held=False)
+        end.press("-")
+        end.await_told(override=0.9, held=False)
+        end.press("3")
+        end.await_told(override=0.3, held=False)
+        end.press("\x1b[A")  # an arrow
+        end.press("\x1a")  # Ctrl-Z would take the program's signs of life away
+        end.resize(40, 10)
+        end.press("+")
+        end.await_told(override=0.4, held=False)
+        end.seen = b""
+        end.await_seen(b"h hold")
+        end.press("s")
+        assert end.end() == 0
+        assert end.said()[-1] == {"stop": True}
+        assert LEAVE in end.seen
+        assert end.seen.rindex(b"the last line") > end.seen.rindex(LEAVE)
+        assert termios.tcgetattr(end.far) == end.before
+
+
+@pytest.mark.parametrize(
+    ("ending", "signum", "code"),
+    [
+        ("error", None, 1),
+        ("return", signal.SIGTERM, 0),
+        pytest.param("exit", None, 7, marks=pytest.mark.slow),
+        pytest.param("return", signal.SIGINT, 0, marks=pytest.mark.slow),
+        pytest.param("return", signal.SIGHUP, 0, marks=pytest.mark.slow),
+    ],
+)
+def test_the_terminal_is_as_it_was_however_the_program_ends(
+    tmp_path: Path, ending: str, signum: signal.Signals | None, code: int
+) -> None:
+    with terminal(tmp_path, ending) as end:
+        end.await_seen(b"repetition 3 of 30")
+        assert termios.tcgetattr(end.far) != end.before
+        if signum is None:
+            end.press("s")
+        else:
+            end.process.send_signal(signum)
+        assert end.end() == code
+        assert termios.tcgetattr(end.far) == end.before
+        assert end.seen.count(ENTER) == end.seen.count(LEAVE) == 1
+
+
+def test_a_dry_run_is_accepted_by_the_word_yes_and_nothing_else(tmp_path: Path) -> None:
+    with terminal(tmp_path, "question") as end:
+        for number, answer in enumerate(("y\n", "\n", "yes\n"), start=1):
+            end.await_seen(b"Type yes to accept")
+            end.seen = b""
+            time.sleep(0.1)  # what is typed before the question is no answer
+            end.press(answer)
+            end.await_said(number)
+        end.await_seen(b"repetition 3 of 30")  # the screen is back
+        end.press("s")
+        assert end.end() == 0
+        assert [said["accepted"] for said in end.said()[:3]] == [False, False, True]
+
+
+def test_a_joint_whose_torque_contradicts_its_weight_is_accepted_by_its_name_and_not_by_yes(
+    tmp_path: Path,
+) -> None:
+    with terminal(tmp_path, "contradiction") as end:
+        for number, answer in enumerate(("yes\n", "joint_1\n", "joint_2\n"), start=1):
+            end.await_seen(b"joint_2: measured torque runs against")
+            end.await_seen(b"type joint_2 to accept")
+            end.seen = b""
+            time.sleep(0.1)  # what is typed before the question is no answer
+            end.press(answer)
+            end.await_said(number)
+        end.await_seen(b"repetition 3 of 30")
+        end.press("s")
+        assert end.end() == 0
+        assert [said["accepted"] for said in end.said()[:3]] == [False, False, True]
+
+
+def test_a_terminal_that_takes_nothing_more_delays_no_stop(tmp_path: Path) -> None:
+    with terminal(tmp_path) as end:
+        end.await_seen(b"repetition 3 of 30")
+        end.reads = False
+        time.sleep(1.5)  # some hundred kB of pictures later it blocks
+        end.process.send_signal(signal.SIGTERM)
+        until = time.monotonic() + 3.0
+        while {"stop": True} not in end.said():
+            assert time.monotonic() < until, "the stop was not seen"
+            time.sleep(0.02)
+
+
+def test_keys_that_are_cut_in_two_are_put_together() -> None:
+    """Over a slow line the parts of an arrow come one by one; none of them is a key."""
+    near, far = pty.openpty()
+    pressed: list[str] = []
+    keyboard = Keyboard(pressed.append)
+    reader = threading.Thread(target=keyboard._read, args=(far,))
+    before = termios.tcgetattr(far)
+    with single_keys(far):
+        reader.start()
+        for part in ("\x1b", "[1;", "5C", "s"):
+            os.write(near, part.encode())
+            time.sleep(0.005)
+        until = time.monotonic() + 5.0
+        while "s" not in pressed and time.monotonic() < until:
+            time.sleep(0.01)
+        keyboard._over.set()
+        reader.join()
+    assert pressed == ["s"]
+    assert termios.tcgetattr(far) == before
+    os.close(near)
+    os.close(far)
+
+
+@pytest.mark.parametrize("what", ["a key that fails", "the terminal is gone"])
+def test_keys_that_are_not_read_any_more_are_told(what: str) -> None:
+    near, far = os.pipe()
+    screen = Screen(NAMES, Stop(), quiet=True)
+    screen._keyboard = keyboard = Keyboard(broken)
+    keyboard.attached = True
+    if what == "a key that fails":
+        os.write(far, b"h")
+    os.close(far)
+    keyboard._read(near)
+    os.close(near)
+    assert not keyboard.attached
+    with pytest.raises(ScreenError, match=r"no key|terminal is gone"):
+        screen.wish()
+
+
+def broken(_: str) -> None:
+    raise KeyError("no key")
+
+
+def test_a_picture_that_cannot_be_drawn_is_told_and_ends_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(plain, "line", lambda _: 1 / 0)
+    with Screen(NAMES, Stop(), console=Console(file=StringIO())) as screen:
+        until = time.monotonic() + 5.0
+        with pytest.raises(ScreenError, match="ZeroDivisionError"):
+            while time.monotonic() < until:
+                screen.show(status())
+                time.sleep(0.01)
+        assert screen.wish() == Wish()
+
+
+# --- no terminal -----------------------------------------------------------------------------
+
+
+def test_without_a_terminal_there_are_lines_and_nobody_accepts() -> None:
+    out = StringIO()
+    with Screen(NAMES, Stop(), console=Console(file=out, width=200)) as screen:
+        assert not screen.can_answer
+        screen.say("first [things] first")
+        screen.show(status())
+        await_text(out, "repetition 7 of 30")
+        assert screen.wish() == Wish()
+    assert out.getvalue().splitlines()[0] == "first [things] first"
+    assert "\x1b" not in out.getvalue()
+    assert out.getvalue().count("repetition 7 of 30") == 1  # not ten a second
+
+
+def test_quiet_says_nothing() -> None:
+    out = StringIO()
+    with Screen(NAMES, Stop(), quiet=True, console=Console(file=out)) as screen:
+        screen.say("nothing")
+        screen.show(status())
+        time.sleep(0.3)
+    assert out.getvalue() == ""
+
+
+def test_a_pipe_that_is_full_holds_up_neither_what_is_shown_nor_the_end() -> None:
+    reads, writes = os.pipe()
+    fcntl.fcntl(writes, fcntl.F_SETPIPE_SZ, 4096)
+    with os.fdopen(writes, "w", buffering=1) as file:
+        began = time.monotonic()
+        with Screen(NAMES, Stop(), console=Console(file=file, width=200)) as screen:
+            for number in range(100):
+                screen.say(f"{number} " + "x" * 180)
+                screen.show(status())
+        assert time.monotonic() - began < 3.0
+        threading.Thread(target=read_to_the_end, args=(reads,), daemon=True).start()
+
+
+def read_to_the_end(reads: int) -> None:
+    with os.fdopen(reads, "rb") as pipe:
+        while pipe.read(4096):
+            pass
+
+
+def await_text(out: StringIO, words: str) -> None:
+    until = time.monotonic() + 5.0
+    while words not in out.getvalue():
+        assert time.monotonic() < until
+        time.sleep(0.02)

@@ -1,0 +1,530 @@
+"""The paper's study: statistics, sentences made from numbers, and a whole one on a small arm."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import stats
+from typer.testing import CliRunner
+
+from hil.archive import open_archive
+from hil.campaign import CampaignFolder
+from hil.cell import Cell
+from hil.cli import app
+from hil.errors import InputError, OperatorStopError
+from hil.progress import Silent
+from hil.study import StudyResults, StudySettings, run_study, study_campaigns, study_settings
+from hil.study.analysis import Run, class_of, classes_of
+from hil.study.designs import SINES, run_searches, searches
+from hil.study.equal_data import EqualData
+from hil.study.execution import Execution, execute
+from hil.study.folder import StudyFolder
+from hil.study.paired import compare, holm
+from hil.study.plans import plan_study
+from hil.study.printed import printed_parameters
+from hil.study.reading import answer_of, reading_of
+from hil.study.records import FitRecord, MotionScore, ScoreRecord
+from hil.study.results import ComparisonResult, StudyParameter
+from hil.study.settings import Effort
+from hil.study.summary import Named, compared_on, condition_result, corrected, parameter_error
+from hil.study.wording import differs
+from hil.study.workers import StudyError, workers_of
+from sim_fixtures.ns16 import CELL_PATH
+from tests.hil.fast_cell import fast_cell
+
+Array = NDArray[np.float64]
+
+errors = st.lists(
+    st.tuples(st.floats(0.01, 10.0), st.floats(0.01, 10.0)), min_size=1, max_size=30
+).map(lambda pairs: tuple(np.array(column) for column in zip(*pairs, strict=True)))
+p_values = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12)
+
+
+# Paired statistics
+
+
+@settings(max_examples=8)
+@given(errors)
+def test_comparing_the_other_way_round_inverts_the_ratio_and_keeps_the_p_value(
+    pair: tuple[Array, Array],
+) -> None:
+    there, back = compare(*pair), compare(*reversed(pair))
+    assert there.ratio * back.ratio == pytest.approx(1.0)
+    assert there.p_value == pytest.approx(back.p_value)
+    assert there.wins + back.wins + int(np.sum(pair[0] == pair[1])) == there.motions
+
+
+@settings(max_examples=8)
+@given(errors, st.floats(0.1, 10.0))
+def test_units_do_not_matter(pair: tuple[Array, Array], unit: float) -> None:
+    plain, scaled = compare(*pair), compare(unit * pair[0], unit * pair[1])
+    assert scaled.ratio == pytest.approx(plain.ratio)
+    assert (scaled.low, scaled.high) == pytest.approx((plain.low, plain.high))
+
+
+@settings(max_examples=8)
+@given(errors)
+def test_the_interval_holds_the_ratio_or_the_ratio_is_of_one_motion(
+    pair: tuple[Array, Array],
+) -> None:
+    found = compare(*pair)
+    logs = np.log(pair[1] / pair[0])
+    assert np.exp(logs.min()) <= found.low * (1.0 + 1e-9)
+    assert found.low <= found.high <= np.exp(logs.max()) * (1.0 + 1e-9)
+
+
+def test_equal_errors_are_no_difference() -> None:
+    same = np.array([0.1, 0.2, 0.3])
+    found = compare(same, same)
+    assert (found.ratio, found.low, found.high, found.wins, found.p_value) == (1, 1, 1, 0, 1)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    random, held, truth = np.random.default_rng(3), 0, 1.1
+    for trial in range(200):
+        first = random.uniform(1.0, 5.0, 30)
+        second = truth * first * np.exp(random.normal(0.0, 0.2, 30))
+        found = compare(first, second, seed=trial)
+        held += found.low <= truth <= found.high
+    # The chance of fewer than 176 of 200 at 93 %, what a percentile bootstrap of 30 has, is 0.5 %.
+    assert held >= stats.binom(200, 0.93).ppf(0.005)
+
+
+@pytest.mark.parametrize("second", [[0.1], [0.1, 0.0], [[0.1], [0.2]]])
+def test_what_is_no_pair_is_refused(second: Sequence[float]) -> None:
+    with pytest.raises(ValueError, match=r"pairs|above zero"):
+        compare(np.array([0.1, 0.2]), np.array(second))
+
+
+@given(p_values)
+def test_holm_never_lowers_a_p_value_and_keeps_their_order(values: list[float]) -> None:
+    corrected = holm(values)
+    assert all(after >= before for before, after in zip(values, corrected, strict=True))
+    assert max(corrected) <= 1.0
+    order = np.argsort(values, kind="stable")
+    assert list(np.array(corrected)[order]) == sorted(corrected)
+
+
+def test_holm_on_the_example_of_every_textbook() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.03]) == [0.03]
+
+
+# Sentences
+
+
+def fitted(values: Array) -> FitRecord:
+    n = values.shape[1]
+    return FitRecord(
+        inputs="",
+        repetitions=[f"excitation_{k:03d}_a1.mcap" for k in range(len(values))],
+        values=values.tolist(),
+        pooled=values.mean(axis=0).tolist(),
+        pooled_std=[0.1] * n,
+        undetermined=[],
+        noise_std=[1.0, 1.0],
+        log10_det=50.0,
+        coupling_index=3.0,
+        n_samples=100,
+        correlation=np.eye(n).tolist(),
+        duration=8.0,
+        time=[0.0, 1.0],
+        position=[[0.0, 1.0]] * 2,
+        velocity=[[0.0, 1.0]] * 2,
+    )
+
+
+def scored(errors: dict[str, Array]) -> ScoreRecord:
+    return ScoreRecord(
+        inputs="",
+        durations=[10.0] * 30,
+        scores={
+            name: [
+                MotionScore(
+                    archive=f"validation_{k:03d}_a1.mcap",
+                    overall=value,
+                    unfiltered=value,
+                    own=None,
+                    relative=[value] * 2,
+                    mean_abs=[value, 2.0 * value],
+                    mean=[0.0, 0.0],
+                )
+                for k, value in enumerate(values.tolist())
+            ]
+            for name, values in errors.items()
+        },
+        examples=[],
+    )
+
+
+def told_of(ratios: Array) -> ComparisonResult:
+    """What becomes of B's errors over A's on so many motions."""
+    a = np.linspace(0.01, 0.03, len(ratios))
+    (one,) = corrected([compared_on("fly-by", None, "a", "b", a.tolist(), (ratios * a).tolist())])
+    return one
+
+
+def told(ratio: float, scatter: float = 0.05, motions: int = 30) -> StudyResults:
+    """A study in which B's errors are so many times A's, but for scatter from motion to motion."""
+    random = np.random.default_rng(5)
+    a = random.uniform(0.01, 0.03, motions)
+    b = ratio * a * np.exp(scatter * random.standard_normal(motions))
+    parameters = [StudyParameter(name=f"p{k}", unit="kg", truth=1.0) for k in range(4)]
+    condition = condition_result(
+        Named("plain", "the arm is what the model says", ()),
+        {"a": "A", "b": "B"},
+        {"a": fitted(random.normal(1.0, 0.1, (5, 4))), "b": fitted(random.normal(1, 0.1, (5, 4)))},
+        {"fly-by": scored({"a": a, "b": b})},
+        parameters,
+        ("hip", "knee"),
+    )
+    results = StudyResults(
+        name="told", cell="told", simulated=True, quick=False, settings=None, software={},
+        joint_names=["hip", "knee"], n_base=4, parameters=parameters, searches=[], table1=[],
+        conditions=[condition], ablations=[], reading=[], missing=[], times={},
+    )  # fmt: skip
+    return results.model_copy(update={"reading": reading_of(results)})
+
+
+@pytest.mark.parametrize(("ratio", "word"), [(0.8, "better"), (1.25, "worse")])
+def test_a_clear_difference_is_told_with_its_direction_and_size(ratio: float, word: str) -> None:
+    results = told(ratio)
+    (one,) = results.conditions[0].comparisons
+    line = answer_of(results)["line"]
+    assert f"B predicts 30 wide fly-by motions {word} than A" in line
+    assert f"{one.ratio:.3f} (95 % interval {one.low:.3f} to {one.high:.3f})" in line
+    assert one.ratio == pytest.approx(ratio, rel=0.05)
+    # Each axis is told on the side it is better for, and none on the other.
+    winner, loser = ("B", "A") if ratio < 1.0 else ("A", "B")
+    sentence = results.reading[0].sentences[0]
+    assert f"{winner} is better on hip" in sentence
+    assert f"{loser} is better on" not in sentence
+
+
+def test_what_may_be_chance_is_never_called_better() -> None:
+    results = told(1.0, scatter=0.3)
+    assert results.conditions[0].comparisons[0].p_corrected > 0.05
+    text = " ".join(s for one in results.reading if one.key == "prediction" for s in one.sentences)
+    assert "show no difference between B and A" in text
+    assert "better" not in text
+
+
+def test_ranks_and_mean_that_point_different_ways_are_no_difference() -> None:
+    # Most motions a little worse, a few far better: ranks say worse, the mean says better.
+    logs = np.array([0.02] * 26 + [-0.6] * 4)
+    one = told_of(np.exp(logs))
+    assert one.p_corrected < 0.05 and one.high < 1.0 and one.wins == 4
+    assert not differs(one)
+    assert differs(told_of(np.exp(-np.abs(logs))))
+
+
+def test_a_difference_of_next_to_nothing_is_told_to_be_one() -> None:
+    assert "though by less than 2 %" in answer_of(told(0.99, scatter=0.005))["line"]
+    assert "though" not in answer_of(told(0.8))["line"]
+
+
+@pytest.mark.parametrize(("motions", "blind"), [(5, True), (6, False)])
+def test_motions_too_few_to_show_anything_are_told(motions: int, blind: bool) -> None:
+    # The smallest p of signed ranks of n is 2 / 2**n; the one comparison here needs no correction,
+    # the two of the joints double it.
+    told_limits = told(0.8, motions=motions).reading[-1]
+    assert told_limits.key == "limits"
+    text = " ".join(told_limits.sentences)
+    assert ("can show no difference whatever they are" in text) is (motions <= 6)
+    assert ("the cross table (1 comparisons)" in text) is blind
+
+
+def test_with_as_much_motion_of_each_the_longer_one_is_cut() -> None:
+    long, short = fitted(np.arange(24.0).reshape(6, 4)), fitted(np.ones((6, 4)))
+    fits = {"a": long.model_copy(update={"duration": 20.0}), "b": short}  # 120 s and 48 s
+    equal = EqualData.of(fits, ["a", "b"])
+    assert equal is not None
+    assert (equal.cut, equal.repetitions, equal.seconds) == ("a", 2, 40.0)
+    assert (equal.other, equal.other_seconds) == ("b", 48.0)
+    assert equal.estimate(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
+    assert EqualData.of({"a": short, "b": short}, ["a", "b"]) is None
+    assert EqualData.of({"a": long}, ["a"]) is None
+
+
+def test_the_distance_to_the_truth_is_one_for_the_base_itself() -> None:
+    truth, base = np.zeros(3), np.array([1.0, -2.0, 3.0])
+    assert parameter_error(base, base, truth) == pytest.approx(1.0)
+    assert parameter_error(-0.5 * base, base, truth) == pytest.approx(0.5)
+    assert parameter_error(truth, base, truth) is None
+
+
+def test_the_planted_values_in_the_units_of_the_print_are_the_manufacturers() -> None:
+    from hil.study.outcome import parameters_of
+
+    cell = Cell.load(CELL_PATH)
+    known = [one for one in parameters_of(cell, planted=True) if one.printed_c is not None]
+    assert len(printed_parameters(cell)) == 58 and len(known) == 52
+    for one in known:
+        assert one.truth is not None and one.printed_c is not None
+        assert one.printed_factor * one.truth == pytest.approx(one.printed_c, abs=6e-4), one.name
+
+
+# A whole study on an arm of two joints
+
+
+@pytest.fixture(scope="module")
+def small() -> StudySettings:
+    return study_settings(quick=True, repetitions=2, motions=5, effects=False).model_copy(
+        update={
+            "motions": 3,
+            "effort_a": Effort(population=8, generations=1),
+            "effort_b": Effort(population=8, generations=1),
+            "fly": (0.0, 0.5),
+            "n_via": (6,),
+            "coupling_weight": (0.3,),
+            "subsets": (1, 2),
+            "noise": (1.0,),
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Cell:
+    return fast_cell(tmp_path_factory.mktemp("arm"), standstill_s=0.1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_sines() -> Iterator[None]:
+    """Sines of 6 s instead of 20: the simulation of sines is what takes longest."""
+    with pytest.MonkeyPatch.context() as patch:
+        words, choices = SINES["a-middle-fast"]
+        for key in list(SINES):
+            patch.delitem(SINES, key)
+        patch.setitem(SINES, "a-middle-fast", (words, choices | {"length": 6.0, "ramp": 1.0}))
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(
+    tmp_path_factory: pytest.TempPathFactory, small: StudySettings, arm: Cell
+) -> tuple[Path, StudyResults]:
+    """A study that Ctrl-C ended after its first campaign, and that was then started again."""
+    root = tmp_path_factory.mktemp("first") / "study"
+
+    def one_and_ctrl_c(executions: Sequence[Execution], *_: object) -> None:
+        execute(executions[0])
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hil.study.run.execute_all", one_and_ctrl_c)
+        with pytest.raises(KeyboardInterrupt):
+            run_study(root, small, Silent(), workers=1, cell=arm)
+    assert not (root / "results.json").exists()
+    return root, run_study(root, small, Silent(), workers=1, cell=arm)
+
+
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures take seconds, and some tests do not look at them."""
+    monkeypatch.setattr("hil.study.outcome.study_page", lambda _: b"")
+
+
+def test_the_study_leaves_results_and_one_self_contained_page(
+    whole: tuple[Path, StudyResults],
+) -> None:
+    root, found = whole
+    assert StudyResults.load(root / "results.json") == found
+    page = (root / "report.html").read_text("utf-8")
+    for part in ("Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Table 1", "Table 2"):
+        assert f"paper, {part}" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert page.count("<script") == 1  # that of all pages, which their policy names
+    assert "SIMULATED ARM" in page
+    for paragraph in found.reading:
+        assert paragraph.sentences
+
+
+@pytest.mark.usefixtures("no_page")
+def test_one_seed_is_one_study_with_any_number_of_processes_and_however_often_interrupted(
+    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell, tmp_path: Path
+) -> None:
+    root, found = whole
+    again = tmp_path / "study"
+    # That a search does not depend on them either is tested where searches are.
+    shutil.copytree(root / "designs", again / "designs")
+    shutil.copy(root / "study.json", again)
+    straight = run_study(again, small, Silent(), workers=2, cell=arm)
+    texts = [
+        one.model_copy(update={"times": {}, "software": {}}).to_json() for one in (found, straight)
+    ]
+    assert texts[0] == texts[1]
+
+
+def test_every_estimate_meets_every_class(whole: tuple[Path, StudyResults]) -> None:
+    _, found = whole
+    assert [one.key for one in found.conditions] == ["plain"]
+    for condition in found.conditions:
+        cells = {(one.method, one.motion_class) for one in condition.cross}
+        classes = ("fly-by", "stop-to-stop", "sinusoid")
+        methods = ["a", "b", "b0", "planted"]
+        if condition.equal_data is not None:
+            methods.append(condition.equal_data.name)
+        assert cells == {(m, c) for m in methods for c in classes}
+        assert len(condition.comparisons) == 9
+        assert all(len(one.archives) == 3 for one in condition.classes)
+    assert [one.key for one in found.ablations] == [
+        "sines", "fly", "n_via", "weight", "repetitions", "noise",
+    ]  # fmt: skip
+
+
+def test_estimates_of_a_rigid_arm_come_to_the_planted_values(
+    whole: tuple[Path, StudyResults],
+) -> None:
+    _, found = whole
+    plain = found.conditions[0]
+    truth = np.array([one.truth for one in found.parameters])
+    for method in plain.methods:
+        assert not method.undetermined
+        distance = np.abs(np.array(method.pooled) - truth)
+        assert np.mean(distance <= 4.0 * np.array(method.pooled_std)) >= 0.8, method.key
+
+
+def test_what_an_estimate_itself_is_off_by_is_what_it_adds_to_the_planted_values(
+    whole: tuple[Path, StudyResults],
+) -> None:
+    _, found = whole
+    for one in found.conditions[0].classes:
+        assert set(one.own) >= {"a", "b", "b0"} and "planted" not in one.own
+        floor = np.array(one.unfiltered["planted"])
+        for key, own in one.own.items():
+            # Norms of what is left: neither side of the triangle is longer than the others.
+            left = np.array(one.unfiltered[key])
+            assert np.all(np.abs(left - floor) <= np.array(own) * (1.0 + 1e-9)), key
+            assert np.all(left <= (floor + np.array(own)) * (1.0 + 1e-9)), key
+    assert all(point.own for one in found.ablations for point in one.points)
+
+
+def test_held_out_motions_lie_where_their_class_is(whole: tuple[Path, StudyResults]) -> None:
+    root, _ = whole
+    for key, name in (("a", "sinusoid"), ("b", "fly-by"), ("b0", "stop-to-stop")):
+        run = Run(key, key, root / "campaigns" / "plain" / key)
+        assert {one: len(names) for one, names in classes_of(run).items()} == {name: 3}
+        first = CampaignFolder(run.root).completed("validation")[0]
+        assert class_of(json.loads(open_archive(first).attachments["plan.json"])) == name
+
+
+@pytest.mark.usefixtures("no_page")
+def test_started_again_nothing_whole_is_done_again(
+    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell, tmp_path: Path
+) -> None:
+    root, found = whole
+    copy = shutil.copytree(root, tmp_path / "copy")
+    kept = ("designs/*/excitation.toml", "campaigns/*/*/archives/*.mcap", "fits/*/*.json")
+    before = {p: p.stat().st_mtime_ns for pattern in kept for p in copy.glob(pattern)}
+    assert len(before) > 30
+    lost = copy / "campaigns" / "plain" / "b" / "archives" / "excitation_001_a1.mcap"
+    lost.unlink()  # as if it had never been written whole
+    again = run_study(copy, small, Silent(), workers=1, cell=arm)
+    after = {p: p.stat().st_mtime_ns for pattern in kept for p in copy.glob(pattern)}
+    new = {path for path in after if after[path] != before.get(path)}
+    assert {path.parent.parent.name for path in new if path.suffix == ".mcap"} == {"b"}
+    assert not any(path.name == "excitation.toml" for path in new)
+    fits = {path.stem for path in new if path.parent.parent.name == "fits"}
+    # What rests on the lost repetition is estimated and predicted with again, and nothing else.
+    assert fits == {"b", "a-sinusoid", "b-fly-by", "b0-stop-to-stop"}
+    methods = zip(again.conditions[0].methods, found.conditions[0].methods, strict=True)
+    assert [now.mean == then.mean for now, then in methods] == [True, False, True]
+
+
+def test_other_settings_are_refused_in_the_same_folder(
+    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell
+) -> None:
+    root, _ = whole
+    with pytest.raises(InputError, match="seed: the study in this folder was begun with 1, not 2"):
+        run_study(root, small.model_copy(update={"seed": 2}), Silent(), workers=1, cell=arm)
+    with pytest.raises(InputError, match="is not empty and holds no study"):
+        run_study(root / "fits", small, Silent(), workers=1, cell=arm)
+
+
+@pytest.mark.usefixtures("no_page")
+def test_recorded_campaigns_give_what_they_allow(
+    whole: tuple[Path, StudyResults], tmp_path: Path
+) -> None:
+    root, found = whole
+    runs = [
+        shutil.copytree(root / "campaigns" / "plain" / key, tmp_path / name)
+        for key, name in (("b", "tuesday"), ("a", "monday"))
+    ]
+    recorded = study_campaigns(tmp_path / "out", runs, Silent(), workers=1)
+    (condition,) = recorded.conditions
+    # Their excitations tell which is A and which is B, whatever they are called.
+    assert [one.label for one in condition.methods] == ["A (monday)", "B (tuesday)"]
+    assert recorded.reading[0].heading.startswith("Does B (tuesday) predict")
+    assert [one.mean for one in condition.methods] == [
+        one.mean for one in found.conditions[0].methods[:2]
+    ]
+    assert {one.motion_class for one in condition.classes} == {"fly-by", "sinusoid"}
+    assert any("stop-to-stop" in sentence for sentence in recorded.missing)
+    assert [one.key for one in recorded.ablations] == ["repetitions"]
+
+
+def test_one_campaign_from_the_command_line(
+    whole: tuple[Path, StudyResults], tmp_path: Path
+) -> None:
+    root, _ = whole
+    only = root / "campaigns" / "plain" / "b"
+    told = CliRunner().invoke(
+        app,
+        ["study", "--campaign", str(only), "-o", str(tmp_path / "one"), "--json", "--workers", "1"],
+    )
+    assert told.exit_code == 0, told.output
+    assert any("nothing is compared" in line for line in json.loads(told.stdout)["missing"])
+    assert (tmp_path / "one" / "report.html").stat().st_size > 10_000
+
+
+def test_a_campaign_is_not_run_again_by_a_study(tmp_path: Path) -> None:
+    told = CliRunner().invoke(app, ["study", "--quick", "--campaign", str(tmp_path)])
+    assert isinstance(told.exception, InputError)
+    assert "is recorded already" in str(told.exception)
+
+
+def test_ctrl_c_leaves_with_one_sentence_and_its_exit_status(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hil.cli.study.run_study", interrupted)
+    ended = CliRunner().invoke(app, ["study", "--quick", "-o", str(tmp_path)])
+    assert isinstance(ended.exception, OperatorStopError)
+    assert ended.exception.exit_code == 130
+    assert f"what is whole is kept in {tmp_path}" in str(ended.exception)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_refusal_in_any_process_is_one_sentence(count: int, tmp_path: Path) -> None:
+    with workers_of(count) as workers, pytest.raises(StudyError) as refused:
+        workers.map(Cell.load, [(tmp_path / "none.toml",)])
+    assert "none.toml" in str(refused.value)
+
+
+def test_an_excitation_that_the_arm_does_not_bear_ends_the_study_with_its_name(
+    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell, tmp_path: Path
+) -> None:
+    root, _ = whole
+    copy = shutil.copytree(root, tmp_path / "copy")
+    found = run_searches(
+        StudyFolder(copy), arm, searches(small, 2), Silent(), workers=1
+    )  # none is searched again
+    plans = plan_study(StudyFolder(copy), arm, small, found)
+    ended = {copy / "campaigns" / "ablation" / "b-fly-0": "joint 2: drive fault"}
+    left = plans.without(ended)
+    assert "b-fly-0" not in left.executions["ablation"]
+    assert left.missing["fly"] == ["b-fly-0 could not be run: joint 2: drive fault"]
+    sines = {copy / "campaigns" / "ablation" / "a-middle-fast": "why"}
+    assert plans.without(sines).missing["sines"]
+    with pytest.raises(StudyError, match=r"plain/b: this arm cannot bear .* drive fault"):
+        plans.without({copy / "campaigns" / "plain" / "b": "drive fault"})

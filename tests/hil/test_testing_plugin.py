@@ -1,0 +1,91 @@
+"""The pytest plugin in somebody else's project: its page's example, and what it costs."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
+
+
+def pytest_in(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """pytest as a stranger runs it: no configuration or conftest of ours."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTEST_ADDOPTS"}
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--strict-markers", *arguments],
+        cwd=folder, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def written(folder: Path) -> list[str]:
+    """The script and the test of the page, as files named there."""
+    text = DOCUMENT.read_text("utf-8")
+    named = re.findall(r"`(\w+\.py)`:?[^`]*?\n\n```python\n(.*?)```", text, re.DOTALL)
+    for name, code in named:
+        (folder / name).write_text(code)
+    return [name for name, _ in named]
+
+
+def test_the_example_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
+    """And, in the same run, a test that reads what an identification leaves."""
+    assert written(tmp_path) == ["to_home.py", "test_to_home.py"]
+    (tmp_path / "test_results.py").write_text(
+        "import json\n"
+        "def test_results(identified_campaign, short_campaign):\n"
+        "    folder = identified_campaign.folder\n"
+        "    assert json.loads(folder.results.read_text())\n"
+        "    assert folder.report.read_bytes().lower().startswith(b'<!doctype html>')\n"
+        "    assert not short_campaign.folder.results.exists()\n"
+    )
+    done = pytest_in(tmp_path, "-W", "error", "-v")
+    assert done.returncode == 0, done.stdout
+    assert "5 passed" in done.stdout
+
+
+def test_pytest_starts_without_anything_heavy(tmp_path: Path) -> None:
+    (tmp_path / "test_light.py").write_text(
+        "import sys\n"
+        "def test_light():\n"
+        "    assert 'hil.testing.plugin' in sys.modules\n"
+        "    heavy = {'numpy', 'scipy', 'pinocchio', 'pydantic', 'hil.cell'} & set(sys.modules)\n"
+        "    assert not heavy\n"
+    )
+    done = pytest_in(tmp_path)
+    assert done.returncode == 0, done.stdout
+
+
+def test_another_arm_a_wrong_script_and_a_fault_that_is_none(tmp_path: Path) -> None:
+    """One run: the conftest's own arm takes the place of the NS 16, and what is wrong fails."""
+    written(tmp_path)
+    script = tmp_path / "to_home.py"
+    script.write_text(script.read_text().replace("cell.home, speed", "cell.initial, speed"))
+    (tmp_path / "conftest.py").write_text(
+        "import pytest\n"
+        "from hil import Cell\n"
+        "from hil.testing import shortened\n"
+        "from sim_fixtures.ns16 import CELL_PATH\n"
+        "@pytest.fixture(scope='session')\n"
+        "def simulated_cell():\n"
+        "    cell = shortened(Cell.load(CELL_PATH))\n"
+        "    text = cell.text.replace('initial_deg = [10.0', 'initial_deg = [33.0')\n"
+        "    return Cell.from_texts(text, cell.urdf, cell.path)\n"
+    )
+    (tmp_path / "test_mine.py").write_text(
+        "import numpy as np\n"
+        "import pytest\n"
+        "from hil.campaign import Stop\n"
+        "def test_arm(simulated_link, simulated_cell):\n"
+        "    where = np.degrees(simulated_cell.controller_angles(simulated_link.connect(Stop())))\n"
+        "    assert abs(where[0] - 33.0) < 0.01\n"
+        "@pytest.mark.controller_faults('earthquake@1')\n"
+        "def test_typo(simulated_link):\n"
+        "    pass\n"
+    )
+    done = pytest_in(tmp_path, "-v", "-k", "comes_home or arm or typo")
+    assert "test_mine.py::test_arm PASSED" in done.stdout, done.stdout
+    assert "test_the_arm_comes_home FAILED" in done.stdout
+    assert "test_mine.py::test_typo ERROR" in done.stdout
+    assert "'earthquake' is none of lose" in done.stdout
