@@ -166,6 +166,7 @@ def moving(controller: UdpController, output: Path, *options: str) -> list[str]:
     ]  # fmt: skip
 
 
+@pytest.mark.slow  # a minute of real time; the links' own tests stop motions too
 def test_over_udp_ctrl_c_brings_the_arm_to_rest_on_its_way(ns16: Cell, tmp_path: Path) -> None:
     output = tmp_path / "move.mcap"
     with UdpController.started(ns16, tmp_path) as controller:
