@@ -35,7 +35,7 @@ class ArchiveDamage:
         offset: byte in the file from which nothing was read.
         reason: what is wrong there.
         bytes_dropped: bytes from there to the end of the file.
-        samples: samples that could be read.
+        samples: samples that could be read; None where no column was asked for.
         duration: time from the first of them to the last [s].
         outcome_missing: whether the outcome is among the losses.
     """
@@ -43,16 +43,16 @@ class ArchiveDamage:
     offset: int
     reason: str
     bytes_dropped: int
-    samples: int = 0
+    samples: int | None = 0
     duration: float = 0.0
     outcome_missing: bool = True
 
     def __str__(self) -> str:
-        read = f"{self.samples} samples ({self.duration:.6g} s) could be read"
+        read = f"; {self.samples} samples ({self.duration:.6g} s) could be read"
         lost = f"the record at byte {self.offset} {self.reason}"
         lost += f" ({self.bytes_dropped} bytes from there on are unused)"
         outcome = "; the outcome is missing" if self.outcome_missing else ""
-        return f"{lost}; {read}{outcome}"
+        return f"{lost}{'' if self.samples is None else read}{outcome}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +196,7 @@ def open_archive(
     if damage is None:
         _check_topics(path, content, selection)
     columns = content.columns()
+    stamp = columns["stamp"] if fields is None or fields else None
     return Archive(
         path=path,
         metadata=metadata,
@@ -204,7 +205,7 @@ def open_archive(
         joint_names=_described(path, metadata).joint_names,
         columns=columns,
         events=tuple(content.events),
-        damage=None if damage is None else _damage(damage, size, content, columns["stamp"]),
+        damage=None if damage is None else _damage(damage, size, content, stamp),
     )
 
 
@@ -284,12 +285,14 @@ def _described(path: Path, metadata: Mapping[str, str]) -> Description:
         ) from error
 
 
-def _damage(damage: Damage, size: int, content: Content, stamp: NDArray[np.int64]) -> ArchiveDamage:
+def _damage(
+    damage: Damage, size: int, content: Content, stamp: NDArray[np.int64] | None
+) -> ArchiveDamage:
     return ArchiveDamage(
         offset=damage.offset,
         reason=damage.reason,
         bytes_dropped=size - damage.offset,
-        samples=len(stamp),
-        duration=float(stamp[-1] - stamp[0]) * 1e-9 if len(stamp) else 0.0,
+        samples=None if stamp is None else len(stamp),
+        duration=0.0 if stamp is None or not len(stamp) else 1e-9 * float(stamp[-1] - stamp[0]),
         outcome_missing=content.outcome is None,
     )

@@ -136,6 +136,10 @@ def test_what_is_missing_is_said_in_a_sentence(archive_bytes: bytes, tmp_path: P
     assert sentence.startswith(str(path))
     assert "is cut off, or its length is corrupt" in sentence
     assert "20 samples (0.19 s) could be read; the outcome is missing" in sentence
+    # Where no column was asked for, nobody has counted them.
+    uncounted = str(open_archive(path, fields=()).damage)
+    assert "samples" not in uncounted
+    assert uncounted.endswith("are unused); the outcome is missing")
 
 
 def test_an_empty_file_is_refused_with_the_reason(tmp_path: Path) -> None:
