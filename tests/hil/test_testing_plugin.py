@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
 
 
@@ -29,6 +31,7 @@ def written(folder: Path) -> list[str]:
     return [name for name, _ in named]
 
 
+@pytest.mark.slow  # a whole run of pytest with real sockets in it
 def test_the_example_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
     """And, in the same run, a test that reads what an identification leaves."""
     assert written(tmp_path) == ["to_home.py", "test_to_home.py"]
