@@ -7,10 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriveTrainError, PacketError
 from drivers.packets import InitPacket
+
+Array = NDArray[np.float64]
 
 _RELATIVE: Final = 1e-6
 """The wire rounds to float32, by 6e-8 at most; a cell file has six digits or more."""
@@ -37,6 +40,33 @@ class Announced:
     differences: tuple[str, ...]
     unusable: str | None
     adopted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class AnnouncedLimits:
+    """Limits of an arm's motors in an init packet, (n,) each; NaN where it has none.
+
+    Attributes:
+        current: A.
+        following_error: thresholds in motor revolutions.
+    """
+
+    current: Array
+    following_error: Array
+
+    @classmethod
+    def of(cls, init: InitPacket, arm: int, n_joints: int) -> AnnouncedLimits:
+        """Those of the first axes of an arm, which counts from 1."""
+        row, axes = arm - 1, slice(0, n_joints)
+        return cls(
+            init.current_limit[row, axes].astype(np.float64),
+            init.following_error[row, axes].astype(np.float64),
+        )
+
+
+def narrower(theirs: Array, ours: Array) -> NDArray[np.bool_]:
+    """Where a limit (n,) of the controller is below the cell's by more than the wire rounds."""
+    return np.asarray(theirs < ours * (1.0 - _RELATIVE))
 
 
 def compare(

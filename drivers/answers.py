@@ -292,8 +292,13 @@ class Answers:
             self._open_mode.require_carried_on(reading, machine.cycle)
 
     def refusal(self, offending: int | None, reading: Reading, words: Words) -> bytes:
-        """Fill the frame with 508 for the offending joint, or with 505 for all."""
-        if offending is None or self.wire is None:
+        """Fill the frame with 508 for the offending joint, or with 505 for all.
+
+        Open axes keep their target with a 508, so each needs one that is a number.
+        """
+        held = list(reading.answer.held)
+        lost = not np.isfinite(words.view(np.float32)[held, D1]).all()
+        if offending is None or self.wire is None or lost:
             self._frame.drive_off(reading.answer, words)
         else:
             slots = self.wire.joint_slots[offending : offending + 1]

@@ -245,6 +245,8 @@ class PositionMode(OpenMode):
             raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=kept
         )
         self._check_taken(cycle, kept)
+        if kept.all():  # a source that ends in mid-motion would leave a jump to rest
+            self._guard.check_set_point(self.held, self._still, "plan", cycle)
         self._taken.add(self._sent)
         self._step = self._still
         slots = self._wire.joint_slots[kept]

@@ -1,4 +1,4 @@
-"""The session's state table drawn: Mermaid text and tables, made from `drivers.states` alone.
+"""The session's state table as a page: its arrows and tables, made from `drivers.states` alone.
 
 ``python -m drivers.state_diagram`` prints the page that stands in ``docs/state-machine.md``.
 """
@@ -18,9 +18,11 @@ Table = Mapping[State, Mapping[Input, State]]
 _TITLE: Final = """# The session's state machine
 
 This page is made from the table `drivers.states.TRANSITIONS` by
-`python -m drivers.state_diagram`; a test fails where the two differ. What each state is answered
-with stands at the head of `drivers/session.py`.
+`python -m drivers.state_diagram`, and its picture by `python docs/state_machine_svg.py`; a test
+fails where they differ. What each state is answered with stands at the head of
+`drivers/session.py`.
 """
+_PICTURE: Final = "state-machine.svg"
 _ANY: Final = "any state after init"
 
 
@@ -60,20 +62,6 @@ def edges(table: Table) -> list[tuple[State | None, State, tuple[Input, ...]]]:
     ]
 
 
-def mermaid(table: Table = TRANSITIONS) -> str:
-    """The diagram, in Mermaid's language."""
-    lines = ["stateDiagram-v2", f'    state "{_ANY}" as any']
-    lines += [f'    state "{label(state)}" as {state.name.lower()}' for state in table]
-    first = min(table)
-    lines.append(f"    [*] --> {first.name.lower()}")
-    for before, after, inputs in edges(table):
-        source = "any" if before is None else before.name.lower()
-        text = ", ".join(label(what) for what in inputs)
-        lines.append(f"    {source} --> {after.name.lower()} : {text}")
-    lines += [f"    {state.name.lower()} --> [*]" for state, row in table.items() if not row]
-    return "\n".join(lines) + "\n"
-
-
 def meanings() -> dict[Input, str]:
     """What each input means: the sentences below the members in the source of `Input`."""
     (enum,) = ast.parse(inspect.getsource(Input)).body
@@ -108,9 +96,8 @@ def page() -> str:
     """The whole of ``docs/state-machine.md``."""
     started = ", ".join(label(state) for state, row in TRANSITIONS.items() if Input.OFF in row)
     return (
-        f"{_TITLE}\n```mermaid\n{mermaid()}```\n\n"
-        f'"{_ANY[0].upper() + _ANY[1:]}" stands for: {started}. An arrow from there is left out '
-        "at each of them.\n\n## Inputs\n\n"
+        f"{_TITLE}\n![States of the session, and what leads from one to the next]({_PICTURE})\n\n"
+        f'"{_ANY[0].upper() + _ANY[1:]}" stands for: {started}.\n\n## Inputs\n\n'
         "A cyclic packet is read as one input, judged by the axes that are to be moved; the "
         "session adds inputs of its own. What leads nowhere in a state cannot happen in it.\n\n"
         f"{input_table()}"

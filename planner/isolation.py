@@ -7,7 +7,7 @@ made of the same children.
 
 The child is a new interpreter, not a fork: it shares no locks, threads or memory with its parent
 and never runs the parent's main module. It is in a session of its own, so that Ctrl-C reaches
-only the parent, and ends when its parent does.
+only the parent, and ends at once when its parent does, even in the middle of a call.
 """
 
 from __future__ import annotations

@@ -19,6 +19,8 @@ from planner.verify import position_rounding
 
 # A last period this much shorter than the others is rounding, not motion.
 _ROUNDING = 1e-9
+# Share of half a joint's range by which a set-point rounded on the wire may lie outside it.
+_CARRIED = 9e-7
 
 
 class _SetPoints(NamedTuple):
@@ -191,7 +193,8 @@ class TrajectoryPlayer:
         self._rewind()
 
     def _check_range(self, offset: Array) -> None:
-        limits, slack = self._limits, position_rounding(self._limits)
+        limits, rounding = self._limits, position_rounding(self._limits)
+        slack = np.maximum(rounding, 0.5 * _CARRIED * (limits.upper - limits.lower))
         for reach, bound, sign in (
             (self._lower + offset, limits.lower, -1.0),
             (self._upper + offset, limits.upper, 1.0),

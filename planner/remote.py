@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import resource
+import select
 import signal
+import threading
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
@@ -37,11 +40,16 @@ class Answer(NamedTuple):
 
 
 def serve(descriptor: int) -> None:
-    """Answer calls that arrive on an inherited socket, until its other end is closed."""
+    """Answer calls that arrive on an inherited socket, until its other end is closed.
+
+    That its caller is gone ends the process in the middle of a call, too: nobody wants the answer,
+    and whoever begins the same again must not find it at work.
+    """
     # A crash is expected here; it must not fill a disk.
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     connection: Connection[bytes, bytes] = Connection(descriptor)
+    threading.Thread(target=_end_with, args=(descriptor,), daemon=True).start()
     try:
         connection.send_bytes(b"ready")
         while True:
@@ -49,6 +57,18 @@ def serve(descriptor: int) -> None:
             connection.send_bytes(numbered(number, _answer(message)))
     except (EOFError, OSError):
         return
+
+
+def _end_with(descriptor: int) -> None:
+    """End this process as soon as the other end of a socket is closed; what is sent is left there.
+
+    A signal at the parent's death (PR_SET_PDEATHSIG) would come when the thread that started this
+    process ends, which is no reason to.
+    """
+    watched = select.poll()
+    watched.register(descriptor, 0)  # a hang-up is always told
+    watched.poll()
+    os._exit(0)
 
 
 def numbered(number: int, message: bytes) -> bytes:

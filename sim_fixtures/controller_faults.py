@@ -15,6 +15,8 @@ SLIP = 1.5
 """Size of an encoder's slip, as a multiple of the axis's following-error threshold."""
 LOAD = 0.9
 """Size of a load, as a share of what the axis's motor can muster."""
+PUSH = 0.15
+"""Size of a push, likewise: nothing trips, and the repetition is another one than its fellows."""
 
 
 class Faultable(Protocol):
@@ -114,6 +116,19 @@ class CurrentSaturation:
 
 
 @dataclass(frozen=True)
+class Push:
+    """Somebody leans against an axis for `count` cycles; no limit is reached."""
+
+    cycle: int
+    axis: int
+    count: int = 50
+
+    def inflict(self, on: Faultable) -> None:
+        """Let it happen."""
+        on.suffer("load", self.axis, PUSH, self.count)
+
+
+@dataclass(frozen=True)
 class Pause:
     """The controller reports mode 500 or 502 for `count` cycles, then closed axes."""
 
@@ -133,5 +148,6 @@ ControllerFault = (
     | AxisLeaves
     | FollowingErrorFault
     | CurrentSaturation
+    | Push
     | Pause
 )

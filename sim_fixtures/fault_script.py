@@ -27,6 +27,7 @@ e-stop@2000                      the emergency stop is pressed
 axis-leaves@2000:axis=3          one axis leaves open mode
 following-error@2000x500:axis=2  the axis is stuck; :slip its encoder is read wrongly
 saturate@2000x500:axis=1         a load drives the current near its limit
+push@2000x50:axis=1              somebody leans against the axis; nothing trips
 pause@2000x50:502                the controller pauses; :500 for the other kind"""
 
 _HEAD: Final = re.compile(r"(?P<kind>[a-z-]+)@(?P<cycle>\d+)(?:x(?P<count>\d+))?")
@@ -158,6 +159,7 @@ _KINDS: Final[dict[str, Callable[[_Line], Fault]]] = {
     "axis-leaves": lambda line: controller.AxisLeaves(line.cycle, line.axis()),
     "following-error": _following_error,
     "saturate": lambda line: controller.CurrentSaturation(line.cycle, line.axis(), line.count(500)),
+    "push": lambda line: controller.Push(line.cycle, line.axis(), line.count(50)),
     "pause": _pause,
 }
 

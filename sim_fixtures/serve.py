@@ -96,7 +96,8 @@ def serve(
         clock: time; the machine's own if left out.
         patience: see `wish`, s.
         stretch: a cycle without an answer is made longer by up to so many s until one comes. No
-            real controller does that; it is for PCs that are held up now and then.
+            real controller does that; it is for PCs that are held up now and then. Once the end is
+            wished, a PC that let such a wait pass counts as gone until it answers again.
     """
     clock = clock if clock is not None else MonotonicClock()
     server = _Server(peer, Wire(far_end, faults, clock), clock, watch, stretch)
@@ -125,6 +126,7 @@ class _Server:
         self._stretch = stretch
         self._due = 0.0
         self._finish_by: float | None = None
+        self._deserted = False
 
     def knock(self, wish: Callable[[], Wish]) -> bool:
         """Repeat the first packet until it is answered; False if told to end before."""
@@ -177,10 +179,11 @@ class _Server:
         self.tally.cycles += 1
         self._wire.send(self.tally.cycles - 1, packet)
         reply = self._reply(packet, sent + self._period)
-        if reply is None and self._stretch:
+        if reply is None and self._stretch and not (self._deserted and self._finish_by is not None):
             until = sent + self._period
             reply = self._reply(packet, until + self._stretch)
             self.tally.stretch(self._clock.now() - until)
+        self._deserted = reply is None
         if reply is not None:
             self.tally.answer.add(self._clock.now() - sent)
         self._hand_over(packet, reply)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from drivers.events import Event
 from drivers.exchange.realtime import RealTimeReport
+
+NO_SUPERVISOR: Final = "the supervisor gives no sign of life"
+"""Why the exchange leaves that missed the heartbeats of the process that started it."""
 
 
 @dataclass(frozen=True)

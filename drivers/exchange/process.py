@@ -72,7 +72,8 @@ class ExchangeProcess:
     """An exchange that runs in a process, and a process session, of its own.
 
     It outlives this process for as long as it takes to stop the arm on its path and to leave
-    open mode; it does so when `beat` was not called for half a second. Use `start`.
+    open mode; it does so when `beat` was not called for half a second while a motion is
+    requested, five seconds otherwise. Use `start`.
 
     Attributes:
         pid: of the process.

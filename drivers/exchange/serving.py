@@ -12,12 +12,13 @@ import numpy as np
 
 from drivers.errors import DriverError, RequestError
 from drivers.events import Event, MotionEnded
-from drivers.exchange.control import STALE, ArchiveState, ControlBlock, Ended
+from drivers.exchange.control import PATIENCE, STALE, ArchiveState, ControlBlock, Ended
 from drivers.exchange.digest import Digest
 from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import Inbox
 from drivers.exchange.latency import bin_of
 from drivers.exchange.notices import (
+    NO_SUPERVISOR,
     ExchangeEvent,
     HoldRefused,
     Leaving,
@@ -150,10 +151,11 @@ class Serving:
             session.stop(self.reason)
 
     def _reasons_to_leave(self, now: float) -> None:
+        silent = now - max(self._control.supervisor_heartbeat, self._began)
         if self._terminated:
             self._leave("the exchange process was told to terminate", ORPHAN_LINGER)
-        elif now - max(self._control.supervisor_heartbeat, self._began) > STALE:
-            self._orphan("the supervisor gives no sign of life")
+        elif silent > (STALE if self._session.requested else PATIENCE):
+            self._orphan(NO_SUPERVISOR)
         elif self._control.finish:
             self._leave("the supervisor wants to end", FINISH_LINGER)
 

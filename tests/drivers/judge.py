@@ -1,100 +1,24 @@
 """Judges a session from outside: by the packets, the answers and the records it left.
 
-Two judges that share nothing with the code under test but the record's layout and the drive
-train (which has tests of its own): `Reception` says which packets get an answer at all,
-`Conduct` what may stand in the answer. Both raise AssertionError.
+It shares nothing with the code under test but the record's layout and the drive train (which has
+tests of its own). `Conduct` says what may stand in an answer, and raises AssertionError;
+`reception.Reception` which packets get an answer at all.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 import oracle
 
 from drivers import DriveTrain, GuardLimits, State
 
-LAST = 0x7FFF
 REFUSALS = (oracle.DRIVE_OFF_REQUEST, oracle.FOLLOWING_ERROR)
 MODE_FIELDS = {1: (1, 2, 4, 5), 2: (4, 5), 4: (1, 2), 5: (1, 2), 7: (1,), 8: (4,), 9: (5,)}
 """Fields of an answer in open mode (facts, section 6); every other one is zero."""
 POSITION_MODES = (1, 4, 5)
 EPS = np.finfo(np.float64).eps
-
-Kind = Literal["nothing", "again", "echo", "init", "cyclic"]
-
-
-def number_of(packet: bytes) -> int:
-    return int.from_bytes(packet[:4], "little", signed=True)
-
-
-@dataclass
-class Reception:
-    """Which packets get an answer, and which packets are the last one once more.
-
-    Attributes:
-        window: numbers ahead of the last one that are later packets of the same session.
-    """
-
-    window: int
-    last: int = 0
-    n_axes: int | None = None
-    silent: bool = False
-    ended: bool = False
-    cold: bool = False
-    synced: bool = False
-    at_init: bool = False
-    last_packet: bytes = b""
-
-    def expect(self, packet: bytes) -> Kind:
-        """What kind of answer it gets; takes note of a packet that gets one."""
-        kind = self._expect(packet)
-        if kind in ("echo", "init", "cyclic"):
-            self.last, self.last_packet, self.silent = number_of(packet), packet, False
-            self.at_init = kind == "init" or (kind == "echo" and self.at_init)
-        return kind
-
-    def _expect(self, packet: bytes) -> Kind:
-        if self.ended:
-            return "nothing"
-        if len(packet) == 1200 and number_of(packet) == 10:
-            return self._init(packet)
-        number = number_of(packet)
-        if len(packet) < 12 or not 1 <= number <= LAST:
-            return "nothing"
-        on = oracle.DRIVE_ON in packet[4:8]
-        if self.n_axes is None:
-            if on or len(packet) >= 1200:
-                return "nothing"
-            self.synced = True
-            return "echo"
-        if self.at_init and self.cold and number in (11, 12) and not on:
-            return "echo" if len(packet) < 1200 else "nothing"
-        ahead = (number - self.last) % LAST
-        if self.silent and not on and number < 10 and ahead != 1:
-            if len(packet) < 1200:
-                self.n_axes, self.at_init, self.synced = None, False, True
-                return "echo"
-            return "nothing"
-        if not oracle.length(self.n_axes) <= len(packet) <= oracle.length(20):
-            return "nothing"
-        if self.silent:
-            return "cyclic"
-        if ahead == 0:
-            # The same number on other bytes is another packet, of no known time.
-            return "again" if packet == self.last_packet else "nothing"
-        return "cyclic" if ahead <= self.window else "nothing"
-
-    def _init(self, packet: bytes) -> Kind:
-        n = int.from_bytes(packet[12:16], "little", signed=True)
-        if not 1 <= n <= 20:
-            return "nothing"
-        if self.at_init and packet == self.last_packet:
-            return "again"
-        self.cold = self.n_axes is None and self.synced
-        self.n_axes, self.synced = n, False
-        return "init"
 
 
 @dataclass
@@ -110,11 +34,13 @@ class Conduct:
         arms: arm of each slot, from 1.
         threshold: (n,) following error in force, motor revolutions.
         current: (n,) A, in force.
+        max_gap: so many packets or answers may be lost in a row without a stop.
 
     Attributes:
         usable: whether this session may move the arm at all.
         entitled: a motion was requested and accepted, and has not ended.
-        stopping: a stop was asked for (or a long gap was) in this interval.
+        stopping: a stop was asked for (or a long gap was, or too many answers were not taken) in
+            this interval.
         overridden: a change of override was accepted in this interval.
         tally: how often which law was put to use.
     """
@@ -136,6 +62,9 @@ class Conduct:
     sent: list[np.ndarray] = field(default_factory=list)
     motor: np.ndarray | None = None
     motors: list[np.ndarray] = field(default_factory=list)
+    max_gap: int = 2
+    lag: int = 0
+    lost: int = 0
     exiting: bool = False
     kept: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     tally: dict[str, int] = field(default_factory=dict)
@@ -246,7 +175,8 @@ class Conduct:
     def _refusal(self, answer: oracle.Packet, safe: oracle.Packet) -> None:
         modes = [axis.mode for axis in answer.axes]
         drive_off = oracle.drive_off(answer)
-        reported = [k for k, mode in enumerate(modes) if mode in REFUSALS]
+        echoed = [axis.mode for axis in safe.axes]  # of a drive that is off: whatever it was
+        reported = [k for k, mode in enumerate(modes) if mode in REFUSALS and mode != echoed[k]]
         assert drive_off or (len(reported) == 1 and reported[0] in self.slots), modes
         for slot, (ours, theirs) in enumerate(zip(answer.axes, safe.axes, strict=True)):
             assert ours.mode == theirs.mode or slot in reported
@@ -312,9 +242,10 @@ class Conduct:
             for slot in self.slots:
                 assert answer.axes[slot] == received.axes[slot].keep(1), "first: target, at rest"
             self.sent = [q, q, q, q]
+            self.motors, self.lag, self.lost = [], 0, 0
         else:
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
-            nearest = np.abs(np.array(self.motors) - r[0]).min(axis=0)
+            nearest = np.abs(np.array(self.motors[-3:]) - r[0]).min(axis=0)
             assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
             low, high = np.float32(motor - rounding), np.float32(motor + rounding)
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
@@ -332,9 +263,20 @@ class Conduct:
         assert (q <= self.limits.upper + 2e-6 * span).all(), "position"
         if self.mode == 1:
             self._beside(a)
-        self.motors = [*([] if self.motor is None else self.motors), motor][-3:]
+        if self.motor is not None:
+            self._count_lost(r[0])
+        self.motors = [*self.motors, motor][-4:]
         self.motor = motor
         del self.sent[:-3]
+
+    def _count_lost(self, target: np.ndarray) -> None:
+        """More than `max_gap` answers that show in no target are reason enough for a stop."""
+        back = np.abs(np.array(self.motors[::-1]) - target)
+        behind = back[0] > self.limits.standstill
+        lag = int(back.argmin(axis=0)[behind].max(initial=0))
+        self.lost += max(0, lag - self.lag)
+        self.lag = lag
+        self.stopping = self.stopping or self.lost > self.max_gap
 
     def _factors(self) -> tuple[float, float]:
         """What acceleration and jerk may be multiplied by, from what was asked for."""

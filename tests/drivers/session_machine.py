@@ -18,7 +18,7 @@ from hypothesis.stateful import (
     precondition,
     rule,
 )
-from judge import POSITION_MODES, Conduct, Reception
+from judge import POSITION_MODES, Conduct
 from model_controller import (
     ARMS,
     AXES,
@@ -30,6 +30,7 @@ from model_controller import (
     Controller,
     N,
 )
+from reception import Reception
 from rig import START, drive_train, limits
 from sources import WILD, corrections, motions
 
@@ -98,6 +99,7 @@ class SessionMachine(RuleBasedStateMachine):
             ARMS,
             threshold=np.full(N, 2.0),
             current=np.full(N, 20.0),
+            max_gap=MAX_GAP,
         )
 
     def start(self, init: bytes = GOOD_INIT) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import socket
@@ -138,6 +139,7 @@ def test_a_controller_that_opens_again_and_again_cannot_put_off_the_end():
 
 def test_without_supervisor_it_answers_as_long_as_the_controllers_program_moves_the_arm():
     with running() as (exchange, controller):
+        exchange._channel.shutdown(socket.SHUT_RDWR)  # as by its death: noticed at once
         controller.beat = lambda: None
         controller.cycle_time = PERIOD
         end = time.monotonic() + 4.5
@@ -624,6 +626,7 @@ def test_a_process_that_cannot_be_started_is_an_error_of_ours_and_leaves_nothing
         raise BlockingIOError(11, "no more processes")
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
+    gc.collect()  # what earlier tests left is closed now, not in between
     before = set(Path("/proc/self/fd").iterdir())
     with pytest.raises(ExchangeError, match="no more processes"):
         ExchangeProcess.start(settings(free_port()))

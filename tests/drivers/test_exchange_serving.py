@@ -11,6 +11,7 @@ from rig import N
 from drivers.errors import RequestError
 from drivers.events import Counters, GapSeen, MotionEnded, PacketRejected
 from drivers.exchange import (
+    NO_SUPERVISOR,
     ControlBlock,
     Ended,
     EventReader,
@@ -21,6 +22,7 @@ from drivers.exchange import (
     control,
     event_log,
 )
+from drivers.exchange.control import PATIENCE, STALE
 from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Serving
 from drivers.states import State
 
@@ -163,6 +165,28 @@ class TestLeaving:
         for _ in range(5):
             bench.step()
         assert len([e for e in bench.reader.drain() if isinstance(e, Leaving)]) == 1
+
+
+class TestASilentSupervisor:
+    @pytest.mark.parametrize(("requested", "borne"), [(True, STALE), (False, PATIENCE)])
+    def test_is_borne_for_longer_where_no_motion_was_requested(self, bench, requested, borne):
+        bench.step()
+        bench.session.requested = requested
+        silent_from = bench.control.supervisor_heartbeat
+        while not bench.serving.reason:
+            bench.clock.time += STEP
+            bench.serving()
+        assert bench.clock.time - silent_from == pytest.approx(borne, abs=1.1 * STEP)
+        assert bench.serving.reason == NO_SUPERVISOR
+        assert "stop" in bench.session.asked
+
+    def test_ends_a_motion_that_it_requests_after_its_silence(self, bench):
+        bench.step()
+        bench.clock.time += 2.0
+        assert not bench.serving()
+        bench.session.requested = True
+        bench.serving()
+        assert bench.session.asked == ["stop"]
 
 
 class TestHold:

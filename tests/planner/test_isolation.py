@@ -206,17 +206,18 @@ def test_a_call_that_takes_too_long_is_ended():
 
 
 @pytest.mark.parametrize("task", ["", "child.send(time.sleep, 60.0)"], ids=["idle", "busy"])
-def test_a_child_outlives_its_parent_by_no_more_than_its_call(task):
+def test_a_child_ends_with_its_parent_even_in_the_middle_of_a_long_call(task):
     script = f"""
 import os, signal, time
 from planner.isolation import PlanningChild
-child = PlanningChild(timeout=0.5)
+child = PlanningChild(timeout=3600.0)
 print(child.call(os.getpid), flush=True)
 {task}
+time.sleep(0.2)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert gone(int(done.stdout), 10.0), done.stderr
+    assert gone(int(done.stdout), 2.0), done.stderr
 
 
 def test_a_crash_costs_a_search_one_individual(aborting_solver, six_axis_limits, random_points):

@@ -14,6 +14,7 @@ from sim_fixtures.controller_faults import (
     EmergencyStop,
     FollowingErrorFault,
     Pause,
+    Push,
     Restart,
 )
 from sim_fixtures.fault_script import GRAMMAR, FaultScriptError, parse_fault, split_faults
@@ -39,6 +40,8 @@ LINES = {
     "following-error@7:axis=2": FollowingErrorFault(7, 2),
     "following-error@7x20:axis=2:slip": FollowingErrorFault(7, 2, "slip", 20),
     "saturate@7x30:axis=1": CurrentSaturation(7, 1, 30),
+    "push@7:axis=2": Push(7, 2),
+    "push@7x30:axis=1": Push(7, 1, 30),
     "pause@7x50:502": Pause(7, 50, 502),
     "pause@7:500": Pause(7, 50, 500),
 }
@@ -84,7 +87,7 @@ def test_a_line_that_is_none_says_why_and_lists_the_grammar(line: str, reason: s
 
 def test_every_example_of_the_grammar_is_a_fault() -> None:
     examples = re.findall(r"^([a-z-]+@\S+)", GRAMMAR, re.MULTILINE)
-    assert len(examples) == 12
+    assert len(examples) == 13
     for line in examples:
         parse_fault(line)
 

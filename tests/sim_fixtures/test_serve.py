@@ -117,6 +117,7 @@ def served(answer: Answer = prompt, *, cycles: int = 50, cost: float = 0.0, **ke
     clock.stalls = keywords.pop("stalls", [])
     cabinet = Cabinet(clock, cycles, cost)
     cabinet.silent_in = keywords.pop("silent_in", set())
+    cabinet.stands = keywords.pop("standing", True)
     link = VirtualLink(clock, answer)
     summary = serve(cabinet, link, clock=clock, **keywords)
     return summary, cabinet, link
@@ -270,6 +271,20 @@ def test_patience_ends_and_what_comes_then_is_missing():
     assert summary.stretched == 1
     assert summary.stretch_max == pytest.approx(0.1)
     assert cabinet.accepted[20] is None
+
+
+def test_at_the_end_a_pc_that_has_left_is_waited_for_once():
+    wishes = iter([Wish.GO_ON] * 5)
+    summary, cabinet, _ = served(
+        lambda k, p: prompt(k, p) if k < 10 else [],
+        wish=lambda: next(wishes, Wish.END),
+        stretch=0.5,
+        patience=1.0,
+        standing=False,
+        cycles=10_000,
+    )
+    assert (summary.stretched, summary.missed) == (1, len(cabinet.accepted) - 10)
+    assert len(cabinet.accepted) > 400
 
 
 def test_the_first_packet_is_repeated_until_somebody_listens():

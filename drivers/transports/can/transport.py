@@ -17,6 +17,7 @@ from drivers.transports.can.bus_load import BusRates, ProfileName
 from drivers.transports.can.ends import PcEnd
 from drivers.transports.can.errors import CanAxesError, CanError, CanModeError
 from drivers.transports.can.layout import MAX_AXES
+from drivers.transports.can.lock import BusLock
 from drivers.transports.can.port import Port
 
 MOVABLE = frozenset((Mode.POSITION, Mode.POSITION_RELATIVE, Mode.DELTA_POSITION))
@@ -33,11 +34,18 @@ class CanTransport:
         bus: python-can's; closed with the transport.
         rates: profile and bit rates.
         clock: s, the arrival of frames that the bus does not stamp.
+        lock: of the bus, where it has one; let go of when the transport is closed.
     """
 
     def __init__(
-        self, bus: can.BusABC, rates: BusRates, *, clock: Callable[[], float] = time.time
+        self,
+        bus: can.BusABC,
+        rates: BusRates,
+        *,
+        clock: Callable[[], float] = time.time,
+        lock: BusLock | None = None,
     ) -> None:
+        self._lock = lock
         self._end = PcEnd(rates)
         self._port = Port(bus, self._end, fd=rates.profile == "fd", clock=clock)
 
@@ -92,6 +100,8 @@ class CanTransport:
     def close(self) -> None:
         """Give the bus up. Closing twice changes nothing."""
         self._port.close()
+        if self._lock is not None:
+            self._lock.release()
 
 
 @dataclass(frozen=True)
@@ -155,9 +165,14 @@ class CanSpec:
         """Open the bus.
 
         Raises:
-            TransportError: it cannot be opened, or (`CanError`) could not carry the session.
+            TransportError: it cannot be opened, another program has it, or (`CanError`) it could
+                not carry the session.
         """
         self.check()
-        return CanTransport(
-            open_bus(self.interface, self.channel, self.rates, self.options), self.rates
-        )
+        lock = BusLock(self.interface, self.channel)
+        try:
+            bus = open_bus(self.interface, self.channel, self.rates, self.options)
+        except BaseException:
+            lock.release()
+            raise
+        return CanTransport(bus, self.rates, lock=lock)
