@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.design import preset
 
+from .bands import bands_of
+from .comparing import Estimated, compared_on, corrected, torque_kernels
 from .designs import SINES, SINES_LABELS, A, B, fly_key, via_key, weight_key
+from .forms import ClassForms
 from .plans import SINES_ABLATION, noise_key
 from .records import FitRecord, ScoreRecord
-from .results import AblationPoint, AblationResult
+from .results import AblationBand, AblationPoint, AblationResult
 from .settings import StudySettings
-from .summary import compared_on, corrected, parameter_error
+from .summary import parameter_error
 
 Array = NDArray[np.float64]
-
-ABLATED: Final = "ablation "
-"""Before the names of estimates from an ablation's own campaigns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,7 @@ class Evidence:
     Attributes:
         fits: of every executed excitation of the ablations, by key.
         main: of A and B with all repetitions.
-        estimates: every estimate that was asked to predict, by name.
-        scores: by class of motion.
+        scores: of the held-out motions, by class.
         truth: planted parameters (p,), None for a real arm.
         missing: what could not be run, by ablation, in sentences.
         sines: key of the sines that method A is represented by.
@@ -40,28 +39,19 @@ class Evidence:
 
     fits: Mapping[str, FitRecord]
     main: Mapping[str, FitRecord]
-    estimates: Mapping[str, Array]
     scores: Mapping[str, ScoreRecord]
     truth: Array | None
     missing: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sines: str = ""
 
+    @cached_property
+    def forms(self) -> dict[str, ClassForms]:
+        """Of the held-out motions, by class: the error of any estimate."""
+        return {name: ClassForms.of(one.forms) for name, one in self.scores.items()}
 
-def subset_name(method: str, repetitions: int) -> str:
-    """Name of the estimate from the first so many repetitions."""
-    return f"{method}-first-{repetitions}"
-
-
-def subsets_of(
-    main: Mapping[str, FitRecord], sizes: Sequence[int], methods: Sequence[str]
-) -> dict[str, Array]:
-    """Estimates from the first repetitions only (p,), by name; sizes there are not are left out."""
-    return {
-        subset_name(method, size): np.mean(main[method].values[:size], axis=0)
-        for method in methods
-        for size in sizes
-        if size <= len(main[method].values)
-    }
+    def executed(self, key: str) -> Array:
+        """Estimates (r, p) of the repetitions of an ablation's own campaign."""
+        return np.array(self.fits[key].values)
 
 
 def ablations(settings: StudySettings, evidence: Evidence) -> list[AblationResult]:
@@ -111,6 +101,7 @@ def ablations(settings: StudySettings, evidence: Evidence) -> list[AblationResul
                 for factor in settings.noise
                 if noise_key(method, factor) in evidence.fits
             ],
+            bands=_bands(evidence, (A, B), few),
             missing=list(evidence.missing.get("noise", ())),
         ),
     ]
@@ -119,8 +110,8 @@ def ablations(settings: StudySettings, evidence: Evidence) -> list[AblationResul
 def _sines(evidence: Evidence, few: int) -> AblationResult:
     """What method A is left free to choose, each beside B."""
     keys = [key for key in SINES if key in evidence.fits]
-    scores = evidence.scores["fly-by"].scores
-    b = [one.overall for one in scores[ABLATED + B]]
+    forms = evidence.forms["fly-by"]
+    b = Estimated(B, evidence.executed(B))
     return AblationResult(
         key=SINES_ABLATION,
         title="What method A may choose",
@@ -137,7 +128,11 @@ def _sines(evidence: Evidence, few: int) -> AblationResult:
         comparisons=corrected(
             [
                 compared_on(
-                    "fly-by", None, key, B, [one.overall for one in scores[ABLATED + key]], b
+                    "fly-by",
+                    Estimated(key, evidence.executed(key)),
+                    b,
+                    torque_kernels(forms),
+                    drifts=False,
                 )
                 for key in keys
             ]
@@ -149,30 +144,26 @@ def _sines(evidence: Evidence, few: int) -> AblationResult:
 def repetition_ablation(
     evidence: Evidence, sizes: Sequence[int], methods: Sequence[str]
 ) -> AblationResult:
-    """Estimates from the first repetitions only."""
-    points = []
+    """Estimates from the first repetitions only, each size beside the last method's."""
+    last = np.array(evidence.main[methods[-1]].values)
+    points, bands = [], []
     for method in methods:
         record = evidence.main[method]
-        for size in sizes:
-            names = subset_name(method, size), methods[-1]
-            if names[0] in evidence.estimates:
-                points.append(
-                    _point(
-                        evidence,
-                        float(size),
-                        method,
-                        record,
-                        names,
-                        repetitions=size,
-                        base=size == len(record.values),
-                    )
-                )
+        values = np.array(record.values)
+        for size in (one for one in sizes if one <= len(values)):
+            reference = last[:size].mean(axis=0)
+            base = size == len(values)
+            points.append(
+                _point(evidence, float(size), method, record, (values[:size], reference), base=base)
+            )
+            bands += bands_of(method, values, size, evidence.forms, evidence.truth, reference)
     return AblationResult(
         key="repetitions",
         title="Number of repetitions",
         variable="repetitions that are fitted",
         words="The first so many repetitions of the study itself; nothing is run again.",
         points=points,
+        bands=bands,
         missing=[],
     )
 
@@ -195,6 +186,7 @@ def _varied(
             for value, name, base in wanted
             if name in evidence.fits
         ],
+        bands=_bands(evidence, (B,), len(evidence.executed(B))),
         missing=list(evidence.missing.get(key, ())),
     )
 
@@ -203,9 +195,25 @@ def _executed(
     evidence: Evidence, value: float, method: str, key: str, *, base: bool
 ) -> AblationPoint:
     """A setting that was run for the ablation, beside B run as often."""
-    record = evidence.fits[key]
-    names = ABLATED + key, ABLATED + B
-    return _point(evidence, value, method, record, names, repetitions=len(record.values), base=base)
+    values = evidence.executed(key), evidence.executed(B).mean(axis=0)
+    return _point(evidence, value, method, evidence.fits[key], values, base=base)
+
+
+def _bands(evidence: Evidence, methods: Sequence[str], size: int) -> list[AblationBand]:
+    """Where the figures lie for other repetitions of the study's own motions."""
+    reference = evidence.executed(B).mean(axis=0)
+    return [
+        band
+        for method in methods
+        for band in bands_of(
+            method,
+            np.array(evidence.main[method].values),
+            size,
+            evidence.forms,
+            evidence.truth,
+            reference,
+        )
+    ]
 
 
 def _point(
@@ -213,34 +221,26 @@ def _point(
     value: float,
     method: str,
     record: FitRecord,
-    names: tuple[str, str],
+    values: tuple[Array, Array],
     *,
-    repetitions: int,
     base: bool,
 ) -> AblationPoint:
-    """One setting; `names` are those of its estimate and of the one it is set beside."""
-    own, reference = (evidence.estimates[name] for name in names)
-    truth = evidence.truth
+    """One setting; `values` are its repetitions (r, p) and the estimate it is set beside (p,)."""
+    repetitions, reference = values
+    own, truth = repetitions.mean(axis=0), evidence.truth
     return AblationPoint(
         value=value,
         method=method,
         base=base,
-        repetitions=repetitions,
+        repetitions=len(repetitions),
         log10_det=record.log10_det,
         coupling_index=record.coupling_index,
         duration=record.duration,
         parameter_error=None if truth is None else parameter_error(own, reference, truth),
-        error={
-            motion_class: float(np.median([one.overall for one in found.scores[names[0]]]))
-            for motion_class, found in evidence.scores.items()
-        },
-        own={
-            motion_class: float(np.median(known))
-            for motion_class, found in evidence.scores.items()
-            if (known := [one.own for one in found.scores[names[0]] if one.own is not None])
-        }
-        if truth is not None
-        else {},
+        error={name: float(np.median(one.overall(own))) for name, one in evidence.forms.items()},
+        own={}
+        if truth is None
+        else {name: float(np.median(one.own(own, truth))) for name, one in evidence.forms.items()},
     )
 
 

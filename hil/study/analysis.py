@@ -205,6 +205,9 @@ def _named(record: ScoreRecord, key: str) -> ScoreRecord:
                 name: [one.model_copy(update={"archive": f"{key}/{one.archive}"}) for one in some]
                 for name, some in record.scores.items()
             },
+            "forms": [
+                one.model_copy(update={"archive": f"{key}/{one.archive}"}) for one in record.forms
+            ],
             "examples": [
                 one.model_copy(update={"archive": f"{key}/{one.archive}"})
                 for one in record.examples
@@ -217,6 +220,9 @@ def _together(first: ScoreRecord, second: ScoreRecord) -> ScoreRecord:
     return first.model_copy(
         update={
             "durations": [*first.durations, *second.durations],
+            "samples": [*first.samples, *second.samples],
+            "left_out": [*first.left_out, *second.left_out],
+            "forms": [*first.forms, *second.forms],
             "scores": {k: [*first.scores[k], *second.scores[k]] for k in first.scores},
             "examples": [*first.examples, *second.examples],
         }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -19,8 +19,7 @@ from planner import PlannerError, plan_in_child
 from .folder import StudyFolder
 from .settings import Effort, StudySettings
 
-A, B, B0 = "a", "b", "b0"
-METHODS: Final = (A, B, B0)
+A, B, B0, AP = "a", "b", "b0", "a-printed"
 SINES: Final = {
     "a-middle": ("about the middle of the ranges, frequencies as printed", {}),
     "a-home": ("about the home posture, frequencies as printed", {"offset": "home"}),
@@ -170,7 +169,7 @@ def run_searches(
     return found
 
 
-def best_sines(found: dict[str, Found]) -> str:
+def best_sines(found: Mapping[str, Found]) -> str:
     """Key of the sines of largest determinant, which is what method A searches.
 
     Raises:
@@ -182,6 +181,18 @@ def best_sines(found: dict[str, Found]) -> str:
         raise NoExcitationError(
             "no sum of sines keeps all constraints of the cell; search longer (without --quick)"
         )
+    return max(able, key=lambda key: able[key])
+
+
+def printed_sines(found: Mapping[str, Found]) -> str | None:
+    """Key of the paper's own method A: the frequencies of its Table 1, largest determinant.
+
+    None where method A's best search has these frequencies itself, or none of them was found.
+    """
+    known = {key: found[key].excitation for key in AS_PRINTED if key in found}
+    able = {key: one.criteria.log10_det for key, one in known.items() if one is not None}
+    if not able or best_sines(found) in able:
+        return None
     return max(able, key=lambda key: able[key])
 
 

@@ -5,15 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hil.cell import Cell
 from hil.files import write_together
 from hil.progress import Reporter
-from hil.simulation import planted_values
 
 from .folder import REPORT, RESULTS
 from .page import study_page
 from .printed import TABLE1, printed_parameters
 from .results import MotionRow, StudyParameter, StudyResults
+
+Array = NDArray[np.float64]
 
 
 def write_outcome(root: Path, results: StudyResults, reporter: Reporter) -> None:
@@ -43,10 +47,9 @@ def printed_rows(cell: Cell) -> list[MotionRow]:
     ]
 
 
-def parameters_of(cell: Cell, *, planted: bool) -> list[StudyParameter]:
-    """The model's parameters with what is known of them beforehand."""
+def parameters_of(cell: Cell, truth: Array | None) -> list[StudyParameter]:
+    """The model's parameters with what is known of them beforehand; `truth` (p,) is planted."""
     model, printed = cell.model, printed_parameters(cell)
-    truth = planted_values(cell) if planted else None
     found = []
     for k, name in enumerate(model.parameter_names):
         row, known = printed.get(name), dict[str, Any]()

@@ -15,10 +15,25 @@ from hil.motion_checks import MotionChecks
 from identification.excitation import Excitation
 from planner import PlanFile
 
-from .designs import B0, SINES, A, B, Found, best_sines, fly_key, via_key, weight_key, with_fly
+from .designs import (
+    AP,
+    B0,
+    SINES,
+    A,
+    B,
+    Found,
+    best_sines,
+    fly_key,
+    printed_sines,
+    via_key,
+    weight_key,
+    with_fly,
+)
+from .drawn import FEWEST
 from .execution import Execution
 from .folder import StudyFolder
 from .motions import sine_motions, via_point_motions
+from .one_effect import ONE_EFFECT, effect_key, effects_of, with_only
 from .settings import StudySettings
 from .workers import StudyError
 
@@ -27,8 +42,16 @@ CONDITIONS: Final = (PLAIN, EFFECTS)
 
 
 # What the keys of an ablation's campaigns have in them.
-_KEY_PARTS: Final = {"fly": "fly", "n_via": "via", "weight": "weight", "noise": "noise"}
+_KEY_PARTS: Final = {
+    "fly": "fly",
+    "n_via": "via",
+    "weight": "weight",
+    "noise": "noise",
+    ONE_EFFECT: "only",
+}
 SINES_ABLATION: Final = "sines"
+_ONE_EFFECT_SHARE: Final = 5
+"""One effect alone is tried on this part of the held-out motions, on two at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +60,15 @@ class Plans:
 
     Attributes:
         sines: key of the search that method A is represented by.
-        excitations: A, B and B with fly 0.
+        printed: key of the search for the paper's own sines; None where these are `sines`, or
+            there are none.
+        excitations: A, B, B with fly 0, and the paper's own sines.
         executions: by condition and key.
         missing: what cannot be run, by ablation, in sentences.
     """
 
     sines: str
+    printed: str | None
     excitations: dict[str, Excitation]
     executions: dict[str, dict[str, Execution]]
     missing: dict[str, list[str]]
@@ -54,7 +80,7 @@ class Plans:
         return sorted(every, key=lambda one: (one.motions, one.effects), reverse=True)
 
     def without(self, ended: Mapping[Path, str]) -> Plans:
-        """These plans less the campaigns of ablations that the controller ended, by folder.
+        """These plans less the campaigns that the controller ended, by folder.
 
         Raises:
             StudyError: A, B or B with fly 0 itself was ended.
@@ -65,7 +91,7 @@ class Plans:
             for key, one in some.items():
                 if one.root not in ended:
                     continue
-                if condition != ABLATION or key == B:
+                if (condition != ABLATION and key != AP) or key == B:
                     raise StudyError(
                         f"{one.root}: this arm cannot bear the excitation that was found for it:"
                         f" {ended[one.root]}; another search (--seed, in another folder) finds"
@@ -94,8 +120,10 @@ def plan_study(
     Raises:
         NoExcitationError: a method has no motion, or no held-out motion keeps the constraints.
     """
-    checks, sines = MotionChecks.of(cell), best_sines(found)
+    checks, sines, printed = MotionChecks.of(cell), best_sines(found), printed_sines(found)
     excitations = {A: _of(found, sines), B: _of(found, B), B0: _of(found, B0)}
+    if printed is not None:
+        excitations[AP] = _of(found, printed)
     count, seed = settings.motions, settings.seed
     fly = excitations[B].fly
     assert fly  # of the preset, above 0: its held-out motions are fly-by whatever the cell says
@@ -112,7 +140,7 @@ def plan_study(
             key: Execution(
                 folder.campaign(condition, key),
                 main,
-                _plan(cell, one, held_out[key]),
+                _plan(cell, one, held_out.get(key, ())),
                 effects=condition == EFFECTS,
             )
             for key, one in excitations.items()
@@ -143,7 +171,34 @@ def plan_study(
             if key in found and (one := found[key].excitation) is not None
         }
     )
-    return Plans(sines, excitations, executions, missing)
+    if with_single_effects(settings):
+        seen = held_out[B][: max(2, count // _ONE_EFFECT_SHARE)]
+        executions[ABLATION] |= _one_effect(folder, few, excitations, seen)
+    return Plans(sines, printed, excitations, executions, missing)
+
+
+def with_single_effects(settings: StudySettings) -> bool:
+    """Whether the effects are tried one by one: of fewer repetitions nothing could be told."""
+    return settings.effects and settings.ablation_repetitions >= FEWEST
+
+
+def _one_effect(
+    folder: StudyFolder,
+    few: Cell,
+    excitations: Mapping[str, Excitation],
+    held_out: Sequence[PlannedMotion],
+) -> dict[str, Execution]:
+    """A and B with one effect each; B's campaign holds motions of the arm with that effect."""
+    return {
+        effect_key(method, effect): Execution(
+            folder.campaign(ABLATION, effect_key(method, effect)),
+            with_only(few, effect),
+            _plan(few, excitations[method], held_out if method == B else ()),
+            effects=True,
+        )
+        for effect in effects_of(few)
+        for method in (A, B)
+    }
 
 
 def with_noise(cell: Cell, factor: float) -> Cell:

@@ -22,9 +22,9 @@ from identification import Factor, Motion, RobotModel
 from identification.excitation import correlation, coupling_index, information, log10_det
 from identification.preprocessing import Samples
 from identification.repetitions import estimate_repetitions
-from identification.smoothing_spline import low_pass
-from identification.validation import FIGURE_BANDWIDTH, PredictionError, for_figure
+from identification.validation import PredictionError, for_figure
 
+from .forms import low_passed, motion_form
 from .records import PLANTED, ExampleRecord, FitRecord, MotionScore, ScoreRecord
 
 Array = NDArray[np.float64]
@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 SHOWN: Final = 1200
 """Rows of a series that a figure is drawn from, at most."""
 FIGURE_DIGITS: Final = 5
+_MOVES: Final = 1e-3
+"""rad/s or m/s: a joint that is faster moves."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ def score(
         _scored(model, table, source.name, run, truth)
         for source, run in zip(prepared.sources.training, runs, strict=True)
     ]
+    usable = [run.usable[_motion_rows(run)] for run in runs]
     scores = {name: [some[k] for some in by_motion] for k, name in enumerate(estimates)}
     examples = []
     if shown:
@@ -109,6 +112,12 @@ def score(
     return ScoreRecord(
         inputs=inputs,
         durations=[float(run.motion.time[-1] - run.motion.time[0]) for run in runs],
+        samples=[len(rows) for rows in usable],
+        left_out=[np.count_nonzero(~rows, axis=0).tolist() for rows in usable],
+        forms=[
+            motion_form(model, source.name, run)
+            for source, run in zip(prepared.sources.training, runs, strict=True)
+        ],
         scores=scores,
         examples=examples,
     )
@@ -125,29 +134,34 @@ def _scored(
     blocks, columns = run.regressor(model)
     for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
         left[:, j] = run.torque[:, j, None] - block @ table[:, used].T
+    everywhere = low_passed(run, left.reshape(len(left), -1)).reshape(left.shape)
     left[~run.usable] = 0.0
-    slow = np.zeros_like(left)
-    for part in run.segments:
-        if run.usable[part].any():
-            flat = left[part].reshape(len(left[part]), -1)
-            slow[part] = low_pass(run.motion.time[part], flat, FIGURE_BANDWIDTH).reshape(
-                left[part].shape
-            )
+    slow = low_passed(run, left.reshape(len(left), -1)).reshape(left.shape)
     best = None if truth is None else left[..., truth]
-    return [_score(name, run, left[..., k], slow[..., k], best) for k in range(len(table))]
+    return [
+        _score(name, run, left[..., k], slow[..., k], everywhere[..., k], best)
+        for k in range(len(table))
+    ]
 
 
-def _score(name: str, run: Samples, left: Array, slow: Array, best: Array | None) -> MotionScore:
+def _score(
+    name: str, run: Samples, left: Array, slow: Array, everywhere: Array, best: Array | None
+) -> MotionScore:
     """Score of what an estimate leaves of the torque (m, n), as it is and low-passed.
 
-    `best` is what the planted values leave: the noise, and what the model leaves out.
+    `everywhere` is low-passed with the rows that are not usable, `best` is what the planted values
+    leave: the noise, and what the model leaves out.
     """
+    whole = _motion_rows(run)
     error = PredictionError.between(run.torque, run.torque - slow, run.usable)
     raw = PredictionError.between(run.torque, run.torque - left, run.usable)
     return MotionScore(
         archive=name,
         overall=error.overall,
         unfiltered=raw.overall,
+        all_rows=PredictionError.between(
+            run.torque[whole], run.torque[whole] - everywhere[whole]
+        ).overall,
         own=None
         if best is None
         else PredictionError.between(run.torque, run.torque - (left - best), run.usable).overall,
@@ -155,6 +169,12 @@ def _score(name: str, run: Samples, left: Array, slow: Array, best: Array | None
         mean_abs=error.mean_absolute.tolist(),
         mean=error.mean.tolist(),
     )
+
+
+def _motion_rows(run: Samples) -> slice:
+    """Samples from the first to the last at which a joint moves."""
+    moving = np.flatnonzero((np.abs(run.motion.velocity) > _MOVES).any(axis=1))
+    return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
 
 
 def _prepared(reading: Reading) -> Prepared:

@@ -1,24 +1,15 @@
-"""What the tables of excitations, parameters and ablations say, in sentences."""
+"""What the tables of excitations and parameters say, in sentences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from hil.report import numbers
 
-from .reading_sines import beside_b
-from .results import (
-    AblationResult,
-    ConditionResult,
-    MethodResult,
-    MotionRow,
-    Paragraph,
-    StudyResults,
-)
-from .wording import opening
+from .results import ConditionResult, MethodResult, MotionRow, Paragraph, StudyResults
+from .wording import labels_of, opening
 
 
 def criteria_paragraph(results: StudyResults) -> Paragraph:
@@ -76,34 +67,48 @@ def parameters_paragraph(results: StudyResults) -> Paragraph:
     for condition in results.conditions:
         methods = {one.key: one for one in condition.methods}
         if {"a", "b"} <= methods.keys():
-            told = [_scatter(condition, methods["a"], methods["b"])]
-            told += _distance(results, methods["a"], methods["b"])
-            sentences.append(" ".join(told))
-        if condition.closeness:
-            parts = [
-                f"{one.second_closer} of {one.parameters} in {one.group}"
-                + (
-                    ""
-                    if one.printed_second_closer is None
-                    else f" (in print {one.printed_second_closer})"
-                )
-                for one in condition.closeness
+            told = [
+                *_scatter(methods["a"], methods["b"]),
+                *_distance(results, methods["a"], methods["b"]),
             ]
-            sentences.append(
-                f"{opening(condition)}, B lies closer to pi_C than A in {'; '.join(parts)}."
-            )
+            if told:
+                sentences.append(f"{opening(condition)}: {' '.join(told)}")
+        if condition.closeness:
+            sentences.append(_closeness(condition))
     return Paragraph(key="parameters", heading="The parameters", sentences=sentences)
 
 
-def _scatter(condition: ConditionResult, a: MethodResult, b: MethodResult) -> str:
+def _closeness(condition: ConditionResult) -> str:
+    """How often the second method comes closer to the manufacturer's column, as in section 4.2."""
+    labels, first = labels_of(condition), condition.closeness[0]
+    in_print = (first.first, first.second) == ("a", "b")  # what the paper has columns of
+    parts = [
+        f"{one.second_closer} of {one.parameters} in {one.group}"
+        + (
+            f" (in print {one.printed_second_closer})"
+            if in_print and one.printed_second_closer is not None
+            else ""
+        )
+        for one in condition.closeness
+    ]
+    return (
+        f"{opening(condition)}, {labels[first.second]} lies closer to π_C than"
+        f" {labels[first.first]} in {'; '.join(parts)}."
+    )
+
+
+def _scatter(a: MethodResult, b: MethodResult) -> list[str]:
+    """How the estimates of single repetitions differ; nothing where there is one repetition."""
     usable = (np.array(a.std) > 0.0) & (np.array(b.std) > 0.0)
+    if min(a.repetitions, b.repetitions) < 2 or not usable.any():
+        return []
     logs = np.log(np.array(b.std)[usable] / np.array(a.std)[usable])
     smaller = int(np.count_nonzero(logs < 0.0))
-    return (
-        f"{opening(condition)}, B's estimates scatter over the repetitions"
+    return [
+        f"B's estimates scatter over the repetitions"
         f" {numbers.fixed(math.exp(float(logs.mean())), 2)} times as much as A's (geometric mean"
         f" of {logs.size} parameters; less in {smaller} of them)."
-    )
+    ]
 
 
 def _distance(results: StudyResults, a: MethodResult, b: MethodResult) -> list[str]:
@@ -118,91 +123,6 @@ def _distance(results: StudyResults, a: MethodResult, b: MethodResult) -> list[s
     ratio = math.exp(float(np.mean([math.log(y / x) for x, y in pairs])))
     closer = sum(y < x for x, y in pairs)
     return [
-        f"Their distance from the planted values is {numbers.fixed(ratio, 2)} times that of A's in"
+        f"B's distance from the planted values is {numbers.fixed(ratio, 2)} times that of A's in"
         f" the geometric mean; B is closer in {closer} of {len(pairs)}."
     ]
-
-
-def ablation_paragraph(ablation: AblationResult) -> Paragraph:
-    """Between which figures one thing moves the others."""
-    sentences = [ablation.words]
-    for method in dict.fromkeys(point.method for point in ablation.points):
-        points = [point for point in ablation.points if point.method == method]
-        if len(points) < 2:
-            continue
-        name = method.upper() if method in ("a", "b") else method
-        spans = []
-        if len({point.coupling_index for point in points}) > 1:
-            spans.append(_span("I_c", [(p.name, p.coupling_index) for p in points], 1))
-            spans.append(_span("log det", [(p.name, p.log10_det) for p in points], 1))
-        spans.append(_span("parameter error", [(p.name, p.parameter_error) for p in points], 2))
-        spans.append(
-            _span(
-                "fly-by error [%]",
-                [(p.name, 100.0 * p.error["fly-by"]) for p in points if "fly-by" in p.error],
-                3,
-            )
-        )
-        spans.append(
-            _span(
-                "own fly-by error [%]",
-                [(p.name, 100.0 * p.own["fly-by"]) for p in points if "fly-by" in p.own],
-                4,
-            )
-        )
-        told = "; ".join(span for span in spans if span)
-        if told:
-            sentences.append(f"{name}, {ablation.variable}: {told}.")
-    sentences += _at_the_end(ablation)
-    sentences += beside_b(ablation)
-    sentences += ablation.missing
-    if ablation.points and ablation.key in ("fly", "n_via", "weight"):
-        count = ablation.points[0].repetitions
-        sentences.append(
-            f"Each setting is one motion, executed {'once' if count == 1 else f'{count} times'}: "
-            "differences may be luck of the search."
-            if ablation.key != "fly"
-            else f"Each setting was executed {'once' if count == 1 else f'{count} times'}."
-        )
-    return Paragraph(key=f"ablation-{ablation.key}", heading=ablation.title, sentences=sentences)
-
-
-def _at_the_end(ablation: AblationResult) -> list[str]:
-    """The two methods beside each other at both ends of what is varied."""
-    by_method = {
-        method: {point.value: point.error for point in ablation.points if point.method == method}
-        for method in dict.fromkeys(point.method for point in ablation.points)
-    }
-    if len(by_method) != 2:
-        return []
-    (first, before), (second, after) = by_method.items()
-    both = sorted(before.keys() & after.keys())
-    if len(both) < 2:
-        return []
-    told = []
-    for value in (both[0], both[-1]):
-        ratios = [
-            f"{numbers.fixed(after[value][name] / error, 2)} on {name}"
-            for name, error in before[value].items()
-            if error > 0.0
-        ]
-        told.append(f"at {value:g} {', '.join(ratios)}")
-    return [
-        f"Median error with {second.upper()} over that with {first.upper()}: {'; '.join(told)}"
-        " motions."
-    ]
-
-
-Setting = tuple[str, float | None]
-
-
-def _span(what: str, points: Sequence[Setting], decimals: int) -> str:
-    """Smallest and largest value, and at which settings."""
-    known = [(value, at) for at, value in points if value is not None and math.isfinite(value)]
-    if len(known) < 2:
-        return ""
-    (low, at_low), (high, at_high) = (pick(known, key=lambda one: one[0]) for pick in (min, max))
-    return (
-        f"{what} from {numbers.fixed(low, decimals)} (at {at_low}) to"
-        f" {numbers.fixed(high, decimals)} (at {at_high})"
-    )

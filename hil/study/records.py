@@ -13,6 +13,8 @@ from pydantic import ValidationError
 from hil.files import make_folder, write_atomically
 from hil.results.frozen import Frozen
 
+from .forms import MotionForm
+
 VERSION = 2
 """Counted up when the same archives come to give other numbers."""
 
@@ -60,6 +62,8 @@ class MotionScore(Frozen):
     """||e|| / ||tau|| over all joints."""
     unfiltered: float
     """The same without the low-pass."""
+    all_rows: float
+    """The same, low-passed, over the whole motion: rows at rest and at reversals are in it."""
     own: float | None
     """||Phi (pi - planted)|| / ||tau||: what the estimate itself is off by; null where nothing is
     planted."""
@@ -81,6 +85,12 @@ class ScoreRecord(Record):
     """How well several estimates predict the motions of one class."""
 
     durations: list[float]
+    samples: list[int]
+    """Of each motion, from the first to the last at which a joint moves."""
+    left_out: list[list[int]]
+    """How many of them the errors leave out, each per joint: at rest, near ends, at reversals."""
+    forms: list[MotionForm]
+    """Of each motion: the error of any other estimate."""
     scores: dict[str, list[MotionScore]]
     examples: list[ExampleRecord]
 

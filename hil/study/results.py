@@ -7,6 +7,7 @@ low-passed at 30 Hz unless they say otherwise.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, ValidationError
 
@@ -15,6 +16,7 @@ from hil.results.frozen import Frozen
 
 from .records import ExampleRecord
 from .settings import StudySettings
+from .verdict import Verdict
 
 SCHEMA_VERSION = 1
 
@@ -100,13 +102,19 @@ class CrossCell(Frozen):
     """Quartiles over the motions."""
     unfiltered_median: float
     """Without the low-pass: the noise of the currents is in it."""
+    all_rows_median: float
+    """Over the whole motion: rows at rest, near ends and at reversals are in it."""
     own_median: float | None
     """Of ||Phi (pi - planted)|| / ||tau||, which has no noise in it; null where nothing is
     planted, or where the arm does what the model leaves out."""
 
 
 class ComparisonResult(Frozen):
-    """Two estimates on the same motions: errors with `second` over errors with `first`."""
+    """Two estimates on the same motions: errors with `second` over errors with `first`.
+
+    The interval takes motions and repetitions as drawn; the verdict rests on it alone. Signed
+    ranks are over the motions, for these two estimates as they are.
+    """
 
     motion_class: str
     joint: str | None
@@ -114,16 +122,35 @@ class ComparisonResult(Frozen):
     first: str
     second: str
     motions: int
+    setting: str = ""
+    """What was varied, in an ablation."""
+    repetitions: list[int]
+    """That `first` and `second` were made from."""
     ratio: float
-    low: float
-    high: float
-    """Bootstrap interval of the ratio, 95 %."""
+    """Geometric mean over the motions."""
+    error: float | None
+    """Standard error of the log ratio, motions and repetitions drawn anew; null where fewer than
+    three repetitions, or one motion, do not tell it."""
+    freedom: float | None
+    """Its degrees of freedom."""
+    level: float
+    """Of the interval by itself, such that all of its table hold at 95 % (Bonferroni)."""
+    low: float | None
+    high: float | None
+    """Interval of the ratio at that level."""
+    verdict: Verdict
+    """On `second`: where the interval leaves out 1."""
     wins: int
     """Motions that `second` predicts better."""
     p_value: float
-    """Wilcoxon's signed-rank test, two-sided."""
+    """Wilcoxon's signed-rank test, two-sided, over the motions, given these estimates."""
     p_corrected: float
-    """After Holm, for all comparisons of its table."""
+    """The same after Holm, for all comparisons of its table."""
+
+    @property
+    def differs(self) -> bool:
+        """Whether a difference is told."""
+        return self.verdict not in ("none", "too few")
 
 
 class ClassResult(Frozen):
@@ -138,6 +165,12 @@ class ClassResult(Frozen):
     """What each estimate itself is off by, where that is known."""
     mean_abs: dict[str, list[list[float]]]
     """Motion by motion, each per joint, N·m: the paper's Fig. 3."""
+    all_rows: dict[str, list[float]]
+    """As `overall`, over the whole motion: rows at rest, near ends and at reversals are in it."""
+    left_out: list[float]
+    """Share of the samples of the motions that all other errors leave out, per joint."""
+    left_out_share: float
+    """Of all joints together."""
 
 
 class ClosenessResult(Frozen):
@@ -214,6 +247,22 @@ class AblationPoint(Frozen):
         return self.label or f"{self.value:g}"
 
 
+class AblationBand(Frozen):
+    """What chance alone does to a figure: subsets of the study's own repetitions of one method."""
+
+    method: str
+    repetitions: int
+    """In each subset."""
+    quantity: Literal["error", "own", "parameter_error"]
+    motion_class: str | None
+    """Null for the parameters."""
+    low: float
+    high: float
+    """2.5 and 97.5 % of the subsets."""
+    subsets: int
+    """How many were looked at."""
+
+
 class AblationResult(Frozen):
     """One thing varied, everything else kept."""
 
@@ -223,7 +272,9 @@ class AblationResult(Frozen):
     words: str
     points: list[AblationPoint]
     comparisons: list[ComparisonResult] = Field(default_factory=list)
-    """With B, where the settings are another method's."""
+    """With B, where the settings are another method's, or setting by setting."""
+    bands: list[AblationBand] = Field(default_factory=list)
+    """Of as many repetitions as the points have; none where the study has no more itself."""
     missing: list[str]
 
 
@@ -232,7 +283,11 @@ class Paragraph(Frozen):
 
     key: str
     heading: str
+    verdict: str = ""
+    """The answer to the heading in one line, where it is a question."""
     sentences: list[str]
+    more: list[str] = Field(default_factory=list)
+    """For those who want to know it more closely."""
 
 
 class StudyResults(Frozen):
@@ -257,7 +312,11 @@ class StudyResults(Frozen):
     missing: list[str]
     """What of the paper's study is not in this one, and why."""
     times: dict[str, float]
-    """s that each step took when this was written; steps found done take next to nothing."""
+    """s that each step took by the clock, over all sessions of a study that was ended."""
+    processor_times: dict[str, float] = Field(default_factory=dict)
+    """s of processor, this process and its children, likewise."""
+    times_whole: bool = True
+    """False where a part was done before times were kept: they are then at least so long."""
 
     def to_json(self) -> str:
         """As indented JSON, the text of `results.json`."""

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -20,30 +18,32 @@ from hil.simulation import planted_values, simulated_link, simulated_provenance
 from hil.version import software
 from sim_fixtures.ns16 import CELL_PATH
 
-from .ablations import ABLATED, Evidence, ablations, subsets_of
+from .ablations import Evidence, ablations
 from .analysis import Run, fit_all, score_all
-from .designs import B0, A, B, Found, notes_of, run_searches, searches
+from .designs import AP, B0, A, B, Found, notes_of, run_searches, searches
 from .equal_data import EqualData
 from .execution import execute_all
 from .folder import StudyFolder
+from .forms import ClassForms
+from .one_effect import ALL, NONE, EffectSetting, effect_ablation, effect_key, effects_of
 from .outcome import parameters_of, printed_rows, write_outcome
-from .plans import ABLATION, EFFECTS, PLAIN, Plans, plan_study
+from .plans import ABLATION, EFFECTS, PLAIN, Plans, plan_study, with_single_effects
 from .reading import reading_of
-from .records import PLANTED, FitRecord
+from .records import PLANTED, FitRecord, ScoreRecord
 from .results import (
-    AblationResult,
     ConditionResult,
     MotionRow,
     SearchResult,
     StudyResults,
 )
 from .settings import StudySettings
+from .stages import Stages
 from .summary import Named, condition_result, estimates_of
 from .workers import Workers, workers_of
 
 Array = NDArray[np.float64]
 
-LABELS: Final = {A: "A", B: "B", B0: "B, fly 0"}
+LABELS: Final = {A: "A", B: "B", B0: "B, fly 0", AP: "A as printed"}
 _CONDITION_WORDS: Final = {
     PLAIN: "the arm is what the model says",
     EFFECTS: "the arm does what the model leaves out",
@@ -77,25 +77,35 @@ def run_study(
         NoExcitationError: a search found no motion.
         OutputError: the results cannot be written.
     """
-    folder, times = StudyFolder(root), dict[str, float]()
+    folder = StudyFolder(root)
     if cell is None:
         cell = Cell.load(CELL_PATH)
     else:
         simulated_link(cell)  # refuses real hardware before anything is searched
         settings = settings.model_copy(update={"cell": _digest(cell)})
     with folder.held(), workers_of(workers) as processes:
+        begun = folder.settings.exists()
         folder.begin(settings)
+        stages = Stages(root, begun=begun)
         wanted = searches(settings, len(cell.joint_names))
-        with _timed(times, "searches"):
+        with stages.stage("searches"):
             found = run_searches(folder, cell, wanted, reporter, workers=workers)
-        with _timed(times, "plans"):
+        with stages.stage("plans"):
             plans = plan_study(folder, cell, settings, found)
-        with _timed(times, "campaigns"):
+        with stages.stage("campaigns"):
             plans = plans.without(execute_all(plans.all, reporter, processes))
-        with _timed(times, "estimates and predictions"):
+        with stages.stage("estimates and predictions"):
             results = _analysed(folder, cell, settings, plans, found, reporter, processes)
-        results = results.model_copy(update={"times": times})
-        write_outcome(root, results, reporter)
+        times = stages.times
+        results = results.model_copy(
+            update={
+                "times": times.wall,
+                "processor_times": times.processor,
+                "times_whole": times.whole,
+            }
+        )
+        with stages.stage("page"):
+            write_outcome(root, results, reporter)
     return results
 
 
@@ -108,45 +118,42 @@ def _analysed(
     reporter: Reporter,
     workers: Workers,
 ) -> StudyResults:
-    parameters = parameters_of(cell, planted=True)
     truth = planted_values(cell)
+    parameters = parameters_of(cell, truth)
     conditions: list[ConditionResult] = []
-    varied: list[AblationResult] = []
     fits: dict[str, dict[str, FitRecord]] = {}
     for condition, executions in plans.executions.items():
         runs = [Run(key, LABELS.get(key, key), one.root) for key, one in executions.items()]
         fits[condition] = fit_all(runs, folder.fits / condition, reporter, workers)
+    scores: dict[str, dict[str, ScoreRecord]] = {}
     for condition in plans.executions:
         if condition == ABLATION:
             continue
-        runs = [
-            Run(key, LABELS[key], folder.campaign(condition, key))
-            for key in plans.executions[condition]
-        ]
-        estimates = estimates_of(fits[condition]) | {PLANTED: truth}
-        equal = EqualData.of(fits[condition], list(LABELS))
-        estimates |= {} if equal is None else equal.estimate(fits[condition])
-        if condition == PLAIN:
-            estimates |= subsets_of(fits[PLAIN], settings.subsets, (A, B))
-            estimates |= {ABLATED + key: one for key, one in estimates_of(fits[ABLATION]).items()}
-        scores = score_all(runs, folder.fits / condition, estimates, (A, B), reporter, workers)
-        named = Named(condition, _CONDITION_WORDS[condition], _effects(cell, condition == EFFECTS))
+        labels = {key: name for key, name in LABELS.items() if key in plans.executions[condition]}
+        runs = [Run(key, label, folder.campaign(condition, key)) for key, label in labels.items()]
+        methods = {key: fits[condition][key] for key in labels}
+        estimates = estimates_of(methods) | {PLANTED: truth}
+        equal = EqualData.of(methods, list(labels))
+        estimates |= {} if equal is None else equal.estimate(methods)
+        scores[condition] = score_all(
+            runs, folder.fits / condition, estimates, (A, B), reporter, workers
+        )
+        on = condition == EFFECTS
+        named = Named(condition, _CONDITION_WORDS[condition], _effects(cell, on), drifts=on)
         conditions.append(
             condition_result(
-                named, LABELS, fits[condition], scores, parameters, cell.joint_names, [PLANTED]
+                named, labels, methods, scores[condition], parameters, cell.joint_names, [PLANTED]
             )
         )
-        if condition == PLAIN:
-            evidence = Evidence(
-                fits[ABLATION],
-                fits[PLAIN],
-                estimates,
-                scores,
-                truth,
-                plans.missing,
-                plans.sines,
-            )
-            varied = ablations(settings, evidence)
+    evidence = Evidence(
+        fits[ABLATION], fits[PLAIN], scores[PLAIN], truth, plans.missing, plans.sines
+    )
+    varied = ablations(settings, evidence)
+    if with_single_effects(settings):
+        one_effect = _effect_settings(
+            folder, cell, settings, plans, fits, scores, reporter, workers
+        )
+        varied.append(effect_ablation(one_effect, fits[PLAIN], evidence.forms, truth))
     results = StudyResults(
         name=folder.root.resolve().name,
         cell=cell.name,
@@ -162,14 +169,58 @@ def _analysed(
         conditions=conditions,
         ablations=varied,
         reading=[],
-        missing=[] if settings.effects else ["The effects that the model leaves out were not run."],
+        missing=_missing(settings),
         times={},
     )
     return results.model_copy(update={"reading": reading_of(results)})
 
 
+def _effect_settings(
+    folder: StudyFolder,
+    cell: Cell,
+    settings: StudySettings,
+    plans: Plans,
+    fits: Mapping[str, Mapping[str, FitRecord]],
+    scores: Mapping[str, Mapping[str, ScoreRecord]],
+    reporter: Reporter,
+    workers: Workers,
+) -> list[EffectSetting]:
+    """What A and B gave without effects, with each by itself, and with all."""
+    few, forms = settings.ablation_repetitions, "fly-by"
+    plain, every = (ClassForms.of(scores[one][forms].forms) for one in (PLAIN, EFFECTS))
+    bases = {A: fits[PLAIN][A], B: fits[PLAIN][B]}, {A: fits[EFFECTS][A], B: fits[EFFECTS][B]}
+    found = [EffectSetting(NONE, bases[0], plain, few, base=True)]
+    for effect in effects_of(cell):
+        keys = {method: effect_key(method, effect) for method in (A, B)}
+        if not fits[ABLATION].keys() >= set(keys.values()):
+            continue  # the arm did not bear one of them, which is told
+        own = {method: fits[ABLATION][key] for method, key in keys.items()}
+        root = plans.executions[ABLATION][keys[B]].root
+        scored = score_all(
+            [Run(keys[B], keys[B], root)],
+            folder.fits / ABLATION,
+            estimates_of(own),
+            (),
+            reporter,
+            workers,
+        )
+        found.append(EffectSetting(effect, own, ClassForms.of(scored[forms].forms), few))
+    return [*found, EffectSetting(ALL, bases[1], every, few, base=True)]
+
+
 def _digest(cell: Cell) -> str:
     return hashlib.sha256((cell.text + cell.urdf).encode()).hexdigest()
+
+
+def _missing(settings: StudySettings) -> list[str]:
+    if not settings.effects:
+        return ["The effects that the model leaves out were not run."]
+    if not with_single_effects(settings):
+        return [
+            "The effects that the model leaves out were not tried one at a time: each setting is"
+            f" run too few times here ({settings.ablation_repetitions}) to tell anything."
+        ]
+    return []
 
 
 def _printed_effort() -> int:
@@ -199,12 +250,14 @@ def _search(found: Found, sines: str) -> SearchResult:
 def _table1(
     plans: Plans, found: Mapping[str, Found], fits: Mapping[str, FitRecord]
 ) -> list[MotionRow]:
-    rows = []
+    rows, searched = [], {A: plans.sines, AP: plans.printed or plans.sines}
     for key, excitation in plans.excitations.items():
+        if key not in fits:
+            continue  # the arm did not bear it, which is told
         rows.append(
             MotionRow(
                 key=key,
-                words=notes_of(found[plans.sines if key == A else key].search),
+                words=notes_of(found[searched.get(key, key)].search),
                 n_samples=excitation.criteria.n_samples,
                 log10_det=excitation.criteria.log10_det,
                 coupling_index=excitation.criteria.coupling_index,
@@ -214,10 +267,3 @@ def _table1(
             )
         )
     return rows
-
-
-@contextmanager
-def _timed(times: dict[str, float], name: str) -> Iterator[None]:
-    begin = time.perf_counter()
-    yield
-    times[name] = round(time.perf_counter() - begin, 1)

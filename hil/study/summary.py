@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Final
@@ -10,8 +10,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from .comparing import Estimated, compared_on, corrected, own_kernels, torque_kernels
+from .designs import AP, B
 from .equal_data import EqualData
-from .paired import compare, holm
+from .forms import ClassForms
 from .records import FitRecord, ScoreRecord
 from .results import (
     ClassResult,
@@ -33,21 +35,58 @@ GROUPS: Final = {
     "rows 33 to 40": range(33, 41),
     "rows 41 to 52, friction": range(41, 53),
 }
-_SEED: Final = 20140901
 
 
 @dataclass(frozen=True)
 class Named:
-    """What a condition is called."""
+    """What a condition is called, and whether its repetitions may be like their neighbours."""
 
     key: str
     words: str
     effects: tuple[str, ...]
+    drifts: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class ClassSight:
+    """All that estimates are compared with on one class of motion.
+
+    Attributes:
+        motion_class: its name.
+        forms: of its motions.
+        estimates: by key, with their repetitions.
+        drifts: whether repetitions may be like their neighbours.
+    """
+
+    motion_class: str
+    forms: ClassForms
+    estimates: Mapping[str, Estimated]
+    drifts: bool
+
+    def compared(
+        self,
+        first: str,
+        second: str,
+        kernels: Callable[[Array], Array],
+        *,
+        joint: str | None = None,
+    ) -> ComparisonResult:
+        """Two of its estimates; a table of one."""
+        before, after = self.estimates[first], self.estimates[second]
+        return compared_on(
+            self.motion_class, before, after, kernels, joint=joint, drifts=self.drifts
+        )
 
 
 def estimates_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
     """The paper's estimate of each: the mean over the repetitions' own estimates (p,)."""
     return {key: np.mean(one.values, axis=0) for key, one in fits.items()}
+
+
+def truth_of(parameters: Sequence[StudyParameter]) -> Array | None:
+    """Planted parameters (p,), where all are known."""
+    known = [one.truth for one in parameters if one.truth is not None]
+    return np.array(known) if len(known) == len(parameters) else None
 
 
 def condition_result(
@@ -74,7 +113,15 @@ def condition_result(
     others = others if equal is None else [equal.name, *others]
     wanted = [*keys, *others]
     classes = [_class_result(name, one, wanted, named.effects) for name, one in scores.items()]
-    first = next((one for one in classes if one.motion_class == "fly-by"), None)
+    repeated = {key: np.array(fits[key].values) for key in keys}
+    if equal is not None:
+        repeated[equal.name] = repeated[equal.cut][: equal.repetitions]
+    estimates = {key: Estimated(key, values) for key, values in repeated.items()}
+    sight = {
+        name: ClassSight(name, ClassForms.of(one.forms), estimates, named.drifts)
+        for name, one in scores.items()
+    }
+    truth = truth_of(parameters)
     return ConditionResult(
         key=named.key,
         words=named.words,
@@ -84,10 +131,12 @@ def condition_result(
         cross=[
             _cell(one, key) for one in classes for key in (*keys, *others) if key in one.overall
         ],
-        comparisons=_comparisons(classes, keys),
-        own_comparisons=_own(classes, keys),
-        joint_comparisons=[] if first is None else _by_joint(first, keys, joint_names),
-        equal_data=None if equal is None else _equal_data(classes, keys, equal),
+        comparisons=_comparisons(sight, keys),
+        own_comparisons=[] if truth is None or named.effects else _own(sight, keys, truth),
+        joint_comparisons=_by_joint(sight["fly-by"], keys, joint_names)
+        if "fly-by" in sight
+        else [],
+        equal_data=None if equal is None else _equal_data(sight, keys, equal),
         closeness=_closeness(fits, keys, parameters),
         examples=list(shown.examples) if (shown := _shown(scores)) is not None else [],
     )
@@ -125,6 +174,7 @@ def _class_result(
 ) -> ClassResult:
     known = [key for key in wanted if key in record.scores]
     own = {key: [one.own for one in record.scores[key] if one.own] for key in known}
+    left_out, samples = np.sum(record.left_out, axis=0), sum(record.samples)
     return ClassResult(
         motion_class=name,
         archives=[one.archive for one in record.scores[known[0]]],
@@ -133,6 +183,9 @@ def _class_result(
         unfiltered={key: [one.unfiltered for one in record.scores[key]] for key in known},
         own={} if effects else {key: values for key, values in own.items() if values},
         mean_abs={key: [one.mean_abs for one in record.scores[key]] for key in known},
+        all_rows={key: [one.all_rows for one in record.scores[key]] for key in known},
+        left_out=(left_out / samples).tolist(),
+        left_out_share=float(left_out.sum() / (samples * left_out.size)),
     )
 
 
@@ -145,59 +198,56 @@ def _cell(result: ClassResult, key: str) -> CrossCell:
         lower=lower,
         upper=upper,
         unfiltered_median=float(np.median(result.unfiltered[key])),
+        all_rows_median=float(np.median(result.all_rows[key])),
         own_median=float(np.median(own)) if (own := result.own.get(key)) else None,
     )
 
 
-def _comparisons(classes: Sequence[ClassResult], keys: Sequence[str]) -> list[ComparisonResult]:
+def compared_pairs(keys: Sequence[str]) -> list[tuple[str, str]]:
+    """Pairs of methods: all, but for the printed sines, which the paper sets beside B alone."""
+    pairs = list(combinations([key for key in keys if key != AP], 2))
+    return [*pairs, (AP, B)] if AP in keys and B in keys else pairs
+
+
+def _comparisons(sight: Mapping[str, ClassSight], keys: Sequence[str]) -> list[ComparisonResult]:
     return corrected(
         [
-            compared_on(
-                one.motion_class, None, first, second, one.overall[first], one.overall[second]
-            )
-            for one in classes
-            for first, second in combinations(keys, 2)
+            one.compared(first, second, torque_kernels(one.forms))
+            for one in sight.values()
+            for first, second in compared_pairs(keys)
         ]
     )
 
 
 def _by_joint(
-    result: ClassResult, keys: Sequence[str], joint_names: Sequence[str]
+    one: ClassSight, keys: Sequence[str], joint_names: Sequence[str]
 ) -> list[ComparisonResult]:
-    """The first two methods, axis by axis, in the mean |e| of the paper's Fig. 3."""
+    """The first two methods, axis by axis, in the length of the error."""
     if len(keys) < 2:
         return []
-    first, second = keys[:2]
     return corrected(
         [
-            compared_on(
-                result.motion_class,
-                joint,
-                first,
-                second,
-                [row[j] for row in result.mean_abs[first]],
-                [row[j] for row in result.mean_abs[second]],
-            )
+            one.compared(keys[0], keys[1], torque_kernels(one.forms, j), joint=joint)
             for j, joint in enumerate(joint_names)
         ]
     )
 
 
-def _own(classes: Sequence[ClassResult], keys: Sequence[str]) -> list[ComparisonResult]:
+def _own(
+    sight: Mapping[str, ClassSight], keys: Sequence[str], truth: Array
+) -> list[ComparisonResult]:
     """The first two methods in what their estimates themselves are off by, class by class."""
     return corrected(
         [
-            compared_on(
-                one.motion_class, None, keys[0], keys[1], one.own[keys[0]], one.own[keys[1]]
-            )
-            for one in classes
-            if len(keys) > 1 and set(keys[:2]) <= one.own.keys()
+            one.compared(keys[0], keys[1], own_kernels(one.forms, truth))
+            for one in sight.values()
+            if len(keys) > 1
         ]
     )
 
 
 def _equal_data(
-    classes: Sequence[ClassResult], keys: Sequence[str], equal: EqualData
+    sight: Mapping[str, ClassSight], keys: Sequence[str], equal: EqualData
 ) -> EqualDataResult:
     """The first two with as much motion of each, on every class."""
     first, second = (equal.name if key == equal.cut else key for key in keys[:2])
@@ -209,52 +259,9 @@ def _equal_data(
         other=equal.other,
         other_seconds=equal.other_seconds,
         comparisons=corrected(
-            [
-                compared_on(
-                    one.motion_class,
-                    None,
-                    first,
-                    second,
-                    one.overall[first],
-                    one.overall[second],
-                )
-                for one in classes
-            ]
+            [one.compared(first, second, torque_kernels(one.forms)) for one in sight.values()]
         ),
     )
-
-
-def compared_on(
-    motion_class: str,
-    joint: str | None,
-    first: str,
-    second: str,
-    before: Sequence[float],
-    after: Sequence[float],
-) -> ComparisonResult:
-    """Errors with `second` over errors with `first`, motion by motion; p not yet corrected."""
-    found = compare(np.array(before), np.array(after), seed=_SEED)
-    return ComparisonResult(
-        motion_class=motion_class,
-        joint=joint,
-        first=first,
-        second=second,
-        motions=found.motions,
-        ratio=found.ratio,
-        low=found.low,
-        high=found.high,
-        wins=found.wins,
-        p_value=found.p_value,
-        p_corrected=found.p_value,
-    )
-
-
-def corrected(comparisons: list[ComparisonResult]) -> list[ComparisonResult]:
-    """The comparisons of one table with p values corrected for their number."""
-    after = holm([one.p_value for one in comparisons])
-    return [
-        one.model_copy(update={"p_corrected": p}) for one, p in zip(comparisons, after, strict=True)
-    ]
 
 
 def _closeness(
