@@ -13,6 +13,7 @@ from hil.batch.axis_figures import friction_of, friction_weights
 from hil.batch.estimates import errors
 from hil.batch.payload_trend import PayloadTrend, freedom_of, payload_trend
 from hil.batch.trend import FALSE_ALARMS, LEAST_FRICTION
+from hil.batch.trend_words import short_names
 from hil.batch.types import LevelEstimate
 from identification import RobotModel
 
@@ -42,6 +43,7 @@ class AxisChange:
         differences: of each campaign against the first; the first's is None.
         p_values: adjusted for all axes and campaigns (k,); NaN of the first.
         changed: which campaigns differ from the first by more than chance and enough to matter.
+        slight: which differ by more than chance, and too little to be told as a change.
         smallest: change that would have been told (k,), as a share; NaN of the first.
     """
 
@@ -54,6 +56,7 @@ class AxisChange:
     differences: tuple[Difference | None, ...]
     p_values: Array
     changed: tuple[bool, ...]
+    slight: tuple[bool, ...]
     smallest: Array
 
     def relative(self, k: int) -> tuple[float, float, float]:
@@ -133,6 +136,11 @@ class Comparison:
         return any(any(axis.changed) for axis in self.axes)
 
     @property
+    def friction_slight(self) -> bool:
+        """Whether friction of any axis differs, but by too little to be told as a change."""
+        return any(any(axis.slight) for axis in self.axes)
+
+    @property
     def load_changed(self) -> bool:
         """Whether what the arm carries, or its inertial parameters, are."""
         return any(self.payload.changed) or any(self.payload.other)
@@ -141,8 +149,18 @@ class Comparison:
 def compare_campaigns(gathered: Gathered) -> Comparison:
     """Compare the campaigns of one arm with the first of them."""
     model, campaigns = gathered.arm.cell.model, gathered.campaigns
-    broken = tuple(f"{one.path} could not be used: {one.reason}" for one in gathered.broken)
-    own = tuple(f"{_named(one)}: {doubt}" for one in campaigns for doubt in one.doubts)
+    broken = tuple(
+        f"{name} could not be used: {one.reason}"
+        for name, one in zip(
+            short_names([one.path for one in gathered.broken]), gathered.broken, strict=True
+        )
+    )
+    called = short_names([one.campaign for one in campaigns])
+    own = tuple(
+        f"{name}: {doubt}"
+        for name, one in zip(called, campaigns, strict=True)
+        for doubt in one.doubts
+    )
     return Comparison(
         arm=gathered.arm.name,
         joint_names=model.joint_names,
@@ -153,7 +171,7 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
         parameters=_parameters(model, gathered),
         payload=payload_trend(model, campaigns, _SHARE),
         prediction=_prediction(campaigns, model.n_joints),
-        doubts=(*broken, *_few(gathered), *_other_motion(model, campaigns), *own),
+        doubts=(*broken, *_few(gathered, called), *_other_motion(model, campaigns, called), *own),
     )
 
 
@@ -183,6 +201,10 @@ def _axes(model: RobotModel, gathered: Gathered) -> tuple[AxisChange, ...]:
         reach = np.array(
             [np.nan if d is None else d.half(_SHARE / max(1, tests)) for d in apart[j]]
         )
+        judged = [
+            (d is not None and bool(p < _SHARE), d is not None and bool(abs(d.value) >= least))
+            for d, p in zip(apart[j], adjusted[j], strict=True)
+        ]
         found.append(
             AxisChange(
                 joint=joint,
@@ -193,10 +215,8 @@ def _axes(model: RobotModel, gathered: Gathered) -> tuple[AxisChange, ...]:
                 repetitions=tuple(rep[:, j] for rep in single),
                 differences=apart[j],
                 p_values=adjusted[j],
-                changed=tuple(
-                    d is not None and bool(p < _SHARE and abs(d.value) >= least)
-                    for d, p in zip(apart[j], adjusted[j], strict=True)
-                ),
+                changed=tuple(sure and large for sure, large in judged),
+                slight=tuple(sure and not large for sure, large in judged),
                 smallest=np.maximum(reach, least) / (size or np.nan),
             )
         )
@@ -275,13 +295,9 @@ def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction
     return Prediction(overall, joints)
 
 
-def _few(gathered: Gathered) -> list[str]:
+def _few(gathered: Gathered, called: Sequence[str]) -> list[str]:
     """Where single repetitions cannot say what repetitions differ by."""
-    single = [
-        _named(one)
-        for one, own in zip(gathered.campaigns, gathered.repetitions, strict=True)
-        if len(own) < 2
-    ]
+    single = [name for name, own in zip(called, gathered.repetitions, strict=True) if len(own) < 2]
     if not single:
         return []
     return [
@@ -290,22 +306,20 @@ def _few(gathered: Gathered) -> list[str]:
     ]
 
 
-def _other_motion(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> list[str]:
+def _other_motion(
+    model: RobotModel, campaigns: Sequence[LevelEstimate], called: Sequence[str]
+) -> list[str]:
     first = campaigns[0].speed_rms
     found = []
-    for one in campaigns[1:]:
+    for name, one in zip(called[1:], campaigns[1:], strict=True):
         if first is None or one.speed_rms is None:
             continue
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.exp(np.abs(np.log(one.speed_rms / first)))
-        fast = [name for name, r in zip(model.joint_names, ratio, strict=True) if r > OTHER_SPEED]
+        fast = [j for j, r in zip(model.joint_names, ratio, strict=True) if r > OTHER_SPEED]
         if fast:
             found.append(
-                f"{_named(one)} moved differently from {_named(campaigns[0])} (typical speed of "
+                f"{name} moved differently from {called[0]} (typical speed of "
                 f"{', '.join(fast)}): what the model leaves out can then look like a change"
             )
     return found
-
-
-def _named(level: LevelEstimate) -> str:
-    return level.campaign.rstrip("/").rsplit("/", 1)[-1]

@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
-from hil.archive import open_archive
+from hil.archive import ArchiveName, open_archive
 from hil.batch import run
-from hil.batch.factors import local_file
-from hil.batch.types import Arm, BatchResult, Broken, LevelEstimate
+from hil.batch.factors import cell_in, local_file, opened
+from hil.batch.types import ArchiveRef, Arm, Broken, LevelEstimate
 from hil.batch.workers import Workers
-from hil.errors import InputError
+from hil.campaign import CampaignFolder
+from hil.cell import Cell
+from hil.errors import HilError, InputError
 from hil.progress import Reporter
+
+_TWO: Final = "name two campaigns or more of one arm"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +57,15 @@ def gather(
         InputError: there is one campaign only, or campaigns are of different arms.
     """
     roots = [_folder(place) for place in places]
-    result = run.reidentify(roots, plan or run.Plan(), workers, reporter)
-    _require_one_arm(result)
+    result = run.reidentify(
+        roots, plan or run.Plan(), workers, reporter, check=_require_campaigns_of_one_arm
+    )
+    broken = [one for one in result.broken if not _superseded(one)]
     campaigns = list(result.campaigns)
     if len(campaigns) < 2:
-        broken = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
+        why = "".join(f"; {one.path}: {one.reason}" for one in broken[:1])
         only = campaigns[0].campaign if campaigns else None
-        raise InputError(
-            only,
-            f"is the only campaign that can be estimated{broken}",
-            remedy="name two campaigns or more of one arm",
-        )
+        raise InputError(only, f"is the only campaign that can be estimated{why}", remedy=_TWO)
     dated = all(one.when for one in campaigns)
     campaigns.sort(key=_in_order(roots))
     if dated:
@@ -79,7 +82,7 @@ def gather(
             for one in campaigns
         ),
         dated=dated,
-        broken=result.broken,
+        broken=tuple(broken),
         simulated=_simulated(result.repetitions[0]),
     )
 
@@ -108,32 +111,57 @@ def _in_order(roots: Sequence[str]) -> Callable[[LevelEstimate], tuple[int, str]
     return key
 
 
-def _require_one_arm(result: BatchResult) -> None:
-    """Friction and mass of another arm are another arm's.
+def _superseded(broken: Broken) -> bool:
+    """Whether it is an attempt that a killed run left behind, and a later run made good."""
+    name, path = ArchiveName.parse(broken.path), Path(broken.path)
+    if name is None or "://" in broken.path:
+        return False
+    try:
+        whole = [one.name for one in CampaignFolder(path.parent.parent).completed(name.kind)]
+    except HilError:
+        return False
+    return any(
+        other is not None and other.index == name.index and other.attempt > name.attempt
+        for other in map(ArchiveName.parse, whole)
+    )
+
+
+def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
+    """Friction and mass of another arm are another arm's, and one campaign has nothing beside it.
 
     Raises:
-        InputError: names two campaigns and what their arms differ in.
+        InputError: names two campaigns and what their arms differ in, or the only one.
     """
-    first = result.campaigns[0] if result.campaigns else None
-    for one in result.campaigns:
-        if first is not None and one.arm != first.arm:
-            here, there = result.arms[one.arm], result.arms[first.arm]
+    of = {ref.key: ref for ref in found if ref.use == "excitation"}
+    if not of:
+        return  # and that is refused
+    first = next(iter(of.values()))
+    for one in of.values():
+        if one.arm != first.arm:
+            here, there = (Arm(ref.arm, _cell(ref)) for ref in (one, first))
             raise InputError(
                 one.campaign,
                 f"is of another arm ({here.name}) than {first.campaign} ({there.name}): "
-                f"{_apart(here, there)}",
+                f"{apart(here.cell, there.cell)}",
                 remedy="compare campaigns of one arm",
             )
+    if len(of) < 2:
+        raise InputError(first.campaign, "is the only campaign that was named", remedy=_TWO)
 
 
-def _apart(one: Arm, other: Arm) -> str:
+def _cell(ref: ArchiveRef) -> Cell:
+    with opened(ref) as archive:
+        return cell_in(archive)
+
+
+def apart(one: Cell, other: Cell) -> str:
     """What two arms differ in, in words."""
-    here, there = one.cell.file, other.cell.file
+    here, there = one.file, other.file
     robots = (table.robot.model_dump(exclude={"payload"}) for table in (here, there))
     differ = [
         words
         for words, apart in (
-            ("robot.urdf", one.cell.urdf != other.cell.urdf),
+            ("robot.urdf", one.urdf != other.urdf),
             ("[robot]", next(robots) != next(robots)),
             ("[drive_train]", here.drive_train != there.drive_train),
         )

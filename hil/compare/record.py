@@ -17,6 +17,7 @@ def to_dict(found: Comparison) -> dict[str, Any]:
         "simulated": found.simulated,
         "changed": found.changed,
         "friction_changed": found.friction_changed,
+        "friction_slight": found.friction_slight,
         "load_changed": found.load_changed,
         "verdict": verdict(found),
         "told": [vars(one) for one in told(found)],
@@ -64,6 +65,7 @@ def _axis(axis: AxisChange) -> dict[str, Any]:
         "interval": [None if one is None else [_number(x) for x in one[1:]] for one in changes],
         "p_value": [_number(p) for p in axis.p_values],
         "changed": list(axis.changed),
+        "slight": list(axis.slight),
         "smallest": [_number(x) for x in axis.smallest],
     }
 

@@ -9,11 +9,12 @@ from typing import Final, Literal
 import numpy as np
 
 from hil.batch.chart import FEWEST
-from hil.batch.trend import ArmTrend
+from hil.batch.trend import LEAST_FRICTION, ArmTrend
 from hil.batch.trend_words import campaign_name, payload_findings
 
 from .comparison import AxisChange, Comparison
 
+_LEAST: Final = f"{100.0 * LEAST_FRICTION:g} %"
 _PREDICTS_WORSE: Final = 1.1
 """Ratio of prediction errors from which a model is said to predict worse."""
 
@@ -23,7 +24,7 @@ class Told:
     """One thing to know.
 
     Attributes:
-        level: "changed", or "same" for what did not, or could not be told.
+        level: "changed", or "same" for what did not, did by little, or could not be told.
         words: a sentence.
         next_step: what to do about it; "" for nothing.
     """
@@ -49,6 +50,9 @@ def verdict(found: Comparison) -> str:
         parts.append("what the arm carries")
     if any(found.payload.other):
         parts.append("inertial parameters")
+    if not parts and found.friction_slight:
+        axes = [axis.joint for axis in found.axes if any(axis.slight)]
+        return f"No change of {_LEAST} or more; friction of {_listed(axes)} differs by less"
     if not parts:
         return "No change can be told"
     return f"Changed: {_listed(parts)}"
@@ -66,6 +70,7 @@ def told(found: Comparison) -> list[Told]:
     for finding in payload_findings(_as_history(found)):
         level: Literal["changed", "same"] = "same" if finding.level == "quiet" else "changed"
         every.append(Told(level, finding.words, finding.next_step))
+    every += _slight(found, called)
     every += _unchanged(found)
     every += _predictions(found, called)
     every.sort(key=lambda one: one.level)  # stable: "changed" comes first
@@ -102,8 +107,27 @@ def _axis_step(axis: AxisChange, k: int) -> str:
     return "Was it warmer, or has gear or lubricant been changed?"
 
 
+def _slight(found: Comparison, called: list[str]) -> list[Told]:
+    """What differs by more than chance, and by less than is told as a change."""
+    sentences = []
+    for k in range(1, len(called)):
+        axes = [axis for axis in found.axes if axis.slight[k]]
+        if not axes:
+            continue
+        sizes = [100.0 * axis.relative(k)[0] for axis in axes]
+        low, high = (f"{pick(sizes):+.1f}" for pick in (min, max))
+        size = low if low == high else f"{low} to {high}"
+        words = (
+            f"Friction of {_listed([axis.joint for axis in axes])} has changed by {size} % from"
+            f" {called[0]} to {called[k]}: more than chance, and less than the {_LEAST} that is"
+            " told as a change."
+        )
+        sentences.append(Told("same", words))
+    return sentences
+
+
 def _unchanged(found: Comparison) -> list[Told]:
-    same = [axis for axis in found.axes if not any(axis.changed)]
+    same = [axis for axis in found.axes if not any(axis.changed) and not any(axis.slight)]
     judged = [axis for axis in same if np.isfinite(axis.p_values).any()]
     silent = [axis.joint for axis in same if not np.isfinite(axis.p_values).any()]
     sentences = []

@@ -87,7 +87,8 @@ def _axis(axis: AxisChange, letters: list[str]) -> Row:
             continue
         change, low, high = (100.0 * one for one in axis.relative(k))
         cells += [
-            ("■ " if axis.changed[k] else "") + numbers.fixed(change, 1, sign=True),
+            ("■ " if axis.changed[k] else "□ " if axis.slight[k] else "")
+            + numbers.fixed(change, 1, sign=True),
             f"{numbers.fixed(low, 1, sign=True)} to {numbers.fixed(high, 1, sign=True)}",
             numbers.significant(float(axis.p_values[k]), 2),
             numbers.significant(100.0 * float(axis.smallest[k]), 2),

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from hil.archive.names import ArchiveName
 from hil.report import numbers
 from hil.report.figures.conduct import warm_up_panels
 from hil.results import RecordedResult, Results
@@ -30,11 +31,29 @@ def context(results: Results) -> dict[str, Any]:
         return {"conduct": None}
     return {
         "conduct": conduct,
+        "when": when(conduct.recorded),
         "health": health(conduct.recorded),
-        "useless": [one for one in conduct.recorded if one.outcome != "completed"],
+        "useless": [(_motion(one), one) for one in conduct.recorded if one.outcome != "completed"],
         "recorded_rows": [_row(one) for one in conduct.recorded],
         "warm_up_panels": warm_up_panels(results),
     }
+
+
+def when(recorded: Sequence[RecordedResult]) -> str:
+    """From the first archive's begin to the last one's, in a sentence."""
+    begins = sorted(one.when for one in recorded if one.when is not None)
+    if not begins:
+        return (
+            "No date is on record; virtual time has none." if recorded else "Nothing was recorded."
+        )
+    first, last = (_to_the_minute(one) for one in (begins[0], begins[-1]))
+    if first[:10] == last[:10]:
+        last = last[11:]
+    return f"{first} to {last}, where the last motion began (UTC)."
+
+
+def _to_the_minute(when: str) -> str:
+    return when[:16].replace("T", " ")
 
 
 def health(recorded: Sequence[RecordedResult]) -> str:
@@ -56,6 +75,12 @@ def health(recorded: Sequence[RecordedResult]) -> str:
 
 def _share(count: int, cycles: int) -> str:
     return f"{numbers.significant(1e6 * count / cycles, 2)} in a million"
+
+
+def _motion(one: RecordedResult) -> str:
+    """What a person calls it."""
+    name = ArchiveName.parse(one.archive)
+    return one.kind if name is None else name.motion
 
 
 def _row(one: RecordedResult) -> RecordedRow:

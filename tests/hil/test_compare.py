@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -125,6 +126,18 @@ def test_one_campaign_is_nothing_to_compare(folders: dict[str, Path]) -> None:
         compared(folders["march"], folders["march"])
 
 
+def test_one_campaign_or_two_arms_are_refused_before_anything_is_estimated(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def estimated(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("hil.batch.run.Work", estimated)
+    for pair in ("march", "march"), ("march", "stranger"):
+        with pytest.raises(InputError):
+            compared(*(folders[name] for name in pair))
+
+
 # From here on campaigns are made in memory.
 
 
@@ -165,6 +178,55 @@ def test_where_repetitions_differ_much_a_small_change_is_not_told() -> None:
     assert [axis.changed[1] for axis in certain.axes] == [j == 3 for j in range(6)]
     assert not uncertain.changed
     assert uncertain.axes[3].smallest[1] > 0.15 > certain.axes[3].smallest[1]
+
+
+def test_a_change_too_small_to_matter_is_told_as_a_difference_and_not_as_no_change() -> None:
+    found = in_memory([Condition(), Condition(friction=1.035 * FRICTION)])
+    assert not found.changed and found.friction_slight
+    slight = [axis for axis in found.axes if axis.slight[1]]
+    assert all(axis.p_values[1] < 0.005 and axis.relative(1)[0] < 0.05 for axis in slight)
+    assert verdict(found).startswith("No change of 5 % or more; friction of ")
+    first = told(found)[0].words
+    assert "less than the 5 % that is told as a change" in first
+    (unchanged,) = (
+        one.words
+        for one in told(found)
+        if one.words.startswith("Friction of") and "not changed" in one.words
+    )
+    for axis in slight:
+        assert axis.joint in first and axis.joint not in unchanged
+    assert "NO CHANGE OF 5 % OR MORE" in Page(render_comparison(found)).text
+
+
+def test_campaigns_of_one_name_in_different_folders_are_told_apart() -> None:
+    found = in_memory([Condition(), Condition()])
+    folders = ("/runs/cold/b", "/runs/warm/b")
+    alike = replace(
+        found,
+        campaigns=tuple(
+            replace(one, campaign=folder)
+            for one, folder in zip(found.campaigns, folders, strict=True)
+        ),
+        dated=False,
+    )
+    assert names(alike) == ["cold/b", "warm/b"]
+
+
+@pytest.mark.slow
+def test_what_a_killed_run_left_and_a_later_one_made_good_is_not_told(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    killed = tmp_path / "killed"
+    shutil.copytree(folders["june"], killed)
+    (whole,) = killed.glob("archives/excitation_001_a1.mcap")
+    later = whole.with_name("excitation_001_a2.mcap")
+    manifest = killed / "manifest.json"
+    whole.rename(later)
+    manifest.write_text(manifest.read_text("utf-8").replace(whole.name, later.name), "utf-8")
+    whole.write_bytes(later.read_bytes()[:5000])
+    found = compared(folders["march"], killed)
+    assert found.friction_changed
+    assert not any(whole.name in doubt for doubt in found.doubts)
 
 
 def test_a_page_of_hostile_names_is_inert() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -21,7 +21,9 @@ Array = NDArray[np.float64]
 
 MOST_POINTS: Final = 3000
 """Of a line; more than three times what a panel shows at once."""
-_STEPS: Final = 65535
+_STEPS: Final = 65534
+_NOTHING: Final = 65535
+"""Stands where nothing was recorded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +31,7 @@ class Trace:
     """One line.
 
     Attributes:
-        values: (m,), finite.
+        values: (m,); NaN where nothing was recorded.
         colour: of the palette.
         width: of the line [px].
         name: what it is, in a word.
@@ -49,11 +51,13 @@ class Plot:
         box: left, top, width and height in the panel [px].
         heading: what stands above: the quantity and its unit.
         traces: its lines, the lowest first.
+        limits: values at which dashed lines are drawn.
     """
 
     box: tuple[float, float, float, float]
     heading: str
     traces: Sequence[Trace]
+    limits: Sequence[float] = ()
 
 
 def traces_text(time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS) -> str:
@@ -64,13 +68,37 @@ def traces_text(time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS
     if time.size < 2 or not time[-1] > time[0]:
         return ""
     grid = np.linspace(time[0], time[-1], min(points, time.size))
+    even = [
+        replace(
+            plot,
+            traces=[replace(one, values=np.interp(grid, time, one.values)) for one in plot.traces],
+        )
+        for plot in plots
+    ]
+    return even_traces_text(0.0, float(time[-1] - time[0]), even)
+
+
+def even_traces_text(
+    begin: float, length: float, plots: Sequence[Plot], marks: Sequence[float] = ()
+) -> str:
+    """Plots whose lines are evenly sampled in time already, from the first instant to the last.
+
+    Args:
+        begin: what the first instant is called [s].
+        length: time from the first to the last [s].
+        plots: them.
+        marks: instants at which upright lines are drawn [s], named like `begin`.
+    """
     content = {
-        "end": round(float(time[-1] - time[0]), 6),
+        "begin": round(begin, 6),
+        "end": round(length, 6),
+        "marks": [round(time - begin, 6) for time in marks],
         "plots": [
             {
                 "box": plot.box,
                 "heading": plot.heading,
-                "lines": [_line(np.interp(grid, time, one.values), one) for one in plot.traces],
+                "limits": [float(f"{limit:.7g}") for limit in plot.limits],
+                "lines": [_line(one.values, one) for one in plot.traces],
             }
             for plot in plots
         ],
@@ -79,9 +107,12 @@ def traces_text(time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS
 
 
 def _line(values: Array, trace: Trace) -> dict[str, str | float]:
-    low, high = float(values.min()), float(values.max())
+    there = np.isfinite(values)
+    known = values[there]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     step = (high - low) / _STEPS or 1.0
-    counts = np.rint((values - low) / step).astype("<u2")
+    counts = np.full(values.shape, _NOTHING, dtype="<u2")
+    counts[there] = np.rint((known - low) / step)
     return {
         "name": trace.name,
         "colour": CSS_VARIABLES[trace.colour],

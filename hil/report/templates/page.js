@@ -78,6 +78,7 @@
   var SVG = "http://www.w3.org/2000/svg";
   var MOST = 1000;      /* points of a line that are drawn at once */
   var CLOSEST = 0.002;  /* of the whole time */
+  var NOTHING = 65535;  /* stands where nothing was recorded */
 
   function element(name, attributes, parent) {
     var made = document.createElementNS(SVG, name);
@@ -88,9 +89,10 @@
 
   function samples(line) {
     var bytes = atob(line.data), found = new Float64Array(bytes.length / 2);
-    for (var k = 0; k < found.length; k++)
-      found[k] = line.low +
-        line.step * (bytes.charCodeAt(2 * k) + 256 * bytes.charCodeAt(2 * k + 1));
+    for (var k = 0; k < found.length; k++) {
+      var count = bytes.charCodeAt(2 * k) + 256 * bytes.charCodeAt(2 * k + 1);
+      found[k] = count === NOTHING ? NaN : line.low + line.step * count;
+    }
     return found;
   }
 
@@ -121,8 +123,8 @@
       var from = first + Math.floor(s * count / stretches);
       var to = first + Math.floor((s + 1) * count / stretches), low = from, high = from;
       for (var i = from; i < to; i++) {
-        if (values[i] < values[low]) low = i;
-        if (values[i] > values[high]) high = i;
+        if (values[i] < values[low] || isNaN(values[low])) low = i;
+        if (values[i] > values[high] || isNaN(values[high])) high = i;
       }
       found.push(Math.min(low, high));
       if (low !== high) found.push(Math.max(low, high));
@@ -137,27 +139,28 @@
 
   function drawPlot(group, plot, content, view, isLast) {
     var box = plot.box, left = box[0], top = box[1], wide = box[2], tall = box[3];
-    var low = Infinity, high = -Infinity;
+    var low = Infinity, high = -Infinity, begin = content.begin;
+    function reach(v) {
+      if (v < low) low = v;
+      if (v > high) high = v;
+    }
     lines(plot).forEach(function (values) {
       var scale = (values.length - 1) / content.end;
-      [view.from, view.to].forEach(function (t) {
-        var v = between(values, t * scale);
-        low = Math.min(low, v);
-        high = Math.max(high, v);
-      });
-      for (var k = Math.ceil(view.from * scale); k <= view.to * scale; k++) {
-        low = Math.min(low, values[k]);
-        high = Math.max(high, values[k]);
-      }
+      [view.from, view.to].forEach(function (t) { reach(between(values, t * scale)); });
+      for (var k = Math.ceil(view.from * scale); k <= view.to * scale; k++) reach(values[k]);
     });
+    if (low > high) low = high = 0;
     var room = 0.06 * (high - low) || Math.abs(high) * 0.01 || 1e-9;
     low -= room;
     high += room;
     function x(t) { return left + wide * (t - view.from) / (view.to - view.from); }
     function y(v) { return top + tall * (high - v) / (high - low); }
-    ticks(view.from, view.to, 6).forEach(function (tick) {
-      element("path", { d: "M" + x(tick.at) + " " + top + "v" + tall, "class": "zoom-grid" }, group);
-      if (isLast) element("text", { x: x(tick.at), y: top + tall + 14, "text-anchor": "middle",
+    function upright(t, kind) {
+      element("path", { d: "M" + x(t) + " " + top + "v" + tall, "class": kind }, group);
+    }
+    ticks(view.from + begin, view.to + begin, 6).forEach(function (tick) {
+      upright(tick.at - begin, "zoom-grid");
+      if (isLast) element("text", { x: x(tick.at - begin), y: top + tall + 14, "text-anchor": "middle",
         "class": "zoom-tick" }, group).textContent = tick.text;
     });
     ticks(low, high, tall > 90 ? 5 : 4).forEach(function (tick) {
@@ -169,14 +172,22 @@
     element("text", { x: left, y: top - 6, "class": "zoom-head" }, group).textContent = plot.heading;
     if (isLast) element("text", { x: left + wide / 2, y: top + tall + 30, "text-anchor": "middle",
       "class": "zoom-head" }, group).textContent = "time [s]";
+    content.marks.filter(function (t) { return t >= view.from && t <= view.to; })
+      .forEach(function (t) { upright(t, "zoom-mark"); });
+    plot.limits.filter(function (v) { return v >= low && v <= high; }).forEach(function (v) {
+      element("path", { d: "M" + left + " " + y(v) + "h" + wide, "class": "zoom-limit" }, group);
+    });
     plot.lines.forEach(function (line, number) {
       var values = lines(plot)[number], scale = (values.length - 1) / content.end;
       var first = Math.ceil(view.from * scale), last = Math.floor(view.to * scale);
-      var path = "M" + x(view.from).toFixed(2) + " " + y(between(values, view.from * scale)).toFixed(2);
-      if (last >= first) chosen(values, first, last).forEach(function (k) {
-        path += "L" + x(k / scale).toFixed(2) + " " + y(values[k]).toFixed(2);
-      });
-      path += "L" + x(view.to).toFixed(2) + " " + y(between(values, view.to * scale)).toFixed(2);
+      var path = "", pen = "M";
+      function to(t, v) {
+        if (isNaN(v)) pen = "M";
+        else path += pen + x(t).toFixed(2) + " " + y(v).toFixed(2), pen = "L";
+      }
+      to(view.from, between(values, view.from * scale));
+      if (last >= first) chosen(values, first, last).forEach(function (k) { to(k / scale, values[k]); });
+      to(view.to, between(values, view.to * scale));
       element("path", { d: path, "class": "zoom-line",
         style: "stroke:" + line.colour + ";stroke-width:" + line.width }, group);
     });
@@ -185,7 +196,7 @@
   function Zoom(panels) {
     var svgs = Array.prototype.slice.call(panels.querySelectorAll("svg[data-traces]"));
     var contents = svgs.map(function (svg) { return JSON.parse(svg.dataset.traces); });
-    var end = contents[0].end, view = { from: 0, to: end }, waiting = false, cursor = null;
+    var begin = contents[0].begin, end = contents[0].end, view = { from: 0, to: end }, waiting = false, cursor = null;
     var fingers = new Map(), drag = null;
 
     function isWhole() { return view.to - view.from >= end * (1 - 1e-9); }
@@ -227,7 +238,7 @@
         });
       });
       range.textContent = isWhole() ? "whole motion" :
-        view.from.toFixed(2) + " to " + view.to.toFixed(2) + " s";
+        (view.from + begin).toFixed(2) + " to " + (view.to + begin).toFixed(2) + " s";
       buttons.forEach(function (one) { one.made.disabled = one.needsZoom && isWhole(); });
       drawCursor();
     }
@@ -253,12 +264,13 @@
             var values = lines(plot)[k];
             var value = between(values, cursor * (values.length - 1) / content.end);
             var part = element("tspan", { dx: k ? 6 : 0 }, text);
-            part.textContent = Number(value.toPrecision(3)).toString().replace("-", "\u2212");
+            part.textContent = isNaN(value) ? "\u2013" :
+              Number(value.toPrecision(3)).toString().replace("-", "\u2212");
             if (plot.lines.length > 1) part.textContent = line.name + " " + part.textContent;
           });
         });
       });
-      if (cursor !== null) where.textContent = "t = " + cursor.toFixed(3) + " s";
+      if (cursor !== null) where.textContent = "t = " + (cursor + begin).toFixed(3) + " s";
       else where.textContent = "";
     }
 

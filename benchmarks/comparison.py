@@ -1,0 +1,99 @@
+"""What `hil compare` says of simulated campaigns: one arm unchanged, then with more friction.
+
+Three short campaigns of one plan on the simulated NS 16, with other noise in each; in the last one
+Coulomb and viscous friction of axis 3 are raised by 35 %.
+
+    python -m benchmarks.comparison [--json] [--repetitions N]
+"""
+
+# ruff: noqa: E402  the number of BLAS threads has to stand before numpy is imported
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import Any, Final
+
+from hil import Campaign, Cell
+from hil.batch.local import LocalWorkers
+from hil.campaign import design
+from hil.cell.text import replaced_value
+from hil.compare import compare_campaigns, gather
+from hil.compare.words import verdict
+from hil.progress import Silent
+from sim_fixtures.ns16 import CELL_PATH
+
+AXIS: Final = 2
+"""Whose friction is raised, from 0."""
+FACTOR: Final = 1.35
+
+
+def with_more_friction(cell: Cell) -> Cell:
+    """The same cell, whose simulated arm has more friction on one axis."""
+    text = cell.text
+    for key in ("coulomb", "viscous"):
+        assert cell.file.simulation is not None
+        values = list(getattr(cell.file.simulation, key))
+        values[AXIS] *= FACTOR
+        text = replaced_value(text, "simulation", key, str(values))
+    return Cell.from_texts(text, cell.urdf, cell.path)
+
+
+def measure(repetitions: int) -> dict[str, Any]:
+    """Run three campaigns, and compare the second and the third with the first."""
+    usual = Cell.load(CELL_PATH).with_campaign(repetitions=repetitions, validation_runs=5)
+    plan = design(usual, Silent())
+    arms = {
+        "first": usual,
+        "unchanged": usual.with_campaign(simulation_seed=2),
+        "rubbing": with_more_friction(usual.with_campaign(simulation_seed=3)),
+    }
+    with tempfile.TemporaryDirectory() as folder, LocalWorkers(1) as workers:
+        places = {name: Path(folder) / name for name in arms}
+        for name, cell in arms.items():
+            Campaign.create(places[name], cell, plan).run(unrehearsed=True)
+
+        def compared(name: str) -> dict[str, Any]:
+            pair = [str(places["first"]), str(places[name])]
+            found = compare_campaigns(gather(pair, workers, Silent()))
+            prediction = found.prediction
+            return {
+                "verdict": verdict(found),
+                "axes": {
+                    axis.joint: {"change": axis.relative(1), "changed": axis.changed[1]}
+                    for axis in found.axes
+                },
+                "prediction": None if prediction is None else prediction.overall,
+            }
+
+        return {name: compared(name) for name in ("unchanged", "rubbing")}
+
+
+def main() -> None:
+    """Print what was found."""
+    parser = argparse.ArgumentParser(description="hil compare on planted changes")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--repetitions", type=int, default=3)
+    options = parser.parse_args()
+    found = measure(options.repetitions)
+    if options.json:
+        print(json.dumps(found, default=lambda array: array.tolist()))
+        return
+    for name, one in found.items():
+        print(f"{name}: {one['verdict']}; prediction error by model and campaign:")
+        print(one["prediction"])
+        for joint, axis in one["axes"].items():
+            change, low, high = (100.0 * share for share in axis["change"])
+            mark = " CHANGED" if axis["changed"] else ""
+            print(f"  {joint}: {change:+.1f} % ({low:+.1f} to {high:+.1f}){mark}")
+
+
+if __name__ == "__main__":
+    main()
