@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo docs test test-slow check bench clean
+.PHONY: help setup demo docs pictures test test-slow check bench clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -25,12 +25,17 @@ demo: $(STAMP)  ## the whole way on the simulated NS 16; leaves runs/demo/report
 docs: $(STAMP)  ## build the documentation; leaves build/docs/index.html, which opens offline
 	$(BIN)/sphinx-build --quiet --fail-on-warning --jobs auto docs build/docs
 
+pictures: $(STAMP)  ## draw the documentation's pictures anew: every example's, and the screen's
+	for script in examples/0*.py; do $(BIN)/python $$script || exit 1; done
+	cp runs/examples/*.png examples/pictures/
+	$(BIN)/python docs/screen_picture.py
+
 test: $(STAMP)  ## lint, types, floors and the fast tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/pytest -n auto --dist loadfile
+	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 test-slow: $(STAMP)  ## the tests that take minutes
 	$(BIN)/pytest -m slow

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
-from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
@@ -28,6 +27,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 myst_dmath_double_inline = True
 
+highlight_language = "none"  # shell lines, verdicts and file excerpts are no Python
 default_role = "literal"  # docstrings write names in single backticks
 add_module_names = False
 toc_object_entries = False
@@ -50,13 +50,3 @@ html_css_files = ["hil.css"]
 html_theme_options = {"source_repository": "", "navigation_with_keys": True}
 pygments_style = "tango"
 pygments_dark_style = "monokai"
-
-
-def _as_text(_app: Any, _page: str, source: list[str]) -> None:
-    """Diagrams in Mermaid's language would need a script from elsewhere: shown as their text."""
-    source[0] = source[0].replace("```mermaid", "```text")
-
-
-def setup(app: Any) -> None:
-    """What Sphinx calls on the way."""
-    app.connect("source-read", _as_text)

@@ -16,7 +16,7 @@ from hil.plots.archive_view import view_of
 from hil.progress import reporter as progress
 from hil.screen import Screen
 
-PICTURES = Path(__file__).parent / "pictures"
+PICTURE = Path("runs/examples/01_operator.png")
 
 
 def operate(cell: Cell, folder: Path) -> Campaign:
@@ -29,7 +29,7 @@ def operate(cell: Cell, folder: Path) -> Campaign:
         campaign = Campaign.create(folder, cell, design(cell, reporter))
     with stop_on_interrupt() as stop:
         print(campaign.rehearse(reporter=reporter, stop=stop).line)
-        with Screen(cell.joint_names, stop, title=cell.name) as screen:
+        with Screen.of(cell, stop) as screen:
             simulated = cell.only_simulated  # on a real arm, the screen asks the person
             campaign.run(stop=stop, operator=screen, reporter=screen, accept_dry_run=simulated)
     print(campaign.identify(reporter=reporter).results.verdict.line)
@@ -44,5 +44,6 @@ if __name__ == "__main__":
     if quick:
         cell = cell.with_campaign(repetitions=3, validation_runs=2)
     campaign = operate(cell, Path(folder or "runs/examples/operator"))
+    PICTURE.parent.mkdir(parents=True, exist_ok=True)
     repetition = campaign.folder.completed("excitation")[0]
-    save(draw_archive(view_of(repetition)), PICTURES / "01_operator.png")
+    save(draw_archive(view_of(repetition)), PICTURE)

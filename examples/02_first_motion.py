@@ -17,7 +17,7 @@ from hil.plots import save
 from hil.plots.archive_picture import draw_archive
 from hil.plots.archive_view import view_of
 
-PICTURE = Path(__file__).parent / "pictures" / "02_first_motion.png"
+PICTURE = Path("runs/examples/02_first_motion.png")
 
 
 def main() -> None:
@@ -31,6 +31,7 @@ def main() -> None:
         archive = Path(folder) / "move_000_a1.mcap"
         ended = send(way, cell, link, archive, stop=stop)
         print(f"{ended.outcome}; {archive.stat().st_size / 1e3:.0f} kB archived")
+        PICTURE.parent.mkdir(parents=True, exist_ok=True)
         save(draw_archive(view_of(archive)), PICTURE)
 
 

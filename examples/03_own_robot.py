@@ -16,6 +16,7 @@ from hil.campaign import design
 from hil.progress import Silent
 
 HERE = Path(__file__).parent
+PICTURE = Path("runs/examples/03_own_robot.png")
 
 
 def main(cell_file: Path) -> None:
@@ -39,7 +40,8 @@ def main(cell_file: Path) -> None:
         axes.set_ylabel(f"{name} [N·m]")
     rows[0].legend(loc="upper right", ncols=2)
     rows[-1].set_xlabel(f"time of {series.example_archive} [s]")
-    figure.savefig(HERE / "pictures" / "03_own_robot.png", dpi=90)
+    PICTURE.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(PICTURE, dpi=90)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from identification.excitation import Excitation, Objective, correlation, midpoi
 from identification.excitation.drawn import moves_through
 from planner import plan_moves
 
-PICTURE = Path(__file__).parent / "pictures" / "04_own_excitation.png"
+PICTURE = Path("runs/examples/04_own_excitation.png")
 VIA = np.radians([  # away from home, joint by joint; home stands at both ends
     [40, 20, -30, 60, -40, 90], [-50, -25, 20, -80, 20, -60], [20, 30, 10, 30, -60, 120],
     [-30, -20, -40, -40, -90, -100], [60, 10, 10, 90, 25, 30],
@@ -61,6 +61,7 @@ def main(*, quick: bool) -> None:
         print(f"{axes.get_title()}\n  {results.verdict.line}")
     ratio = np.exp(np.mean(np.log(std[0]) - np.log(std[1])))
     print(f"the search makes intervals {ratio:.2f} times narrower (geometric mean over parameters)")
+    PICTURE.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(PICTURE, dpi=90)
 
 

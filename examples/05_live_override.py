@@ -19,7 +19,7 @@ from hil.campaign.motion_watch import MotionProgress, Wish
 from hil.cell_link import cell_link
 from hil.move import send, straight_way
 
-PICTURE = Path(__file__).parent / "pictures" / "05_live_override.png"
+PICTURE = Path("runs/examples/05_live_override.png")
 
 
 class Person:
@@ -59,4 +59,5 @@ speed = np.degrees(np.diff(q, axis=0)) / cell.period
 rows[1].plot(np.arange(len(speed)) * cell.period, speed, label=cell.joint_names)
 rows[1].set(xlabel="time [s]", ylabel="commanded speed [°/s]")
 rows[1].legend(ncols=3, fontsize="small")
+PICTURE.parent.mkdir(parents=True, exist_ok=True)
 figure.savefig(PICTURE, dpi=90)

@@ -17,6 +17,7 @@ from hil.cell.text import replaced_value
 from hil.progress import Silent
 
 HERE = Path(__file__).parent
+PICTURE = Path("runs/examples/06_batch.png")
 
 
 def record(root: Path) -> None:
@@ -46,7 +47,8 @@ def main() -> None:
                 axes.errorbar(month, value, 1.96 * std, fmt=style, capsize=4)
     axes.set(ylabel="Coulomb friction [N·m]", ylim=(0, None))
     axes.set_title("round: shoulder, square: elbow; 95 % intervals", fontsize="medium")
-    figure.savefig(HERE / "pictures" / "06_batch.png", dpi=90)
+    PICTURE.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(PICTURE, dpi=90)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from hil.plots.archive_view import view_of
 from hil.simulation import simulated_controller
 
 CELL = "sim_fixtures/ns16/cell.toml"
-PICTURE = Path(__file__).parent / "pictures" / "07_own_transport.png"
+PICTURE = Path("runs/examples/07_own_transport.png")
 PATIENCE = 60.0  # s that the controller waits for an answer
 
 
@@ -86,8 +86,8 @@ def main() -> None:
     with TemporaryDirectory() as folder, stop_on_interrupt() as stop:
         archive = Path(folder) / "move_000_a1.mcap"
         way = straight_way(cell, link.connect(stop), cell.home)
-        print(send(way, cell, link, archive, stop=stop).outcome)
-        print(f"{link.transport.packets} packets, the last one after {link.transport.now:.3f} s")
+        print(send(way, cell, link, archive, stop=stop).outcome, link.transport.packets, "packets")
+        PICTURE.parent.mkdir(parents=True, exist_ok=True)
         save(draw_archive(view_of(archive, joints=("1",))), PICTURE)
 
 

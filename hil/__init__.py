@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hil import errors
+
 if TYPE_CHECKING:
     from hil.campaign import Campaign
     from hil.cell import Cell
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 
 _HOME = {"Campaign": "hil.campaign", "Cell": "hil.cell", "open_recording": "hil.recordings"}
 
-__all__ = ["Campaign", "Cell", "open_recording"]
+__all__ = ["Campaign", "Cell", "errors", "open_recording"]
 
 
 def __getattr__(name: str) -> Any:

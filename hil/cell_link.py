@@ -32,13 +32,22 @@ def cell_link(
         LiveViewError: the live view cannot be served, or time is virtual.
     """
     if cell.controller.transport == "simulated":
-        if live is not None:
-            raise LiveViewError(
-                None,
-                "--live shows real time; this run is simulated in virtual time",
-                remedy="leave it out, or run against `hil simulate` over the loopback",
-            )
+        require_watchable(cell, live)
         yield simulated_link(cell)
         return
     with LiveLink.open(cell, accept_init=accept_init, live=live) as link:
         yield link
+
+
+def require_watchable(cell: Cell, live: LiveView | None) -> None:
+    """Refuse a live view of what is simulated in virtual time.
+
+    Raises:
+        LiveViewError: one is wanted of a cell with the transport "simulated".
+    """
+    if live is not None and cell.controller.transport == "simulated":
+        raise LiveViewError(
+            None,
+            "--live shows real time; this run is simulated in virtual time",
+            remedy="leave it out, or run against `hil simulate` over the loopback",
+        )

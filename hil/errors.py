@@ -20,6 +20,7 @@ HilError                   exit status 1
     ├── CellError          the cell file
     ├── SettingsError      the settings of a design
     ├── CampaignFolderError     the campaign folder
+    ├── WrongObjectError   an argument of another type than it has to be (a TypeError too)
     └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
 ```
 """

@@ -34,6 +34,11 @@ def leave_if_interrupted() -> Iterator[None]:
 
 def _leave(signum: int, frame: FrameType | None) -> NoReturn:
     del signum, frame
-    sys.stderr.write("error: interrupted\n")
+    sys.stderr.write("stopped: interrupted\n")
     sys.stderr.flush()
+    if "--json" in sys.argv:
+        sys.stdout.write(
+            '{"error": "interrupted", "kind": "OperatorStopError", "exit_code": 130}\n'
+        )
+        sys.stdout.flush()
     os._exit(130)

@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
+from drivers.announced import narrower
 from hil.cell import AngleFrame, Cell, CellError
 from hil.violation_text import always_so, violation_text
 from identification.excitation import (
@@ -20,6 +22,8 @@ from identification.excitation import (
 from identification.excitation.collision.built_in import told
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic
 from planner.verify import check_rest, check_smooth
+
+Array = NDArray[np.float64]
 
 LONGEST: Final = 600.0
 """s; a longer motion is refused. Checking takes time and memory as the motion is long, and an
@@ -42,12 +46,15 @@ class MotionChecks:
         currents: motor currents by the nominal model, with its uncertainty, and joint torques
             where the cell limits them.
         frame: of the angles in which refusals are worded.
+        cell_limit: (n,) A, the cell's current limits where narrower ones of the controller are in
+            force; None where they are in force themselves.
     """
 
     limits: JointLimits
     checker: CollisionChecker
     currents: CurrentModel
     frame: AngleFrame
+    cell_limit: Array | None = None
 
     @classmethod
     def of(cls, cell: Cell) -> Self:
@@ -58,6 +65,19 @@ class MotionChecks:
             currents=current_model(cell),
             frame=AngleFrame.of(cell),
         )
+
+    def within(self, announced: Array) -> Self:
+        """These checks where a controller announces current limits (n,) [A] of its own.
+
+        The narrower of the two count for each motor; these very checks where that is the cell's
+        for all of them.
+        """
+        below = narrower(announced, self.currents.current_limit)
+        if not below.any():
+            return self
+        ours = self.currents.current_limit
+        currents = replace(self.currents, current_limit=np.where(below, announced, ours))
+        return replace(self, currents=currents, cell_limit=ours)
 
     @property
     def not_checked(self) -> str | None:
@@ -91,7 +111,22 @@ class MotionChecks:
 
     def _told(self, violation: Violation) -> str:
         text, remedy = violation_text(violation, self.frame), always_so(violation, self.checker)
+        if violation.kind == "current":
+            text += self._whose_limit(violation.subject)
         return text if remedy is None else f"{text}; {remedy}"
+
+    def _whose_limit(self, motor: str) -> str:
+        """Of the current of a motor ("motor of elbow"): what to do where it is the controller's."""
+        joint = [f"motor of {name}" for name in self.currents.model.joint_names].index(motor)
+        if self.cell_limit is None:
+            return ""
+        ours, theirs = self.cell_limit[joint], self.currents.current_limit[joint]
+        if theirs == ours:
+            return ""
+        return (
+            f"; the controller announces {theirs:.6g} A as the limit of that motor, the cell file "
+            f"says {ours:.6g} A: write the controller's figure into [drive_train] current_limit"
+        )
 
 
 def collision_checker(cell: Cell) -> CollisionChecker:

@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 
 from drivers.events import MotionEnded
 from hil.archive import ArchiveSpec
+from hil.campaign.announced_limits import checks_in_force
 from hil.campaign.errors import MotionRefusedError
 from hil.campaign.motion_link import MotionLink
 from hil.campaign.motion_watch import MotionWatch, unwatched_motion
 from hil.campaign.plan import moves_to_dict
+from hil.campaign.reach import at_limit, beyond
 from hil.campaign.stop import Stop
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
 from hil.recording import kind_entry, origin_of
 from planner import Move, PiecewiseCubic, PlanFile, TrajectoryPlayer, in_child, plan_moves
-from planner.errors import PlannerError
 
 Array = NDArray[np.float64]
 
@@ -41,6 +42,7 @@ class Way:
         trajectory: the motion.
         moves: what it was planned from.
         speed: fraction of the joints' speeds.
+        checks: that it passed.
         not_checked: what the check of contacts leaves out, in words; "" for nothing.
     """
 
@@ -49,6 +51,7 @@ class Way:
     trajectory: PiecewiseCubic
     moves: PlanFile
     speed: float
+    checks: MotionChecks
     not_checked: str = ""
 
     @property
@@ -131,25 +134,25 @@ def straight_way(
         start: (n,) rad.
         target: (n,) rad.
         speed: fraction of the joints' speeds; the cell's `approach_speed` if left out.
-        checks: those of the cell, where they are at hand.
+        checks: the cell's if left out; `checks_in_force` has those with a connected controller's
+            own limits, which `send` asks for again.
 
     Raises:
         MotionRefusedError: it breaks a limit, touches something or needs too much current.
+        PlannerError: the solver crashed, or found no way.
     """
     checks = checks or MotionChecks.of(cell)
     speed = cell.campaign.approach_speed if speed is None else speed
-    outside = _outside(cell, target)
-    if outside is not None:
+    if (standing := beyond(cell, start)) is not None:
+        raise MotionRefusedError("the way", standing, "jog the arm to within [limits]")
+    if (outside := beyond(cell, target, "would go to")) is not None:
         raise MotionRefusedError("the way", outside, "name a posture within [limits]")
-    try:
-        motion = in_child(plan_moves, start, (Move(target, speed=speed),), cell.joint_limits)
-    except PlannerError as error:
-        raise MotionRefusedError("the way", str(error), "jog the arm to within [limits]") from error
-    problem = checks.refusal(motion.trajectory)
-    if problem is not None:
-        raise MotionRefusedError("the way", problem, "go by way of another posture, or jog the arm")
+    limits = cell.joint_limits
+    to = Move(at_limit(target, limits), speed=speed)
+    motion = in_child(plan_moves, at_limit(start, limits), (to,), limits)
+    _require(checks, motion.trajectory)
     moves = PlanFile.of(motion, cell.joint_names)
-    return Way(start, target, motion.trajectory, moves, speed, checks.not_checked or "")
+    return Way(start, target, motion.trajectory, moves, speed, checks, checks.not_checked or "")
 
 
 def send(
@@ -174,9 +177,14 @@ def send(
         durable: wait at each flush until the disk has the data.
 
     Raises:
+        MotionRefusedError: the controller announces a current limit below the cell's, and the way
+            needs more.
         ControllerFault: it was not accepted (nothing moved), or the link broke.
         ArchiveWriteError: the archive cannot be written; the arm was stopped.
     """
+    checks = checks_in_force(cell, link.connection, way.checks)
+    if checks is not way.checks:
+        _require(checks, way.trajectory)
     bounds = cell.file.bounds
     player = TrajectoryPlayer(
         way.trajectory,
@@ -210,15 +218,8 @@ def send(
     return link.run(player, spec, stop, watch=watch)
 
 
-def _outside(cell: Cell, target: Array) -> str | None:
-    """Which joint of a posture is beyond its limits, in words."""
-    limits, frame = cell.joint_limits, AngleFrame.of(cell)
-    beyond = np.flatnonzero((target < limits.lower) | (target > limits.upper))
-    if not len(beyond):
-        return None
-    joint = int(beyond[0])
-    ends = np.sort([frame.shown(limits.lower)[joint], frame.shown(limits.upper)[joint]])
-    return (
-        f"{cell.joint_names[joint]} would go to {frame.shown(target)[joint]:.6g}°, its limits are "
-        f"{ends[0]:.6g}° and {ends[1]:.6g}° ({frame.whose})"
-    )
+def _require(checks: MotionChecks, trajectory: PiecewiseCubic) -> None:
+    problem = checks.refusal(trajectory)
+    if problem is not None:
+        remedy = "go slower or by way of another posture, or jog the arm"
+        raise MotionRefusedError("the way", problem, remedy)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -95,14 +96,31 @@ def kind_entry(path: Path, kind: str) -> dict[str, str]:
     return {} if ArchiveName.parse(path) is not None else {"kind": kind}
 
 
-def origin_of(cell: Cell, *, only_simulated: bool | None = None) -> dict[str, str]:
-    """As metadata: where and with what it was recorded; a time of day only for a real arm.
+def origin_of(
+    cell: Cell, *, only_simulated: bool | None = None, virtual: bool | None = None
+) -> dict[str, str]:
+    """As metadata: where, when and with what it was recorded; virtual time has no date.
 
     Args:
-        cell: its own link says whether only a simulated arm can move, where that is left out.
-        only_simulated: of the link that is really used.
+        cell: its own link says what is left out.
+        only_simulated: of the link that is really used: whether only a simulated arm can move.
+        virtual: whether time is, on that link.
     """
-    versions = {f"software.{name}": version for name, version in software().items()}
-    if cell.only_simulated if only_simulated is None else only_simulated:
-        return {"simulated": "yes", **versions}
-    return {"recorded_at": datetime.now(UTC).isoformat(timespec="seconds"), **versions}
+    if only_simulated is None:
+        only_simulated = cell.only_simulated
+    if virtual is None:
+        virtual = cell.controller.transport == "simulated"
+    return {
+        "simulated": "yes" if only_simulated else "no",
+        **({} if virtual else {"recorded_at": _now()}),
+        **{f"software.{name}": version for name, version in software().items()},
+    }
+
+
+def dated_anew(metadata: Mapping[str, str]) -> dict[str, str]:
+    """The same, for an archive that begins now; what has no date gets none."""
+    return {**metadata, **({"recorded_at": _now()} if "recorded_at" in metadata else {})}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

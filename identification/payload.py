@@ -16,6 +16,9 @@ from identification.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 
+_ROUNDING = 1e-9
+"""Share of the largest principal moment."""
+
 
 @dataclass(frozen=True)
 class Payload:
@@ -28,6 +31,9 @@ class Payload:
             zz [kg m²]; a point without it.
         frame: link of the robot description whose frame that is, such as "tool0"; without it the
             frame of the last joint.
+
+    Raises:
+        ModelError: no body has this mass, or a figure is not finite.
     """
 
     mass: float
@@ -40,6 +46,15 @@ class Payload:
             raise ModelError(f"the payload weighs {self.mass!r} kg; give its mass, zero or more")
         if not all(math.isfinite(value) for value in (*self.centre, *self.inertia)):
             raise ModelError("the payload's centre or inertia holds a number that is not finite")
+
+    @property
+    def possible(self) -> bool:
+        """Whether a body can have this inertia.
+
+        Principal moments are not negative, and none exceeds the sum of the others.
+        """
+        least, middle, most = np.linalg.eigvalsh(_tensor(self.inertia))
+        return bool(least >= -_ROUNDING * most and most <= (1.0 + _ROUNDING) * (least + middle))
 
     @property
     def parameters(self) -> Array:

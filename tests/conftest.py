@@ -16,6 +16,30 @@ settings.register_profile(
 settings.load_profile("hil")
 
 
+_LONGEST = (
+    "test_fault_matrix.py",
+    "test_batch_dask.py",
+    "test_cli.py",
+    "test_process_death.py",
+    "test_one_sided_errors.py",
+    "test_session_machine.py",
+    "test_record_command.py",
+    "test_run_kills.py",
+    "test_design_command.py",
+    "test_estimators.py",
+    "test_study.py",
+    "test_batch_reidentify.py",
+    "test_commands.py",
+    "test_isolation.py",
+)
+"""Files that take longest: the workers of `make test` begin with them, so that none ends alone."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {name: place for place, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))  # within a file as it was
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of real recordings and captures that lies beside the project, where it is present."""

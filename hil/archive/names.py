@@ -11,8 +11,20 @@ from hil.errors import ArchiveError
 
 KINDS = ("standstill", "move", "warmup", "dryrun", "excitation", "validation", "imported")
 SUFFIX = ".mcap"
+WORDS = {
+    "dryrun": "dry run",
+    "warmup": "warm-up",
+    "excitation": "repetition",
+    "imported": "recording",
+}
+"""What a person calls a kind, where that is another word."""
 
 _PATTERN = re.compile(r"(?P<kind>[a-z]+)_(?P<index>\d{3,})_a(?P<attempt>[1-9]\d*)\.mcap")
+
+
+def motion_name(kind: str, index: int) -> str:
+    """What a person calls a motion, counted from 1: "repetition 1" for the excitation 0."""
+    return f"{WORDS.get(kind, kind)} {index + 1}"
 
 
 @dataclass(frozen=True, order=True)
@@ -61,6 +73,11 @@ class ArchiveName:
         if match is None or match["kind"] not in KINDS:
             return None
         return cls(match["kind"], int(match["index"]), int(match["attempt"]))
+
+    @property
+    def motion(self) -> str:
+        """What a person calls it; without the attempt."""
+        return motion_name(self.kind, self.index)
 
     def metadata(self) -> dict[str, str]:
         """The name as entries of the archive's metadata."""

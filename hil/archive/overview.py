@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.archive import container, foreign_json
+from hil.archive.names import WORDS, motion_name
 from hil.archive.reader import Archive, open_archive
 from hil.archive.survey import survey
 
@@ -101,10 +102,10 @@ def overview(path: str | PathLike[str]) -> Overview:
 
 
 def _title(metadata: Mapping[str, str]) -> str:
-    title = metadata["kind"]
-    if "index" in metadata:
-        title += f" {metadata['index']}, attempt {metadata.get('attempt', '1')}"
-    return title
+    kind, index = metadata["kind"], metadata.get("index", "")
+    if not index.isdecimal():
+        return WORDS.get(kind, kind)
+    return f"{motion_name(kind, int(index))}, attempt {metadata.get('attempt', '1')}"
 
 
 def _outcome(archive: Archive) -> str:

@@ -27,6 +27,7 @@ from drivers.exchange import (
     ResumeRefused,
 )
 from hil.archive.events import Level
+from hil.counted import counted
 
 
 def describe(event: ExchangeEvent) -> str:
@@ -35,11 +36,10 @@ def describe(event: ExchangeEvent) -> str:
         case StateChanged():
             return f"{event.before.name} -> {event.after.name} in cycle {event.cycle}"
         case GapSeen():
-            return f"{event.missed} packets missed before cycle {event.cycle}"
+            return f"{counted(event.missed, 'packet')} missed before cycle {event.cycle}"
         case AnswersLost():
-            return (
-                f"{event.count} answers were not taken by the controller, until cycle {event.cycle}"
-            )
+            were = f"{counted(event.count, 'answer')} {'was' if event.count == 1 else 'were'}"
+            return f"{were} not taken by the controller, until cycle {event.cycle}"
         case MotionStarted():
             return f"first set-point in cycle {event.cycle}"
         case OverrideChanged():
@@ -49,9 +49,9 @@ def describe(event: ExchangeEvent) -> str:
         case MotionEnded():
             return f"{event.outcome} in cycle {event.cycle}: {event.reason}"
         case PacketRejected(kind="answered late"):
-            return f"{event.count} answers left more than a cycle after their packet"
+            return f"{counted(event.count, 'answer')} left more than a cycle after their packet"
         case PacketRejected():
-            return f"{event.count} {event.kind} packets got no answer"
+            return f"{counted(event.count, f'{event.kind} packet')} got no answer"
         case Refused():
             return str(event.error)
         case LinkLost():

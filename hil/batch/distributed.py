@@ -120,15 +120,7 @@ class DaskWorkers(Workers):
         *,
         done: Callable[[int], None] | None = None,
     ) -> Iterator[Summed[T, S]]:
-        """Do all tasks, and yield the sum of each group while later ones are still worked on.
-
-        Args:
-            groups: the work, in an order that decides about the last bits.
-            add: sum of two totals, importable on the workers; it must not change them.
-            done: called with a number of tasks whenever so many more are finished.
-
-        Yields:
-            The sum of each group in turn. A task that fails, crashes or hangs has a `Broken` in it.
+        """The same as of any workers, but later groups are worked on meanwhile.
 
         Raises:
             ClusterError: all workers, or the scheduler, are gone for longer than the patience.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -58,7 +58,12 @@ class Plan:
 
 
 def reidentify(
-    roots: Sequence[str], plan: Plan, workers: Workers, reporter: Reporter
+    roots: Sequence[str],
+    plan: Plan,
+    workers: Workers,
+    reporter: Reporter,
+    *,
+    check: Callable[[Sequence[ArchiveRef]], None] = lambda _: None,
 ) -> BatchResult:
     """Identify every arm from all its archives: repetition by repetition, campaign, and pooled.
 
@@ -70,6 +75,7 @@ def reidentify(
         plan: how.
         workers: who does the work on archives.
         reporter: of progress.
+        check: given the archives that were found, before their samples are read; may refuse them.
 
     Raises:
         NothingToFitError: there is not one archive that can be fitted.
@@ -78,6 +84,7 @@ def reidentify(
     """
     with _kept(plan) as where:
         found = discover(roots, where, workers, reporter)
+        check(found.refs)
         work = Work(workers, plan.choices, where, reporter)
         work.broken += found.broken
         campaigns = [
@@ -213,10 +220,14 @@ class _Estimates:
 
     def _nothing(self) -> NothingToFitError:
         problem = "there is no excitation and no imported recording that can be fitted"
-        broken = self._work.broken
+        broken = list(dict.fromkeys(map(_once, self._work.broken)))
         if broken:
-            problem += f"; {len(broken)} archives are broken, such as {broken[0].path}"
-            problem += f" ({broken[0].reason})"
+            path, reason = broken[0]
+            problem += (
+                f"; {path} could not be used: {reason}"
+                if len(broken) == 1
+                else f"; {len(broken)} could not be used, the first of them {path}: {reason}"
+            )
         return NothingToFitError(None, problem)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
@@ -77,10 +77,22 @@ def campaign_name(arm: ArmTrend, k: int) -> str:
 
 def campaign_folder(arm: ArmTrend, k: int) -> str:
     """The last part of its folder, and what its cell states where a folder holds several."""
-    name = _last_part(arm.campaigns[k]) or f"campaign {k + 1}"
+    name = short_names(arm.campaigns)[k] or f"campaign {k + 1}"
     if arm.campaigns.count(arm.campaigns[k]) == 1:
         return name
     return f"{name}, {arm.setups[k] or 'nothing stated'}"
+
+
+def short_names(folders: Sequence[str]) -> list[str]:
+    """The end of each folder's path that no other one of them ends with: mostly its last part."""
+    paths = [folder.rstrip("/") for folder in folders]
+    return [_short(path, [f"/{other}" for other in paths if other != path]) for path in paths]
+
+
+def _short(path: str, others: Sequence[str]) -> str:
+    parts = path.split("/")
+    ends = ("/".join(parts[-count:]) for count in range(1, len(parts)))
+    return next((end for end in ends if not any(o.endswith(f"/{end}") for o in others)), path)
 
 
 def _last_part(folder: str) -> str:

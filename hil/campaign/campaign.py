@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from hil.archive.live_view import LiveView
 from hil.cell import Cell
@@ -17,7 +18,7 @@ from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from identification.excitation import Excitation
 
-from .errors import CampaignFolderError
+from .errors import CampaignFolderError, WrongObjectError
 from .execution_result import RunResult
 from .folder import CampaignFolder
 from .intervals import require_runnable
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from sim_fixtures import SimulatedDrive
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Campaign:
     """One folder: a cell, a plan, and what of it has been done."""
 
@@ -45,25 +46,36 @@ class Campaign:
     @classmethod
     def create(
         cls,
-        root: Path,
+        folder: Path | str,
         cell: Cell,
-        plan: CampaignPlan | Excitation,
+        excitation: Excitation | CampaignPlan,
         checks: MotionChecks | None = None,
     ) -> Campaign:
         """A new campaign folder with its own copies of cell, URDF and plan.
 
         Args:
-            root: the folder to make; it may hold the design that the plan comes from.
+            folder: the folder to make; it may hold the design that the plan comes from.
             cell: the cell.
-            plan: excitation and validation motions, or an excitation, around which validation
-                motions are then drawn as `[campaign]` says.
+            excitation: an excitation, around which validation motions are drawn as `[campaign]`
+                says; or a whole plan, with validation motions of its own.
             checks: those of the cell, where they are at hand.
 
         Raises:
             CampaignFolderError: the folder holds something already.
             MotionRefusedError: the plan can never run on the cell; no folder was made.
             NoExcitationError: no validation motion keeps the constraints of the cell.
+            WrongObjectError: it was given something that is no cell or no excitation.
         """
+        root = _path(folder)
+        _require(cell, "cell", (Cell,), "give one that was loaded (`hil.Cell.load(path)`)")
+        _require(
+            excitation,
+            "excitation",
+            (Excitation, CampaignPlan),
+            "give an Excitation (`hil.design.load_design(folder, cell)`, `hil.campaign.design`) or "
+            "a CampaignPlan",
+        )
+        plan = excitation
         if isinstance(plan, Excitation):
             checks = checks or MotionChecks.of(cell)
             plan = plan_around(cell, plan, checks)
@@ -71,35 +83,38 @@ class Campaign:
         make_folder(root)
         if any(path.name not in DESIGN_FILES for path in root.iterdir()):
             raise CampaignFolderError(root, "is not empty", "name a new folder")
-        folder = CampaignFolder(root)
-        own = cell.with_urdf(folder.cell, folder.urdf.name)
-        files = {folder.urdf: own.urdf, folder.cell: own.text, folder.plan: plan.to_text()}
+        made = CampaignFolder(root)
+        own = cell.with_urdf(made.cell, made.urdf.name)
+        files = {made.urdf: own.urdf, made.cell: own.text, made.plan: plan.to_text()}
         try:
-            make_folder(folder.archives)
+            make_folder(made.archives)
             for path, text in files.items():
                 write_atomically(path, text)
-            folder.seal()
+            made.seal()
         except OSError:
             for path in files:
                 path.unlink(missing_ok=True)
-            folder.archives.rmdir()
+            made.archives.rmdir()
             raise
-        return cls(folder, own, plan)
+        return cls(made, own, plan)
 
     @classmethod
-    def open(cls, root: Path) -> Campaign:
+    def open(cls, folder: Path | str) -> Campaign:
         """An existing campaign folder.
 
         Raises:
             CampaignFolderError: it is not one.
             InputError: its cell or plan cannot be read.
         """
-        folder = CampaignFolder(root)
-        if not folder.plan.exists():
+        there = CampaignFolder(_path(folder))
+        if not there.plan.exists():
             raise CampaignFolderError(
-                root, "is not a campaign folder", "name one that has plan.json"
+                there.root, "is not a campaign folder", "name one that has plan.json"
             )
-        return cls(folder, Cell.load(folder.cell), CampaignPlan.load(folder.plan))
+        return cls(there, Cell.load(there.cell), CampaignPlan.load(there.plan))
+
+    def __repr__(self) -> str:
+        return f"Campaign({str(self.folder.root)!r}, cell {self.cell.name!r})"
 
     def status(self) -> CampaignStatus:
         """What is done, what is next, and what to type for it."""
@@ -244,3 +259,15 @@ class Campaign:
                 live=live,
             ),
         )
+
+
+def _path(folder: object) -> Path:
+    """A folder as the caller names it."""
+    _require(folder, "folder", (str, PathLike), "give the path of a folder")
+    return Path(cast("str | PathLike[str]", folder))
+
+
+def _require(given: object, name: str, kinds: tuple[type, ...], remedy: str) -> None:
+    """Refuse what is of another type than was asked for."""
+    if not isinstance(given, kinds):
+        raise WrongObjectError(name, given, remedy)

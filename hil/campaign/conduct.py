@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from hil.archive import ArchiveName, open_archive
+from hil.counted import counted
 from hil.errors import ArchiveError, HilError
 from hil.results.conduct import ConductResult, RecordedResult, StepResult, WarmUpResult
 
@@ -54,7 +55,8 @@ def _rehearsed(folder: CampaignFolder) -> StepResult:
         return StepResult(step=name, done=False, words=words, details=[])
     passed = sum(one.passed for one in found.criteria)
     words = f"{passed} of {len(found.criteria)} criteria passed on the simulated arm"
-    details = [one.sentence for one in found.criteria]
+    details = [] if found.doubt is None else [found.doubt]
+    details += [one.sentence for one in found.criteria]
     details += [f"not seen by it: {sentence}" for sentence in found.not_seen]
     return StepResult(step=name, done=found.passed, words=words, details=details)
 
@@ -66,7 +68,7 @@ def _dry_run(folder: CampaignFolder) -> StepResult:
         return StepResult(step=name, done=False, words=found, details=[])
     if found is None:
         return StepResult(step=name, done=False, words="none of this plan on record", details=[])
-    words = f"{len(found.archives)} motions at {found.override:.0%} of their speed"
+    words = f"{counted(len(found.archives), 'motion')} at {found.override:.0%} of their speed"
     if found.accepted is None:
         return StepResult(step=name, done=False, words=f"{words}, not accepted", details=[])
     currents = ", ".join(
@@ -79,7 +81,7 @@ def _dry_run(folder: CampaignFolder) -> StepResult:
         words=f"{words}, accepted by {found.accepted.by} at {found.accepted.at}",
         details=[
             f"largest current, of its limit: {currents}",
-            f"{found.missed} packets missed, {found.late} answers late",
+            f"{counted(found.missed, 'packet')} missed, {counted(found.late, 'answer')} late",
             *(f"{doubt}; it was accepted by name" for doubt in found.doubts),
         ],
     )
@@ -89,12 +91,34 @@ def _warmed(found: WarmUp | str | None) -> StepResult:
     name = "warm-up"
     if found is None or isinstance(found, str):
         return StepResult(step=name, done=False, words=found or "none", details=[])
-    lost = len(found.earlier)
+    details = [_lost(len(found.earlier))] if found.earlier else []
+    if found.outcome == "not warm":
+        details.append(_drifting(found))
     return StepResult(
         step=name,
         done=found.outcome == "warm",
-        words=f"{found.outcome} after {len(found.motions)} motions",
-        details=[f"{lost} motions before were lost in a pause"] if lost else [],
+        words=f"{found.outcome} after {counted(len(found.motions), 'motion')}",
+        details=details,
+    )
+
+
+def _lost(motions: int) -> str:
+    return (
+        f"{counted(motions, 'motion')} before {'was' if motions == 1 else 'were'} lost in a pause"
+    )
+
+
+def _drifting(found: WarmUp) -> str:
+    """What a reader of the results must know of an arm that was not warm."""
+    change = float(found.curve.change[-1]) if found.motions else math.nan
+    left = (
+        f"friction still changed by {change:.2%} a motion"
+        if math.isfinite(change)
+        else ("no joint moved enough to tell its friction")
+    )
+    return (
+        f"{left}; below {found.threshold:.2%} was wanted, so the repetitions were begun while it "
+        "may have drifted, and what is estimated is its mean over them"
     )
 
 

@@ -19,6 +19,7 @@ from hil.files import write_or_tell
 from .errors import CampaignFolderError
 from .folder import CampaignFolder
 from .gravity_check import AGAINST, GravityCheck
+from .kind_of_arm import made_by
 from .operator import DryRunSummary
 
 OVERRIDE: Final = 0.2
@@ -139,8 +140,10 @@ class DryRun:
         found = cls.load(folder, plan_hash)
         if found is None or found.simulated is not simulated:
             return None
-        whole = [path.name for path in folder.completed("dryrun")]
-        return found if len(whole) >= motions and whole[:motions] == [*found.archives] else None
+        paths = folder.completed("dryrun")[:motions]
+        if len(paths) < motions or [path.name for path in paths] != [*found.archives]:
+            return None
+        return found if all(made_by(path, simulated) for path in paths) else None
 
     @classmethod
     def of(

@@ -14,6 +14,7 @@ from .execution_runner import Runner
 from .folder import CampaignFolder
 from .gates import not_accepted
 from .intervals import Interval
+from .kind_of_arm import made_by
 from .operator import Operator
 from .quality_entry import Entering
 from .stop import Stop
@@ -123,4 +124,7 @@ class DryRunStage:
         return "accepted"
 
     def _whole(self, slow: Interval) -> str | None:
-        return self._folder.whole(slow.kind, slow.index)
+        """Name of its whole archive, if this kind of arm made it."""
+        name = self._folder.whole(slow.kind, slow.index)
+        made = name is not None and made_by(self._folder.archives / name, self._simulated)
+        return name if made else None

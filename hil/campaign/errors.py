@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive.commands import Failed
+from hil.counted import counted
 from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError, UnsafeError
 
 
@@ -18,6 +19,15 @@ class CampaignFolderError(InputError):
 
     def __init__(self, folder: Path, problem: str, remedy: str) -> None:
         super().__init__(folder, problem, remedy=remedy)
+
+
+class WrongObjectError(InputError, TypeError):
+    """An argument is of another type than it has to be."""
+
+    def __init__(self, argument: str, given: object, remedy: str) -> None:
+        what = "None" if given is None else f"an object of type {type(given).__name__}"
+        problem = f"is {what}"
+        super().__init__(None, problem, field=argument, remedy=remedy)
 
 
 class MotionRefusedError(UnsafeError):
@@ -32,9 +42,10 @@ class MotionFailedError(ControllerFault):
     """A motion ended otherwise than planned; what was recorded is archived.
 
     Attributes:
-        motion: which one.
+        motion: which one, as a person counts: "repetition 1".
         outcome: "stopped", "refused" or "lost".
         reason: in words.
+        sentence: all of this, and the archive, without what is to be done.
         flight_recorder: (k,) of `drivers.cycle_dtype`, the last records up to the refusal; None
             where nothing was refused.
     """
@@ -45,12 +56,15 @@ class MotionFailedError(ControllerFault):
         outcome: str,
         reason: str,
         flight_recorder: NDArray[np.void] | None = None,
+        archive: str | None = None,
     ) -> None:
         self.motion, self.outcome, self.reason = motion, outcome, reason
         self.flight_recorder = flight_recorder
+        which = motion if archive is None else f"{motion} ({archive})"
+        how = reason if reason.startswith(outcome) else f"{outcome}: {reason}"
+        self.sentence = f"{which} was {how}"
         super().__init__(
-            f"{motion} ended {outcome}: {reason}; "
-            "everything recorded is archived, run the campaign again to continue."
+            f"{self.sentence}; everything recorded is archived, run the campaign again to continue."
         )
 
 
@@ -99,9 +113,33 @@ class RepetitionsRejectedError(HilError):
     def __init__(self, motion: str, reasons: Sequence[str]) -> None:
         self.motion, self.reasons = motion, tuple(reasons)
         super().__init__(
-            f"{motion} was of no use {len(self.reasons)} times, at last because "
+            f"{motion} was of no use {counted(len(self.reasons), 'time')}, at last because "
             f"{self.reasons[-1]}; all attempts are archived with their reasons: find the cause, "
             "then run the campaign again to continue."
+        )
+
+
+class ArmChangedError(RepetitionsRejectedError):
+    """Later attempts at a motion agree with each other, and not with the repetitions that count.
+
+    Attributes:
+        counted: file names of the archives that count.
+        later: of those that agree with each other and were rejected.
+    """
+
+    def __init__(
+        self, motion: str, differs: str, counted: Sequence[str], later: Sequence[str]
+    ) -> None:
+        self.motion, self.reasons = motion, (differs,)
+        self.counted, self.later = tuple(counted), tuple(later)
+        HilError.__init__(
+            self,
+            f"{motion}: the last {len(later)} attempts ({', '.join(later)}) agree with each other, "
+            f"and not with the {len(counted)} repetitions that count ({', '.join(counted)}): "
+            f"{differs}. Something drags on the arm, slipped or was changed, or the first ones "
+            "were disturbed. Look at the arm: payload, tool, cables, belts, brakes, what stands "
+            "near it. If it can be put back as it was, do so and run the campaign again; if the "
+            "later ones are right, begin a new campaign.",
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drivers.events import InitReceived, LinkLost, MotionEnded, MotionStarted, Refused
@@ -38,6 +39,7 @@ class ExchangeView:
 
     Attributes:
         exchange: the process.
+        explained: adds the cause to what the process says, where it is known here.
         connection: what is known of the controller.
         lost: the last loss of the link.
         ended: the end of the motion asked for last, if its event came.
@@ -47,6 +49,7 @@ class ExchangeView:
     """
 
     exchange: ExchangeProcess
+    explained: Callable[[str], str] = str
     connection: Connection = field(default_factory=Connection)
     lost: LinkLost | None = None
     ended: MotionEnded | None = None
@@ -82,7 +85,7 @@ class ExchangeView:
             elif isinstance(event, ExchangeFailed):
                 self._said = event.trace.strip().splitlines()[-1]
             elif isinstance(event, Leaving | ExchangeEnded) and not self._said:
-                self._said = event.reason
+                self._said = self.explained(event.reason)
         return events
 
     def forget_motion(self) -> None:

@@ -18,6 +18,7 @@ from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 
+from .announced_limits import checks_in_force
 from .dry_run import OVERRIDE
 from .dry_run_stage import DryRunStage
 from .execution_archive import Archiving, provenance_of
@@ -30,6 +31,7 @@ from .gates import (
     require_one_world,
     require_own_figures,
     require_rehearsed,
+    require_rehearsed_thresholds,
     require_simulated,
 )
 from .intervals import Interval, require_joined, require_sound, wanted, with_ways
@@ -38,7 +40,7 @@ from .live_link import LiveLink
 from .motion_link import MotionLink
 from .operator import Operator, Unattended
 from .quality_entry import Entering
-from .repeating import play_until_good
+from .repeating import any_warmth, play_until_good
 from .stop import Stop
 from .warmup_stage import WarmUpStage
 from .ways import Ways, seen_in_dry_run
@@ -96,9 +98,7 @@ def run_campaign(
             folder,
             cell,
             campaign.plan,
-            provenance_of(cell, virtual=virtual, only_simulated=simulated)
-            if provenance is None
-            else provenance,
+            provenance_of(cell, provenance, virtual=virtual, only_simulated=simulated),
             not virtual if choices.durable is None else choices.durable,
             plan_hash,
         )
@@ -150,6 +150,7 @@ class _Run:
             stop=stop,
         )
         self._dry_state: DryRunState = "left out"
+        self._notes: list[str] = []
 
     def require_gates(self) -> None:
         """Refuse what was not rehearsed, or whose dry run nobody can accept.
@@ -161,7 +162,10 @@ class _Run:
         if choices.unrehearsed:
             require_simulated(self._folder, self._simulated)
             return
-        require_rehearsed(self._folder, self._archiving.plan_hash)
+        rehearsal = require_rehearsed(self._folder, self._archiving.plan_hash)
+        if (doubt := rehearsal.doubt) is not None:
+            self._notes.append(doubt)
+            self._reporter.say(f"note: {doubt}")
         require_dry_run(
             self._folder,
             self._dry_run.found(),
@@ -185,10 +189,11 @@ class _Run:
             if checks.not_checked is not None:
                 self._reporter.say(checks.not_checked)
             # What is wrong with a motion itself is told before anything is connected.
-            require_sound([*dry, *missing, *(warming if missing else [])], checks)
+            warming = warming if missing else []
+            require_sound([*dry, *missing, *warming], checks)
             with self._opened(link) as opened:
                 before = opened.cycles
-                self._stages(opened, checks, dry, missing, archives)
+                self._stages(opened, checks, dry, missing, warming, archives)
                 cycles = opened.cycles - before
         return self._result(archives, cycles)
 
@@ -206,6 +211,7 @@ class _Run:
         checks: MotionChecks,
         dry: list[Interval],
         missing: list[Interval],
+        warming: list[Interval],
         archives: list[str],
     ) -> None:
         if isinstance(link, LiveLink):
@@ -215,6 +221,12 @@ class _Run:
                 self._reporter.say(link.live.invitation)
         where = link.connect(self._stop)
         require_own_figures(link, self._folder.root)
+        found = None if self._choices.unrehearsed else self._dry_run.found()
+        require_rehearsed_thresholds(self._cell, link, self._folder.root, found)
+        narrowed = checks_in_force(self._cell, link.connection, checks)
+        if narrowed is not checks:  # the controller's own limits, for the first time known
+            checks = narrowed
+            require_sound([*dry, *missing, *warming], checks)
         # A dry run and a warm-up go the ways of the motions that they are made of.
         joined = with_ways(self._cell, [*dry, *missing], where)
         require_sound([one for one in joined if one.kind == "move"], checks)
@@ -252,11 +264,18 @@ class _Run:
     def _run_until_good(self, runner: Runner, interval: Interval) -> None:
         """Run a motion of the plan, as often as it takes and is allowed."""
         total = sum(one.kind == interval.kind for one in self._wanted)
-        play_until_good(runner, self._entering, interval, interval.index + 1, total, self._reporter)
-        if interval.kind == "standstill":
-            return
-        self._warm_up.moved()
-        if interval.kind == "excitation":
+        play_until_good(
+            runner,
+            self._entering,
+            interval,
+            interval.index + 1,
+            total,
+            self._reporter,
+            warmth=self._warm_up if interval.kind == "excitation" else any_warmth,
+        )
+        if interval.kind == "validation":
+            self._warm_up.moved()
+        elif interval.kind == "excitation":
             self._watch.note(f"{interval}: good, {self._entering.agreement()}")
 
     def _settle_dry_run(self) -> None:
@@ -275,9 +294,12 @@ class _Run:
             return sum((one.kind, one.index) not in missing for one in total), len(total)
 
         found = None if self._choices.unrehearsed else self._dry_run.found()
-        notes = [] if found is None else [f"dry run: {doubt}" for doubt in found.doubts]
+        notes = [*self._notes]
+        notes += [] if found is None else [f"dry run: {doubt}" for doubt in found.doubts]
         if (cold := self._warm_up.note) is not None:
             notes.append(cold)
+        notes += self._warm_up.pauses
+        notes += self._entering.notes
         notes += self._watch.troubles
         return RunResult(
             campaign=str(self._folder.root),

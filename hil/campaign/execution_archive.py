@@ -9,11 +9,12 @@ from typing import Any
 
 from hil.archive import ArchiveName, ArchiveSpec
 from hil.cell import Cell
-from hil.recording import origin_of
+from hil.recording import dated_anew, origin_of
 from hil.version import software
 
 from .folder import CampaignFolder
 from .intervals import Interval
+from .kind_of_arm import SIMULATED, said_of
 from .plan import CampaignPlan, moves_to_dict
 
 REPEATED = ("excitation", "warmup")
@@ -47,7 +48,7 @@ class Archiving:
             self.folder.archives / name.filename,
             joint_names=cell.joint_names,
             period=cell.period,
-            metadata=self._metadata() | dict(self.provenance),
+            metadata=self._metadata() | dated_anew(self.provenance),
             attachments={
                 "cell.toml": cell.text.encode(),
                 "robot.urdf": cell.urdf.encode(),
@@ -58,8 +59,9 @@ class Archiving:
         )
 
     def made(self, metadata: Mapping[str, str]) -> bool:
-        """Whether an archive with this metadata was made of exactly this plan."""
-        return metadata.get("plan_hash") == self.plan_hash
+        """Whether an archive with this metadata was made of exactly this plan, by such an arm."""
+        arm = self.provenance.get(SIMULATED)
+        return metadata.get("plan_hash") == self.plan_hash and metadata.get(SIMULATED) == arm
 
     def _plan_of(self, interval: Interval) -> dict[str, Any]:
         """The trajectory of an interval, its moves, and how an excitation was found."""
@@ -69,27 +71,37 @@ class Archiving:
         return {"trajectory": interval.trajectory.to_dict(), **moves}
 
     def _metadata(self) -> dict[str, str]:
+        # One seed is one campaign to the byte, whatever its folder is called.
+        simulated = self.provenance.get(SIMULATED) == said_of(True)
+        named = {} if simulated else {"campaign": self.folder.root.resolve().name}
         return {
-            "campaign": self.folder.root.resolve().name,
+            **named,
             "cell": self.cell.name,
             "plan_hash": self.plan_hash,
             **{f"software.{name}": version for name, version in software().items()},
         }
 
 
-def provenance_of(cell: Cell, *, virtual: bool, only_simulated: bool) -> dict[str, str]:
-    """What is said of where archives come from; a time of day only where an arm may have moved.
+def provenance_of(
+    cell: Cell, said: Mapping[str, str] | None, *, virtual: bool, only_simulated: bool
+) -> dict[str, str]:
+    """What is said of where archives come from; a time of day only in real time.
 
     Args:
         cell: of the campaign.
+        said: by the caller, who alone knows what a link of his simulates; None for nothing.
         virtual: whether time is.
-        only_simulated: whether nothing but a simulated arm can move.
+        only_simulated: whether nothing but a simulated arm can move. No caller changes that.
     """
     if not virtual:
-        return origin_of(cell, only_simulated=only_simulated)
-    from hil.simulation import simulated_provenance  # it opens links of ours
+        own = origin_of(cell, only_simulated=only_simulated, virtual=False)
+    elif said is None:
+        from hil.simulation import simulated_provenance  # it opens links of ours
 
-    return simulated_provenance(cell, effects=False)
+        own = simulated_provenance(cell, effects=False)
+    else:
+        own = {}
+    return own | dict(said or {}) | {SIMULATED: said_of(only_simulated)}
 
 
 def not_entered(folder: CampaignFolder) -> list[str]:

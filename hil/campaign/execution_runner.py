@@ -110,11 +110,12 @@ class Runner:
         if ended.outcome == "completed" or spec.path.exists():  # else it was stopped before
             self.archives.append(spec.path.name)
         if ended.outcome != "completed":
-            if spec.path.exists():
-                self.archiving.folder.add(spec.path.name, ended.outcome)
+            archived = spec.path.name if spec.path.exists() else None
+            if archived is not None:
+                self.archiving.folder.add(archived, ended.outcome)
             refused = self.link.connection.refused if ended.outcome == "refused" else None
             recorder = None if refused is None else refused.flight_recorder
-            raise MotionFailedError(str(interval), ended.outcome, ended.reason, recorder)
+            raise MotionFailedError(str(interval), ended.outcome, ended.reason, recorder, archived)
         self.task.advance(duration / most, str(interval))
         return spec.path.name
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
+from typing import cast
+
+from hil.archive.names import WORDS
 
 from .motion_watch import MotionProgress, Wish
 from .operator import DriftCurve, Operator, Phase, RunStatus
@@ -10,15 +14,6 @@ from .stop import Stop
 
 NOTES = 4
 """Last notes on quality that are shown."""
-PHASES: dict[str, Phase] = {
-    "dryrun": "dry run",
-    "warmup": "warm-up",
-    "standstill": "standstill",
-    "excitation": "repetition",
-    "validation": "validation",
-    "move": "move",
-}
-"""What a kind of archive is called on the screen."""
 
 
 @dataclass(eq=False)
@@ -34,6 +29,8 @@ class RunWatch:
         stop: brings the arm to rest on its path.
         time_left: s of motion after the present one, at full speed.
         drift: of the warm-up so far.
+        began: when the present motion began, or the last one [s since 1970]; later than it was
+            asked for where it was held.
         blind: what went wrong with showing, None for nothing; nothing is shown from then on.
         deaf: what went wrong first with asking for a wish, None for nothing.
     """
@@ -42,8 +39,10 @@ class RunWatch:
     stop: Stop
     time_left: float = 0.0
     drift: DriftCurve | None = None
+    began: float = 0.0
     blind: Exception | None = None
     deaf: Exception | None = None
+    _shown: bool = False
     _held_deaf: bool = False
     _phase: Phase = "move"
     _number: int = 1
@@ -63,8 +62,9 @@ class RunWatch:
             duration: at full speed [s].
             most: largest override.
         """
-        self._phase, self._number, self._total = PHASES[kind], number, total
+        self._phase, self._number, self._total = _phase_of(kind), number, total
         self._duration, self._most = duration, most
+        self._shown = False
         self._tell(None)
 
     def note(self, text: str) -> None:
@@ -73,7 +73,9 @@ class RunWatch:
         self._tell(None)
 
     def show(self, progress: MotionProgress) -> None:
-        """See `MotionWatch.show`."""
+        """See `MotionWatch.show`; links do not show a motion before they ask for it."""
+        if not self._shown:
+            self._shown, self.began = True, time.time()
         self._tell(progress)
 
     def wish(self) -> Wish:
@@ -122,6 +124,10 @@ class RunWatch:
             self.operator.show(status)
         except Exception as error:  # likewise
             self.blind = error
+
+
+def _phase_of(kind: str) -> Phase:
+    return cast(Phase, WORDS.get(kind, kind))
 
 
 def _words(error: Exception) -> str:

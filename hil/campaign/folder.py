@@ -17,13 +17,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from hil.archive import ArchiveName
 from hil.archive.amend import REJECTED
 from hil.files import write_atomically
 
-from .errors import CampaignFolderError
+from .errors import CampaignFolderError, NotRehearsedError
 from .sealed import MESH, MISSING, as_text, checksums, combined
 
 if TYPE_CHECKING:
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 LOCK = "campaign.lock"
 LOCK_PATIENCE = 0.5
 """s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
+_ANOTHER: Final = "{} is not the one this campaign began with"
+_RESTORE: Final = "restore it, or begin a new campaign"
 
 
 @dataclass(frozen=True)
@@ -191,29 +193,37 @@ class CampaignFolder:
         Raises:
             CampaignFolderError: something was recorded, and one of them changed since.
         """
-        if self._content()["archives"]:
-            self.require_unchanged()
-        elif self._content()["inputs"] != self._inputs():
-            self.seal()
+        if not self._content()["archives"]:
+            if self._content()["inputs"] != self._inputs():
+                self.seal()
+        elif changed := self._changed():
+            raise CampaignFolderError(self.root, _ANOTHER.format(changed), _RESTORE)
 
     def require_unchanged(self) -> None:
         """Refuse to go on if cell, URDF or plan are not those the campaign began with.
 
         Raises:
-            CampaignFolderError: names the file that changed.
+            NotRehearsedError: names the file that changed.
         """
-        sealed, now = self._content()["inputs"], self._inputs()
+        changed = self._changed()
+        if changed:
+            remedy = (
+                _RESTORE
+                if self._content()["archives"]
+                else f"restore it, or rehearse again (`hil rehearse {self.root}`)"
+            )
+            raise NotRehearsedError(self.root, f"was edited: {_ANOTHER.format(changed)}", remedy)
+
+    def _changed(self) -> str | None:
+        """The first file that is not the one that was sealed."""
+        sealed: dict[str, str] = self._content()["inputs"]
+        now = self._inputs()
         for name in sorted(sealed.keys() | now.keys()):
             if name.startswith(MESH) and name not in sealed:
                 continue  # sealed by a version that did not look at meshes
             if sealed.get(name) != now.get(name):
-                raise CampaignFolderError(
-                    self.root,
-                    f"{name} is not the one this campaign began with",
-                    "restore it, or begin a new campaign"
-                    if self._content()["archives"]
-                    else f"restore it, or rehearse again (`hil rehearse {self.root}`)",
-                )
+                return name
+        return None
 
     def manifest(self) -> list[Entry]:
         """Closed archives in the order they were made.

@@ -7,23 +7,30 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
+from drivers.drive_train import TURN
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
+from .announced_limits import narrower_thresholds
 from .dry_run import DryRun
 from .errors import AgainstGravityError, CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .gravity_check import AGAINST
+from .kind_of_arm import SIMULATED, said_of
 from .motion_link import MotionLink
 from .rehearsal import Rehearsal
 
 _ADDRESS: Final = ("transport", "host", "port", "bind", "can", "packets")
 """Keys of `[controller]` that say where it is, and not what is exchanged."""
+_MADE_BY: Final = {"yes": "a simulated arm", "no": "a real arm"}
+"""By what an archive says of itself."""
 
 
-def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> None:
-    """Refuse a plan whose rehearsal on the simulated twin was not passed.
+def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> Rehearsal:
+    """The rehearsal of a plan; one that was not passed on the simulated twin is refused.
 
     Args:
         folder: of the campaign.
@@ -44,6 +51,7 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> N
         failed = "; ".join(found.failures) or "a criterion was not met"
         remedy = f"correct the cell or design another motion, then {rehearse}"
         raise NotRehearsedError(folder.root, f"failed its rehearsal ({failed})", remedy)
+    return found
 
 
 def require_simulated(folder: CampaignFolder, only_simulated: bool) -> None:
@@ -68,17 +76,17 @@ def require_one_world(folder: CampaignFolder, only_simulated: bool) -> None:
     did must not be pooled.
 
     Raises:
-        CampaignFolderError: the archives that are there are of the other kind.
+        CampaignFolderError: an archive that is there is of the other kind, or does not say of
+            which it is.
     """
     for metadata in _metadata_of_all(folder):
-        if not only_simulated and metadata.get("simulated") == "yes":
-            what, link = "a simulated arm", "a real one"
-            break
-        if only_simulated and "recorded_at" in metadata and metadata.get("simulated") != "yes":
-            what, link = "a real arm", "a simulated one"
+        made_by = metadata.get(SIMULATED, "")
+        if made_by != said_of(only_simulated):
             break
     else:
         return
+    what = _MADE_BY.get(made_by, "an arm that they do not name")
+    link = "a simulated one" if only_simulated else "a real one"
     raise CampaignFolderError(
         folder.root,
         f"holds archives of {what}, and its link leads to {link}",
@@ -148,6 +156,39 @@ def require_own_figures(link: MotionLink, root: Path) -> None:
             f"controller's ({'; '.join(known.differences)})",
             "write the controller's figures into the cell file and rehearse",
         )
+
+
+def require_rehearsed_thresholds(
+    cell: Cell, link: MotionLink, root: Path, found: DryRun | None
+) -> None:
+    """Refuse a controller that trips at a smaller following error than the rehearsal allowed.
+
+    Args:
+        cell: of the campaign.
+        link: connected.
+        root: of the campaign.
+        found: its dry run, for what was needed then; None where there is none.
+
+    Raises:
+        NotRehearsedError: names each joint and both thresholds.
+    """
+    below = narrower_thresholds(cell, link.connection)
+    if not below:
+        return
+    needed = "what the motions need at full speed, no model tells"
+    if found is not None:
+        turns = np.abs(cell.drive_train.motor_from_joint) @ np.array(found.following_error) / TURN
+        seen = ", ".join(
+            f"{joint} {turn:.3g}" for joint, turn in zip(cell.joint_names, turns, strict=True)
+        )
+        needed = f"at {found.override:.0%} of the speed the dry run needed {seen}"
+    raise NotRehearsedError(
+        root,
+        "was planned and rehearsed with wider following-error thresholds than the controller "
+        f"announces ({'; '.join(below)}; {needed})",
+        "write the controller's into [drive_train] following_error of the cell file and rehearse, "
+        "or widen them in the controller",
+    )
 
 
 def require_dry_run(

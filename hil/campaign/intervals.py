@@ -9,12 +9,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.archive.names import motion_name
 from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 from planner import FourierSeries, Move, PiecewiseCubic, PlanFile, in_child, plan_moves
 
 from .errors import MotionRefusedError
 from .plan import CampaignPlan
+from .reach import at_limit, beyond
 
 Array = NDArray[np.float64]
 
@@ -43,7 +45,7 @@ class Interval:
     from_arm: bool = False
 
     def __str__(self) -> str:
-        return f"{self.kind} {self.index}"
+        return motion_name(self.kind, self.index)
 
 
 def wanted(cell: Cell, plan: CampaignPlan) -> list[Interval]:
@@ -149,9 +151,17 @@ def hold(position: Array, duration: float) -> PiecewiseCubic:
 
 
 def way(cell: Cell, start: Array, end: Array) -> Interval:
-    """The straight way between two postures; planned where a crash does not end us."""
-    move = Move(end, speed=cell.campaign.approach_speed)
-    motion = in_child(plan_moves, start, (move,), cell.joint_limits)
+    """The straight way between two postures (n,) [rad]; planned where a crash does not end us.
+
+    Raises:
+        MotionRefusedError: the arm stands outside its limits.
+    """
+    limits = cell.joint_limits
+    for posture in (start, end):
+        if (problem := beyond(cell, posture)) is not None:
+            raise MotionRefusedError("the way", problem, "jog the arm to within [limits]")
+    move = Move(at_limit(end, limits), speed=cell.campaign.approach_speed)
+    motion = in_child(plan_moves, at_limit(start, limits), (move,), limits)
     return Interval("move", 0, motion.trajectory, PlanFile.of(motion, cell.joint_names))
 
 

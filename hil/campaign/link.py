@@ -43,7 +43,7 @@ AFTERMATH_CYCLES = 1000
 """So long a motion that was refused or lost is waited for, at most, until its archive is full."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Link:
     """Session, transport and recorder of one connection in virtual time; a `MotionLink`.
 
@@ -67,6 +67,10 @@ class Link:
     connection: Connection = field(default_factory=Connection)
     packets: PacketRing | None = None
     cell: Cell | None = None
+
+    def __repr__(self) -> str:
+        whose = "" if self.cell is None else f"{self.cell!r}, "
+        return f"Link({whose}{self.cycles} cycles archived)"
 
     @classmethod
     def over(
@@ -121,7 +125,7 @@ class Link:
 
         exchange(self.transport, self.session, until=ready)
         self._events()
-        self.connection.require_usable()
+        self.connection.require_usable(self.cell)
         if stop.requested:
             raise ControllerFault("stopped by the operator before anything moved")
         if self.session.state is not State.CLOSED or last is None:
@@ -195,7 +199,7 @@ class Link:
             raise OperatorStopError("ended before the controller came: nothing was recorded")
         if self.connection.init is None:
             raise ControllerFault("the controller did not start a session: nothing was recorded")
-        self.connection.require_usable()
+        self.connection.require_usable(self.cell)
         with self._open(spec) as writer:
             taking = _Taking(self, Recorder(writer, self.session.drive_train))
             limit = None if duration is None else round(duration / writer.period)

@@ -1,14 +1,13 @@
 """A real link: exchange and archive in processes of their own, supervised from here.
 
-This process only asks: it hands motions and archives over, says every 50 ms that it lives, and
-reports. The exchange answers the controller, whatever happens here; the archive process writes what
-the exchange leaves in shared memory. Each of the three notices the death of the others, and then
-the arm comes to rest on its path.
+This process only asks: it hands motions and archives over, says every 50 ms that it lives (as long
+as the loop that supervises a motion turns), and reports. The exchange answers the controller,
+whatever happens here; the archive process writes what the exchange leaves in shared memory. Each of
+the three notices the death of the others, and then the arm comes to rest on its path.
 """
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -35,6 +34,7 @@ from hil.errors import ControllerFault
 
 from .errors import write_error
 from .exchange_view import ExchangeView
+from .heartbeat import Heartbeat
 from .live_motion import LiveMotion
 from .live_recording import LiveRecording
 from .motion_link import Connection, Recorded, Watch, described, drives_in_force, unwatched
@@ -48,8 +48,6 @@ READY = frozenset((State.CLOSED, State.OPENING, State.OPEN))
 until a motion is asked for."""
 POLL = 0.02
 """s between two looks at everything while a motion runs."""
-BEAT = 0.05
-"""s between two heartbeats; the exchange stops the arm after 0.5 s without one."""
 OPEN_TIMEOUT = 10.0
 """s within which a file must have been created."""
 END_TIMEOUT = 30.0
@@ -67,6 +65,7 @@ class LiveLink:
         cell: whose controller is at the far end.
         exchange: the process that answers.
         archive: the process that writes.
+        heart: tells the exchange that this process lives.
         finish: asks the far end to end the session; only a simulated one can be asked.
         view: what is known of the exchange.
         cycles: records archived so far.
@@ -82,6 +81,7 @@ class LiveLink:
     cell: Cell
     exchange: ExchangeProcess
     archive: ArchiveProcessHandle
+    heart: Heartbeat
     finish: Callable[[], None] = field(default=lambda: None)
     cycles: int = 0
     late: int = 0
@@ -94,7 +94,7 @@ class LiveLink:
     _closed: bool = False
 
     def __post_init__(self) -> None:
-        self.view = ExchangeView(self.exchange)
+        self.view = ExchangeView(self.exchange, explained=self.heart.explained)
 
     @classmethod
     def open(
@@ -140,18 +140,21 @@ class LiveLink:
             raise ControllerFault(str(error)) from error
         except OSError as error:
             raise ControllerFault(f"the exchange process cannot be started: {error}") from error
+        # At once: the archive process may take longer to start than the exchange waits for a sign.
+        heart = Heartbeat(exchange.beat)
+        heart.start()
         try:
             archive = ArchiveProcessHandle.start(
                 exchange, len(cell.joint_names), exchange.packets_fd
             )
         except BaseException as error:
+            heart.end()
             exchange.finish()
             exchange.close()
             if isinstance(error, OSError):
                 raise ControllerFault(f"the archive process cannot be started: {error}") from error
             raise
-        link = cls(cell, exchange, archive, finish, only_simulated=stays_here(spec))
-        threading.Thread(target=link._beat, daemon=True).start()
+        link = cls(cell, exchange, archive, heart, finish, only_simulated=stays_here(spec))
         if live is not None:
             try:
                 link._serve(live)
@@ -176,7 +179,7 @@ class LiveLink:
         last: Array | None = None
         while not stop.requested and time.monotonic() < deadline:
             self.view.look()
-            self.connection.require_usable()
+            self.connection.require_usable(self.cell)
             records = reader.drain()
             if len(records):
                 last = records["target_position"][-1].copy()
@@ -281,6 +284,7 @@ class LiveLink:
             ArchiveWriteError: the disk refuses.
             ControllerFault: the archive process does not answer.
         """
+        self.heart.rest()  # what was supervised is over, or never began
         path = self.open_path
         self.archive.send(Close(self.job, outcome, reason))
         deadline = time.monotonic() + OPEN_TIMEOUT
@@ -331,16 +335,12 @@ class LiveLink:
             raise ControllerFault(f"{failure}; nothing was sent")
         self.live = replace(view, port=answer.port)
 
-    def _beat(self) -> None:
-        while not self._closed and self.exchange.alive:
-            self.exchange.beat()
-            time.sleep(BEAT)
-
     def _shut(self) -> str | None:
         """End both processes; what was wrong with them, None if nothing was."""
         if self._closed:
             return None
         self._closed = True
+        self.heart.end()
         trouble: str | None = None
         try:
             self.finish()

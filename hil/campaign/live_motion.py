@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, get_args
 
 from drivers.errors import DriverError, RequestError
@@ -53,7 +54,15 @@ class LiveMotion:
             return MotionEnded("stopped", NOT_BEGUN, -1, -1)
         self._view.forget_motion()
         sight = self._sight(source)
-        self._submit(source, spec)
+        self._link.heart.turn()
+        try:
+            self._submit(source, spec)
+            return self._supervised(sight, spec)
+        finally:
+            self._link.heart.rest()
+
+    def _supervised(self, sight: Sight, spec: ArchiveSpec) -> MotionEnded:
+        """How the motion that was asked for ended."""
         due = math.inf
         while True:
             self._look(sight)
@@ -86,7 +95,8 @@ class LiveMotion:
             self._exchange.submit(source)
         except RequestError as error:
             self._link.complete("refused", str(error))
-            raise ControllerFault(f"{error}; {spec.path} says so") from error
+            why = self._link.heart.explained(str(error))
+            raise ControllerFault(f"{why}; {spec.path} says so") from error
         except DriverError as error:
             self._raise_failure()
             self._exchange.stop()
@@ -95,6 +105,7 @@ class LiveMotion:
 
     def _look(self, sight: Sight) -> None:
         """Take in what is new, pass wishes on, and show it if that is due."""
+        self._link.heart.turn()
         sight.note(self._view.look())
         if self._stop.requested and not self._told:
             self._exchange.stop()
@@ -128,10 +139,12 @@ class LiveMotion:
         self._link.count(closed)
         self._view.look()
         if self._view.ended is not None:
-            return self._view.ended
+            ended = self._view.ended
+            return replace(ended, reason=self._link.heart.explained(ended.reason))
         if closed.outcome in get_args(Outcome) and self._view.motion_ended:
             outcome: Outcome = closed.outcome  # type: ignore[assignment]
-            return MotionEnded(outcome, closed.reason, closed.interval, -1)
+            reason = self._link.heart.explained(closed.reason)
+            return MotionEnded(outcome, reason, closed.interval, -1)
         failure = self._view.failure() or closed.reason
         alone = "the controller gets no answers and acts by its own watch"
         raise ControllerFault(f"{failure}; {alone}; the archive ({closed.outcome}) is whole so far")
@@ -163,6 +176,7 @@ class LiveMotion:
         while not self._view.motion_ended and time.monotonic() < deadline:
             if self._view.failure() is not None:
                 return False
+            self._link.heart.turn()
             self._view.look()
             time.sleep(POLL)
         return self._view.motion_ended

@@ -51,7 +51,7 @@ class LiveRecording:
     def run(self, spec: ArchiveSpec, duration: float | None, wait: float | None) -> Recorded:
         """Wait for the controller, record, and answer until the arm rests."""
         self._await_controller(wait)
-        self._link.connection.require_usable()
+        self._link.connection.require_usable(self._link.cell)
         inits = self._view.inits
         self._link.open_archive(spec, from_now=False, until_ended=False)
         self._reader = self._link.reader()

@@ -114,16 +114,25 @@ class Connection:
         elif isinstance(event, Refused):
             self.refused = event
 
-    def require_usable(self) -> None:
-        """Raise ControllerFault where the arm cannot be moved."""
+    def require_usable(self, cell: Cell | None) -> None:
+        """Refuse a controller that is not the cell's.
+
+        Args:
+            cell: whose controller it should be, where that is known.
+
+        Raises:
+            ControllerFault: the arm cannot be moved.
+        """
         if self.unusable is None:
             return
         remedy = ""
         if self.differences and not self.adopted:
-            remedy = (
-                "; correct the cell file; only `hil record` and `hil move` can use the "
-                "controller's figures instead (--accept-init)"
-            )
+            remedy = "; correct the cell file, or the controller"
+            if cell is not None and self.init is not None and _may_accept(cell, self.init):
+                remedy += (
+                    "; only `hil record` and `hil move` can use the controller's figures instead "
+                    "(--accept-init)"
+                )
         raise ControllerFault(f"the controller cannot be used: {self.unusable}{remedy}")
 
 
@@ -241,6 +250,13 @@ def drives_in_force(cell: Cell, connection: Connection) -> DriveTrain:
         return drives
     others = frozenset(table.other_axes)
     return compare(drives, cell.period, init, table.arm, True, others).drive_train
+
+
+def _may_accept(cell: Cell, init: InitPacket) -> bool:
+    """Whether the controller's figures can be accepted: not another cycle, nor a closed axis."""
+    table = cell.controller
+    others = frozenset(table.other_axes)
+    return compare(cell.drive_train, cell.period, init, table.arm, True, others).adopted
 
 
 def _in_force(text: bytes, drives: DriveTrain) -> bytes:

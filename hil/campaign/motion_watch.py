@@ -96,8 +96,9 @@ class MotionProgress:
 class MotionWatch(Protocol):
     """Whoever looks at a motion and may slow, hold and release it.
 
-    Both are called from the thread that runs the motion, and should return at once. On a real
-    link a slow watch delays nothing but itself.
+    Both are called from the loop that supervises the motion and must return at once: no stop and
+    no hold is passed on meanwhile. On a real link the arm is brought to rest on its path when one
+    of them takes longer than a second.
     """
 
     def show(self, progress: MotionProgress) -> None:

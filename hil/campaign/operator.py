@@ -95,7 +95,12 @@ class DryRunSummary:
 
 
 class Operator(Protocol):
-    """Who watches a run. A slow or dead one delays nothing but what is shown."""
+    """Who watches a run.
+
+    `show` and `wish` are called from the loop that supervises the motion and must return at once:
+    no stop and no hold is passed on meanwhile. On a real link the arm is brought to rest on its
+    path when one of them takes longer than a second. One that raises costs only what it shows.
+    """
 
     @property
     def can_answer(self) -> bool:

@@ -51,6 +51,23 @@ _OUTLYING: Final = 6.0
 
 
 @dataclass(frozen=True)
+class Groups:
+    """Repetitions of two kinds: each agrees with its own and with none of the others.
+
+    Attributes:
+        counted: file names of those that count.
+        later: of attempts that were rejected for being unlike them.
+    """
+
+    counted: tuple[str, ...]
+    later: tuple[str, ...]
+
+    def with_one(self, name: str) -> Groups:
+        """One more later attempt."""
+        return Groups(self.counted, (*self.later, name))
+
+
+@dataclass(frozen=True)
 class Problem:
     """Why a motion is of no use.
 
@@ -58,11 +75,13 @@ class Problem:
         sentence: in words.
         by_hand: whether somebody held or slowed it: that says nothing against the arm.
         apart: whether it is only unlike the repetitions before it.
+        against: where so many attempts agree with it that the arm itself may be another by now.
     """
 
     sentence: str
     by_hand: bool = False
     apart: bool = False
+    against: Groups | None = None
 
     def __str__(self) -> str:
         return self.sentence

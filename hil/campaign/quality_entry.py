@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
+
 from hil.archive import ArchiveName, open_archive
 from hil.archive.amend import REJECTED, amend_outcome
 from hil.cell import Cell
@@ -12,7 +16,18 @@ from .execution_result import Rejected
 from .folder import CampaignFolder
 from .intervals import Interval
 from .plan import CampaignPlan
-from .quality import FIELDS, Played, Problem, RepetitionCheck, problem_of, torn_or_slowed
+from .quality import (
+    FIELDS,
+    Groups,
+    Played,
+    Problem,
+    RepetitionCheck,
+    problem_of,
+    torn_or_slowed,
+)
+
+_FEWEST_ALIKE: Final = 2
+"""Attempts that must agree before they speak against what counts."""
 
 
 class Entering:
@@ -29,6 +44,7 @@ class Entering:
     Attributes:
         rejected: what was found to be of no use.
         adopted: what an earlier run completed and did not live to enter.
+        notes: what a reader must know of how repetitions were judged.
     """
 
     def __init__(self, folder: CampaignFolder, cell: Cell, plan: CampaignPlan) -> None:
@@ -37,11 +53,18 @@ class Entering:
         self._check.learn(folder.completed("excitation"))
         self.rejected: list[Rejected] = []
         self.adopted: list[str] = []
+        self.notes: list[str] = []
 
-    def enter(self, interval: Interval, name: str) -> Problem | None:
-        """Judge the whole archive of an interval and enter it; why it is of no use, or None."""
-        played, problem = None, None
-        if interval.kind in ("excitation", "validation", "warmup"):
+    def enter(self, interval: Interval, name: str, known: Problem | None = None) -> Problem | None:
+        """Judge the whole archive of an interval and enter it; why it is of no use, or None.
+
+        Args:
+            interval: what was run.
+            name: of the archive.
+            known: what is wrong with it, where that is known already.
+        """
+        played, problem = None, known
+        if problem is None and interval.kind in ("excitation", "validation", "warmup"):
             played = self._played(name)
             if interval.kind == "excitation":
                 problem = self._judged(played)
@@ -53,6 +76,8 @@ class Entering:
             amend_outcome(self._folder.archives / name, REJECTED, problem.sentence)
             self._folder.add(name, REJECTED, problem.sentence)
             self.rejected.append(Rejected(name, problem.sentence))
+            if problem.against is not None:
+                return replace(problem, against=problem.against.with_one(name))
             return problem
         self._folder.add(name, "completed")
         if played is not None and interval.kind == "excitation":
@@ -60,42 +85,67 @@ class Entering:
         return None
 
     def _judged(self, played: Played) -> Problem | None:
-        """What is wrong with a repetition; where it is the first one that is, that is rejected."""
+        """What is wrong with a repetition.
+
+        One that is unlike those that count may be right all the same. Where enough later attempts
+        agree with each other and not with the only one that counts, that one is rejected: nothing
+        speaks for it. Where two or more that agree count, no vote tells a disturbed beginning from
+        an arm that was changed: a person has to look.
+        """
         problem = self._check.problem(played)
-        if problem is None or not problem.apart or self._check.known != 1:
+        if problem is None or not problem.apart:
             return problem
         good = self._folder.completed("excitation")
-        alike = next((one for one in self._unlike_the_first() if self._alike(one, played)), None)
-        if alike is None or len(good) != 1:
+        alike, beside = self._alike(played)
+        enough = max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions)
+        if len(alike) + 1 < max(enough, beside + 2):
             return problem
-        first = good[0]
-        reason = f"{alike} and the repetition after it agree with each other, and not with this one"
-        amend_outcome(first, REJECTED, reason)
-        self._folder.reject(first.name, reason)
-        self.rejected.append(Rejected(first.name, reason))
+        if len(good) > 1:
+            groups = Groups(tuple(path.name for path in good), alike)
+            return replace(problem, against=groups)
+        reason = f"{', '.join(alike)} and the next repetition agree with each other, not with this"
+        for path in good:
+            amend_outcome(path, REJECTED, reason)
+            self._folder.reject(path.name, reason)
+            self.rejected.append(Rejected(path.name, reason))
+            self.notes.append(
+                f"{path.name} was the only repetition that counted, and was rejected because "
+                f"{len(alike) + 1} later ones agree with each other and not with it: it was "
+                "disturbed, or the arm was changed after it"
+            )
         self._check = RepetitionCheck(self._cell, self._motion)
         return None
 
-    def _unlike_the_first(self) -> list[str]:
-        """Repetitions that were rejected, and that nothing is wrong with by themselves."""
-        return [
-            entry.name
-            for entry in self._folder.manifest()
-            if (name := ArchiveName.parse(entry.name)) is not None
-            and (name.kind, entry.outcome) == ("excitation", REJECTED)
-        ]
+    def _alike(self, played: Played) -> tuple[tuple[str, ...], int]:
+        """Attempts that agree with this one and each other, and how many do with the good ones.
 
-    def _alike(self, name: str, played: Played) -> bool:
-        """Whether a repetition agrees with a rejected one, which is good by itself."""
-        try:
-            other = self._played(name)
-        except ArchiveError:
-            return False
-        if problem_of(other, self._motion, self._cell) is not None:
-            return False
-        check = RepetitionCheck(self._cell, self._motion)
-        check.accept(other)
-        return check.problem(played) is None
+        Of those that were rejected since one was good: what was unlike an earlier one that counted
+        says nothing against those that count now.
+        """
+        check, alike, beside = RepetitionCheck(self._cell, self._motion), list[str](), 0
+        check.accept(played)
+        for name, other in self._sound_but_rejected().items():
+            beside += self._check.problem(other) is None
+            if check.problem(other) is None:
+                check.accept(other)
+                alike.append(name)
+        return tuple(alike), beside
+
+    def _sound_but_rejected(self) -> dict[str, Played]:
+        """Repetitions rejected since the last good one, and sound by themselves, in order."""
+        found: dict[str, Played] = {}
+        for entry in self._folder.manifest():
+            name = ArchiveName.parse(entry.name)
+            if name is None or name.kind != "excitation":
+                continue
+            if entry.outcome != REJECTED:
+                found.clear()
+                continue
+            with suppress(ArchiveError):
+                played = self._played(entry.name)
+                if problem_of(played, self._motion, self._cell) is None:
+                    found[entry.name] = played
+        return found
 
     def _played(self, name: str) -> Played:
         return Played.of(open_archive(self._folder.archives / name, fields=FIELDS))

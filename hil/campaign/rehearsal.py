@@ -61,6 +61,8 @@ class Rehearsal(Frozen):
     repetitions: int
     motion_seconds: float
     software: dict[str, str]
+    failed_seeds: tuple[int, ...] = ()
+    """With which exactly this plan failed before."""
 
     @model_validator(mode="after")
     def _judged_by_its_criteria(self) -> Self:
@@ -102,13 +104,29 @@ class Rehearsal(Frozen):
         """What did not pass, in sentences."""
         return tuple(one.sentence for one in self.criteria if not one.passed)
 
+    def after(self, before: Rehearsal | None) -> Rehearsal:
+        """This one, with what the same plan failed with before: another seed does not undo it."""
+        if before is None or before.plan_hash != self.plan_hash:
+            return self
+        failed = {*before.failed_seeds} | (set() if before.passed else {before.seed})
+        return self.model_copy(update={"failed_seeds": tuple(sorted(failed - {self.seed}))})
+
+    @property
+    def doubt(self) -> str | None:
+        """What a reader of one that passed must know, in a sentence; None for nothing."""
+        if not self.passed or not self.failed_seeds:
+            return None
+        seeds = ", ".join(map(str, self.failed_seeds))
+        return f"the rehearsal passed with seed {self.seed}, but failed with seed {seeds}"
+
     @property
     def line(self) -> str:
         """How it went, in one sentence."""
         if self.passed:
+            but = "" if self.doubt is None else f"; {self.doubt}"
             return (
                 f"the rehearsal passed all {len(self.criteria)} criteria; what it cannot see is "
-                "in rehearsal.json (not_seen)"
+                f"in rehearsal.json (not_seen){but}"
             )
         return f"the rehearsal failed: {'; '.join(self.failures)}"
 

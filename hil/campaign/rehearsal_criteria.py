@@ -170,7 +170,7 @@ def _predicting(joints: Sequence[str], ratio: Array) -> Criterion:
     value = float(ratio[worst])
     passed = bool(np.isfinite(ratio).all()) and value <= MOST_ERROR
     found = (
-        f"on unseen motion the torque error is {value:.3g} times what noise leaves "
+        f"on unseen motion the torque error is {value:.2f} times what noise leaves "
         f"({joints[worst]}), at most {MOST_ERROR:g} is wanted"
     )
     remedy = ": the excitation teaches too little; search a better one (`hil design`)"

@@ -90,6 +90,7 @@ def rehearse(
             raise CampaignFolderError(
                 folder.root, "a mesh was changed while it was rehearsed", "rehearse again"
             )
+        found = found.after(before)
         found.save(folder.rehearsal)
         return found
 
@@ -180,7 +181,7 @@ def _run(
 
 def _told(error: Exception) -> str:
     if isinstance(error, MotionFailedError):
-        return f"{error.motion} ended {error.outcome}: {error.reason}"
+        return error.sentence
     return str(error).rstrip(".")
 
 

@@ -45,6 +45,10 @@ LOOP_CYCLES: Final = 0.5
 """A target current acts over the cycle before the packet: half a cycle earlier on average."""
 RESONANCE: Final = 500.0
 """rad/s of a main axis, rotor against link, where the cell says nothing of elasticity."""
+FASTEST: Final = 800.0
+"""rad/s that no resonance exceeds in any posture: the simulated arm is stepped in half cycles."""
+POSTURES: Final = 60
+"""That are looked at for it."""
 MAIN_AXES: Final = 3
 SLOWEST_LOOP: Final = 0.002
 """s; a slower current loop would shake the simulated arm."""
@@ -225,13 +229,39 @@ def _simulation(
 def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
     """Effects at their default sizes, with springs that suit the size of the arm."""
     n = len(cell.joint_names)
-    model = pinocchio.buildModelFromXML(cell.urdf)
-    links = pinocchio.crba(model, model.createData(), cell.home).diagonal()
+    links = _inertia(cell, cell.home).diagonal()
     reduced = rotors * links / np.maximum(rotors + links, np.finfo(np.float64).tiny)
     main = (np.arange(n) < MAIN_AXES) & (reduced > 0.0)
     compliance = np.zeros(n)
     compliance[main] = 1.0 / (reduced[main] * RESONANCE**2)
+    if main.any():
+        compliance *= max(1.0, _fastest(cell, rotors, compliance) / FASTEST) ** 2
     return replace(UnmodelledEffects.default_sizes(n), elasticity=tuple(compliance.tolist()))
+
+
+def _inertia(cell: Cell, posture: Array) -> Array:
+    """Inertia matrix of the links (n, n) [kg m²]."""
+    model = pinocchio.buildModelFromXML(cell.urdf)
+    upper = np.triu(pinocchio.crba(model, model.createData(), posture))
+    return np.asarray(upper + np.triu(upper, 1).T)
+
+
+def _fastest(cell: Cell, rotors: Array, compliance: Array) -> float:
+    """Fastest resonance of springs (n,) in any of some postures within the limits [rad/s].
+
+    Where axes are almost parallel, as the first and the third of an arm with seven, the link beyond
+    a spring is much lighter than its own inertia says: the next axis gives way.
+    """
+    limits, soft = cell.joint_limits, compliance > 0.0
+    shares = np.random.default_rng(0).random((POSTURES, len(rotors)))
+    postures = [cell.home, *(limits.lower + shares * (limits.upper - limits.lower))]
+    root = 1.0 / np.sqrt(compliance[soft])
+    found = 0.0
+    for posture in postures:
+        inertia = _inertia(cell, posture) + np.diag(np.where(soft, 0.0, rotors))
+        mobility = np.linalg.inv(inertia)[np.ix_(soft, soft)] + np.diag(1.0 / rotors[soft])
+        found = max(found, float(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1]))
+    return float(np.sqrt(found))
 
 
 def _servo(cell: Cell) -> ServoSettings:

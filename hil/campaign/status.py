@@ -5,8 +5,10 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
+from hil.archive import ArchiveName
+from hil.counted import counted
 from hil.errors import HilError
 from hil.results import Results
 
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
 
 State = Literal["done", "next", "blocked"]
 
+_WANTED: Final = ("standstill", "excitation", "validation", "dryrun")
+"""Kinds of motion that a campaign cannot do without."""
+
 
 @dataclass(frozen=True)
 class Step:
@@ -31,7 +36,8 @@ class Step:
             or "report".
         state: whether it is done, is to be done next, or waits for one before it.
         sentence: what is known of it.
-        command: what to type for it; "" for what is done.
+        command: what to type for it; "" for what is done, and where no command helps (the
+            sentence then says what does).
     """
 
     name: str
@@ -63,7 +69,7 @@ class CampaignStatus:
 
     @property
     def next_command(self) -> str:
-        """What to type next; "" where nothing is left to do."""
+        """What to type next; "" where nothing is left to do, or where no command helps."""
         return next((step.command for step in self.steps if step.state == "next"), "")
 
     def to_dict(self) -> dict[str, Any]:
@@ -80,6 +86,9 @@ class _Found:
     command: str
 
 
+_LEFT_OUT = _Found(True, "left out, as a simulated arm allows", "")
+
+
 def status_of(campaign: Campaign) -> CampaignStatus:
     """Look at what lies in a campaign's folder; nothing is changed.
 
@@ -87,20 +96,23 @@ def status_of(campaign: Campaign) -> CampaignStatus:
         CampaignFolderError: its manifest cannot be read.
     """
     folder = campaign.folder
-    looks: list[tuple[str, Callable[[], _Found]]] = [
-        ("design", lambda: _design(campaign)),
-        ("rehearse", lambda: _rehearsal(folder)),
-        ("dry run", lambda: _dry_run(campaign)),
-        ("warm-up", lambda: _warm_up(campaign)),
-        ("repetitions", lambda: _motions(campaign, "excitation", "repetitions")),
-        ("validation", lambda: _motions(campaign, "validation", "validation motions")),
-        ("identify", lambda: _identified(folder)),
-        ("report", lambda: _reported(folder)),
+    at = _quoted(folder)
+    # With what makes the file of a step anew, should it be damaged: nothing makes up for the cell
+    # or the plan of recordings, nor for what a person saw.
+    looks: list[tuple[str, Callable[[], _Found], str]] = [
+        ("design", lambda: _design(campaign), ""),
+        ("rehearse", lambda: _rehearsal(campaign), f"hil rehearse {at} --again"),
+        ("dry run", lambda: _dry_run(campaign), ""),
+        ("warm-up", lambda: _warm_up(campaign), ""),
+        ("repetitions", lambda: _motions(campaign, "excitation", "repetitions"), ""),
+        ("validation", lambda: _motions(campaign, "validation", "validation motions"), ""),
+        ("identify", lambda: _identified(folder), f"hil identify {at}"),
+        ("report", lambda: _reported(folder), f"hil report {at}"),
     ]
     steps: list[Step] = []
     waits_for = ""
-    for name, look in looks:
-        found = _looked(look, folder)
+    for name, look, mend in looks:
+        found = _looked(look, mend)
         if found.done:
             steps.append(Step(name, "done", found.sentence))
         elif not waits_for:
@@ -112,27 +124,30 @@ def status_of(campaign: Campaign) -> CampaignStatus:
     return CampaignStatus(str(folder.root), folder.plan_hash, tuple(steps), _notes(folder))
 
 
-def _looked(look: Callable[[], _Found], folder: CampaignFolder) -> _Found:
+def _looked(look: Callable[[], _Found], mend: str) -> _Found:
     try:
         return look()
     except HilError as error:  # a file of one step says nothing of the others
-        return _Found(False, str(error), f"hil status {_quoted(folder)}")
+        return _Found(False, str(error).rstrip("."), mend)
 
 
 def _design(campaign: Campaign) -> _Found:
     excitation, folder = campaign.plan.excitation, campaign.folder
     sentence = (
         f"an excitation of {excitation.trajectory.duration:.1f} s and "
-        f"{len(campaign.plan.validation)} validation motions"
+        f"{counted(len(campaign.plan.validation), 'validation motion')}"
     )
     if folder.manifest():  # until something is recorded, a rehearsal takes changes in
         folder.require_unchanged()
     return _Found(True, sentence, "")
 
 
-def _rehearsal(folder: CampaignFolder) -> _Found:
+def _rehearsal(campaign: Campaign) -> _Found:
+    folder = campaign.folder
     command = f"hil rehearse {_quoted(folder)}"
     found = Rehearsal.load(folder)
+    if found is None and _left_out(campaign):
+        return _LEFT_OUT
     if found is None:
         return _Found(False, "not rehearsed on the simulated arm yet", command)
     if found.plan_hash != folder.plan_hash:
@@ -140,7 +155,8 @@ def _rehearsal(folder: CampaignFolder) -> _Found:
         return _Found(False, sentence, command)
     if not found.passed:
         return _Found(False, found.line, command)
-    return _Found(True, f"passed all {len(found.criteria)} criteria", "")
+    but = "" if found.doubt is None else f"; {found.doubt}"
+    return _Found(True, f"passed all {len(found.criteria)} criteria{but}", "")
 
 
 def _dry_run(campaign: Campaign) -> _Found:
@@ -156,8 +172,8 @@ def _dry_run(campaign: Campaign) -> _Found:
         if folder.dry_run.exists():
             was = "of another plan, of another kind of arm, or its archives are gone"
             return _Found(False, f"the one on record does not count: it is {was}", command)
-        if simulated and folder.completed("excitation"):
-            return _Found(True, "left out, as a simulated arm allows", "")
+        if _left_out(campaign):
+            return _LEFT_OUT
         return _Found(False, "not done: every motion at a fifth of its speed", command)
     if found.accepted is None:
         accept = f"hil run {_quoted(folder)} --accept-dry-run"
@@ -166,6 +182,12 @@ def _dry_run(campaign: Campaign) -> _Found:
         words = f"done ({found.duration:.0f} s), but not accepted{but}"
         return _Found(False, words, accept + names)
     return _Found(True, f"accepted by {found.accepted.by}, {found.accepted.at}", "")
+
+
+def _left_out(campaign: Campaign) -> bool:
+    """Whether a simulated arm has done all at full speed, so that no gate is left to pass."""
+    kinds = ("excitation", "validation")
+    return campaign.cell.only_simulated and all(_motions(campaign, k, k).done for k in kinds)
 
 
 def _warm_up(campaign: Campaign) -> _Found:
@@ -178,7 +200,7 @@ def _warm_up(campaign: Campaign) -> _Found:
             return _Found(True, "left out", "")
         return _Found(False, "not done", f"hil run {_quoted(folder)}")
     done = found.outcome != "going on"
-    words = f"{found.outcome} after {len(found.motions)} motions"
+    words = f"{found.outcome} after {counted(len(found.motions), 'motion')}"
     return _Found(done, words, f"hil run {_quoted(folder)}")
 
 
@@ -224,13 +246,22 @@ def _notes(folder: CampaignFolder) -> tuple[str, ...]:
     entries = folder.manifest()
     known = {entry.name for entry in entries}
     there = sorted(path.name for path in folder.archives.glob("*.mcap"))
-    torn = [
-        f"{name} is torn or was never entered; its motion is run again"
-        for name in there
-        if name not in known
-    ]
+    torn = [_left_behind(folder, name) for name in there if name not in known]
     busy = ("a run or a rehearsal is at work on it now",) if folder.busy else ()
     return (*busy, *folder.damaged(), *torn, *filter(None, map(_of_no_use, entries)))
+
+
+def _left_behind(folder: CampaignFolder, name: str) -> str:
+    """What becomes of an archive that its run had no time to enter."""
+    left = f"{name} was left by a run that was killed"
+    parsed = ArchiveName.parse(name)
+    if (
+        parsed is None
+        or parsed.kind not in _WANTED
+        or folder.whole(parsed.kind, parsed.index) is not None
+    ):
+        return f"{left}; nothing is missing without it"
+    return f"{left}: taken over if it is whole, its motion run again if not"
 
 
 def _of_no_use(entry: Entry) -> str:

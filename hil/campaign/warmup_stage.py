@@ -13,6 +13,7 @@ from .execution_watch import RunWatch
 from .folder import CampaignFolder
 from .intervals import Interval
 from .plan import CampaignPlan
+from .quality import Problem
 from .quality_entry import Entering
 from .repeating import play_until_good
 from .warmup import FrictionMeter, WarmUp, drift_wanted
@@ -29,6 +30,10 @@ class WarmUpStage:
         reporter: told of what is decided.
         watch: shows the curve.
         simulated: whether nothing but a simulated arm can move.
+
+    Attributes:
+        pauses: after which this run warmed up anew, in sentences.
+        threshold: change per motion that counts as warm; 0 where no warm-up is wanted.
     """
 
     def __init__(
@@ -45,6 +50,7 @@ class WarmUpStage:
         self._folder, self._cell, self._plan = folder, cell, plan
         self._plan_hash, self._reporter, self._watch = plan_hash, reporter, watch
         self._meter: FrictionMeter | None = None
+        self.pauses: list[str] = []
         self.threshold = drift_wanted(cell, only_simulated=simulated)
 
     @property
@@ -94,6 +100,26 @@ class WarmUpStage:
             self._watch.note(_told(state))
         self._reporter.say(_told(state))
 
+    def keep(self, runner: Runner, entering: Entering) -> None:
+        """Warm up anew where the joints have cooled down since they moved last.
+
+        Raises:
+            RepetitionsRejectedError: as `run`.
+        """
+        found = self._found()
+        if self.threshold and found is not None and found.motions and found.cold(time.time()):
+            self.run(runner, entering)
+
+    def lost(self, began: float) -> Problem | None:
+        """What is wrong with a repetition that began then [s since 1970]; None if it was warm.
+
+        A hold before it may last as long as a person likes.
+        """
+        found = self._found()
+        if not self.threshold or found is None or not found.motions or not found.cold(began):
+            return None
+        return Problem(f"{_rested(found, began)} when it began and was taken to be cold", True)
+
     def moved(self) -> None:
         """A motion has ended that keeps the joints warm."""
         found = self._found()
@@ -132,13 +158,20 @@ class WarmUpStage:
             state = replace(self._with(state, name), moved_at=max(state.moved_at or 0.0, written))
             state.save(self._folder.warmup)
         if state.motions and state.cold(time.time()):
-            pause = time.time() - (state.moved_at or 0.0)
-            rested = f"rested for {pause / 60.0:.0f} min" if state.moved_at else "rested"
-            if pause < 0.0:
-                rested = "moved last at a time that is still to come (a clock was put back)"
-            self._reporter.say(f"the arm has {rested} and is taken to be cold: warming up anew")
+            rested = _rested(state, time.time())
+            self._reporter.say(f"{rested} and is taken to be cold: warming up anew")
+            self.pauses.append(f"{rested} during the campaign, and was warmed up anew")
             state = state.cooled()
         return state
+
+
+def _rested(state: WarmUp, now: float) -> str:
+    """How long the arm has rested, as the beginning of a sentence."""
+    if state.moved_at is None:
+        return "the arm had rested"
+    if now < state.moved_at:
+        return "the arm moved last at a time that is still to come (a clock was put back)"
+    return f"the arm had rested for {(now - state.moved_at) / 60.0:.0f} min"
 
 
 def _told(state: WarmUp) -> str:

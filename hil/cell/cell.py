@@ -64,7 +64,7 @@ class CellFile(BaseModel):
     simulation: SimulationTable | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cell:
     """One cell: its file's text, its URDF's text, and what both describe.
 
@@ -113,6 +113,9 @@ class Cell:
         check_lengths(cell)
         check_built(cell)
         return cell
+
+    def __repr__(self) -> str:
+        return f"Cell({str(self.path)!r}, {self.name!r})"
 
     @property
     def name(self) -> str:

@@ -2,7 +2,8 @@
 
 Exit status: 0 done, 1 internal error or a result that cannot be written, 2 bad input, 3 refused as
 unsafe, 4 controller fault, 5 done, but not good (a model, a PC that is not fit for the cycle,
-archives of a batch that could not be used), 130 stopped by the operator.
+archives of a batch that could not be used), 130 stopped by the operator. With `--json` stdout is
+one JSON object, also where the command fails (`hil.cli.failing`).
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from hil.errors import HilError
+from hil.errors import HilError, OperatorStopError
 from identification import IdentificationError
 from planner import PlannerError
 
+from .failing import asks_for_json, exit_code_of, told_as_json
 from .lazy import LazyCommands
 
 COMMANDS = LazyCommands(
@@ -47,12 +49,27 @@ COMMANDS = LazyCommands(
     **{"import": "imports"},
 )
 
+_JSON = "hil.cli.json"
+
 
 class Group(TyperGroup):
     """The commands of `COMMANDS`."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**{**settings, "commands": COMMANDS})
+
+    def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
+        """The context of one call, which knows whether JSON is asked for."""
+        asked = asks_for_json(args)
+        with told_as_json(asked):
+            context = super().make_context(info_name, args, *more, **extra)
+        context.meta[_JSON] = asked
+        return context
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; where it fails, say so in the form that was asked for."""
+        with told_as_json(ctx.meta.get(_JSON, False)):
+            return super().invoke(ctx)
 
 
 app = typer.Typer(
@@ -74,18 +91,19 @@ def main() -> None:
     """Run the command line; known errors become one sentence and an exit status."""
     try:
         app(standalone_mode=True)
-    except HilError as error:
-        _fail(str(error), error.exit_code)
-    except (IdentificationError, PlannerError) as error:
-        _fail(str(error), 2)
+    except (HilError, IdentificationError, PlannerError) as error:
+        _fail(str(error), exit_code_of(error), stopped=isinstance(error, OperatorStopError))
     except KeyboardInterrupt:
-        _fail("interrupted", 130)
+        _fail("interrupted", 130, stopped=True)
 
 
-def _fail(text: str, status: int) -> None:
+def _fail(text: str, status: int, *, stopped: bool = False) -> None:
+    """End with one sentence; what a person stopped is no error."""
+    word = "[bold yellow]stopped:[/]" if stopped else "[bold red]error:[/]"
+    console = Console(stderr=True)
     try:
-        Console(stderr=True).print(
-            f"[bold red]error:[/] {_escaped(text)}", highlight=False, soft_wrap=True
+        console.print(
+            f"{word} {_escaped(text)}", highlight=False, soft_wrap=not console.is_terminal
         )
     except OSError:  # the terminal is gone; the status still counts
         nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -11,8 +11,8 @@ import typer
 
 from hil.archive.check import ASPECTS, Check, check_archive
 from hil.archive.overview import Overview, overview
+from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
-from hil.archive.repair import repaired_name
 from hil.errors import ArchiveError, InputError
 
 app = typer.Typer(help="Look into archives, check and repair them.", no_args_is_help=True)
@@ -71,6 +71,9 @@ def repair(
     in_place: Annotated[
         bool, typer.Option("--in-place", help="Replace the archive, once the repair has succeeded.")
     ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print what was saved and lost as JSON.")
+    ] = False,
 ) -> None:
     """Rewrite a torn or damaged archive so that every reader accepts it.
 
@@ -81,8 +84,11 @@ def repair(
     try:
         done = repair_archive(file, output, in_place=in_place)
     except ArchiveError as error:
-        typer.echo(_shown([f"error: {error}"]), err=True)
+        _say_error(file, error, as_json=as_json)
         raise typer.Exit(FAILED) from error
+    if as_json:
+        typer.echo(json.dumps(_repair_dict(done)))
+        raise typer.Exit(LOST if done.losses else 0)
     for loss in done.losses:
         typer.echo(_shown([f"lost: {loss}"]), err=True)
     if done.output is None:
@@ -90,6 +96,17 @@ def repair(
     else:
         typer.echo(f"wrote {done.output}: {_saved(done.samples, done.samples_lost)}")
     raise typer.Exit(LOST if done.losses else 0)
+
+
+def _repair_dict(done: Repair) -> dict[str, object]:
+    return {
+        "file": str(done.path),
+        "output": None if done.output is None else str(done.output),
+        "whole": done.whole,
+        "losses": list(done.losses),
+        "samples": done.samples,
+        "samples_lost": done.samples_lost,
+    }
 
 
 def _saved(samples: int, lost: int | None) -> str:

@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from hil.cell import Cell
 from hil.cli.verdict import NOT_GOOD
-from hil.doctor.link import link_of
+from hil.doctor.link import controller_in, link_of
 from hil.doctor.report import as_json, show
 from hil.doctor.run import examine
 from hil.progress import reporter
@@ -41,15 +40,16 @@ def doctor(
     Looks at permissions, processor, kernel, network card, route, port or CAN bus, and disk; then
     measures wake-up and turnaround latency in processes with the real-time settings of the
     exchange. Sends nothing to the controller, changes nothing, needs no root; run it as the user
-    who will run hil. Every remedy is a command to type. Without CELL the cycle is 1 ms.
+    who will run hil. Every remedy is a command to type. Without CELL the cycle is 1 ms; of
+    a CELL only [controller] has to be filled in.
 
     Exit status: 0 fit for the cell's cycle; 5 not fit, or the link cannot work, or measured for
     less than 60 s, so that the verdict is provisional; 2 bad input.
     """
-    loaded = None if cell is None else Cell.load(cell)
+    controller = None if cell is None else controller_in(cell)
     diagnosis = examine(
-        link=None if loaded is None else link_of(loaded),
-        cycle_ms=1 if loaded is None else loaded.controller.cycle_ms,
+        link=None if controller is None else link_of(controller),
+        cycle_ms=1 if controller is None else controller.cycle_ms,
         seconds=QUICK_SECONDS if quick else duration,
         place=output,
         reporter=reporter(quiet=json),

@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from hil.cli.verdict import NOT_GOOD
@@ -19,8 +18,6 @@ from identification.payload import Payload
 
 LONGEST_DELAY = 0.5
 """s; what is longer is a slip of the unit."""
-
-_ROUNDING = 1e-9
 
 
 def gains(
@@ -119,15 +116,15 @@ def _payload(
         )
     x, y, z = _numbers(centre, 3, "--centre")
     xx, xy, xz, yy, yz, zz = _numbers(inertia, 6, "--inertia")
-    least, middle, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if least < -_ROUNDING * most or most > (1.0 + _ROUNDING) * (least + middle):
+    payload = Payload(mass, (x, y, z), (xx, xy, xz, yy, yz, zz), frame)
+    if not payload.possible:
         raise InputError(
             None,
             "no body has this tensor",
             field="--inertia",
             remedy="principal moments are not negative, and none exceeds the sum of the others",
         )
-    return Payload(mass, (x, y, z), (xx, xy, xz, yy, yz, zz), frame)
+    return payload
 
 
 def _numbers(text: str, count: int, field: str) -> list[float]:

@@ -127,6 +127,12 @@ def identify(
         output = output or (archives[0] / "paper" if paper else archives[0])
         make_folder(output)
         loose = sorted(archives[0].glob("*.mcap"))
+        if not loose and not (archives[0] / "manifest.json").exists():
+            raise InputError(
+                archives[0],
+                "holds neither a campaign nor archives",
+                remedy="name the folder of a campaign (`hil design -o`), or archives (*.mcap)",
+            )
         if loose and not (archives[0] / "manifest.json").exists():
             # A folder of `hil record`.
             found = identify_archives(loose, reporter, options, predict=unseen)

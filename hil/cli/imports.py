@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json as json_format
 import math
 from pathlib import Path
 from typing import Annotated, Literal
@@ -60,6 +61,7 @@ Kind = Annotated[
         "(the noise of the positions)."
     ),
 ]
+Json = Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")]
 
 
 @app.command("rosbag2")
@@ -82,6 +84,7 @@ def rosbag2(
     locked: Locked = None,
     held: Held = None,
     kind: Kind = "excitation",
+    json: Json = False,
 ) -> None:
     """Import sensor_msgs/JointState from a rosbag2, or from any MCAP file; joints go by name.
 
@@ -106,7 +109,7 @@ def rosbag2(
         held_joints=held or (),
         use=_use(kind),
     )
-    _tell(path)
+    _tell(path, json=json)
 
 
 def log(
@@ -135,6 +138,7 @@ def log(
             "what they explain; angles and torques stay those of the map.",
         ),
     ] = False,
+    json: Json = False,
 ) -> None:
     """Import a log of numbers: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
 
@@ -149,7 +153,7 @@ def log(
         use=_use(kind),
         coupled=not uncoupled,
     )
-    _tell(path)
+    _tell(path, json=json)
 
 
 app.command("log")(log)
@@ -159,9 +163,13 @@ for _name in ("csv", "npz"):
     app.command(_name, hidden=True)(log)
 
 
-def _tell(path: Path) -> None:
+def _tell(path: Path, *, json: bool) -> None:
     """What was read, as the archive keeps it."""
     found = Findings.of(open_archive(path).metadata)
+    if json:
+        told = {"archive": str(path), "found": found.lines, "doubts": found.doubts}
+        typer.echo(json_format.dumps(told, ensure_ascii=False))
+        return
     for line in found.lines:
         typer.echo(line)
     for doubt in found.doubts:

@@ -15,6 +15,7 @@ import typer
 
 from drivers.events import MotionEnded
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
+from hil.campaign.announced_limits import checks_in_force, narrower_thresholds
 from hil.campaign.motion_watch import MotionProgress, Wish
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
@@ -121,7 +122,13 @@ def move(
             link.close()
             _tell("the arm is there already; nothing was sent", {"outcome": "there"}, json=json)
             return
-        way = straight_way(cell, here, target, speed=None if speed is None else speed / 100.0)
+        way = straight_way(
+            cell,
+            here,
+            target,
+            speed=None if speed is None else speed / 100.0,
+            checks=checks_in_force(cell, link.connection),
+        )
         if not json:
             typer.echo(_described(way, cell, link))
         _confirm(cell, link, yes=yes, json=json)
@@ -258,6 +265,8 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
         f"{way.duration:.2f} s at {100.0 * way.speed:.3g} % of the joints' speeds, {frame.whose}; "
         f"limits, motor currents, floor, walls and the arm itself are kept; to {who}"
     )
+    below = narrower_thresholds(cell, link.connection)
+    lines += [f"the smaller following-error threshold counts, {told}" for told in below]
     return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
 
 

@@ -16,12 +16,12 @@ from hil.cli.plan_input import (
     isolated,
     moves_through,
     planned_again,
-    random_via_points,
     read_via_points,
 )
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import check_format, draw_plan, save
+from hil.random_motion import random_via_points
 from planner.motion_csv import to_csv
 from planner.moves import Fly, FlyDistance, FlyPercent, MotionPlan, plan_moves
 from planner.plan_file import PlanFile

@@ -1,4 +1,4 @@
-"""What `hil plan` is asked to plan: a plan file, a table of via points, or random ones."""
+"""What `hil plan` is asked to plan: a plan file, or a table of via points."""
 
 from __future__ import annotations
 
@@ -30,8 +30,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 PLAN_FILES = (".toml", ".json")
-_STEP = 0.1
-"""deg; random via points are as round as those a person teaches."""
 
 
 def read_plan_file(path: Path) -> PlanFile:
@@ -137,17 +135,6 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
             path, f"{len(points)} via points", remedy="a motion needs a start and a target"
         )
     return frame.urdf(np.array(points))
-
-
-def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> Array:
-    """Return the home posture, or the middle of the limits, and random points (1 + m, n) [rad]."""
-    limits = cell.joint_limits
-    ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
-    shares = np.random.default_rng(seed).random((count, limits.n_joints))
-    shown = ends[0] + shares * (ends[1] - ends[0])
-    shown = np.clip(np.round(shown / _STEP) * _STEP, *ends)
-    home = cell.home if cell.file.campaign is not None else (limits.lower + limits.upper) / 2.0
-    return np.vstack((home, frame.urdf(shown)))
 
 
 def moves_through(

@@ -10,10 +10,12 @@ import typer
 
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically
-from hil.plots import check_format, save
+from hil.plots import save
 from hil.plots.archive_page import archive_page
+from hil.plots.archive_panels import BINS as PAGE_BINS
 from hil.plots.archive_picture import draw_archive
-from hil.plots.archive_view import view_of
+from hil.plots.archive_view import BINS, view_of
+from hil.plots.plan_picture import FORMATS
 
 PAGE = ".html"
 
@@ -49,14 +51,23 @@ def plot(
 
     Works on archives of hil and on imported ones, as far as they have these. Of a long archive the
     lowest and highest sample of each short stretch are drawn, so that no peak is lost; --start and
-    --stop show a part of it as closely as you like. Seconds count from the first sample.
+    --stop show a part of it as closely as you like, and a page (*.html) is zoomed into with the
+    mouse, two fingers or the keys + - 0. Seconds count from the first sample.
 
     **Example:** `hil plot runs/demo/archives/excitation_000_a1.mcap --joint 2 -o joint_2.html`
     """
+    if archive.is_dir():
+        raise InputError(
+            archive, "is a folder", remedy=f"name an archive, such as one of {archive}/archives"
+        )
     target = output or Path(archive.with_suffix(".png").name)
-    if target.suffix.lower() != PAGE:
-        check_format(target)
-    view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()))
+    if target.suffix.lower() not in (PAGE, *FORMATS):
+        known = ", ".join((*FORMATS, PAGE))
+        raise InputError(
+            target, f"{target.suffix!r} is no format for pictures", remedy=f"use {known}"
+        )
+    bins = PAGE_BINS if target.suffix.lower() == PAGE else BINS
+    view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()), bins=bins)
     make_folder(target.parent)
     if target.suffix.lower() == PAGE:
         try:

@@ -9,6 +9,7 @@ import typer
 
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.rehearsal import Rehearsal
+from hil.lines import say
 from hil.progress import reporter as make_reporter
 
 from .verdict import NOT_GOOD
@@ -53,8 +54,8 @@ def rehearse(
         typer.echo(found.model_dump_json())
     else:
         for line in [] if quiet else _lines(found):
-            typer.echo(line, err=True)
-        typer.echo(found.line)
+            say(line)
+        say(found.line)
     if not found.passed:
         raise typer.Exit(NOT_GOOD)
 

@@ -14,6 +14,7 @@ from hil.batch.table import relative_error
 from hil.batch.trend import ArmTrend, Trends
 from hil.batch.trend_words import findings, summary
 from hil.batch.types import Arm, BatchResult, Broken, LevelEstimate
+from hil.counted import counted
 
 _LISTED: Final = 20
 _WIDTH: Final = 42
@@ -135,18 +136,14 @@ def _times(reason: str, count: int) -> str:
 def last_line(result: BatchResult) -> str:
     """What was used, and what was not."""
     counts = (
-        _count(len(result.repetitions), "repetition"),
-        _count(len(result.campaigns), "campaign"),
-        _count(len(result.arms), "arm"),
+        counted(len(result.repetitions), "repetition"),
+        counted(len(result.campaigns), "campaign"),
+        counted(len(result.arms), "arm"),
     )
     return (
-        f"{counts[0]} in {counts[1]} of {counts[2]}; {_count(result.read, 'archive')} read,"
+        f"{counts[0]} in {counts[1]} of {counts[2]}; {counted(result.read, 'archive')} read,"
         f" {result.cached} known, {len(result.skipped)} left alone, {len(result.broken)} broken"
     )
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def as_dict(result: BatchResult, found: Trends, written: Sequence[Path]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json as json_format
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from hil.campaign import Campaign
 from hil.progress import reporter as make_reporter
+from hil.results import Results
 
 
 def report(
@@ -16,10 +18,20 @@ def report(
         Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
     ],
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print where it is and the verdict as JSON.")
+    ] = False,
 ) -> None:
     """Make the report of CAMPAIGN anew and print where it is.
 
     From the results that are there, without estimating anything; where archives have come since,
     or nothing was identified yet, as `hil identify` does it.
     """
-    typer.echo(Campaign.open(campaign).report(reporter=make_reporter(quiet=quiet)))
+    opened = Campaign.open(campaign)
+    page = opened.report(reporter=make_reporter(quiet=quiet or json))
+    if not json:
+        typer.echo(page)
+        return
+    verdict = Results.load(opened.folder.results).verdict
+    told = {"report": str(page), "good": verdict.good, "verdict": verdict.line}
+    typer.echo(json_format.dumps(told, ensure_ascii=False))

@@ -5,15 +5,18 @@ from __future__ import annotations
 import json as json_format
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from hil.archive import ArchiveName
 from hil.archive.live_view import LiveView
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.execution_result import RunResult
+from hil.cell_link import require_watchable
 from hil.cli.verdict import NOT_GOOD, as_json, finish
-from hil.errors import ControllerFault, HilError, InputError, OperatorStopError
+from hil.errors import ControllerFault, InputError, OperatorStopError
+from hil.lines import say
 from hil.progress import reporter as make_reporter
 from hil.screen import Screen
 
@@ -78,33 +81,28 @@ def run(
     when a gate refuses, 4 when the controller or the link failed, 5 when the model is not good or
     a motion was of no use again and again, 130 when it was stopped.
     """
-    try:
-        if dry_run and accept_dry_run:
-            raise InputError(
-                None,
-                "--dry-run and --accept-dry-run together",
-                remedy="run the one, look at the arm, then the other",
-            )
-        opened = Campaign.open(campaign)
-        if rehearse:
-            with stop_on_interrupt() as stop:
-                opened.rehearse(reporter=make_reporter(quiet=quiet or json), stop=stop)
-        result = _run(
-            opened,
-            quiet=quiet or json,
-            live=live,
-            dry_run_only=dry_run,
-            accept_dry_run=accept_dry_run,
-            accept_torque=accept_torque or (),
+    if dry_run and accept_dry_run:
+        raise InputError(
+            None,
+            "--dry-run and --accept-dry-run together",
+            remedy="run the one, look at the arm, then the other",
         )
-        if dry_run or no_identify:
-            _tell(result, json=json)
-            return
-        _identify(opened, result, quiet=quiet, json=json)
-    except HilError as error:
-        if json:
-            typer.echo(json_format.dumps(_failure(campaign, error), ensure_ascii=False))
-        raise
+    opened = Campaign.open(campaign)
+    if rehearse:
+        with stop_on_interrupt() as stop:
+            opened.rehearse(reporter=make_reporter(quiet=quiet or json), stop=stop)
+    result = _run(
+        opened,
+        quiet=quiet or json,
+        live=live,
+        dry_run_only=dry_run,
+        accept_dry_run=accept_dry_run,
+        accept_torque=accept_torque or (),
+    )
+    if dry_run or no_identify:
+        _tell(result, json=json)
+        return
+    _identify(opened, result, quiet=quiet, json=json)
 
 
 def _run(
@@ -117,10 +115,12 @@ def _run(
     accept_torque: Sequence[str],
 ) -> RunResult:
     """Run with the screen; Ctrl-C stops the arm, then the program."""
-    name, names = campaign.folder.root.resolve().name, campaign.cell.joint_names
+    name = campaign.folder.root.resolve().name
+    view = None if live is None else LiveView.parse(live)
+    require_watchable(campaign.cell, view)  # also where nothing is left to run
     with (
         stop_on_interrupt() as stop,
-        Screen(names, stop, title=name, quiet=quiet) as operator,
+        Screen.of(campaign.cell, stop, title=name, quiet=quiet) as operator,
     ):
         try:
             return campaign.run(
@@ -128,7 +128,7 @@ def _run(
                 stop,
                 operator,
                 operator=operator,
-                live=None if live is None else LiveView.parse(live),
+                live=view,
                 dry_run_only=dry_run_only,
                 accept_dry_run=accept_dry_run,
                 accept_torque=accept_torque,
@@ -164,17 +164,18 @@ def _tell(result: RunResult, *, json: bool) -> None:
         f"{tested} of {tests}, {len(result.rejected)} rejected"
     )
     for note in result.notes:
-        typer.echo(note)
+        say(note)
     for one in result.rejected:
-        typer.echo(f"{one.archive}: {one.reason}")
+        say(f"{_both(one.archive)}: {one.reason}")
     if result.dry_run == "to be accepted":
         known = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
         right = (
             "you know why, and the motions looked right" if known else "the motions looked right"
         )
-        typer.echo(f"if {right}, go on with `hil run {result.campaign} --accept-dry-run{known}`")
+        say(f"if {right}, go on with `hil run {result.campaign} --accept-dry-run{known}`")
 
 
-def _failure(campaign: Path, error: HilError) -> dict[str, Any]:
-    """What a script is told of a run that ended with an error."""
-    return {"campaign": str(campaign), "error": str(error), "exit_code": error.exit_code}
+def _both(archive: str) -> str:
+    """What a person calls the motion, and its archive."""
+    name = ArchiveName.parse(archive)
+    return archive if name is None else f"{name.motion} ({archive})"

@@ -36,8 +36,17 @@ def status(
     console.print(_table(found))
     for note in found.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
-    last = f"next: {found.next_command}" if found.next_command else "every step is done"
-    console.print(last, markup=False, highlight=False, soft_wrap=True)
+    console.print(_last(found), markup=False, highlight=False, soft_wrap=True)
+
+
+def _last(found: CampaignStatus) -> str:
+    """What to type next."""
+    if found.complete:
+        return "every step is done"
+    if found.next_command:
+        return f"next: {found.next_command}"
+    stuck = next(step for step in found.steps if step.state == "next")
+    return f"next: {stuck.sentence}"
 
 
 def _table(found: CampaignStatus) -> Table:

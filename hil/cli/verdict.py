@@ -9,6 +9,7 @@ from typing import Final
 
 import typer
 
+from hil.lines import say
 from hil.results import JointJudgement, Results
 
 NOT_GOOD = 5
@@ -32,10 +33,10 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
         for line in [] if quiet else table(results):
             typer.echo(line, err=True)
         if results.fitted is not None and not quiet:
-            typer.echo(results.fitted.words, err=True)
+            say(results.fitted.words, err=True)
         for line in sentences(results, quiet=quiet):
-            typer.echo(line, err=True)
-        typer.echo(results.verdict.line)
+            say(line, err=True)
+        say(results.verdict.line)
     if not results.verdict.good:
         raise typer.Exit(NOT_GOOD)
 

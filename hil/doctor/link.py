@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hil.cell import Cell
+    from hil.cell.schema import ControllerTable
 
 
 @dataclass(frozen=True)
@@ -33,13 +35,30 @@ Link = UdpLink | CanLink
 """None stands for a simulated controller: there is no link to look at."""
 
 
-def link_of(cell: Cell) -> Link | None:
-    """The link of a cell, None if its controller is simulated.
+def controller_in(path: Path) -> ControllerTable:
+    """`[controller]` of a cell file, which may have other figures still to be filled in.
 
     Raises:
-        CellError: the cell has no `[controller]`.
+        CellError: the file cannot be used, or `[controller]` is not known.
     """
-    table = cell.controller
+    from hil.cell import Cell
+    from hil.cell.schema import ControllerTable
+    from hil.cell.unknown import UnknownFieldsError
+
+    try:
+        return Cell.load(path).controller
+    except UnknownFieldsError as unknown:
+        table = tomllib.loads(path.read_text(encoding="utf-8")).get("controller")
+        if table is None or any(name.startswith("controller.") for name in unknown.fields):
+            raise
+        try:
+            return ControllerTable.model_validate(table)
+        except ValueError:
+            raise unknown from None
+
+
+def link_of(table: ControllerTable) -> Link | None:
+    """The link that `[controller]` names, None if it is simulated."""
     if table.transport == "udp":
         return UdpLink(table.host, table.port, table.bind)
     if table.transport == "can" and table.can is not None:

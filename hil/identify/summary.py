@@ -71,7 +71,7 @@ def summarise(
     ]
     gram = information(_executed(cell.model, training, rows))
     simulated = sources.metadata.get("simulated") == "yes"
-    truth = _planted(cell, sources.metadata) if simulated else None
+    truth = planted_in(cell, sources.metadata) if simulated else None
     return Results(
         name=name,
         cell=cell.name,
@@ -109,7 +109,7 @@ def summarise(
     )
 
 
-def _planted(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
+def planted_in(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
     """What was planted in the simulated arm (p,): as the archive says, or else its cell."""
     if "planted" in metadata:
         told = json.loads(metadata["planted"])

@@ -20,8 +20,9 @@ from identification.errors import ModelError
 from identification.kinematics import Chain, chain_from_urdf
 from planner.toml_value import toml_key, toml_value
 
-from .fixing import with_fixed
+from .fixing import mimics, with_fixed
 from .known import Known, from_urdf
+from .quiet import quiet_libraries
 
 _ONE_FOR_ALL: Final = frozenset(
     (
@@ -66,17 +67,20 @@ class NewCell:
         """The same arm, with other things known of it."""
         return replace(self, known=known)
 
-    @staticmethod
-    def urdf_beside(path: Path) -> Path:
-        """Where the URDF is written, if it has to be: beside the cell file."""
-        return path.with_suffix(".urdf")
+    def urdf_beside(self, path: Path) -> Path:
+        """Where the URDF is written, if it has to be: beside the cell file, never over its own."""
+        beside = path.with_suffix(".urdf")
+        if beside.resolve() == self.urdf_path.resolve():
+            return path.with_name(f"{path.stem}_fixed.urdf")
+        return beside
 
 
 def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
     """What a URDF alone says of a cell.
 
     Joints that slide cannot be moved by this software: they are fixed at zero (the nearest
-    position in their range), and a note says so.
+    position in their range). Joints that follow another one have no motor of their own, and a
+    model without closed loops cannot say what moves them: they are fixed too. Notes say so.
 
     Args:
         path: of the URDF.
@@ -103,11 +107,20 @@ def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
         for name, turns in zip(chain.joint_names, chain.revolute, strict=True)
         if not turns and name not in fixed
     ]
-    positions = {**_nearest_to_zero(text, sliding), **fixed}
+    following = {name: led for name, led in mimics(text).items() if name in chain.joint_names}
+    at = {name: led.offset for name, led in following.items() if name not in sliding}
+    positions = {**_nearest_to_zero(text, sliding), **at, **fixed}
     notes = tuple(
         f"{name} slides, and is fixed at {positions[name]:g} m in the cell's copy of the URDF; "
         f"--fix {name}=… for another position"
         for name in sliding
+    )
+    notes += tuple(
+        f"{name} follows {led.joint} (<mimic>), which no model here does: it is fixed at "
+        f"{positions[name]:g} rad in the cell's copy of the URDF, --fix {name}=… for another "
+        "position. If it is part of a linkage that carries the arm, this model is not of your arm"
+        for name, led in following.items()
+        if name not in sliding
     )
     used = with_fixed(text, positions) if positions else text
     moving = _chain(path, used).joint_names
@@ -130,7 +143,8 @@ def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
 
 def _chain(path: Path, urdf: str) -> Chain:
     try:
-        return chain_from_urdf(urdf)
+        with quiet_libraries():
+            return chain_from_urdf(urdf)
     except ModelError as error:
         raise InputError(path, str(error), remedy="correct the URDF") from error
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -12,6 +13,33 @@ from scipy.spatial.transform import Rotation
 _OF_MOVING_JOINTS: Final = (
     "axis", "limit", "mimic", "dynamics", "safety_controller", "calibration"
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """What a joint follows.
+
+    Attributes:
+        joint: the one that leads it.
+        offset: its own position [rad or m] where that stands at zero.
+    """
+
+    joint: str
+    offset: float
+
+
+def mimics(urdf: str) -> dict[str, Mimic]:
+    """Joints that follow another one, by name; an offset that is no number counts as 0."""
+    found = {}
+    for joint in ET.fromstring(urdf).findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            try:
+                offset = float(mimic.get("offset", "0"))
+            except ValueError:
+                offset = 0.0
+            found[joint.get("name", "")] = Mimic(mimic.get("joint", "?"), offset)
+    return found
 
 
 def with_fixed(urdf: str, positions: Mapping[str, float]) -> str:

@@ -172,7 +172,7 @@ def _headline(figure: Figure, view: ArchiveView, height: float) -> None:
         f"{shown:.2f} s {part}",
         f"{facts.samples} samples",
         view.angles,
-        f"packets missed at {len(view.gaps)} places" if len(view.gaps) else "",
+        _missed(view),
         facts.lost,
         facts.damage or "",
         "red dashes: limits" if _has_limits(view) else "",
@@ -185,6 +185,15 @@ def _headline(figure: Figure, view: ArchiveView, height: float) -> None:
         fontsize=style.SMALL + 0.5,
         color=style.MUTED,
     )
+
+
+def _missed(view: ArchiveView) -> str:
+    """Also where there is nothing to tell, for a person looks for it; "" where nobody counted."""
+    if not view.states:
+        return ""
+    if not len(view.gaps):
+        return "no packet missed"
+    return f"packets missed at {len(view.gaps)} place{'s' * (len(view.gaps) > 1)}"
 
 
 def _has_limits(view: ArchiveView) -> bool:

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 _WINDOW: Final = 60.0
 """s of an archive that are in memory at a time."""
-_BINS: Final = 600
+BINS: Final = 600
 """Stretches of the whole time of which the lowest and the highest sample are drawn."""
 _LEAP: Final = 10.0
 """Samples left out, by which a line is broken."""
@@ -109,6 +109,7 @@ def view_of(
     start: float | None = None,
     stop: float | None = None,
     joints: Sequence[str] = (),
+    bins: int = BINS,
 ) -> ArchiveView:
     """Read what is drawn of an archive.
 
@@ -117,6 +118,7 @@ def view_of(
         start: s since its first sample; the beginning if left out.
         stop: s, likewise; the end.
         joints: names or numbers from 1 of the joints wanted; all if empty.
+        bins: stretches of the time shown, of which the lowest and the highest sample are kept.
 
     Raises:
         ArchiveError: it cannot be read, or holds no sample in that time.
@@ -137,7 +139,7 @@ def view_of(
         )
     shown = _wanted(head.joint_names, joints)
     scales = _Scales.of(head)
-    collected = _Collected(shown, end - begin)
+    collected = _Collected(shown, end - begin, bins)
     for archive in _windows(path, origin, begin, end):
         collected.take(archive, scales, origin)
     events = tuple(
@@ -269,11 +271,12 @@ def _slides(archive: Archive, n: int) -> NDArray[np.bool_]:
 class _Collected:
     """Thinned lines, grown window by window."""
 
-    def __init__(self, joints: Sequence[int], duration: float) -> None:
+    def __init__(self, joints: Sequence[int], duration: float, bins: int) -> None:
         self.states: list[tuple[float, float, str]] = []
         self.gaps: list[float] = []
         self._joints = list(joints)
         self._duration = max(duration, 1e-9)
+        self._bins = bins
         self._lines: dict[str, list[tuple[list[Array], list[Array]]]] = {}
 
     def take(self, archive: Archive, scales: _Scales, origin: float) -> None:
@@ -282,12 +285,12 @@ class _Collected:
             return
         time = columns["stamp"] * 1e-9 - origin
         share = (time[-1] - time[0]) / self._duration
-        bins = max(2, round(_BINS * share))
+        bins = max(2, round(self._bins * share))
         leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
         for name, values in _shown(columns, scales):
             lines = self._lines.setdefault(name, [([], []) for _ in self._joints])
             for (times, parts), joint in zip(lines, self._joints, strict=True):
-                for t, v in _runs(time, values[:, joint], bins):
+                for t, v in runs(time, values[:, joint], bins):
                     if times and t[0] - times[-1][-1] > leap:
                         times.append(np.array([np.nan]))
                         parts.append(np.array([np.nan]))
@@ -349,8 +352,14 @@ def _shown(columns: Mapping[str, NDArray[Any]], scales: _Scales) -> Iterator[tup
         yield "following", np.where(driven[:, np.newaxis], error, np.nan)
 
 
-def _runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]:
-    """Stretches of finite values, each thinned; `bins` are for all of them together."""
+def runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]:
+    """Stretches of finite values, each thinned; `bins` are for all of them together.
+
+    Args:
+        time: (m,) [s].
+        values: (m,); NaN where there is nothing.
+        bins: see `hil.report.figures.canvas.thinned`.
+    """
     finite = np.isfinite(values)
     edges = np.flatnonzero(np.diff(finite, prepend=False, append=False))
     for a, b in zip(edges[::2], edges[1::2], strict=True):

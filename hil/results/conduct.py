@@ -21,7 +21,7 @@ class RecordedResult(Frozen):
     archive: str
     kind: str
     when: str | None
-    """Begin, ISO 8601; null in virtual time."""
+    """Begin, ISO 8601 (UTC); null in virtual time."""
     seconds: float
     cycles: int
     missed: int

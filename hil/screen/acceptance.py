@@ -15,6 +15,7 @@ from rich.table import Table
 from hil.campaign.gravity_check import AGAINST
 from hil.campaign.operator import DryRunSummary
 from hil.campaign.stop import Stop
+from hil.counted import counted
 
 from . import marks
 
@@ -68,5 +69,6 @@ def _table(summary: DryRunSummary) -> Table:
             agree = "not seen"
         table.add_row(name, degrees, f"{100.0 * share:.0f} % of its limit", agree)
     archives = ", ".join(summary.archives)
-    table.caption = f"{summary.missed} packets missed, {summary.late} answers late; {archives}"
+    link = f"{counted(summary.missed, 'packet')} missed, {counted(summary.late, 'answer')} late"
+    table.caption = f"{link}; {archives}"
     return table

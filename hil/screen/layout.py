@@ -24,6 +24,10 @@ WIDE: Final = 64
 """Columns from which on there are bars beside the numbers."""
 STALE: Final = 1.0
 """s without news after which the screen says so."""
+SIMULATED: Final = "SIMULATED"
+"""What the first line says where nothing but a simulated arm can move."""
+_LEAST_TITLE: Final = 8
+"""Columns of the title that stay whatever stands behind it."""
 _NUMBERS: Final = 28
 """Columns of a joint's numbers beside its name and bars."""
 
@@ -41,6 +45,8 @@ class Shown:
         age: s since the status came.
         said: lines that the run said, oldest first.
         keys: whether keys are read.
+        far_end: what is moved: "SIMULATED", or the controller's address.
+        left: time to the end as a person waits for it, in words; that of motion if left out.
     """
 
     title: str
@@ -51,6 +57,8 @@ class Shown:
     age: float = 0.0
     said: tuple[str, ...] = ()
     keys: bool = True
+    far_end: str = ""
+    left: str = ""
 
 
 def lines(shown: Shown, width: int, height: int) -> list[Text]:
@@ -87,12 +95,20 @@ def _fitting(room: int, joints: list[Text], drift: list[Text], news: list[Text])
 
 def _heading(shown: Shown, width: int) -> Text:
     status = shown.status
-    text = Text(shown.title, style="bold")
-    if status is None:
-        return text.append("  beginning", style="dim")
-    text.append(f"  {status.phase} {status.number} of {status.total}", style="bold cyan")
-    left = f"{marks.clock(status.time_left)} left"
-    text.truncate(max(0, width - len(left) - 2), overflow="ellipsis")
+    where = Text()
+    if shown.far_end:
+        style = "bold green" if shown.far_end == SIMULATED else "bold yellow"
+        where.append("  ").append(shown.far_end, style=style)
+    where.append("  beginning" if status is None else "", style="dim")
+    left = ""
+    if status is not None:
+        where.append(f"  {status.phase} {status.number} of {status.total}", style="bold cyan")
+        left = shown.left or f"{marks.clock(status.time_left)} left"
+    room = max(0, width - len(left) - 2)
+    text = Text(shown.title, style="bold")  # gives way to where it is and what it is doing
+    text.truncate(max(min(_LEAST_TITLE, room), room - where.cell_len), overflow="ellipsis")
+    text.append_text(where)
+    text.truncate(room, overflow="ellipsis")
     text.append(left.rjust(width - text.cell_len))
     return text
 

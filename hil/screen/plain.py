@@ -7,8 +7,8 @@ from hil.campaign.operator import RunStatus
 from . import marks
 
 
-def line(status: RunStatus) -> str:
-    """Where a run stands, in one line."""
+def line(status: RunStatus, left: str = "") -> str:
+    """Where a run stands, in one line; `left` says in words how long a person waits."""
     parts = [f"{status.phase} {status.number} of {status.total}"]
     motion = status.motion
     if motion is not None:
@@ -34,5 +34,5 @@ def line(status: RunStatus) -> str:
             f"friction changed by {100.0 * drift.change[-1]:.1f} % "
             f"(warm below {100.0 * drift.threshold:g} %)"
         )
-    parts.append(f"{marks.clock(status.time_left)} left")
+    parts.append(left or f"{marks.clock(status.time_left)} left")
     return ", ".join(parts)

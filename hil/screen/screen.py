@@ -22,12 +22,15 @@ from rich.live import Live
 from hil.campaign.motion_watch import Wish
 from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.campaign.stop import Stop
+from hil.cell import Cell
+from hil.lines import put
 from hil.progress import Silent, Task
 
-from . import plain
+from . import marks, plain
 from .acceptance import ask
 from .keys import Keyboard, after, can_read, stops
-from .layout import Shown, lines
+from .layout import SIMULATED, Shown, lines
+from .pace import Pace
 
 DRAWN_EVERY: Final = 0.1
 """s between two pictures."""
@@ -39,6 +42,18 @@ NEWEST: Final = 8
 """Of the lines said meanwhile that are shown."""
 REMEMBERED: Final = 200
 """Lines said meanwhile that are left on the terminal at the end."""
+
+
+def far_end_of(cell: Cell) -> str:
+    """What the first line says of the cell's own link."""
+    table = cell.controller
+    if cell.only_simulated:
+        return SIMULATED
+    return (
+        table.host
+        if table.transport != "can" or table.can is None
+        else f"{table.can.interface}:{table.can.channel}"
+    )
 
 
 class Display(Protocol):
@@ -94,7 +109,7 @@ class PlainLines:
         if at == self._at and time.monotonic() < self._due:
             return
         self._at, self._due = at, time.monotonic() + LINE_EVERY
-        self._console.out(plain.line(status), highlight=False)
+        put(self._console, plain.line(status, shown.left))
 
     def close(self) -> None:
         """Print what was said last."""
@@ -102,7 +117,7 @@ class PlainLines:
 
     def _catch_up(self) -> None:
         while self._unsaid:
-            self._console.out(self._unsaid.popleft(), highlight=False)
+            put(self._console, self._unsaid.popleft())
 
 
 class Nothing:
@@ -126,6 +141,8 @@ class Screen:
         joint_names: of the n joints.
         stop: set by the keys s and q.
         title: of the run.
+        far_end: what is moved, for the first line: `SIMULATED`, or the controller's address.
+        virtual: whether the controller's time is; the time left is that of waiting all the same.
         quiet: show nothing; keys are not read either.
         console: written to; standard output if left out.
     """
@@ -136,6 +153,8 @@ class Screen:
         stop: Stop,
         *,
         title: str = "hil",
+        far_end: str = "",
+        virtual: bool = False,
         quiet: bool = False,
         console: Console | None = None,
     ) -> None:
@@ -144,7 +163,8 @@ class Screen:
         self._quiet = quiet
         self._stop = stop
         self._wish = Wish()
-        self._shown = Shown(title, tuple(joint_names), keys=False)
+        self._shown = Shown(title, tuple(joint_names), keys=False, far_end=far_end)
+        self._pace = Pace(virtual=virtual)
         self._came = time.monotonic()
         self._said: deque[str] = deque(maxlen=REMEMBERED)
         self._undo = contextlib.ExitStack()
@@ -153,6 +173,18 @@ class Screen:
         self._slow_phase = False
         self._keyboard: Keyboard | None = None
         self._undrawn: Exception | None = None
+
+    @classmethod
+    def of(cls, cell: Cell, stop: Stop, *, title: str = "", quiet: bool = False) -> Screen:
+        """The screen of a run on a cell's own link; `title` is the cell's name if left out."""
+        return cls(
+            cell.joint_names,
+            stop,
+            title=title or cell.name,
+            far_end=far_end_of(cell),
+            virtual=cell.controller.transport == "simulated",
+            quiet=quiet,
+        )
 
     def __enter__(self) -> Screen:
         self._open()
@@ -168,7 +200,9 @@ class Screen:
         Raises:
             ScreenError: nothing is drawn any more.
         """
-        self._shown, self._came = replace(self._shown, status=status), time.monotonic()
+        self._came = time.monotonic()
+        self._pace.take(status, self._came, held=self._wish.held)
+        self._shown = replace(self._shown, status=status, left=self._left(status))
         self._leave_dry_run(status)
         if self._undrawn is not None:
             raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
@@ -206,6 +240,7 @@ class Screen:
         if not self.can_answer:
             return False
         self._undo.close()
+        self._pace.pause()
         try:
             self._leave_what_was_said()
             return not self._stuck and ask(self._console, summary, self._stop)
@@ -238,6 +273,12 @@ class Screen:
                 override = min(override, motion.override)
             self._wish = after(self._wish, key, override)
 
+    def _left(self, status: RunStatus) -> str:
+        waiting = self._pace.left(status.time_left)
+        if waiting is None:
+            return f"{marks.clock(status.time_left)} of motion left"
+        return f"{marks.clock(waiting)} left"
+
     def _open(self) -> None:
         self._undo = contextlib.ExitStack()
         over = threading.Event()
@@ -265,13 +306,14 @@ class Screen:
     def _draw(self, display: Display, over: threading.Event) -> None:
         try:
             while not over.wait(DRAWN_EVERY):
-                display.draw(self._now())
+                display.draw(self.shown())
         except Exception as error:  # it shows nothing more, and `show` says why; the run goes on
             self._undrawn = error
         with contextlib.suppress(Exception):
             display.close()
 
-    def _now(self) -> Shown:
+    def shown(self) -> Shown:
+        """What is shown now."""
         keyboard = self._keyboard
         return replace(
             self._shown,
@@ -286,4 +328,4 @@ class Screen:
         """Print it on the shell's page, unless the terminal takes nothing any more."""
         while self._full and self._said and not self._stuck:
             with contextlib.suppress(OSError, ValueError):
-                self._console.out(self._said.popleft(), highlight=False)
+                put(self._console, self._said.popleft())

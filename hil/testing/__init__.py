@@ -10,12 +10,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .faulty import faulty_controller, faulty_link
     from .short import run_campaign, shortened
     from .udp import UdpController
 
-_HOME = {"UdpController": "udp", "run_campaign": "short", "shortened": "short"}
+_HOME = {
+    "UdpController": "udp",
+    "faulty_controller": "faulty",
+    "faulty_link": "faulty",
+    "run_campaign": "short",
+    "shortened": "short",
+}
 
-__all__ = ["UdpController", "run_campaign", "shortened"]
+__all__ = ["UdpController", "faulty_controller", "faulty_link", "run_campaign", "shortened"]
 
 
 def __getattr__(name: str) -> Any:

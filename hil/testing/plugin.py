@@ -55,11 +55,9 @@ def simulated_controller(
     simulated_cell: Cell, controller_faults: tuple[str, ...]
 ) -> SimulatedController:
     """A fresh controller with its arm, in virtual time; one seed is one run."""
-    from hil.simulation import simulated_controller as made
-    from sim_fixtures.fault_script import parse_fault, split_faults
+    from hil.testing.faulty import faulty_controller
 
-    _, own = split_faults(map(parse_fault, controller_faults))
-    return made(simulated_cell, faults=own)
+    return faulty_controller(simulated_cell, *controller_faults)
 
 
 @pytest.fixture
@@ -69,13 +67,9 @@ def simulated_link(
     controller_faults: tuple[str, ...],
 ) -> Link:
     """A link to `simulated_controller`, as `Campaign.run` takes it; not yet connected."""
-    from drivers.transports import SimulatedTransport
-    from hil.campaign import Link
-    from sim_fixtures.fault_script import parse_fault, split_faults
+    from hil.testing.faulty import faulty_link
 
-    of_link, _ = split_faults(map(parse_fault, controller_faults))
-    transport = SimulatedTransport(simulated_controller, of_link)
-    return Link.over(transport, simulated_cell, simulated_controller.finish)
+    return faulty_link(simulated_cell, *controller_faults, controller=simulated_controller)
 
 
 @pytest.fixture(scope="session")

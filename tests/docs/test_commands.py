@@ -9,12 +9,15 @@ import re
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
-from hil import Campaign
+from hil import Campaign, Cell
+from hil.campaign import design
 from hil.cli import app
+from hil.progress import Silent
 from tests.docs.typed import PAGES, ROOT, commands, parse
 
 TYPED_ELSEWHERE = {
@@ -43,35 +46,33 @@ OTHER_PROGRAMS = {
 
 NOT_TYPED = {
     "hil demo --effects": "minutes",
-    "hil demo --resume": "goes on with one that was stopped",
+    "hil demo --resume": "goes on with one that was stopped; tests/hil/test_cli.py stops one",
     "hil demo --link udp": "minutes, in real time",
     "hil demo --excitation": "the whole NS 16 campaign: minutes",
     "hil demo --output runs/demo": "a campaign of the fixture stands in its place",
-    "hil design cell.toml --earlier": "a search of half a minute",
-    "hil design cell.toml --method b -o runs/b": "a search of half a minute",
+    "hil design cell.toml --method b -o runs/b": "half a minute; a short one needs other settings",
     "hil doctor cell.toml --duration 14400": "four hours",
     "hil simulate": "waits for a PC; tests/hil/test_simulate.py runs it",
     "hil record": "waits for a controller; tests/hil/test_record_command.py runs it",
-    "hil move": "needs a controller; tests/hil/test_move.py runs it",
     "hil run campaigns/october --live": "needs a campaign on a real link",
     "hil import rosbag2": "needs a recording; tests/hil/test_importers_rosbag2.py",
     "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",
     "hil gains empty.mcap": "typed in bring-your-own-robot.md",
     "hil identify ur10.mcap": "needs a recording; tests/benchmarks/test_real_data.py",
-    "hil identify a.mcap b.mcap": "typed in bring-your-own-robot.md, with names of its own",
     "hil reidentify /data": "needs other people's archives",
     "hil reidentify s3:": "network",
     "hil reidentify https:": "network",
-    "hil compare": "needs two campaigns; tests/hil/test_compare.py makes them",
-    "hil study": "minutes to an hour; tests/hil/test_study.py runs a short one",
+    "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
+    "hil study --output": "an hour; tests/hil/test_study.py runs a short one",
 }
 """Beginnings of commands that are read and not run, and why."""
 
 SHORTER = {
     "design": ("--settings", "quick.toml"),
     "doctor": ("--duration", "1"),
+    "move": ("--yes",),
 }
-"""What is added so that a command takes seconds."""
+"""What is added so that a command takes seconds, and asks nobody."""
 
 NOT_GOOD_EITHER = ("doctor", "identify", "run")
 """May end with 5: this computer need not be fit, a campaign of seconds no good one."""
@@ -105,7 +106,27 @@ def put_demo(workplace: Path, campaign: Campaign) -> None:
     """Leave what `hil demo` leaves, and what pages take from there."""
     shutil.copytree(campaign.folder.root, workplace / "runs" / "demo")
     (workplace / "archives").symlink_to(workplace / "runs" / "demo" / "archives")
-    shutil.copy(campaign.folder.completed("excitation")[0], workplace / "a.mcap")
+    for name, archive in zip("ab", campaign.folder.completed("excitation"), strict=False):
+        shutil.copy(archive, workplace / f"{name}.mcap")
+
+
+@pytest.fixture(scope="module")
+def two_campaigns(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two small campaigns of the arm of two joints, march and june."""
+    folder = tmp_path_factory.mktemp("two")
+    cell = Cell.load(ROOT / "examples" / "two_joints" / "cell.toml")
+    cell = cell.with_campaign(repetitions=2, validation_runs=1)
+    plan = design(cell, Silent())
+    for seed, name in enumerate(("march", "june"), 1):
+        own = cell.with_campaign(simulation_seed=seed)
+        Campaign.create(folder / name, own, plan).run(unrehearsed=True, durable=False)
+    return folder
+
+
+def put_two(workplace: Path, folder: Path, *names: str) -> None:
+    """Leave both campaigns under the names that a page gives them."""
+    for name, campaign in zip(names, sorted(folder.iterdir(), reverse=True), strict=False):
+        shutil.copytree(campaign, workplace / "runs" / name)
 
 
 def reason_not_to(words: list[str]) -> str | None:
@@ -162,8 +183,15 @@ def test_no_exception_is_left_over() -> None:
 
 
 FAST = ("connect.md", "motion.md")
-AFTER_A_DEMO = ("README.md", "design.md", "tutorial.md")
-SLOW = ("README.md", "design.md", "tutorial.md")
+AFTER_A_DEMO = ("README.md", "tutorial.md")
+AFTER_TWO = {
+    "README.md": ("march", "june"),
+    "compare.md": ("march", "june"),
+    "design.md": ("demo",),
+    "study.md": ("a", "b"),
+}
+"""Pages that name campaigns of one arm, and how."""
+SLOW = ("README.md", "compare.md", "design.md", "study.md", "tutorial.md")
 
 
 @pytest.mark.parametrize(
@@ -174,6 +202,8 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(
 ) -> None:
     if name in AFTER_A_DEMO:
         put_demo(workplace, request.getfixturevalue("identified_campaign"))
+    if name in AFTER_TWO:
+        put_two(workplace, request.getfixturevalue("two_campaigns"), *AFTER_TWO[name])
     page = next(page for page in PAGES if page.name == name)
     assert type_page(page)
 
@@ -183,3 +213,18 @@ def test_every_page_with_something_to_type_is_typed() -> None:
         page.name for page in PAGES if any(reason_not_to(words) is None for words in commands(page))
     }
     assert to_type <= {*FAST, *SLOW, *TYPED_ELSEWHERE}
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_runs(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On the arm of two joints, whose campaign is shorter than the NS 16's."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert "sim_fixtures/ns16/cell.toml" in code
+    names: dict[str, Any] = {}
+    exec(
+        compile(code.replace("sim_fixtures/ns16/cell.toml", "cell.toml"), "README.md", "exec"),
+        names,
+    )
+    assert "The model" in capsys.readouterr().out.splitlines()[-1]
+    assert names["recording"].n_samples > 0

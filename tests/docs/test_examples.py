@@ -1,4 +1,4 @@
-"""Each script of examples/ runs, says what it does, and leaves its picture beside."""
+"""Each script of examples/ runs, says what it does, and leaves its picture below runs."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_it_runs(path: Path, tmp_path: Path) -> None:
     for name in ("sim_fixtures", "tests"):
         (tmp_path / name).symlink_to(ROOT / name)
     folder = tmp_path / "examples"
-    (folder / "pictures").mkdir(parents=True)
+    folder.mkdir()
     (folder / "two_joints").symlink_to(ROOT / "examples" / "two_joints")
     script = folder / path.name
     script.write_text(path.read_text("utf-8"))
@@ -79,4 +79,5 @@ def test_it_runs(path: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert LAST_LINE[path.name[:2]] in done.stdout
-    assert (folder / "pictures" / f"{path.stem}.png").stat().st_size > 5_000
+    assert (tmp_path / "runs" / "examples" / f"{path.stem}.png").stat().st_size > 5_000
+    assert sorted(one.name for one in folder.iterdir()) == sorted([path.name, "two_joints"])

@@ -67,6 +67,11 @@ def test_every_link_to_a_file_leads_to_one(page: Path) -> None:
             assert (page.parent / target).exists(), target
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_diagram_needs_a_script_to_be_drawn(page: Path) -> None:
+    assert "```mermaid" not in page.read_text("utf-8")
+
+
 def test_every_page_is_in_the_table_of_contents() -> None:
     docs = ROOT / "docs"
     listed = set()

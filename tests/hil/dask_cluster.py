@@ -44,6 +44,10 @@ class Cluster:
         self.workers.append(worker)
         return worker
 
+    def forget_the_dead(self) -> None:
+        """Keep the workers that run, in the order in which they were started."""
+        self.workers = [worker for worker in self.workers if worker.poll() is None]
+
     def _start(self, kind: str, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
         log = (self._folder / f"{kind}-{time.monotonic_ns()}.log").open("wb")
         with log:
@@ -54,6 +58,7 @@ class Cluster:
                     **os.environ,
                     "PYTHONPATH": str(_ROOT),
                     "DASK_DISTRIBUTED__DIAGNOSTICS__NVML": "false",
+                    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "false",
                     **self._environment,
                     **environment,
                 },

@@ -21,7 +21,10 @@ class Viewer:
 
     def __init__(self, port: int) -> None:
         self.socket = client.connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], compression=None
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[SUBPROTOCOL],
+            compression=None,
+            close_timeout=0.5,  # s; one that reads nothing does not read the answer either
         )
         self.info = self._text("serverInfo")
         self.channels: dict[str, dict[str, Any]] = {}

@@ -60,6 +60,15 @@ def workers(cluster: Cluster) -> Iterator[DaskWorkers]:
         yield workers
 
 
+@pytest.fixture
+def pair(cluster: Cluster) -> Cluster:
+    """The cluster with two workers that live, the first of which may be killed."""
+    cluster.forget_the_dead()
+    while len(cluster.workers) < 2:
+        cluster.add_worker()
+    return cluster
+
+
 def connected(cluster: Cluster, timeout: float = PATIENCE, patience: float = PATIENCE):
     return DaskWorkers(cluster.address, identity=work.identity, timeout=timeout, patience=patience)
 
@@ -165,21 +174,21 @@ def test_a_folder_that_workers_do_not_see_is_refused(workers: DaskWorkers, tmp_p
 # Workers that die, join and differ
 
 
-def test_a_worker_killed_in_mid_run_changes_no_bit(tmp_path: Path) -> None:
+def test_a_worker_killed_in_mid_run_changes_no_bit(pair: Cluster) -> None:
     killed: list[int] = []
 
-    with running(tmp_path, workers=2) as cluster, connected(cluster) as workers:
+    with connected(pair) as workers:
         both(workers)
 
         def done(count: int) -> None:
             killed.append(count)
-            if sum(killed) >= 20 and cluster.workers[0].poll() is None:
-                cluster.workers[0].kill()
+            if sum(killed) >= 20 and pair.workers[0].poll() is None:
+                pair.workers[0].kill()
 
         groups = [[work.task(work.slow_numbers, k) for k in range(80)]]
         (found,) = workers.sums(groups, work.add, done=done)
-        assert cluster.workers[0].wait(1.0) == -9
-        assert cluster.workers[1].poll() is None
+        assert pair.workers[0].wait(1.0) == -9
+        assert pair.workers[1].poll() is None
     assert found.notes == tuple(range(80))
     assert found.total.tobytes() == alone(range(80))
 
@@ -250,34 +259,30 @@ def test_a_scheduler_without_workers_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
-    tmp_path: Path, campaign: Campaign
+    tmp_path: Path, campaign: Campaign, pair: Cluster
 ) -> None:
-    """Four campaigns, told apart by a record that no estimate reads."""
-    for number in range(4):
+    """Two campaigns, told apart by a record that no estimate reads."""
+    for number in range(2):
         _copy_with_mark(campaign.folder.root, tmp_path / "data" / f"{number}", f"copy {number}")
     plan, roots = run.Plan(keep=False), [str(tmp_path / "data")]
-    (tmp_path / "dask").mkdir()
-    with running(tmp_path / "dask", workers=2) as cluster:
-        hands = DaskWorkers(cluster.address, identity=code_digest, patience=PATIENCE)
-        with _KillsOne(hands, cluster.workers[0]) as workers:
-            found = run.reidentify(roots, plan, workers, Silent())
-        assert cluster.workers[0].wait(1.0) == -9
-        assert cluster.workers[1].poll() is None
+    hands = DaskWorkers(pair.address, identity=code_digest, patience=PATIENCE)
+    with _KillsOne(hands, pair.workers[0]) as workers:
+        found = run.reidentify(roots, plan, workers, Silent())
+    assert pair.workers[0].wait(1.0) == -9
+    assert pair.workers[1].poll() is None
     with LocalWorkers(1) as workers:
         expected = run.reidentify(roots, plan, workers, Silent())
     assert not found.broken
-    assert len(found.campaigns) == 4
+    assert len(found.campaigns) == 2
     assert _figures(found) == _figures(expected)
 
 
 def test_archives_behind_a_web_server_are_read_by_the_workers(
-    tmp_path: Path, campaign: Campaign
+    campaign: Campaign, cluster: Cluster
 ) -> None:
-    (tmp_path / "dask").mkdir()
     plan = run.Plan(keep=False)
     with (
         served(campaign.folder.root) as address,
-        running(tmp_path / "dask", workers=1) as cluster,
         DaskWorkers(cluster.address, identity=code_digest, patience=PATIENCE) as workers,
     ):
         found = run.reidentify([address], plan, workers, Silent())

@@ -366,7 +366,11 @@ def test_nothing_to_fit_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(NothingToFitError, match="no archive"):
         batch(tmp_path)
     (tmp_path / "bad.mcap").write_bytes(b"")
-    with pytest.raises(NothingToFitError, match=r"bad\.mcap"):
+    with pytest.raises(NothingToFitError) as caught:
+        batch(tmp_path)
+    assert str(caught.value).count("bad.mcap") == 1
+    (tmp_path / "worse.mcap").write_bytes(b"x")
+    with pytest.raises(NothingToFitError, match=r"2 could not be used, the first of them \S+bad"):
         batch(tmp_path)
 
 

@@ -24,6 +24,7 @@ from hil.campaign import (
     Link,
     MotionFailedError,
     MotionRefusedError,
+    NotRehearsedError,
     PlannedMotion,
     Stop,
 )
@@ -241,7 +242,7 @@ def test_what_the_arm_does_after_a_refusal_is_recorded(
     controller = simulated_controller(campaign.cell)
     lose = Lose(600, "to_controller")
     link = Link.over(SimulatedTransport(controller, [lose]), campaign.cell)
-    with pytest.raises(MotionFailedError, match="ended lost"):
+    with pytest.raises(MotionFailedError, match=r"move 1 \(move_000_a1\.mcap\) was lost: "):
         campaign.run(link, Stop(), Silent(), provenance={}, durable=False, unrehearsed=True)
     archive = open_archive(campaign.folder.archives / "move_000_a1.mcap")
     (ended,) = (event for event in archive.events if event.name == "MotionEnded")
@@ -273,7 +274,7 @@ def test_a_plan_that_changed_since_is_refused(
     campaign = Campaign.create(tmp_path / "changed", *one_repetition(cell, plan))
     text = campaign.folder.plan.read_text("utf-8")
     campaign.folder.plan.write_text(text.replace('"seed": 1', '"seed": 2'), "utf-8")
-    with pytest.raises(CampaignFolderError, match=r"plan\.json is not the one"):
+    with pytest.raises(NotRehearsedError, match=r"plan\.json is not the one"):
         execute(Campaign.open(campaign.folder.root))
 
 
@@ -283,7 +284,7 @@ def test_motions_that_do_not_join_are_refused_before_anything_moves(
     good = plan.validation[0].trajectory
     shifted = tuple(np.column_stack([c[:, 0] + 0.01, c[:, 1:]]) for c in good.coefficients)
     bad = replace(plan, validation=(PlannedMotion(PiecewiseCubic(good.knots, shifted)),))
-    with pytest.raises(MotionRefusedError, match="validation 0 was not sent: it begins with joint"):
+    with pytest.raises(MotionRefusedError, match="validation 1 was not sent: it begins with joint"):
         Campaign.create(tmp_path / "jump", cell.with_campaign(validation_runs=1), bad)
     assert not list(tmp_path.iterdir()), "no folder is made for what can never run"
 
@@ -359,7 +360,7 @@ def test_a_motion_outside_the_limits_is_refused_before_anything_moves(
         for j, c in enumerate(good.coefficients)
     )
     bad = replace(plan, validation=(PlannedMotion(PiecewiseCubic(good.knots, far)),))
-    with pytest.raises(MotionRefusedError, match=r"validation 0 was not sent: .*position of J2"):
+    with pytest.raises(MotionRefusedError, match=r"validation 1 was not sent: .*position of J2"):
         Campaign.create(tmp_path / "far", cell.with_campaign(validation_runs=1), bad)
     assert not list(tmp_path.iterdir()), "no folder is made for what can never run"
 
@@ -393,7 +394,7 @@ def test_an_older_folder_with_a_motion_that_must_not_be_sent_is_refused_before_a
     with monkeypatch.context() as once:
         once.setattr(campaign_module, "require_runnable", lambda *arguments: None)
         campaign = Campaign.create(tmp_path / "floor", raised, plan)
-    with pytest.raises(MotionRefusedError, match=r"standstill 0 .*collision of .*floor.*home_deg"):
+    with pytest.raises(MotionRefusedError, match=r"standstill 1 .*collision of .*floor.*home_deg"):
         execute(campaign)
     assert not list(campaign.folder.archives.iterdir())
 
@@ -407,10 +408,10 @@ def test_only_where_the_way_from_the_arm_is_not_free_is_it_to_be_jogged(
     buried = MotionChecks.of(
         Cell.from_texts(cell.text.replace("floor = 0.0", "floor = 0.3"), cell.urdf, cell.path)
     )
-    with pytest.raises(MotionRefusedError, match=r"move 0 .*jog the arm"):
+    with pytest.raises(MotionRefusedError, match=r"move 1 .*jog the arm"):
         require_sound(ways, buried)
     wild = Interval("excitation", 0, hold(cell.home + 10.0, 1.0))
-    with pytest.raises(MotionRefusedError, match=r"excitation 0 .*; design another motion\."):
+    with pytest.raises(MotionRefusedError, match=r"repetition 1 .*; design another motion\."):
         require_sound([wild], buried)
 
 

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import shutil
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 
-from hil.campaign import Campaign
+from hil.archive.names import motion_name
+from hil.campaign import Campaign, MotionFailedError
 from hil.campaign.conduct import conduct_of
 from hil.campaign.dry_run import Acceptance, DryRun
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.warmup import WarmMotion, WarmUp
+from hil.cell import Cell
 from hil.identify import identify_campaign
 from hil.progress import Silent
+from hil.recording import dated_anew, origin_of
+from hil.report.conduct import when
+from sim_fixtures.ns16 import CELL_PATH
 
 from .fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
@@ -70,6 +76,8 @@ def test_rehearsal_dry_run_warm_up_and_rejections_are_told(folder: CampaignFolde
     assert "accepted by ada at 2026-03-01" in steps["dry run"].words
     assert "shoulder 30%, elbow 12%" in steps["dry run"].details[0]
     assert not steps["warm-up"].done and steps["warm-up"].words == "not warm after 3 motions"
+    (drifting,) = steps["warm-up"].details
+    assert "still changed by 11.11% a motion; below 0.20% was wanted" in drifting
     assert "1 rejected" in steps["repetitions"].words
     assert found.warm_up is not None
     assert found.warm_up.friction == [[10.0, None], [9.0, None], [8.0, None]]
@@ -101,3 +109,36 @@ def test_what_cannot_be_read_is_told_and_stops_nothing(folder: CampaignFolder) -
 def test_identify_puts_it_into_the_results(ran: Campaign) -> None:
     found = identify_campaign(ran.folder.root, Silent())
     assert found.results.conduct == conduct_of(ran.folder)
+
+
+def test_a_motion_in_real_time_has_the_date_on_which_it_began_and_virtual_time_has_none() -> None:
+    cell = Cell.load(CELL_PATH)
+    assert "recorded_at" not in origin_of(cell)
+    said = origin_of(cell, virtual=False)
+    assert said["simulated"] == "yes"
+    assert datetime.fromisoformat(said["recorded_at"]).tzinfo is not None
+    earlier = {**said, "recorded_at": "2026-03-01T08:00:00+00:00"}
+    assert dated_anew(earlier)["recorded_at"] >= said["recorded_at"]
+    assert "recorded_at" not in dated_anew({"simulated": "yes"})
+
+
+def test_the_report_says_from_when_to_when(ran: Campaign) -> None:
+    recorded = conduct_of(ran.folder).recorded
+    assert when(recorded).startswith("No date")
+    dates = ("2026-03-01T10:05:00+00:00", "2026-03-01T08:01:30+00:00")
+    dated = [
+        one.model_copy(update={"when": date}) for one, date in zip(recorded[:2], dates, strict=True)
+    ]
+    assert when(dated).startswith("2026-03-01 08:01 to 10:05, ")
+
+
+def test_a_motion_is_named_as_a_person_counts_and_with_its_archive() -> None:
+    stopped = MotionFailedError(
+        motion_name("excitation", 0), "stopped", "stopped by the operator", None,
+        "excitation_000_a1.mcap",
+    )  # fmt: skip
+    assert str(stopped).startswith(
+        "repetition 1 (excitation_000_a1.mcap) was stopped by the operator; everything recorded"
+    )
+    lost = MotionFailedError(motion_name("dryrun", 1), "lost", "the link went silent")
+    assert lost.sentence == "dry run 2 was lost: the link went silent"

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import re
-import shlex
+import shutil
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from hil.archive import open_archive
 from hil.cell import Cell
+from hil.cell.link import with_link
 from hil.cell.unknown import UnknownFieldsError
 from hil.demo_link import free_port
-from sim_fixtures.ns16 import CELL_PATH
-from tests.hil.new_cells import filled_in
+from tests.docs import typed
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = ROOT / "docs" / "first-hour.md"
@@ -24,8 +25,13 @@ DOCUMENT = ROOT / "docs" / "first-hour.md"
 
 def commands() -> list[list[str]]:
     """The page's command lines, in order."""
-    blocks = re.findall(r"```\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
-    return [shlex.split(line) for block in blocks for line in block.splitlines() if line]
+    return typed.commands(DOCUMENT)
+
+
+def edit(path: Path, **instead: int) -> None:
+    """What the page says is to be written into `[controller]` of the copy."""
+    (block,) = re.findall(r"```toml\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
+    path.write_text(with_link(path.read_text("utf-8"), **{**tomllib.loads(block), **instead}))
 
 
 def hil(arguments: list[str], folder: Path) -> subprocess.Popen[str]:
@@ -36,39 +42,20 @@ def hil(arguments: list[str], folder: Path) -> subprocess.Popen[str]:
     )  # fmt: skip
 
 
-def fill_in(path: Path) -> None:
-    """What the person knows of the NS 16, from its own cell file; still over UDP."""
-    own = Cell.load(CELL_PATH).file
-    assert own.limits is not None
-    assert own.drive_train is not None
-    assert own.nominal is not None
-    drives = own.drive_train
-    text = filled_in(
-        path, 6,
-        limits__frame="controller",
-        limits__lower_deg=own.limits.lower_deg, limits__upper_deg=own.limits.upper_deg,
-        limits__velocity_deg=own.limits.velocity_deg, limits__torque=[],
-        limits__acceleration_deg=own.limits.acceleration_deg, limits__jerk_deg=own.limits.jerk_deg,
-        campaign__home_deg=[0.0, 0.0, -90.0, 0.0, 90.0, 0.0],
-        workspace__floor=0.0,
-        nominal__rotor_inertia=own.nominal.rotor_inertia,
-        nominal__coulomb=own.nominal.coulomb, nominal__viscous=own.nominal.viscous,
-        drive_train__joint_sign=drives.joint_sign,
-        drive_train__joint_offset_deg=drives.joint_offset_deg,
-        drive_train__torque_constant=drives.torque_constant,
-    )  # fmt: skip
-    path.write_text(text.replace('transport = "simulated"', 'transport = "udp"'))
-
-
 @pytest.mark.slow
 def test_the_commands_of_the_page_run_in_their_order(tmp_path: Path) -> None:
     (tmp_path / "sim_fixtures").symlink_to(ROOT / "sim_fixtures")
     simulate, *steps = commands()
     assert [step[1] for step in steps] == [
-        "new", "doctor", "record", "plot", "move", "plot", "move"
+        "new", "sim_fixtures/ns16/cell.toml", "doctor", "record", "plot", "move", "plot", "move"
     ]  # fmt: skip
     port = str(free_port())
     for step in steps:
+        if step[0] == "cp":
+            for name in step[1:-1]:
+                shutil.copy(tmp_path / name, tmp_path / step[-1])
+            edit(tmp_path / "cell.toml", port=int(port))
+            continue
         needs_controller = step[1] in {"new", "record", "move"}
         # A computer that runs tests need not be fit for a robot.
         far = [part.replace("2001", port) for part in simulate] + ["--patience", "0.5"]
@@ -83,15 +70,43 @@ def test_the_commands_of_the_page_run_in_their_order(tmp_path: Path) -> None:
         # doctor --quick is provisional: 5, whatever this computer can do.
         assert done.returncode == (5 if step[1] == "doctor" else 0), (step, said)
         if step[1] == "new":
-            with pytest.raises(UnknownFieldsError):
+            with pytest.raises(UnknownFieldsError) as unknown:
                 Cell.load(tmp_path / "cell.toml")
-            fill_in(tmp_path / "cell.toml")
+            assert len(unknown.value.fields) == 12
+            assert "twelve fields" in DOCUMENT.read_text("utf-8")
     moves = sorted((tmp_path / "moves").glob("*.mcap"))
     assert [open_archive(path).kind for path in moves] == ["move", "move"]
     assert all(open_archive(path).complete for path in moves)
     assert open_archive(tmp_path / "archives" / "standstill_000_a1.mcap").complete
     assert (tmp_path / "standstill.png").exists()
     assert (tmp_path / "first_move.png").exists()
+
+
+def test_the_copy_of_the_simulated_arms_cell_is_whole_and_reaches_the_controller_of_the_page(
+    tmp_path: Path,
+) -> None:
+    (copy,) = (step for step in commands() if step[0] == "cp")
+    for name in copy[1:-1]:
+        shutil.copy(ROOT / name, tmp_path)
+    edit(tmp_path / "cell.toml")
+    cell = Cell.load(tmp_path / "cell.toml")
+    assert cell.only_simulated
+    (simulate,) = (step for step in commands() if step[1] == "simulate")
+    assert simulate[-1] == f"{cell.controller.host}:{cell.controller.port}"
+
+
+def test_the_list_names_every_field_that_hil_new_leaves_open() -> None:
+    from hil.cell.unknown import WHERE
+
+    items = re.findall(r"(?m)^- (`.*?):", DOCUMENT.read_text("utf-8"))
+    said = {field for item in items for field in re.findall(r"`(\w+)`", item)}
+    fields = {name.partition(".")[2] for name in WHERE}
+    told = {
+        "lower_deg", "upper_deg", "velocity_deg", "gear_ratio", "calibration", "k54", "k64", "k65",
+        "current_limit", "following_error", "cycle_ms", "host", "mesh_folders",
+    }  # fmt: skip
+    assert len(said) == 12
+    assert fields - told == said  # the others come from URDF and init packet
 
 
 def test_the_page_and_the_command_line_know_the_same_options() -> None:
@@ -102,6 +117,8 @@ def test_the_page_and_the_command_line_know_the_same_options() -> None:
 
     group = get_command(app)
     for command in commands():
+        if command[0] != "hil":
+            continue
         parameters = group.commands[command[1]].params  # type: ignore[attr-defined]
         known = {option for parameter in parameters for option in parameter.opts}
         given = {part for part in command[2:] if part.startswith("-")}

@@ -21,12 +21,14 @@ from hil.campaign import (
     Stop,
 )
 from hil.campaign.live_link import LiveLink
+from hil.campaign.quick_design import design
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.demo_link import free_port, loopback_link
 from hil.errors import ArchiveWriteError, ControllerFault
 from hil.progress import Silent
 from hil.simulation import simulated_link
+from tests.hil.fast_cell import fast_cell
 
 PATIENT = ("--patience", "0.5")
 """A test asks what happens, not how fast: the controller waits where this machine pauses."""
@@ -47,10 +49,9 @@ def campaign_of(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
     return Campaign.create(folder, short, CampaignPlan(plan.excitation, plan.validation[:1]))
 
 
-def test_a_campaign_over_real_sockets_leaves_whole_gap_free_archives(
-    tmp_path: Path, cell: Cell, plan: CampaignPlan
-) -> None:
-    campaign = campaign_of(tmp_path / "campaign", on_loopback(cell), plan)
+def test_a_campaign_over_real_sockets_leaves_whole_gap_free_archives(tmp_path: Path) -> None:
+    fast = fast_cell(tmp_path)
+    campaign = campaign_of(tmp_path / "campaign", on_loopback(fast), design(fast, Silent()))
     with loopback_link(campaign.cell, options=PATIENT) as link:
         campaign.run(link, Stop(), Silent(), provenance={"simulated": "yes"}, unrehearsed=True)
         assert not link.exchange.alive

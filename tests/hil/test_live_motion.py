@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,10 @@ from hil.cell import Cell
 from hil.cell.link import stays_here
 from hil.cli.record import record
 from hil.demo_link import free_port, loopback_link
+from hil.move import send, straight_way
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
+from tests.hil.fast_cell import fast_cell
 
 PATIENT = ("--patience", "0.5")
 """A test asks what happens, not how fast: the controller waits where this machine pauses."""
@@ -182,6 +185,29 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
             if what.endswith("opening"):
                 assert ended.reason == "it had not begun"
                 assert "MotionStarted" not in [event.name for event in archive.events]
+
+
+@pytest.mark.slow  # waits for a real second of silence; test_heartbeat shows the rule by itself
+def test_a_watch_that_hangs_brings_the_arm_to_rest(tmp_path: Path) -> None:
+    cell = fast_cell(tmp_path).with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
+
+    class Hangs(Pressed):
+        def show(self, progress: MotionProgress) -> None:
+            if (progress.motion_time or 0.0) > 0.5:
+                time.sleep(4.0)
+
+    with loopback_link(cell, options=PATIENT) as link:
+        where = link.connect(Stop())
+        way = straight_way(cell, where, where + np.radians([40.0, 40.0]), speed=0.02)
+        assert way.duration > 4.0
+        ended = send(way, cell, link, tmp_path / "a.mcap", stop=Stop(), watch=Hangs())
+        assert ended.outcome == "stopped"
+        assert "looks at the motion (show, wish) did not return for" in ended.reason
+    archive = open_archive(tmp_path / "a.mcap")
+    sent = archive.columns["commanded_position"]
+    sent = sent[np.isfinite(sent).all(axis=1)]
+    done = (sent[-1] - where) / (way.target - where)
+    assert np.all(done < 0.9), "not gone on with to its end"
 
 
 @pytest.mark.parametrize(

@@ -235,6 +235,24 @@ def test_nothing_is_overwritten_unless_asked_for(two_joints: Path, tmp_path: Pat
     assert path.read_text() != "mine"
 
 
+def test_a_joint_that_follows_another_is_fixed_and_it_is_said(
+    two_joints: Path, tmp_path: Path
+) -> None:
+    """In a copy with a name of its own, should the cell file be called like the URDF."""
+    follows = '<mimic joint="hip" multiplier="-1" offset="0.3"/><limit effort="60" velocity="0"/>'
+    text = TWO_JOINTS.replace('<limit effort="60" velocity="0"/>', follows)
+    two_joints.write_text(text)
+    summary = new(two_joints, two_joints.with_suffix(".toml"))
+    assert summary["joints"] == ["hip"]
+    (note,) = summary["notes"]
+    assert note.startswith("knee follows hip (<mimic>)") and "fixed at 0.3 rad" in note
+    assert two_joints.read_text() == text
+    cell = tomllib.loads(two_joints.with_suffix(".toml").read_text())["cell"]
+    assert cell["urdf"] == "two_fixed.urdf"
+    model = pin.buildModelFromXML((tmp_path / "two_fixed.urdf").read_text())
+    assert [*model.names][1:] == ["hip"]
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -260,5 +278,6 @@ def test_the_command_prints_one_sentence_for_a_file_that_is_no_urdf(tmp_path: Pa
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith(f"error: {tmp_path / 'arm.urdf'}: ")
+    (line,) = done.stderr.splitlines()  # and none of the library that read it
+    assert line.startswith(f"error: {tmp_path / 'arm.urdf'}: ")
     assert "Traceback" not in done.stderr

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import hil.identify.sources
 from hil.campaign import Campaign, CampaignPlan
 from hil.cell import Cell
+from hil.cell.text import replaced_value
 from hil.identify import identify_campaign
 from hil.progress import Silent
 from hil.recordings import recording_of
@@ -26,6 +27,28 @@ from identification import FrictionLaw
 from sim_fixtures import SimulatedDrive
 
 Run = Callable[..., Campaign]
+
+
+@pytest.fixture(scope="module")
+def short(cell: Cell) -> Cell:
+    """No more motion, and no more cycles of it, than a verdict needs."""
+    text = replaced_value(cell.text, "controller", "cycle_ms", 2)
+    slower = Cell.from_texts(text, cell.urdf, cell.path)
+    return slower.with_campaign(repetitions=2, validation_runs=1)
+
+
+@pytest.fixture(scope="module")
+def motions(plan: CampaignPlan) -> CampaignPlan:
+    """One of each kind."""
+    return CampaignPlan(plan.excitation, plan.validation[:1])
+
+
+@pytest.fixture(scope="module")
+def honest(
+    tmp_path_factory: pytest.TempPathFactory, short: Cell, motions: CampaignPlan, run: Run
+) -> Campaign:
+    """A campaign of the robot that the cell describes; tests only read it."""
+    return run(tmp_path_factory.mktemp("honest") / "campaign", short, motions)
 
 
 def verdict(campaign: Campaign) -> VerdictResult:
@@ -48,15 +71,15 @@ def torque_constants_of_2_and_3_swapped(drive: SimulatedDrive) -> SimulatedDrive
     return replace(drive, torque_constant=tuple(constants))
 
 
-def test_the_honest_cell_is_green(campaign: Campaign) -> None:
-    found = verdict(campaign)
+def test_the_honest_cell_is_green(honest: Campaign) -> None:
+    found = verdict(honest)
     assert found.good, found.line
 
 
 def test_effects_that_the_model_leaves_out_stay_green_at_their_usual_size(
-    tmp_path: Path, cell: Cell, plan: CampaignPlan, run: Run
+    tmp_path: Path, short: Cell, motions: CampaignPlan, run: Run
 ) -> None:
-    found = verdict(run(tmp_path / "effects", cell, plan, effects=True))
+    found = verdict(run(tmp_path / "effects", short, motions, effects=True))
     assert found.good, found.line
 
 
@@ -67,19 +90,19 @@ def test_effects_that_the_model_leaves_out_stay_green_at_their_usual_size(
 )
 def test_a_robot_that_is_not_what_the_cell_says_is_red(
     tmp_path: Path,
-    cell: Cell,
-    plan: CampaignPlan,
+    short: Cell,
+    motions: CampaignPlan,
     run: Run,
     error: Callable[[SimulatedDrive], SimulatedDrive],
 ) -> None:
-    physical = error(simulated_drive(cell))
-    found = verdict(run(tmp_path / "tampered", cell, plan, drive=physical))
+    physical = error(simulated_drive(short))
+    found = verdict(run(tmp_path / "tampered", short, motions, drive=physical))
     assert not found.good, found.line
 
 
 @pytest.mark.parametrize("joint", range(6))
 def test_one_torque_constant_of_the_wrong_sign_is_red(
-    campaign: Campaign, monkeypatch: pytest.MonkeyPatch, joint: int
+    honest: Campaign, monkeypatch: pytest.MonkeyPatch, joint: int
 ) -> None:
     def turned(archive: hil.identify.sources.Archive) -> object:
         recording = recording_of(archive)
@@ -88,12 +111,12 @@ def test_one_torque_constant_of_the_wrong_sign_is_red(
         return replace(recording, torque=recording.torque * signs)
 
     monkeypatch.setattr(hil.identify.sources, "recording_of", turned)
-    found = verdict(campaign)
+    found = verdict(honest)
     assert not found.good, found.line
 
 
 def test_friction_columns_of_the_wrong_sign_are_red(
-    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+    honest: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The prediction stays as good, but friction that drives a joint is impossible."""
     columns = FrictionLaw.columns
@@ -103,6 +126,6 @@ def test_friction_columns_of_the_wrong_sign_are_red(
         out[0] *= -1.0
 
     monkeypatch.setattr(FrictionLaw, "columns", turned)
-    found = verdict(campaign)
+    found = verdict(honest)
     assert not found.good, found.line
     assert any("Coulomb friction of" in reason for reason in found.reasons)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import json
 import os
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +20,10 @@ from hil.archive import Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import ArchiveError, InputError
-from hil.plots.archive_view import view_of
+from hil.plots.archive_page import archive_page
+from hil.plots.archive_panels import BINS, even
+from hil.plots.archive_picture import draw_archive
+from hil.plots.archive_view import ArchiveView, Trace, view_of
 
 
 @pytest.fixture
@@ -107,13 +114,61 @@ def test_a_picture_without_a_display(excitation: Path, name: str, tmp_path: Path
         cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(f"{name}: excitation 0, attempt 1")
+    assert done.stdout.startswith(f"{name}: repetition 1, attempt 1")
     content = (tmp_path / name).read_bytes()
-    head = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF", "html": b"<!doctype html>"}
+    head = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF", "html": b"<!DOCTYPE html>"}
     assert content.startswith(head[name.partition(".")[2]])
     if name == "a.html":
         assert b"http://" not in content.replace(b"http://www.w3.org", b"")
         assert b"MotionEnded" in content
+
+
+def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
+    view = view_of(excitation, joints=("2",), bins=BINS)
+    page = archive_page(view).decode("utf-8")
+    (text,) = re.findall(r'data-traces="([^"]*)"', page)
+    content = json.loads(html.unescape(text))
+    assert [plot["heading"] for plot in content["plots"]] == [q.title for q in view.quantities]
+    (line,) = content["plots"][2]["lines"]
+    counts = np.frombuffer(base64.b64decode(line["data"]), dtype="<u2")
+    current = open_archive(excitation).columns["target_current"][:, 1]
+    kept = current if len(current) <= 2 * BINS else view.quantities[2].traces[0].value
+    values = line["low"] + line["step"] * counts
+    assert values.max() == pytest.approx(kept.max(), abs=line["step"])
+    assert values.min() == pytest.approx(kept.min(), abs=line["step"])
+    assert content["marks"] == [round(time, 6) for time, _, _, _ in view.events]
+    assert content["plots"][2]["limits"] == [
+        pytest.approx(bound) for bound in (view.quantities[2].traces[0].low,
+                                           view.quantities[2].traces[0].high)
+    ]  # fmt: skip
+    assert "Zoom over time" in page and "MotionEnded" in page
+
+
+def test_an_even_line_keeps_samples_peaks_and_gaps() -> None:
+    time = np.arange(100) * 0.01
+    value = np.sin(9.0 * time)
+    assert even(Trace(time, value), time) == pytest.approx(value)
+    value[[20, 71]] = 5.0, -5.0
+    coarse = even(Trace(time, value), np.linspace(0.0, time[-1], 20))
+    assert coarse.max() == 5.0 and coarse.min() == -5.0
+    broken = Trace(
+        np.concatenate([time[:40], [np.nan], time[60:]]),
+        np.concatenate([value[:40], [np.nan], value[60:]]),
+    )
+    there = np.isfinite(even(broken, time))
+    assert there.tolist() == [True] * 40 + [False] * 20 + [True] * 40
+
+
+def test_the_header_says_whether_packets_were_missed(excitation: Path) -> None:
+    """In words also where none was, and nothing where nobody counts them."""
+    view = view_of(excitation)
+
+    def header(view: ArchiveView) -> str:
+        return " ".join(text.get_text() for text in draw_archive(view).texts)
+
+    assert "no packet missed" in header(view)
+    assert "packets missed at 1 place " in header(replace(view, gaps=np.array([1.0])))
+    assert "missed" not in header(replace(view, states=(), events=()))
 
 
 def test_the_shares_of_limits_are_told_to_a_script(excitation: Path, tmp_path: Path) -> None:

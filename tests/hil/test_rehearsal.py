@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from drivers.drive_train import DriveTrain
 from hil.archive import open_archive
-from hil.campaign import Campaign, CampaignFolderError, NotRehearsedError, Stop
+from hil.campaign import Campaign, NotRehearsedError, Stop
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.rehearsal import Rehearsal
@@ -207,7 +207,7 @@ def test_a_change_of_cell_or_plan_takes_the_rehearsal_away(
     cell.write_text(cell.read_text().replace("coulomb = [6.0, 3.0]", "coulomb = [6.0, 3.5]", 1))
     with pytest.raises(NotRehearsedError, match="another cell, URDF or plan"):
         require_rehearsed(campaign.folder)
-    with pytest.raises(CampaignFolderError, match=r"cell\.toml is not the one.*hil rehearse"):
+    with pytest.raises(NotRehearsedError, match=r"cell\.toml is not the one.*hil rehearse"):
         campaign.run()
     step = Campaign.open(campaign.folder.root).status().steps[1]
     assert (step.name, step.state) == ("rehearse", "next")

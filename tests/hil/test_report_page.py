@@ -98,7 +98,7 @@ def test_zoomed_in_the_samples_are_those_of_the_series(html: str) -> None:
             (measured, series.example_measured[:, j]),
             (predicted, series.example_predicted[:, j]),
         ):
-            step = np.ptp(wanted) / 65535.0
+            step = np.ptp(wanted) / 65534.0
             np.testing.assert_allclose(found, np.interp(grid, time, wanted), atol=step)
         (error,) = (decoded(line) for line in lower["lines"])
         np.testing.assert_allclose(error, measured - predicted, atol=np.ptp(measured) / 20000.0)
@@ -125,7 +125,7 @@ def test_how_it_was_run_is_told_with_what_was_run_again_and_why(page: Page) -> N
     text = page.text
     assert "How it was run" in text
     assert "6 of 6 criteria passed" in text and "Accepted by ada" in text and "2 late" in text
-    assert "excitation_001_a1.mcap (rejected) : it was held" in text.replace("): ", ") : ")
+    assert "Repetition 2 ( excitation_001_a1.mcap ) rejected: it was held" in text
     assert "3 packets missed (205 in a million)" in text
     rows = page.table("Recorded as")
     assert [row["Outcome"] for row in rows] == ["completed", "▲ rejected", "completed"]
@@ -139,6 +139,17 @@ def test_without_a_campaign_there_is_nothing_to_tell(page: Page) -> None:
     quiet = conduct(warm_up=None, recorded=[])
     told = Page(render_report(make_results(conduct=quiet), make_series())).text
     assert "No archive could be read" in told and "Warm-up" not in told
+
+
+def test_an_arm_that_did_not_get_warm_is_told_where_it_was_run(page: Page) -> None:
+    cold = conduct()
+    cold["warm_up"] |= {"verdict": "not warm"}
+    words = {"done": False, "words": "not warm after 3 motions", "details": ["still 1.3% a motion"]}
+    cold["steps"] = [{"step": "warm-up", **words}]
+    text = Page(render_report(make_results(conduct=cold), make_series())).text
+    assert "▲ Not warm after 3 motions" in text and "still 1.3% a motion" in text
+    assert "the arm was not warm when the repetitions began" in text
+    assert "not warm" not in page.text
 
 
 def test_hostile_words_of_a_campaign_are_inert() -> None:

@@ -24,9 +24,18 @@ from drivers.transports import SimulatedTransport
 from hil.archive import open_archive
 from hil.batch.cache import Where
 from hil.batch.discovery import discover
-from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError, quality_entry
+from hil.campaign import (
+    Campaign,
+    CampaignFolderError,
+    Link,
+    MotionRefusedError,
+    NotRehearsedError,
+    quality_entry,
+)
+from hil.campaign.announced_limits import checks_in_force
+from hil.campaign.conduct import conduct_of
 from hil.campaign.dry_run import OVERRIDE, DryRun
-from hil.campaign.errors import DryRunError, RepetitionsRejectedError
+from hil.campaign.errors import ArmChangedError, DryRunError, RepetitionsRejectedError
 from hil.campaign.execution_result import RunResult
 from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.gates import require_rehearsed
@@ -38,9 +47,10 @@ from hil.campaign.warmup import COLD_AFTER, WarmUp
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.cli import app
-from hil.errors import OperatorStopError, OutputError
+from hil.errors import ControllerFault, HilError, OperatorStopError, OutputError
 from hil.identify.sources import gather_sources
 from hil.motion_checks import MotionChecks
+from hil.move import send, straight_way
 from hil.progress import Silent
 from hil.simulation import simulated_controller, simulated_drive, simulated_link
 from sim_fixtures.controller_faults import Faultable
@@ -189,7 +199,7 @@ def test_a_mesh_belongs_to_what_was_rehearsed(tmp_path: Path) -> None:
     before = folder.plan_hash
     mesh.write_bytes(b"a larger cube")
     assert folder.plan_hash != before
-    with pytest.raises(CampaignFolderError, match=r"mesh package://arm/link\.stl is not the one"):
+    with pytest.raises(NotRehearsedError, match=r"mesh package://arm/link\.stl is not the one"):
         folder.require_unchanged()
     # On another computer, which reads what was recorded, the mesh need not be there.
     mesh.unlink()
@@ -217,6 +227,27 @@ def test_a_dry_run_of_a_simulated_arm_opens_no_gate_to_a_real_one_however_it_cam
         assert (step.name, step.state) == ("dry run", "next")
         assert "does not count" in step.sentence
         assert not list(mine.folder.archives.iterdir())
+
+
+@pytest.mark.parametrize("said", [{"operator": "me"}, {"simulated": "no"}, None])
+def test_the_link_says_which_kind_of_arm_moved_whatever_the_caller_says(
+    make: Make, monkeypatch: pytest.MonkeyPatch, said: dict[str, str] | None
+) -> None:
+    campaign = make(real=True)
+    twin = simulated_link(campaign.cell, instead_of_hardware=True)
+    if said is None:  # as of a version that left it to the caller
+        monkeypatch.setattr("hil.campaign.execution.provenance_of", lambda *_, **__: {})
+    campaign.run(twin, provenance=said, dry_run_only=True)
+    monkeypatch.undo()
+    first = next(campaign.folder.archives.iterdir())
+    kind = open_archive(first, fields=()).metadata.get("simulated")
+    assert kind == (None if said is None else "yes")
+    real = Real(simulated_link(campaign.cell, instead_of_hardware=True))
+    with pytest.raises(CampaignFolderError, match=r"holds archives of .*leads to a real one"):
+        campaign.run(real, dry_run_only=True)
+    assert DryRun.that_counts(
+        campaign.folder, plan_hash=campaign.folder.plan_hash, motions=2, simulated=False
+    ) is None  # fmt: skip
 
 
 def test_a_dry_run_whose_archives_are_gone_or_that_is_of_an_older_version_does_not_count(
@@ -273,6 +304,59 @@ def test_the_controllers_own_figures_do_not_replace_those_that_were_checked(
     assert flag.exit_code == 2
 
 
+def to_one_that_announces(campaign: Campaign, old: str, new: str) -> Link:
+    """A link to a simulated controller whose own cell file differs in one line."""
+    assert old in campaign.cell.text
+    text = campaign.cell.text.replace(old, new)
+    other = Cell.from_texts(text, campaign.cell.urdf, campaign.cell.path)
+    controller = simulated_controller(other)
+    return Link.over(SimulatedTransport(controller), campaign.cell, controller.finish)
+
+
+CURRENT = ("current_limit = [20.0, 12.0]", "current_limit = [3.0, 12.0]")
+
+
+@pytest.mark.parametrize(
+    ("line", "error", "told"),
+    [
+        (CURRENT, MotionRefusedError,
+         r"motor of shoulder: \S+ A, .*controller announces 3 A .*cell file says 20 A: write"),
+        (("following_error = [1.0, 1.0]", "following_error = [1.0, 0.01]"), NotRehearsedError,
+         r"elbow: 0\.01 motor revolutions in the controller, 1 in the cell file.*rehearse"),
+        (("cycle_ms = 2", "cycle_ms = 1"), ControllerFault,
+         r"cycle is 1 ms in the controller, 2 ms in the cell; correct the cell file, or the c\w+$"),
+    ],
+)  # fmt: skip
+def test_what_the_controller_announces_is_looked_at_before_anything_moves(
+    tmp_path: Path, dry: Campaign, line: tuple[str, str], error: type[HilError], told: str
+) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    before = sorted(campaign.folder.archives.iterdir())
+    with pytest.raises(error, match=told):
+        campaign.run(to_one_that_announces(campaign, *line))
+    assert sorted(campaign.folder.archives.iterdir()) == before
+
+
+def test_wider_limits_of_a_controller_change_nothing(tmp_path: Path, dry: Campaign) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    link = to_one_that_announces(campaign, CURRENT[0], "current_limit = [30.0, 13.0]")
+    assert campaign.run(link, dry_run_only=True).dry_run == "accepted"
+    link.connect(Stop())
+    checks = MotionChecks.of(campaign.cell)
+    assert checks_in_force(campaign.cell, link.connection, checks) is checks
+
+
+def test_a_single_way_keeps_the_current_limit_that_the_controller_announces(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    cell = dry.cell
+    link = to_one_that_announces(dry, CURRENT[0], "current_limit = [0.5, 12.0]")
+    way = straight_way(cell, link.connect(Stop()), cell.home)
+    with pytest.raises(MotionRefusedError, match=r"the way .*announces 0\.5 A"):
+        send(way, cell, link, tmp_path / "move.mcap", stop=Stop())
+    assert not (tmp_path / "move.mcap").exists()
+
+
 def test_what_a_warm_up_sends_is_checked_in_the_run_that_sends_it(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -316,6 +400,25 @@ def test_a_rehearsal_on_other_gears_than_the_cell_files_opens_no_gate(
     monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: good)
     assert campaign.rehearse(drive=drive) is good
     assert Rehearsal.load(campaign.folder) is None
+
+
+def test_a_plan_that_failed_with_another_seed_passes_and_says_so(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hil.campaign import rehearsal_run
+
+    campaign = make()
+    good = Rehearsal.load(campaign.folder)
+    pass_rehearsal(campaign.folder, passed=False)
+    assert good is not None
+    other = good.model_copy(update={"seed": 7})
+    monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: other)
+    told = "passed with seed 7, but failed with seed 1"
+    assert told in campaign.rehearse(seed=7).line
+    assert told in campaign.rehearse(seed=7, again=True).line, "nor is it forgotten"
+    assert told in campaign.status().steps[1].sentence
+    assert any(told in note for note in campaign.run(dry_run_only=True).notes)
+    assert any(told in one for one in conduct_of(campaign.folder).steps[0].details)
 
 
 def without_last(content: dict[str, Any]) -> None:
@@ -394,35 +497,88 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
 class Push:
     """Somebody leans against the upper arm for 0.1 s."""
 
-    def __init__(self, cycle: int) -> None:
-        self.cycle = cycle
+    def __init__(self, cycle: int, load: float = 0.15) -> None:
+        self.cycle, self._load = cycle, load
 
     def inflict(self, on: Faultable) -> None:
-        on.suffer("load", 1, 0.15, 50)
+        on.suffer("load", 1, self._load, 50)
 
 
-def test_a_first_repetition_that_was_touched_does_not_spoil_all_others(
-    tmp_path: Path, make: Make
-) -> None:
-    first = open_archive(
-        finished(make("undisturbed")).folder.archives / "excitation_000_a1.mcap", fields=["cycle"]
-    )
-    middle = int(np.mean(first.columns["cycle"][[0, -1]]))
-    campaign = make(repetitions=3)
-    faults: list[Any] = [Push(middle)]
-    controller = simulated_controller(campaign.cell, faults=faults)
+def run_pushed(campaign: Campaign, *faults: Push) -> RunResult:
+    """A run during which the arm is leant against."""
+    controller = simulated_controller(campaign.cell, faults=list[Any](faults))
     link = Link.over(SimulatedTransport(controller), campaign.cell, controller.finish)
-    result = campaign.run(link, unrehearsed=True, durable=False)
+    return campaign.run(link, unrehearsed=True, durable=False)
+
+
+def middle_of(campaign: Campaign, archive: str) -> int:
+    """The cycle in the middle of a motion."""
+    found = open_archive(campaign.folder.archives / archive, fields=["cycle"])
+    return int(np.mean(found.columns["cycle"][[0, -1]]))
+
+
+def test_a_first_repetition_that_was_touched_does_not_spoil_all_others(make: Make) -> None:
+    undisturbed = finished(make("undisturbed"))
+    campaign = make(repetitions=3)
+    result = run_pushed(campaign, Push(middle_of(undisturbed, "excitation_000_a1.mcap")))
     assert result.complete
     assert [one.archive for one in result.rejected] == [
-        "excitation_001_a1.mcap", "excitation_000_a1.mcap"
+        "excitation_001_a1.mcap", "excitation_001_a2.mcap", "excitation_000_a1.mcap"
     ]  # fmt: skip
-    assert "agree with each other, and not with this one" in result.rejected[1].reason
+    assert "agree with each other, not with this" in result.rejected[2].reason
+    assert any("excitation_000_a1.mcap was the only repetition" in note for note in result.notes)
     good = [path.name for path in campaign.folder.completed("excitation")]
-    assert good == ["excitation_000_a2.mcap", "excitation_001_a2.mcap", "excitation_002_a1.mcap"]
+    assert good == ["excitation_000_a2.mcap", "excitation_001_a3.mcap", "excitation_002_a1.mcap"]
     touched = open_archive(campaign.folder.archives / "excitation_000_a1.mcap")
     assert (touched.outcome or {})["outcome"] == "rejected"
     assert not campaign.folder.damaged()
+
+
+class Drag(Push):
+    """From a cycle on something drags on the upper arm for good."""
+
+    def inflict(self, on: Faultable) -> None:
+        on.suffer("load", 1, self._load, 10**9)
+
+
+def test_an_arm_that_is_changed_in_mid_campaign_stops_it_and_outvotes_nobody(make: Make) -> None:
+    undisturbed = finished(make("undisturbed", repetitions=3)).folder.archives
+    third = open_archive(undisturbed / "excitation_002_a1.mcap", fields=["cycle"])
+    campaign = make(repetitions=3)
+    with pytest.raises(ArmChangedError) as changed:
+        run_pushed(campaign, Drag(int(third.columns["cycle"][0]) - 1, load=0.05))
+    assert changed.value.exit_code == 5
+    assert changed.value.counted == ("excitation_000_a1.mcap", "excitation_001_a1.mcap")
+    assert changed.value.later == tuple(f"excitation_002_a{k}.mcap" for k in (1, 2, 3))
+    for part in ("excitation_001_a1.mcap", "excitation_002_a3.mcap", "current of shoulder"):
+        assert part in str(changed.value)
+    good = [path.name for path in campaign.folder.completed("excitation")]
+    assert good == ["excitation_000_a1.mcap", "excitation_001_a1.mcap"], "nothing is judged anew"
+
+
+@pytest.mark.slow
+def test_two_first_repetitions_that_were_touched_differently_are_left_out(make: Make) -> None:
+    undisturbed = finished(make("undisturbed", repetitions=2))
+    first, second = (middle_of(undisturbed, f"excitation_00{n}_a1.mcap") for n in (0, 1))
+    campaign = make(repetitions=3)
+    result = run_pushed(campaign, Push(first), Push(second, load=-0.1))
+    assert result.complete
+    assert [one.archive for one in result.rejected] == [
+        "excitation_001_a1.mcap", "excitation_001_a2.mcap", "excitation_001_a3.mcap",
+        "excitation_000_a1.mcap",
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_minority_that_agrees_does_not_outvote_those_that_count(make: Make) -> None:
+    undisturbed = finished(make("undisturbed", repetitions=3))
+    campaign = make(repetitions=3)
+    cycle = middle_of(undisturbed, "excitation_002_a1.mcap")
+    length = cycle - middle_of(undisturbed, "excitation_001_a1.mcap")
+    result = run_pushed(campaign, Push(cycle), Push(cycle + length))
+    assert result.complete
+    rejected = [one.archive for one in result.rejected]
+    assert rejected == ["excitation_002_a1.mcap", "excitation_002_a2.mcap"]
 
 
 def finished(campaign: Campaign) -> Campaign:
@@ -446,8 +602,25 @@ def test_a_repetition_that_somebody_slowed_is_no_attempt_while_he_has_let_go(mak
     assert result.complete
     assert len(result.rejected) == 1
     kept = make("kept", bad_repetitions=0)
-    with pytest.raises(RepetitionsRejectedError, match="of no use 1 times"):
+    with pytest.raises(RepetitionsRejectedError, match="of no use 1 time,"):
         kept.run(operator=Person(lambda status: Wish(0.5)), unrehearsed=True)
+
+
+def test_a_script_that_slows_each_repetition_for_a_moment_does_not_move_the_arm_for_ever(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.campaign.repeating.MOST_BY_HAND", 2)
+    monkeypatch.setattr("hil.campaign.sight.SHOWN_EVERY", 0.0)
+    campaign, stop = make(), Stop()
+
+    def at_its_begin(status: RunStatus) -> Wish:
+        stop.requested = len(list(campaign.folder.archives.glob("excitation*"))) > 4
+        done = None if status.motion is None else status.motion.motion_time
+        begins = status.phase == "repetition" and done is not None and done < 0.5
+        return Wish(0.5 if begins else 1.0)
+
+    with pytest.raises(RepetitionsRejectedError, match=r"of no use 2 times.* held or slowed"):
+        campaign.run(operator=Person(at_its_begin), stop=stop, unrehearsed=True)
 
 
 # --- warm-up
@@ -473,6 +646,31 @@ def test_warmth_is_told_by_what_was_written_down_and_not_by_the_times_of_files(m
     assert "warmup" not in again(time.time() - 10.0 * COLD_AFTER), "it moved a moment ago"
     rested(campaign, -3600.0)
     assert "warmup" in again(time.time()), "a clock was put back"
+
+
+@pytest.mark.parametrize("when", ["before", "held"])
+def test_an_arm_that_rests_for_hours_in_mid_campaign_is_warmed_up_anew(
+    make: Make, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    """Between two repetitions, or while a person holds the next one before it begins."""
+    campaign, clock = make(warmup_drift=0.9, warmup_least=4, repetitions=2), time.time
+    passed = [0.0]
+    monkeypatch.setattr("hil.campaign.warmup_stage.time.time", lambda: clock() + passed[0])
+
+    class Leaves(Person):
+        def show(self, status: RunStatus) -> None:
+            super().show(status)
+            second = (status.phase, status.number) == ("repetition", 2)
+            if second if when == "held" else any("good" in note for note in status.notes):
+                passed[0] = 2.0 * 3600.0
+
+    result = campaign.run(operator=Leaves(), unrehearsed=True)
+    assert result.complete
+    made = [kind for kind in kinds(result) if kind in ("warmup", "excitation")]
+    cold = ["excitation"] if when == "held" else []
+    assert made == [*["warmup"] * 4, "excitation", *cold, *["warmup"] * 4, "excitation"]
+    assert len(result.rejected) == len(cold)
+    assert any("rested for 120 min during the campaign" in note for note in result.notes)
 
 
 def test_a_warm_up_motion_that_was_slowed_tells_nothing_of_friction(make: Make) -> None:

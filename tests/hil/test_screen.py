@@ -28,10 +28,16 @@ from drivers.states import State
 from hil.campaign.motion_watch import Latency, MotionProgress, Wish
 from hil.campaign.operator import DriftCurve, RunStatus
 from hil.campaign.stop import Stop
+from hil.cell import Cell
+from hil.cell.link import with_link
+from hil.cell.schema import CanTable
+from hil.lines import put
 from hil.screen import Screen, marks, plain
 from hil.screen.keys import Keyboard, after, single_keys, typed
 from hil.screen.layout import Shown, lines
-from hil.screen.screen import ScreenError
+from hil.screen.pace import Pace
+from hil.screen.screen import ScreenError, far_end_of
+from sim_fixtures.ns16 import CELL_PATH
 
 RIG = Path(__file__).with_name("screen_rig.py")
 NAMES = tuple(f"joint_{number}" for number in range(1, 7))
@@ -108,6 +114,53 @@ def test_stop_hold_and_silence_are_said() -> None:
     assert "no news for 3 s" in drawn(80, 24, Shown("x", NAMES, at, age=3.2))[2]
 
 
+@pytest.mark.parametrize("width", [48, 64, 80])
+@pytest.mark.parametrize("far_end", ["SIMULATED", "10.2.12.150"])
+def test_the_first_line_says_what_is_moved_however_long_the_title(width: int, far_end: str) -> None:
+    shown = Shown("a long title " * 6, NAMES, status(), far_end=far_end, left="0:42 left")
+    first = drawn(width, 24, shown)[0]
+    assert far_end in first
+    assert first.endswith("0:42 left")
+    assert "repetition" in first
+
+
+def test_the_far_end_of_a_cell_is_simulated_or_has_an_address() -> None:
+    cell = Cell.load(CELL_PATH)
+
+    def said(**link: Any) -> str:
+        return far_end_of(Cell.from_texts(with_link(cell.text, **link), cell.urdf, CELL_PATH))
+
+    assert said() == said(transport="udp", host="127.0.0.1") == "SIMULATED"
+    assert said(transport="udp") == "10.2.12.150"
+    can = CanTable(interface="socketcan", channel="can0")
+    assert said(transport="can", can=can) == "socketcan:can0"
+
+
+def test_in_virtual_time_what_is_left_is_the_time_that_a_person_waits() -> None:
+    """A run of 100 s of motion that takes 25 s, with a pause of a person in between."""
+    pace, real = Pace(virtual=True), Pace(virtual=False)
+    for tenth in range(121):
+        now, left = tenth / 10.0, 100.0 - 4.0 * tenth / 10.0
+        pace.take(RunStatus("dry run", 1, 1, left), now, held=False)
+        if tenth == 10:
+            assert pace.left(left) is None
+    pace.pause()
+    for tenth in range(11):  # a rejected repetition made it longer; nothing moves while held
+        pace.take(RunStatus("repetition", 1, 3, 60.0), 500.0 + tenth, held=tenth > 0)
+    assert pace.left(60.0) == pytest.approx(15.0)
+    assert real.left(60.0) == 60.0
+
+
+def test_a_terminal_breaks_lines_between_words_and_a_file_gets_them_whole() -> None:
+    sentence = "one sentence that is [longer] than any line of this terminal is wide :smile:"
+    for terminal in (True, False):
+        out = StringIO()
+        put(Console(file=out, width=30, force_terminal=terminal, color_system=None), sentence)
+        rows = out.getvalue().splitlines()
+        assert " ".join(row.strip() for row in rows) == sentence
+        assert (len(rows) > 1) is terminal
+
+
 def test_a_temperature_is_shown_if_there_is_one() -> None:
     hot = status(temperature=np.array([41.0, 42.0, 43.0, 44.0, 45.0, 46.0]))
     assert any("43°C" in line for line in drawn(80, 24, Shown("x", NAMES, hot)))
@@ -128,6 +181,7 @@ def test_a_bar_is_as_long_as_its_share() -> None:
 
 def test_a_plain_line_says_the_same() -> None:
     line = plain.line(status())
+    assert plain.line(status(), "0:42 left").endswith(", 0:42 left")
     for words in (
         "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
         "following error 130 % of its limit", "current 88 % of its limit", "19:05 left",
@@ -435,7 +489,7 @@ def broken(_: str) -> None:
 def test_a_picture_that_cannot_be_drawn_is_told_and_ends_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(plain, "line", lambda _: 1 / 0)
+    monkeypatch.setattr(plain, "line", lambda *_: 1 / 0)
     with Screen(NAMES, Stop(), console=Console(file=StringIO())) as screen:
         until = time.monotonic() + 5.0
         with pytest.raises(ScreenError, match="ZeroDivisionError"):

@@ -180,7 +180,7 @@ def test_what_cannot_even_be_looked_at_is_refused_by_name(
     bad = designed(replace(sines(quick), **changes))
     with pytest.raises(MotionRefusedError, match=reason):
         plan_around(quick, bad)
-    with pytest.raises(MotionRefusedError, match=f"excitation 0 was not sent: .*{reason}"):
+    with pytest.raises(MotionRefusedError, match=f"repetition 1 was not sent: .*{reason}"):
         Campaign.create(tmp_path / "bad", quick, replace(swinging, excitation=bad))
 
 

@@ -34,7 +34,7 @@ def written(folder: Path) -> list[str]:
 @pytest.mark.slow  # a whole run of pytest with real sockets in it
 def test_the_example_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
     """And, in the same run, a test that reads what an identification leaves."""
-    assert written(tmp_path) == ["to_home.py", "test_to_home.py"]
+    assert written(tmp_path) == ["to_home.py", "test_to_home.py", "test_bad_repetition.py"]
     (tmp_path / "test_results.py").write_text(
         "import json\n"
         "def test_results(identified_campaign, short_campaign):\n"
@@ -45,7 +45,7 @@ def test_the_example_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
     )
     done = pytest_in(tmp_path, "-W", "error", "-v")
     assert done.returncode == 0, done.stdout
-    assert "5 passed" in done.stdout
+    assert "6 passed" in done.stdout
 
 
 def test_pytest_starts_without_anything_heavy(tmp_path: Path) -> None:

@@ -78,6 +78,14 @@ def test_a_mass_that_cannot_be_is_refused(mass: float) -> None:
         Payload(mass, (0.0, 0.0, 0.0))
 
 
+def test_an_inertia_that_no_body_has_is_told() -> None:
+    at = (0.0, 0.0, 0.0)
+    assert Payload(1.0, at).possible
+    assert Payload(1.0, at, (0.1, 0.0, 0.0, 0.2, 0.0, 0.3)).possible, "a flat body"
+    assert not Payload(1.0, at, (0.1, 0.0, 0.0, 0.1, 0.0, 0.3)).possible
+    assert not Payload(1.0, at, (-0.1, 0.0, 0.0, 0.1, 0.0, 0.1)).possible
+
+
 def test_a_recording_of_the_loaded_arm_gives_the_parameters_of_the_bare_one() -> None:
     payload = Payload(16.0, (0.1, 0.0, 0.2), INERTIA, "link_6")
     law = FrictionLaw(third=None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import socket
 import subprocess
 import threading
@@ -21,12 +22,14 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from hil.cell import Cell
+from hil.cell.schema import ControllerTable
+from hil.cell.unknown import UnknownFieldsError
 from hil.cli.doctor import doctor
 from hil.doctor import probe
 from hil.doctor.check import Check, Status
 from hil.doctor.fitness import Fitness, in_words, judge
 from hil.doctor.latency import RESERVE, Latency
-from hil.doctor.link import CanLink, UdpLink, link_of
+from hil.doctor.link import CanLink, UdpLink, controller_in, link_of
 from hil.doctor.measure import disk_trial, measure, obtained, run_probe
 from hil.doctor.report import as_json, histogram, remedies, show
 from hil.doctor.run import Diagnosis, examine
@@ -311,13 +314,22 @@ def cell_text(**controller: object) -> str:
 
 
 def test_the_link_is_the_cells() -> None:
-    def cell(text: str) -> Cell:
-        return Cell.from_texts(text, Cell.load(CELL_PATH).urdf, CELL_PATH)
+    def cell(text: str) -> ControllerTable:
+        return Cell.from_texts(text, Cell.load(CELL_PATH).urdf, CELL_PATH).controller
 
     assert link_of(cell(cell_text())) is None
     assert link_of(cell(cell_text(transport="udp"))) == UdpLink("10.2.12.150", 1000, "0.0.0.0")
     bus = '\n[controller.can]\ninterface = "socketcan"\nchannel = "can0"\n'
     assert link_of(cell(cell_text(transport="can") + bus)) == CanLink("socketcan", "can0", True)
+
+
+def test_of_a_cell_that_is_being_filled_in_the_controller_is_enough(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(re.sub(r"(?m)^torque_constant = .*$", 'torque_constant = "?"', cell_text()))
+    assert link_of(controller_in(path)) is None
+    path.write_text(re.sub(r"(?m)^cycle_ms = .*$", 'cycle_ms = "?"', cell_text()))
+    with pytest.raises(UnknownFieldsError, match=r"controller\.cycle_ms"):
+        controller_in(path)
 
 
 def test_the_command_measures_judges_and_sends_the_controller_nothing(tmp_path: Path) -> None:

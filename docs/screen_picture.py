@@ -1,0 +1,119 @@
+"""Draw docs/screen.png: the screen of a run on the simulated NS 16, as the program draws it.
+
+`python docs/screen_picture.py` runs a short campaign in virtual time, for a minute or so, and takes
+the screen in the middle of its third repetition.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from matplotlib import font_manager
+from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
+from rich.segment import Segment
+from rich.style import Style
+from rich.terminal_theme import MONOKAI, TerminalTheme
+
+from hil import Campaign, Cell
+from hil.campaign import Stop, design
+from hil.campaign.operator import RunStatus
+from hil.progress import Silent, reporter
+from hil.screen import Screen
+from hil.screen.layout import Shown, lines
+
+HERE: Final = Path(__file__).parent
+COLUMNS, ROWS = 80, 24
+REPETITION: Final = 3
+MIDDLE: Final = 0.4
+"""Of the motion that is done when the picture is taken."""
+HEIGHT, MARGIN = 20, 14
+"""Pixels of a letter, and around the screen."""
+EIGHTHS: Final = " ▏▎▍▌▋▊▉█"
+THEME: Final[TerminalTheme] = MONOKAI
+
+Colour = tuple[int, int, int]
+
+
+class Photographer(Screen):
+    """A screen that nobody sees, of which one moment is kept."""
+
+    taken: Shown | None = None
+
+    def show(self, status: RunStatus) -> None:
+        """Keep it, if it is the moment."""
+        super().show(status)
+        motion = status.motion
+        if self.taken is None and (status.phase, status.number) == ("repetition", REPETITION):
+            done = 0.0 if motion is None else (motion.motion_time or 0.0)
+            if motion is not None and done > MIDDLE * (motion.duration or 0.0):
+                self.taken = replace(self.shown(), keys=True)
+
+
+def photographed() -> Shown:
+    """A moment of a run."""
+    cell = Cell.load(HERE.parent / "sim_fixtures" / "ns16" / "cell.toml")
+    cell = cell.with_campaign(repetitions=5, validation_runs=1)
+    with TemporaryDirectory() as folder:
+        campaign = Campaign.create(Path(folder) / "october", cell, design(cell, reporter()))
+        with Photographer.of(cell, stop := Stop(), title="october", quiet=True) as screen:
+            campaign.run(None, stop, Silent(), operator=screen, unrehearsed=True, durable=False)
+    assert isinstance(screen, Photographer)
+    assert screen.taken is not None
+    return screen.taken
+
+
+def picture(shown: Shown) -> Image.Image:
+    """The screen, letter by letter."""
+    console = Console(width=COLUMNS, height=ROWS, force_terminal=True, color_system="truecolor")
+    fonts = {bold: _font(bold) for bold in (False, True)}
+    wide = fonts[False].getlength("m")
+    high = round(1.35 * HEIGHT)
+    size = (round(COLUMNS * wide) + 2 * MARGIN, ROWS * high + 2 * MARGIN)
+    image = Image.new("RGB", size, THEME.background_color)
+    draw = ImageDraw.Draw(image)
+    for row, line in enumerate(lines(shown, COLUMNS, ROWS)):
+        column = 0
+        for segment in Segment.strip_links(console.render(line, console.options)):
+            style, y = segment.style or Style(), MARGIN + row * high
+            ink, paper = _colours(style)
+            for letter in segment.text.rstrip("\n"):
+                x = MARGIN + column * wide
+                box = (x, y, x + wide, y + high - 1)
+                if paper != THEME.background_color:
+                    draw.rectangle(box, fill=paper)
+                if letter in EIGHTHS[1:]:
+                    share = EIGHTHS.index(letter) / 8
+                    draw.rectangle((x, y + 2, x + share * wide, y + high - 3), fill=ink)
+                else:
+                    draw.text((x, y), letter, font=fonts[bool(style.bold)], fill=ink)
+                column += 1
+    return image
+
+
+def _font(bold: bool) -> ImageFont.FreeTypeFont:
+    found = font_manager.FontProperties(
+        family="DejaVu Sans Mono", weight="bold" if bold else "normal"
+    )
+    return ImageFont.truetype(font_manager.findfont(found), HEIGHT)
+
+
+def _colours(style: Style) -> tuple[Colour, Colour]:
+    """Of a letter and what is behind it."""
+    paper: Colour = THEME.background_color
+    ink: Colour = THEME.foreground_color
+    if style.color is not None and not style.color.is_default:
+        ink = tuple(style.color.get_truecolor(THEME))  # type: ignore[assignment]
+    if style.dim:
+        ink = tuple((2 * i + p) // 3 for i, p in zip(ink, paper, strict=True))  # type: ignore[assignment]
+    return (paper, ink) if style.reverse else (ink, paper)
+
+
+if __name__ == "__main__":
+    picture(photographed()).save(
+        sys.argv[1] if sys.argv[1:] else HERE / "screen.png", optimize=True
+    )

@@ -1,0 +1,57 @@
+"""Limits that a connected controller announces, where they are narrower than the cell's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from drivers.announced import AnnouncedLimits, narrower
+from hil.cell import Cell
+from hil.motion_checks import MotionChecks
+
+from .motion_link import Connection, drives_in_force
+
+
+def announced_by(cell: Cell, connection: Connection) -> AnnouncedLimits | None:
+    """The limits of the cell's arm in the controller's init packet; None before there is one."""
+    if connection.init is None:
+        return None
+    return AnnouncedLimits.of(connection.init, cell.controller.arm, len(cell.joint_names))
+
+
+def checks_in_force(
+    cell: Cell, connection: Connection, checks: MotionChecks | None = None
+) -> MotionChecks:
+    """What a motion to a connected controller is checked against.
+
+    The narrower of the cell's and the controller's current limits count, and gears that were
+    accepted from the controller; the very `checks` where both are the cell's.
+
+    Args:
+        cell: whose arm moves.
+        connection: to its controller.
+        checks: those of the cell, where they are at hand.
+    """
+    checks = MotionChecks.of(cell) if checks is None else checks
+    if connection.adopted:
+        gears = drives_in_force(cell, connection).motor_from_joint
+        checks = replace(checks, currents=replace(checks.currents, motor_from_joint=gears))
+    announced = announced_by(cell, connection)
+    return checks if announced is None else checks.within(announced.current)
+
+
+def narrower_thresholds(cell: Cell, connection: Connection) -> tuple[str, ...]:
+    """Following-error thresholds of the controller below the cell's, in words joint by joint.
+
+    No model tells how far a servo lags behind, so that no motion can be checked against them.
+    """
+    announced = announced_by(cell, connection)
+    if announced is None:
+        return ()
+    ours = np.array(cell.drive_table.following_error)
+    return tuple(
+        f"{cell.joint_names[joint]}: {announced.following_error[joint]:.6g} motor revolutions in "
+        f"the controller, {ours[joint]:.6g} in the cell file"
+        for joint in np.flatnonzero(narrower(announced.following_error, ours))
+    )

@@ -1,0 +1,116 @@
+"""`--json`: one JSON object on stdout also where a command fails, in one form for all of them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from hil.campaign import Campaign
+from hil.cli import COMMANDS, app, main
+from hil.cli.failing import as_json, exit_code_of
+from hil.errors import ControllerFault, InputError
+from planner import PlannerError
+
+NOWHERE = "/nowhere"
+FAILING = {
+    "design": ("design", NOWHERE),
+    "rehearse": ("rehearse", NOWHERE),
+    "run": ("run", NOWHERE),
+    "status": ("status", NOWHERE),
+    "identify": ("identify", NOWHERE),
+    "report": ("report", NOWHERE),
+    "new": ("new", "--urdf", NOWHERE, "-o", "cell.toml"),
+    "plot": ("plot", NOWHERE),
+    "move": ("move", NOWHERE, "--to", "home"),
+    "compare": ("compare", NOWHERE),
+    "study": ("study", "--campaign", NOWHERE),
+    "reidentify": ("reidentify", NOWHERE, "--workers", "1"),
+    "gains": ("gains", NOWHERE, NOWHERE, "--mass", "1"),
+    "plan": ("plan", NOWHERE, "--cell", NOWHERE),
+    "record": ("record", NOWHERE),
+    "simulate": ("simulate", NOWHERE),
+    "doctor": ("doctor", NOWHERE),
+    "import": ("import", "rosbag2", NOWHERE, "-o", "out.mcap", "--urdf", NOWHERE),
+    "archive": ("archive", "info", NOWHERE),
+    "demo": ("demo", "--nonsense"),
+}
+"""A call of each command that cannot succeed."""
+
+
+def called(*arguments: str) -> Result:
+    return CliRunner().invoke(app, [*arguments, "--json"])
+
+
+def test_every_command_is_here() -> None:
+    assert {*FAILING} == {*COMMANDS}
+
+
+@pytest.mark.parametrize("command", [*FAILING])
+def test_a_command_that_fails_prints_one_object(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = called(*FAILING[command])
+    told = json.loads(result.stdout)
+    assert told["error"]
+    if command != "archive":  # which says it of each of several files
+        assert told["exit_code"] == 2
+        assert told["kind"].isidentifier()
+    assert [path.name for path in tmp_path.iterdir()] == []
+
+
+def test_what_was_typed_wrong_is_told_likewise() -> None:
+    for arguments in (("status",), ("bla",), ("plot", "--no-such-option")):
+        result = called(*arguments)
+        assert (result.exit_code, json.loads(result.stdout)["exit_code"]) == (2, 2)
+    plain = CliRunner().invoke(app, ["status"])
+    assert (plain.exit_code, plain.stdout) == (2, "")
+
+
+def test_an_error_of_input_tells_its_parts() -> None:
+    told = as_json(InputError("a.toml", "is empty", field="cell", remedy="fill it"))
+    assert told == {
+        "error": "a.toml: cell: is empty; fill it",
+        "kind": "InputError",
+        "exit_code": 2,
+        "path": "a.toml",
+        "field": "cell",
+        "problem": "is empty",
+        "remedy": "fill it",
+    }
+
+
+def test_exit_codes_are_those_of_the_errors() -> None:
+    found = [exit_code_of(error) for error in (ControllerFault(""), PlannerError(), OSError())]
+    assert found == [4, 2, 1]
+
+
+@pytest.mark.parametrize(("raised", "code"), [(KeyboardInterrupt(), 130), (MemoryError(), 1)])
+def test_ctrl_c_and_what_nobody_foresaw_are_told_too(
+    raised: BaseException, code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise raised
+
+    monkeypatch.setattr(Campaign, "open", fail)
+    told = json.loads(called("status", NOWHERE).stdout)
+    assert told["exit_code"] == code and told["error"]
+    silent = CliRunner().invoke(app, ["status", NOWHERE])
+    assert silent.stdout == ""
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_the_exit_status_of_the_program_is_the_same_with_json(
+    more: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["hil", "status", NOWHERE, *more])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr()
+    assert ended.value.code == 2
+    assert "is not a campaign folder" in said.err
+    assert bool(said.out) == bool(more)

@@ -1,0 +1,171 @@
+"""The command line only asks, calls the Python face, and tells: it computes and decodes nothing."""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from hil.campaign import Campaign
+from hil.cli import app
+
+ROOT = Path(__file__).resolve().parents[2]
+SHELL = sorted((ROOT / "hil" / "cli").glob("*.py"))
+OURS = ("hil", "drivers", "planner", "identification", "sim_fixtures")
+TERMINAL = ("typer", "click", "rich")
+ALGEBRA = ("numpy", "scipy", "pinocchio", "coal", "ruckig", "pymoo", "cma", "cvxpy", "clarabel",
+           "matplotlib", "mcap", "zstandard", "lz4", "isal", "rosbags", "can", "serial", "pydantic",
+           "jinja2", "viser", "foxglove", "distributed", "fsspec", "pyarrow")  # fmt: skip
+WIRE = ("socket", "struct", "multiprocessing", "ctypes", "mmap")
+OF_NUMPY = {"array", "asarray", "isfinite", "degrees", "max", "abs", "argmax", "float64"}
+"""What it takes to say a number: nothing here estimates, solves, draws lots or integrates."""
+LOOPS = (ast.For, ast.While, ast.ListComp, ast.SetComp, ast.GeneratorExp, ast.DictComp)
+MATHS = (ast.Mult, ast.MatMult, ast.Pow, ast.Div, ast.FloorDiv)
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Full names of what a module imports, wherever in it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{'.' * node.level}{node.module or ''}.{a.name}" for a in node.names)
+
+
+def doings(source: str) -> list[str]:
+    """What a module of the command line does that is not its to do."""
+    tree, found = ast.parse(source), []
+    for name in imported(tree):
+        top = name.lstrip(".").split(".")[0]
+        if top in WIRE or (top in ALGEBRA and not name.startswith("numpy")):
+            found.append(f"imports {name}")
+        if top in OURS and any(part.startswith("_") for part in name.split(".")):
+            found.append(f"imports {name}, which is private")
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Attribute)
+            and isinstance(node.value, ast.Name)
+            and node.value.id == "np"
+            and node.attr not in OF_NUMPY
+        ):
+            found.append(f"calls numpy.{node.attr}")
+        if isinstance(node, LOOPS):
+            found += [f"computes {what} in a loop" for what in computed(node)]
+    return found
+
+
+def computed(loop: ast.AST) -> Iterator[str]:
+    """Products and quotients of two things that are not known beforehand: no change of units."""
+    for node in ast.walk(loop):
+        if (
+            isinstance(node, ast.BinOp)
+            and isinstance(node.op, MATHS)
+            and not any(
+                isinstance(side, ast.Constant | ast.List) for side in (node.left, node.right)
+            )
+        ):
+            yield ast.unparse(node)
+
+
+FIGURES = {
+    "gains.py": {"computes gains.interval_factor * gains.std[motor] in a loop",
+                 "computes gains.interval_factor * gains.std[m] in a loop"},
+    "plan.py": {"computes getattr(extrema, q) / getattr(plan.limits, q) in a loop"},
+}  # fmt: skip
+"""Figures that are made while they are told: an interval of a spread, a share of a limit."""
+
+
+@pytest.mark.parametrize("path", SHELL, ids=lambda path: path.stem)
+def test_a_command_computes_decodes_and_connects_nothing_itself(path: Path) -> None:
+    assert set(doings(path.read_text("utf-8"))) == FIGURES.get(path.name, set())
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import scipy.optimize",
+        "from mcap.reader import make_reader",
+        "import socket",
+        "from hil.batch.run import _Estimates",
+        "import numpy as np\nx = np.linalg.lstsq(a, b)",
+        "total = [weight * error for weight, error in pairs]",
+        "def f():\n    for k in range(n):\n        torque += regressor[k] @ values",
+    ],
+)
+def test_what_would_be_too_much_is_seen(source: str) -> None:
+    assert doings(source)
+
+
+def test_nothing_that_a_script_uses_knows_the_command_line() -> None:
+    for package in OURS:
+        for path in (ROOT / package).rglob("*.py"):
+            if path in SHELL or path == ROOT / "hil" / "__main__.py":
+                continue
+            names = list(imported(ast.parse(path.read_text("utf-8"))))
+            assert not [n for n in names if n.startswith(("hil.cli", "typer", ".cli"))], path
+
+
+class Face:
+    """Stands for `hil.Campaign`: keeps what it is asked, and answers with words."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, dict[str, Any]]] = []
+        self.folder = SimpleNamespace(root=Path("c"))
+        controller = SimpleNamespace(transport="simulated")
+        self.cell = SimpleNamespace(
+            joint_names=("one", "two"), controller=controller, only_simulated=True
+        )
+
+    def _note(self, name: str, words: dict[str, Any], answer: Any) -> Any:
+        self.asked.append((name, words))
+        return answer
+
+    def rehearse(self, **words: Any) -> Any:
+        answer = SimpleNamespace(line="passed by the face", criteria=[], not_seen=[], passed=True)
+        return self._note("rehearse", words, answer)
+
+    def run(self, *_: Any, **words: Any) -> Any:
+        answer = SimpleNamespace(to_dict=lambda: {"ran": "by the face"})
+        return self._note("run", words, answer)
+
+    def status(self) -> Any:
+        return self._note("status", {}, SimpleNamespace(to_dict=lambda: {"stands": "by the face"}))
+
+    def report(self, **words: Any) -> Any:
+        return self._note("report", words, "made by the face")
+
+
+@pytest.mark.parametrize(
+    ("line", "asked", "told"),
+    [
+        ("rehearse c --seed 3 -q", ("rehearse", {"seed": 3, "again": False}), "passed by the face"),
+        ("status c --json", ("status", {}), {"stands": "by the face"}),
+        ("report c -q", ("report", {}), "made by the face"),
+        (
+            "run c --no-identify --json --accept-dry-run",
+            ("run", {"accept_dry_run": True, "dry_run_only": False, "live": None}),
+            {"ran": "by the face", "verdict": None},
+        ),
+    ],
+)
+def test_a_command_of_a_campaign_is_one_call_and_its_answer(
+    line: str,
+    asked: tuple[str, dict[str, Any]],
+    told: str | dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    face = Face()
+    monkeypatch.setattr(Campaign, "open", classmethod(lambda *_: face))
+    result = CliRunner().invoke(app, line.split())
+    assert result.exit_code == 0, result.output
+    ((name, words),) = face.asked
+    assert name == asked[0]
+    assert {key: words[key] for key in asked[1]} == asked[1]
+    output = result.stdout.strip()
+    assert (json.loads(output) if isinstance(told, dict) else output) == told
