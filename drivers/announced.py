@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 _RELATIVE: Final = 1e-6
 """The wire rounds to float32, by 6e-8 at most; a cell file has six digits or more."""
+_WRITTEN: Final = 1e-5
+"""Of a limit: six digits written by a person may be rounded by half of this."""
 _FACTOR: Final = 2.0
 """Gear ratios further apart are not of the same kind of arm."""
 _COUPLING: Final = 1.0
@@ -65,8 +67,13 @@ class AnnouncedLimits:
 
 
 def narrower(theirs: Array, ours: Array) -> NDArray[np.bool_]:
-    """Where a limit (n,) of the controller is below the cell's by more than the wire rounds."""
-    return np.asarray(theirs < ours * (1.0 - _RELATIVE))
+    """Where a limit (n,) of the controller is below the cell's by more than six digits round."""
+    return np.asarray(theirs < ours * (1.0 - _WRITTEN))
+
+
+def shown(value: float) -> str:
+    """A figure of the wire in the fewest digits that are that float32 again."""
+    return str(np.float32(value)).removesuffix(".0")
 
 
 def compare(

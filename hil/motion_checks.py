@@ -8,7 +8,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.announced import narrower
+from drivers.announced import narrower, shown
 from hil.cell import AngleFrame, Cell, CellError
 from hil.violation_text import always_so, violation_text
 from identification.excitation import (
@@ -124,8 +124,8 @@ class MotionChecks:
         if theirs == ours:
             return ""
         return (
-            f"; the controller announces {theirs:.6g} A as the limit of that motor, the cell file "
-            f"says {ours:.6g} A: write the controller's figure into [drive_train] current_limit"
+            f"; the controller announces {shown(theirs)} A as the limit of that motor, the cell "
+            f"file says {ours:.9g} A: write the controller's into [drive_train] current_limit"
         )
 
 

@@ -157,6 +157,7 @@ class ExchangeProcess:
             hand_over(self._channel, identity, source)
         except OSError as error:
             raise ExchangeError(f"the exchange process is gone: {error}") from error
+        self.beat()  # the next cycle may take it, and wants a sign of life no older than that
         self._control.program_id = identity
         answered = 0
         try:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.announced import AnnouncedLimits, narrower
+from drivers.announced import AnnouncedLimits, narrower, shown
 from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 
@@ -41,6 +41,19 @@ def checks_in_force(
     return checks if announced is None else checks.within(announced.current)
 
 
+def narrower_currents(cell: Cell, connection: Connection) -> tuple[str, ...]:
+    """Current limits of the controller below the cell's, which then count, in words by joint."""
+    announced = announced_by(cell, connection)
+    if announced is None:
+        return ()
+    ours = np.array(cell.drive_table.current_limit)
+    return tuple(
+        f"{cell.joint_names[joint]}: the controller's current limit of "
+        f"{shown(announced.current[joint])} A counted, the cell file says {ours[joint]:.9g} A"
+        for joint in np.flatnonzero(narrower(announced.current, ours))
+    )
+
+
 def narrower_thresholds(cell: Cell, connection: Connection) -> tuple[str, ...]:
     """Following-error thresholds of the controller below the cell's, in words joint by joint.
 
@@ -51,7 +64,7 @@ def narrower_thresholds(cell: Cell, connection: Connection) -> tuple[str, ...]:
         return ()
     ours = np.array(cell.drive_table.following_error)
     return tuple(
-        f"{cell.joint_names[joint]}: {announced.following_error[joint]:.6g} motor revolutions in "
-        f"the controller, {ours[joint]:.6g} in the cell file"
+        f"{cell.joint_names[joint]}: {shown(announced.following_error[joint])} motor "
+        f"revolutions in the controller, {ours[joint]:.9g} in the cell file"
         for joint in np.flatnonzero(narrower(announced.following_error, ours))
     )

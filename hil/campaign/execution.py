@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 
-from .announced_limits import checks_in_force
+from .announced_limits import checks_in_force, narrower_currents
 from .dry_run import OVERRIDE
 from .dry_run_stage import DryRunStage
 from .execution_archive import Archiving, provenance_of
@@ -227,6 +227,7 @@ class _Run:
         if narrowed is not checks:  # the controller's own limits, for the first time known
             checks = narrowed
             require_sound([*dry, *missing, *warming], checks)
+        self._notes += narrower_currents(self._cell, link.connection)
         # A dry run and a warm-up go the ways of the motions that they are made of.
         joined = with_ways(self._cell, [*dry, *missing], where)
         require_sound([one for one in joined if one.kind == "move"], checks)

@@ -64,7 +64,7 @@ class RunWatch:
         """
         self._phase, self._number, self._total = _phase_of(kind), number, total
         self._duration, self._most = duration, most
-        self._shown = False
+        self._shown, self.began = False, time.time()
         self._tell(None)
 
     def note(self, text: str) -> None:

@@ -85,7 +85,7 @@ def require_one_world(folder: CampaignFolder, only_simulated: bool) -> None:
             break
     else:
         return
-    what = _MADE_BY.get(made_by, "an arm that they do not name")
+    what = _MADE_BY.get(made_by, "an arm that they do not name (an earlier version wrote them)")
     link = "a simulated one" if only_simulated else "a real one"
     raise CampaignFolderError(
         folder.root,

@@ -48,6 +48,11 @@ class Heartbeat:
         """Beat no more."""
         self._over = True
 
+    def begin(self) -> None:
+        """A motion is asked for: what went before is no cause of what happens to it."""
+        self._stalled = self._starved = 0.0
+        self.turn()
+
     def turn(self) -> None:
         """The loop that supervises a motion turns; it must again within `STALL` s, until `rest`."""
         self._turned = self._clock()

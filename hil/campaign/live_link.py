@@ -68,6 +68,7 @@ class LiveLink:
         heart: tells the exchange that this process lives.
         finish: asks the far end to end the session; only a simulated one can be asked.
         view: what is known of the exchange.
+        inits: init packets until the controller was connected.
         cycles: records archived so far.
         late: answers so far that were late or left out for a newer one's.
         untaken: answers so far that the controller did not take.
@@ -83,6 +84,7 @@ class LiveLink:
     archive: ArchiveProcessHandle
     heart: Heartbeat
     finish: Callable[[], None] = field(default=lambda: None)
+    inits: int = 0
     cycles: int = 0
     late: int = 0
     untaken: int = 0
@@ -184,6 +186,7 @@ class LiveLink:
             if len(records):
                 last = records["target_position"][-1].copy()
             if self.view.state in READY and last is not None:
+                self.inits = self.view.inits
                 return last
             if (failure := self.view.failure()) is not None:
                 raise ControllerFault(f"{failure}; the controller gets no answers")

@@ -52,11 +52,13 @@ class LiveMotion:
         if not self._wanted(source):
             self._link.complete("stopped", NOT_BEGUN)
             return MotionEnded("stopped", NOT_BEGUN, -1, -1)
+        self._require_same_session()
         self._view.forget_motion()
         sight = self._sight(source)
-        self._link.heart.turn()
+        self._link.heart.begin()
         try:
             self._submit(source, spec)
+            self._link.heart.turn()
             return self._supervised(sight, spec)
         finally:
             self._link.heart.rest()
@@ -89,6 +91,16 @@ class LiveMotion:
         except ControllerFault as error:
             self._link.complete("void", str(error))
             raise
+
+    def _require_same_session(self) -> None:
+        """A controller that began anew may announce limits that no motion was checked against."""
+        self._view.look()
+        if self._view.inits > self._link.inits:
+            why = "the controller began a new session since it was connected"
+            self._link.complete("void", why)
+            raise ControllerFault(
+                f"{why}; nothing was sent, run again: its limits are checked anew"
+            )
 
     def _submit(self, source: MotionSource, spec: ArchiveSpec) -> None:
         try:

@@ -99,7 +99,8 @@ def move(
     **Example:** `hil move cell.toml --joint 1 --by 5 --speed 5`, then
     `hil move cell.toml --to start`.
 
-    Exit status 0 when it arrived (or was there), 3 when the way is refused or nobody confirmed it,
+    Exit status 0 when it arrived (or was there), 2 when what was typed cannot be used or the
+    planner failed, 3 when the way is refused or nobody confirmed it,
     4 when the controller or the link failed, 130 when it was stopped.
     """
     if (to is None) == (joint is None) or (joint is None) != (by is None):

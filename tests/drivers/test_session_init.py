@@ -7,6 +7,7 @@ import pytest
 from rig import START, N, Rig, drive_train, init_packet, smooth_move, still
 
 from drivers import InitReceived, Mode, RequestError, State
+from drivers.announced import narrower, shown
 from drivers.packets import NO_SLOT
 
 
@@ -326,3 +327,21 @@ class TestOtherAxes:
         rig = self.extra(1, 7, other_axes={(1, 8), (2, 7)})
         rig.start()
         assert "axis 7 of arm 1" in rig.seen(InitReceived)[0].unusable
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours", "below"),
+    [
+        (np.float32(1.23456514), 1.23457, False),  # six digits, as a person types what he was told
+        (np.float32(1.2345), 1.2346, True),
+        (np.float32(0.1), 0.1, False),
+        (np.float32(np.nan), 1.0, False),
+    ],
+)
+def test_a_limit_is_narrower_only_by_more_than_six_digits_round(theirs, ours, below):
+    assert narrower(np.array([theirs], dtype=np.float64), np.array([ours])).tolist() == [below]
+
+
+def test_a_limit_is_shown_in_digits_that_are_that_limit_again():
+    for value in np.random.default_rng(1).uniform(0.1, 50.0, 200).astype(np.float32):
+        assert np.float32(shown(value)) == value

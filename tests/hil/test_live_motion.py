@@ -23,6 +23,7 @@ from hil.cell import Cell
 from hil.cell.link import stays_here
 from hil.cli.record import record
 from hil.demo_link import free_port, loopback_link
+from hil.errors import ControllerFault
 from hil.move import send, straight_way
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
@@ -185,6 +186,19 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
             if what.endswith("opening"):
                 assert ended.reason == "it had not begun"
                 assert "MotionStarted" not in [event.name for event in archive.events]
+
+        monkeypatch.undo()
+        link.view.inits += 1  # as by another init packet, whose limits nobody has seen
+        player = TrajectoryPlayer(
+            motion, cell.period, cell.joint_limits, start_tolerance=START_TOLERANCE
+        )
+        path = tmp_path / "anew.mcap"
+        spec = ArchiveSpec(path, cell.joint_names, cell.period, {"kind": "move"}, drives)
+        with pytest.raises(ControllerFault, match=r"new session .* nothing was sent"):
+            link.run(player, spec, Stop())
+        told = open_archive(path).outcome
+        assert told is not None
+        assert told["outcome"] == "void"
 
 
 @pytest.mark.slow  # waits for a real second of silence; test_heartbeat shows the rule by itself

@@ -59,7 +59,7 @@ class BusLock:
 
 def _path(interface: str, channel: str) -> Path:
     """Of the lock; the same for each name of one serial port."""
-    if Path(channel).exists():
+    if channel.startswith("/"):
         channel = str(Path(channel).resolve())
     name = re.sub(r"[^0-9A-Za-z.]+", "_", f"{interface}_{channel}")
     return Path(tempfile.gettempdir()) / f"hil-can-{name}.lock"

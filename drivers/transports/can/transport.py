@@ -99,9 +99,11 @@ class CanTransport:
 
     def close(self) -> None:
         """Give the bus up. Closing twice changes nothing."""
-        self._port.close()
-        if self._lock is not None:
-            self._lock.release()
+        try:
+            self._port.close()
+        finally:
+            if self._lock is not None:
+                self._lock.release()
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ class TestInfo:
         done = run("info", written.path)
         assert done.exit_code == 0
         for words in (
-            "validation 3, attempt 1",
+            "validation 4, attempt 1",
             "completed",
             "43 samples, 0.420 s at 100 Hz",
             "a, b",
