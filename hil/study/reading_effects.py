@@ -16,7 +16,7 @@ from .wording import (
     listed,
     mark,
     opening,
-    outcome,
+    outcome_in,
     percent,
 )
 
@@ -51,15 +51,14 @@ def _verdict(plain: ConditionResult, real: ConditionResult) -> str:
     before, after = compared(plain, FLY_BY), compared(real, FLY_BY)
     if before is None or after is None:
         return ""
-    labels = labels_of(plain)
     if (before.differs, before.ratio < 1.0) == (after.differs, after.ratio < 1.0) or not (
         before.differs or after.differs
     ):
-        told = outcome(after, labels)
+        told = outcome_in(real, after)
         return f"On fly-by motions it does not: {told} either way."
     return (
-        f"On fly-by motions it does: without them {outcome(before, labels)}; with them"
-        f" {outcome(after, labels)}."
+        f"On fly-by motions it does: without them {outcome_in(plain, before)}; with them"
+        f" {outcome_in(real, after)}."
     )
 
 

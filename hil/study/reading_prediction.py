@@ -25,7 +25,7 @@ from .wording import (
     listed,
     main_class,
     opening,
-    outcome,
+    outcome_in,
     percent,
     ratio_words,
     under_each,
@@ -57,7 +57,7 @@ def prediction_paragraph(results: StudyResults) -> Paragraph:
     return Paragraph(
         key="prediction",
         heading=heading,
-        verdict=under_each([(c, outcome(one, labels_of(c))) for c, one in pairs]),
+        verdict=under_each([(c, outcome_in(c, one)) for c, one in pairs]),
         sentences=[
             *_at_home(pairs),
             _sentence(pairs),

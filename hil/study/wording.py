@@ -99,6 +99,22 @@ def outcome(one: ComparisonResult, labels: Mapping[str, str]) -> str:
     return f"{better} is {slightly}better, its error {saved} % smaller"
 
 
+def outcome_in(condition: ConditionResult, one: ComparisonResult) -> str:
+    """What is told of the first two methods, and whether more motion of one is all there is to it.
+
+    As many repetitions of a longer motion are more data, and see more of an arm that warms up.
+    """
+    told, equal = outcome(one, labels_of(condition)), condition.equal_data
+    if equal is None or not one.differs:
+        return told
+    gone = any(
+        each.verdict == "none"
+        for each in equal.comparisons
+        if each.motion_class == one.motion_class
+    )
+    return f"{told}, but not with as much motion of each" if gone else told
+
+
 def ratio_words(one: ComparisonResult, labels: Mapping[str, str]) -> str:
     """The ratio of two errors and what is told of it, as the end of a sentence."""
     first, second = labels[one.first], labels[one.second]

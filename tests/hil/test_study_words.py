@@ -23,6 +23,7 @@ from hil.study.results import (
     AblationPoint,
     AblationResult,
     ConditionResult,
+    EqualDataResult,
     StudyParameter,
     StudyResults,
 )
@@ -124,6 +125,21 @@ def test_the_answer_says_how_it_turns_with_effects() -> None:
     assert {one.key: one.verdict for one in same.reading}["effects"].startswith(
         "On fly-by motions it does not: B is better"
     )
+
+
+@pytest.mark.parametrize(("ratio", "gone"), [(1.0, True), (1.25, False)])
+def test_a_difference_that_is_only_more_motion_is_told_to_be_that(ratio: float, gone: bool) -> None:
+    """A's motion is the longer one; `ratio` is that of B over as much motion of A."""
+    cut = condition(ratio, scatter=0.3 if gone else 0.05).comparisons
+    equal = EqualDataResult(
+        cut="a", name="a, cut", repetitions=2, seconds=40.0, other="b", other_seconds=38.0,
+        comparisons=[one.model_copy(update={"first": "a, cut"}) for one in cut],
+    )  # fmt: skip
+    uneven = condition(1.25, named=EFFECTS).model_copy(update={"equal_data": equal})
+    told = study(condition(1.0, scatter=0.3), uneven).reading
+    for one in (told[0], next(each for each in told if each.key == "effects")):
+        assert "with unmodelled effects A is better" in one.verdict or "them A is" in one.verdict
+        assert ("% smaller, but not with as much motion of each." in one.verdict) is gone
 
 
 def test_every_answer_is_short() -> None:
