@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.announced import AnnouncedLimits, narrower, shown
 from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 
 from .motion_link import Connection, drives_in_force
+
+Array = NDArray[np.float64]
 
 
 def announced_by(cell: Cell, connection: Connection) -> AnnouncedLimits | None:
@@ -42,16 +45,12 @@ def checks_in_force(
 
 
 def narrower_currents(cell: Cell, connection: Connection) -> tuple[str, ...]:
-    """Current limits of the controller below the cell's, which then count, in words by joint."""
+    """Current limits of the controller below the cell's, in words joint by joint."""
     announced = announced_by(cell, connection)
     if announced is None:
         return ()
     ours = np.array(cell.drive_table.current_limit)
-    return tuple(
-        f"{cell.joint_names[joint]}: the controller's current limit of "
-        f"{shown(announced.current[joint])} A counted, the cell file says {ours[joint]:.9g} A"
-        for joint in np.flatnonzero(narrower(announced.current, ours))
-    )
+    return _below(cell, announced.current, ours, "A")
 
 
 def narrower_thresholds(cell: Cell, connection: Connection) -> tuple[str, ...]:
@@ -63,8 +62,12 @@ def narrower_thresholds(cell: Cell, connection: Connection) -> tuple[str, ...]:
     if announced is None:
         return ()
     ours = np.array(cell.drive_table.following_error)
+    return _below(cell, announced.following_error, ours, "motor revolutions")
+
+
+def _below(cell: Cell, theirs: Array, ours: Array, unit: str) -> tuple[str, ...]:
     return tuple(
-        f"{cell.joint_names[joint]}: {shown(announced.following_error[joint])} motor "
-        f"revolutions in the controller, {ours[joint]:.9g} in the cell file"
-        for joint in np.flatnonzero(narrower(announced.following_error, ours))
+        f"{cell.joint_names[joint]}: {shown(theirs[joint])} {unit} in the controller, "
+        f"{ours[joint]:.9g} in the cell file"
+        for joint in np.flatnonzero(narrower(theirs, ours))
     )

@@ -227,7 +227,8 @@ class _Run:
         if narrowed is not checks:  # the controller's own limits, for the first time known
             checks = narrowed
             require_sound([*dry, *missing, *warming], checks)
-        self._notes += narrower_currents(self._cell, link.connection)
+        if below := narrower_currents(self._cell, link.connection):
+            self._notes.append(f"the controller's own current limits counted ({'; '.join(below)})")
         # A dry run and a warm-up go the ways of the motions that they are made of.
         joined = with_ways(self._cell, [*dry, *missing], where)
         require_sound([one for one in joined if one.kind == "move"], checks)

@@ -346,6 +346,13 @@ def test_wider_limits_of_a_controller_change_nothing(tmp_path: Path, dry: Campai
     assert checks_in_force(campaign.cell, link.connection, checks) is checks
 
 
+def test_a_narrower_limit_that_every_motion_keeps_is_told(tmp_path: Path, dry: Campaign) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    link = to_one_that_announces(campaign, CURRENT[0], "current_limit = [19.5, 12.0]")
+    (note,) = [one for one in campaign.run(link).notes if "limits" in one]
+    assert "counted (shoulder: 19.5 A in the controller, 20 in the cell file)" in note
+
+
 def test_a_single_way_keeps_the_current_limit_that_the_controller_announces(
     tmp_path: Path, dry: Campaign
 ) -> None:
