@@ -13,6 +13,7 @@ from drivers.events import MotionEnded
 from hil.archive import ArchiveSpec
 from hil.campaign.announced_limits import checks_in_force
 from hil.campaign.errors import MotionRefusedError
+from hil.campaign.intervals import player_of
 from hil.campaign.motion_link import MotionLink
 from hil.campaign.motion_watch import MotionWatch, unwatched_motion
 from hil.campaign.plan import moves_to_dict
@@ -22,14 +23,12 @@ from hil.cell import AngleFrame, Cell
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
 from hil.recording import kind_entry, origin_of
-from planner import Move, PiecewiseCubic, PlanFile, TrajectoryPlayer, in_child, plan_moves
+from planner import Move, PiecewiseCubic, PlanFile, in_child, plan_moves
 
 Array = NDArray[np.float64]
 
 THERE = 1e-4
 """rad; an arm that is so near to a posture is there."""
-START_TOLERANCE = 1e-3
-"""rad by which the arm may have moved between the planning of the way and its beginning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,17 +184,7 @@ def send(
     checks = checks_in_force(cell, link.connection, way.checks)
     if checks is not way.checks:
         _require(checks, way.trajectory)
-    bounds = cell.file.bounds
-    player = TrajectoryPlayer(
-        way.trajectory,
-        cell.period,
-        cell.joint_limits,
-        override_acceleration=bounds.override.acceleration,
-        override_jerk=bounds.override.jerk,
-        stop_acceleration=bounds.stop.acceleration,
-        stop_jerk=bounds.stop.jerk,
-        start_tolerance=START_TOLERANCE,
-    )
+    player = player_of(cell, way.trajectory)
     spec = ArchiveSpec(
         path,
         joint_names=cell.joint_names,

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.progress import Task
-from planner import FourierSeries, TrajectoryPlayer
+from planner import FourierSeries
 
 from .dry_run import OVERRIDE
 from .errors import MotionFailedError
 from .execution_archive import REPEATED, Archiving
 from .execution_watch import RunWatch
-from .intervals import START_TOLERANCE, Interval, ends
+from .intervals import Interval, ends, player_of
 from .motion_link import MotionLink
 from .stop import Stop
 from .ways import Ways
@@ -105,7 +105,11 @@ class Runner:
         self.watch.time_left = max(0.0, self.watch.time_left - duration / most)
         self.watch.begin(interval.kind, number, total, duration, most)
         ended = self.link.run(
-            self._player(interval), spec, self.stop, override=most, watch=self.watch
+            player_of(self.cell, interval.trajectory),
+            spec,
+            self.stop,
+            override=most,
+            watch=self.watch,
         )
         if ended.outcome == "completed" or spec.path.exists():  # else it was stopped before
             self.archives.append(spec.path.name)
@@ -118,16 +122,3 @@ class Runner:
             raise MotionFailedError(str(interval), ended.outcome, ended.reason, recorder, archived)
         self.task.advance(duration / most, str(interval))
         return spec.path.name
-
-    def _player(self, interval: Interval) -> TrajectoryPlayer:
-        cell, bounds = self.cell, self.cell.file.bounds
-        return TrajectoryPlayer(
-            interval.trajectory,
-            cell.period,
-            cell.joint_limits,
-            override_acceleration=bounds.override.acceleration,
-            override_jerk=bounds.override.jerk,
-            stop_acceleration=bounds.stop.acceleration,
-            stop_jerk=bounds.stop.jerk,
-            start_tolerance=START_TOLERANCE,
-        )

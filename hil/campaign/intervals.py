@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from hil.archive.names import motion_name
 from hil.cell import Cell
 from hil.motion_checks import MotionChecks
-from planner import FourierSeries, Move, PiecewiseCubic, PlanFile, in_child, plan_moves
+from planner import (
+    FourierSeries,
+    Move,
+    PiecewiseCubic,
+    PlanFile,
+    TrajectoryPlayer,
+    in_child,
+    plan_moves,
+)
 
 from .errors import MotionRefusedError
 from .plan import CampaignPlan
@@ -140,6 +148,21 @@ def ends(interval: Interval) -> tuple[Array, Array]:
     """Where a motion begins and where it ends, (n,) [rad] each."""
     start, end = interval.trajectory.sample(np.array([0.0, interval.trajectory.duration]))[0]
     return start, end
+
+
+def player_of(cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> TrajectoryPlayer:
+    """Plays a motion within the three sets of bounds of a cell."""
+    bounds = cell.file.bounds
+    return TrajectoryPlayer(
+        trajectory,
+        cell.period,
+        cell.joint_limits,
+        override_acceleration=bounds.override.acceleration,
+        override_jerk=bounds.override.jerk,
+        stop_acceleration=bounds.stop.acceleration,
+        stop_jerk=bounds.stop.jerk,
+        start_tolerance=START_TOLERANCE,
+    )
 
 
 def hold(position: Array, duration: float) -> PiecewiseCubic:
