@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo docs pictures test test-slow check bench clean
+.PHONY: help setup demo docs pictures test test-slow audit bench clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -30,15 +30,21 @@ pictures: $(STAMP)  ## draw the documentation's pictures anew: every example's, 
 	cp runs/examples/*.png examples/pictures/
 	$(BIN)/python docs/screen_picture.py
 
-test: $(STAMP)  ## lint, types, floors and the fast tests
+test: $(STAMP)  ## lint, types, floors, declared dependencies and the fast tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/deptry .
 	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 test-slow: $(STAMP)  ## the tests that take minutes
 	$(BIN)/pytest -m slow
+
+audit: $(STAMP)  ## known vulnerabilities of every pinned dependency (asks the Python Package Index)
+	$(BIN)/python -m pip check
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt pip-audit==2.10.1
+	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
 
 bench: $(STAMP)  ## every benchmark that needs no data beside the project
 	$(BIN)/python -m benchmarks.regressor

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-import click
 import numpy as np
 import typer
 
@@ -244,7 +243,7 @@ def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
     who = "the simulated arm" if link.only_simulated else f"the arm of {cell.name}"
     try:
         agreed = typer.confirm(f"The way is free, and {who} may move?")
-    except click.Abort:
+    except typer.Abort:
         agreed = False
     if not agreed:
         raise OperatorStopError("not confirmed; nothing was sent.")

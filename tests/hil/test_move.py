@@ -191,11 +191,13 @@ def test_over_udp_ctrl_c_brings_the_arm_to_rest_on_its_way(ns16: Cell, tmp_path:
     assert np.ptp(share, axis=1).max() < 1e-3  # and never left it
 
 
-def test_on_a_terminal_the_way_is_shown_and_no_means_no(tmp_path: Path) -> None:
+@pytest.mark.parametrize("answer", [b"n\n", b"\x03"], ids=["no", "Ctrl-C"])
+def test_on_a_terminal_the_way_is_shown_and_no_means_no(tmp_path: Path, answer: bytes) -> None:
     master, slave = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "hil", "move", str(CELL_PATH), "--to", "home", "-o", str(tmp_path)],
         stdin=slave, stdout=slave, stderr=slave, close_fds=True,
+        preexec_fn=lambda: os.login_tty(slave),
     )  # fmt: skip
     os.close(slave)
     said, answered = b"", False
@@ -206,7 +208,7 @@ def test_on_a_terminal_the_way_is_shown_and_no_means_no(tmp_path: Path) -> None:
             break
         said += part
         if not answered and b"[y/N]" in said:
-            os.write(master, b"n\n")
+            os.write(master, answer)
             answered = True
     os.close(master)
     assert process.wait(30) == 130
