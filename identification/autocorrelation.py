@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
+from scipy import fft
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -88,8 +88,9 @@ def _products(values: Array, lags: int) -> Array:
     m, n = values.shape
     found = np.zeros((lags + 1, n))
     reach = min(lags, m - 1)
-    whole = fftconvolve(values, values[::-1], axes=0)
-    found[: reach + 1] = whole[m - 1 : m + reach]
+    length = fft.next_fast_len(m + reach, real=True)  # so long that nothing wraps round
+    power = np.abs(fft.rfft(values, length, axis=0)) ** 2
+    found[: reach + 1] = fft.irfft(power, length, axis=0)[: reach + 1]
     return found
 
 

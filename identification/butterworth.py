@@ -18,7 +18,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
-from scipy.signal import butter, periodogram, sosfiltfilt
 
 from identification.errors import ShapeError
 from identification.motion import Motion
@@ -63,6 +62,8 @@ def choose_cutoff(
     Raises:
         RecordingError: no stretch is long enough.
     """
+    from scipy.signal import periodogram  # slow to import, and seldom used
+
     own = max(recording.segments(), key=lambda segment: int(segment.stop - segment.start))
     _refuse_short(own.stop - own.start)
     if noise_variance is None:
@@ -146,6 +147,8 @@ def _filtered_spline(one: Recording, cutoff: Array, order: int) -> BSpline:
 
 def _filtered(channel: Array, cutoff: float, step: float, order: int) -> Array:
     """One channel, forwards and backwards."""
+    from scipy.signal import butter, sosfiltfilt
+
     sections = butter(order, cutoff, fs=1.0 / step, output="sos")
     padding = min(len(channel) - 1, int(np.ceil(_PADDING_PERIODS / (cutoff * step))))
     return np.asarray(sosfiltfilt(sections, channel, padlen=padding))

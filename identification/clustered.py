@@ -16,7 +16,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from identification.augmented_rows import augmented_rows
 from identification.covariance import Clustered, block_length, leverage_corrected
@@ -25,6 +24,7 @@ from identification.losses import LeastSquares, Loss
 from identification.model import RobotModel
 from identification.phase_factor import FINE_BLOCK, block_runs, fine_blocks, merged
 from identification.preprocessing import Samples
+from identification.quantiles import student_limit
 
 Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ def clustered_covariance(
         covariance=covariance,
         determined=determined,
         design_effect=float((corrected**2).sum() / max(1, corrected.shape[1])),
-        interval_factor=float(student.ppf(0.975, max(1, count - 1))),
+        interval_factor=float(student_limit(0.025, max(1, count - 1))),
         words=f"cluster-robust covariance over {count} blocks of {length * FINE_BLOCK:g} s",
     )
 

@@ -29,10 +29,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
-from scipy.stats import t as student
 
 from identification.estimation import Estimate, mark_undetermined, solve
 from identification.phase_factor import FINE_BLOCK, PhaseFactor, merged
+from identification.quantiles import student_limit
 
 Array = NDArray[np.float64]
 
@@ -100,7 +100,7 @@ def block_covariance(phase: PhaseFactor, weights: Array, values: Array) -> Clust
         covariance=covariance,
         determined=solution.determined,
         design_effect=float((corrected**2).sum() / max(1, corrected.shape[1])),
-        interval_factor=float(student.ppf(0.975, max(1, count - 1))),
+        interval_factor=float(student_limit(0.025, max(1, count - 1))),
         words=f"cluster-robust covariance over {count} blocks of {length * FINE_BLOCK:g} s",
     )
 

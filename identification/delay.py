@@ -25,8 +25,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm as normal
-from scipy.stats import t as student
 
 from identification.covariance import block_length, spread
 from identification.delay_grid import DelayGrid
@@ -37,6 +35,7 @@ from identification.motion import Motion
 from identification.noise import difference_variance
 from identification.phase_factor import FINE_BLOCK
 from identification.preprocessing import Preprocessing, Samples, prepare
+from identification.quantiles import normal_limit, student_limit
 from identification.recording import Recording
 from identification.smoothing_spline import ORDER, SmoothingSpline, fit_smoothing_spline
 
@@ -116,7 +115,7 @@ class DelayEstimate:
         The intervals are widened for the number of comparisons (Bonferroni).
         """
         known = self.determined
-        several = normal.isf(0.025 / max(1, int(np.count_nonzero(known)))) / normal.isf(0.025)
+        several = normal_limit(0.025 / max(1, int(np.count_nonzero(known)))) / normal_limit(0.025)
         apart = np.abs(self.delays[known] - self.common)
         return bool(np.all(apart <= several * self.interval_factor * self.std[known]))
 
@@ -243,7 +242,7 @@ class _Blocks:
         gram = np.add.reduceat(gram, np.arange(0, len(gram), length), axis=0)
         moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, root)
         covariance = np.asarray(moved.T @ moved)
-        return covariance, float(student.ppf(0.975, max(1, len(gram) - 1)))
+        return covariance, float(student_limit(0.025, max(1, len(gram) - 1)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
-from scipy.stats import t as student
 
 from identification.covariance import block_length, left_out, spread
 from identification.estimation import solve
@@ -37,6 +35,7 @@ from identification.instrument_factor import InstrumentFactor
 from identification.instrumental import InstrumentalEstimate, solve_cross
 from identification.model import RobotModel
 from identification.phase_factor import merged
+from identification.quantiles import fisher_tail, student_limit
 
 Array = NDArray[np.float64]
 
@@ -110,10 +109,10 @@ def endogeneity_test(
     statistic, freedom, gamma, gamma_std = _wald(*_augmented(blocks, added))
     coefficient = np.full((2, factor.n_joints), np.nan)
     coefficient[:, active] = gamma, gamma_std
-    p_value = float(fisher.sf(statistic, *freedom)) if np.isfinite(statistic) else np.nan
+    p_value = float(fisher_tail(statistic, *freedom)) if np.isfinite(statistic) else np.nan
     shift, shift_std, count = _shift(blocks)
     names, known = factor.parameter_names, shift_std > 0.0
-    critical = student.ppf(1.0 - LEVEL / (2 * max(1, int(known.sum()))), max(1, count - 1))
+    critical = student_limit(LEVEL / (2 * max(1, int(known.sum()))), max(1, count - 1))
     shifted = tuple(
         names[k] for k in np.flatnonzero(known & (np.abs(shift) > critical * shift_std))
     )

@@ -26,7 +26,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from identification.covariance import block_length, with_block_covariance
 from identification.errors import IdentificationError
@@ -34,6 +33,7 @@ from identification.estimation import Estimate, Solution, joint_weights, residua
 from identification.factor import Factor, NormalEquations
 from identification.model import RobotModel
 from identification.phase_factor import PhaseFactor
+from identification.quantiles import student_limit
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -340,7 +340,7 @@ def _rise(difference: Array) -> tuple[float, bool]:
 @lru_cache
 def _chance(freedom: int) -> float:
     """What Student's t exceeds one time in twenty."""
-    return float(student.ppf(_LEVEL, freedom))
+    return float(student_limit(1.0 - _LEVEL, freedom))
 
 
 def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], rule: CutRule) -> str:

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from identification.preprocessing import Samples
+from identification.quantiles import student_limit
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class FrictionDrift:
     @property
     def significant(self) -> NDArray[np.bool_]:
         """Whether the trend stands out of the scatter (n,)."""
-        limit = student.isf(0.5 * _CHANCE, self.freedom)
+        limit = student_limit(0.5 * _CHANCE, self.freedom)
         known = np.isfinite(self.change)
         size = np.abs(np.where(known, self.change, 0.0))
         return np.asarray(size > limit * np.where(known, self.change_std, np.inf))

@@ -26,13 +26,13 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
-from scipy.stats import t as student
 
 from identification.covariance import block_length, spread
 from identification.errors import IdentificationError
 from identification.estimation import Solution, mark_undetermined, solve
 from identification.factor import NormalEquations
 from identification.gain_factor import GainFactor
+from identification.quantiles import student_limit
 
 Array = NDArray[np.float64]
 GainMethod = Literal["weighted", "total"]
@@ -322,7 +322,7 @@ def _clustered(information: Array, scores: Array, solution: Solution) -> tuple[A
     information = np.add.reduceat(information, edges, axis=0)
     scores = np.add.reduceat(scores, edges, axis=0)
     moved = spread(information, scores, solution.root)
-    return np.asarray(moved.T @ moved), float(student.ppf(0.975, max(1, len(scores) - 1)))
+    return np.asarray(moved.T @ moved), float(student_limit(0.025, max(1, len(scores) - 1)))
 
 
 def _loaded(gram: Array, p: int) -> bool:

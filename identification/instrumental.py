@@ -24,7 +24,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from identification.covariance import block_length, spread, with_block_covariance
 from identification.errors import IdentificationError
@@ -40,6 +39,7 @@ from identification.factor import Factor
 from identification.instrument_factor import InstrumentFactor
 from identification.model import RobotModel
 from identification.phase_factor import FINE_BLOCK, merged
+from identification.quantiles import student_limit
 
 Array = NDArray[np.float64]
 
@@ -212,5 +212,5 @@ def _with_covariance(
             for name, known in zip(model.parameter_names, solution.determined, strict=True)
             if not known
         ),
-        interval_factor=float(student.ppf(0.975, max(1, len(scores) - 1))),
+        interval_factor=float(student_limit(0.025, max(1, len(scores) - 1))),
     )

@@ -14,13 +14,13 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from identification.errors import IdentificationError
 from identification.finding import Finding, listed
 from identification.model import RobotModel
 from identification.nominal_prior import NOMINAL_SHARE
 from identification.preprocessing import Samples
+from identification.quantiles import student_limit
 
 Array = NDArray[np.float64]
 
@@ -179,7 +179,7 @@ def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
     lost = (np.linalg.norm(rigid) / size_alone) ** 2 - 1.0
     misfit = _FRICTION_SHARE * np.linalg.norm(friction) / size_alone
     wonder = _SURE * float(np.sqrt(share**2 * (1.0 + _LINKS_APART * lost) + misfit**2))
-    tolerance = student.ppf(0.975, _BLOCKS - 1) * std + wonder
+    tolerance = student_limit(0.025, _BLOCKS - 1) * std + wonder
     # Friction and noise have the unit of the torque, so a tolerance is large where the scale is.
     told = tolerance < _LEAST_TOLD * max(1.0, abs(scale))
     return (scale, float(tolerance)) if told else (np.nan, np.inf)

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from identification.preprocessing import Samples
+from identification.quantiles import student_limit
 from identification.residual_blocks import (
     BlockMean,
     BlockSums,
@@ -63,7 +63,7 @@ class Profile:
         """
         seen = np.isfinite(self.bins.mean)
         freedom = np.maximum(self.bins.blocks - 1, 1)
-        limit = student.isf(0.5 * CHANCE / np.maximum(seen.sum(axis=1), 1)[:, None], freedom)
+        limit = student_limit(0.5 * CHANCE / np.maximum(seen.sum(axis=1), 1)[:, None], freedom)
         std = np.where(seen & (self.bins.std > 0.0), self.bins.std, np.inf)
         return np.asarray((np.abs(np.where(seen, self.bins.mean, 0.0)) > limit * std).any(axis=1))
 

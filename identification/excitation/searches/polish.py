@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import rankdata
 
 from identification.errors import ShapeError
 from identification.excitation.errors import DesignError
@@ -169,6 +168,8 @@ def _merits(scores: Scores, fitness: Fitness) -> _Merits:
 
 def _ranks(merits: _Merits) -> Array:
     """Return ranks from 1 for the best (m,), alike for motions that are alike."""
+    from scipy.stats import rankdata  # slow to import, and only a search needs it
+
     pairs = np.stack((-merits.fitness, merits.excess))
     order = np.lexsort(pairs)
     steps = np.any(np.diff(pairs[:, order], axis=1) != 0.0, axis=0)
