@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo docs pictures test test-slow audit bench clean
+.PHONY: help setup demo docs pictures test test-slow coverage mutants audit bench clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -40,6 +40,21 @@ test: $(STAMP)  ## lint, types, floors, declared dependencies and the fast tests
 
 test-slow: $(STAMP)  ## the tests that take minutes
 	$(BIN)/pytest -m slow
+
+coverage: $(STAMP)  ## lines and branches of drivers, planner and identification that tests reach
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt coverage==7.17.3
+	rm -rf build/coverage && mkdir -p build/coverage
+	COVERAGE_FILE="$(CURDIR)/build/coverage/data" $(BIN)/coverage run -m pytest -n auto --dist loadfile --no-loadscope-reorder \
+	  tests/drivers tests/planner tests/identification tests/sim_fixtures tests/hil tests/test_*.py
+	COVERAGE_FILE="$(CURDIR)/build/coverage/data" $(BIN)/coverage combine --quiet
+	for package in drivers planner identification; do \
+	  COVERAGE_FILE="$(CURDIR)/build/coverage/data" $(BIN)/coverage report --include="$$package/*" --fail-under=90 || exit 1; \
+	done
+
+mutants: $(STAMP)  ## changes to what decides an answer, one by one, that no test finds; hours, resumable
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt mutmut==3.8.1
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/mutmut run --max-children 2
+	$(BIN)/mutmut results
 
 audit: $(STAMP)  ## known vulnerabilities of every pinned dependency (asks the Python Package Index)
 	$(BIN)/python -m pip check

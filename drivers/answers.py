@@ -150,8 +150,8 @@ class Answers:
         self._frame.safe(reading.answer, words)
         status = reading.answer.status
         if state not in HAS_SET_POINTS:
-            asked = self._unholdable(machine, reading, words)
-            return status if asked is None else asked
+            self._hold_where_nothing_moves(machine, reading, words)
+            return status
         if self._open_mode is None:
             raise RefusalError(f"this arm cannot be moved: {self.unusable}", machine.cycle)
         self._require_targets(reading.others, machine.cycle)
@@ -174,11 +174,8 @@ class Answers:
         self._asked_at = machine.cycle
         return self._asking_for_exit(status)
 
-    def _unholdable(self, machine: Machine, reading: Reading, words: Words) -> bytes | None:
-        """Axes that are open where nothing is moved are answered their target, if that can be.
-
-        Returns:
-            Status bytes once drive-off was asked for and still has to be, else None.
+    def _hold_where_nothing_moves(self, machine: Machine, reading: Reading, words: Words) -> None:
+        """Axes that are open are answered their target if that can be, else drive-off is asked for.
 
         Raises:
             GuardError: they cannot be held there; told once, not in each cycle.
@@ -191,9 +188,9 @@ class Answers:
             if not self._told:
                 self._told = True
                 raise
-            return self.refusal(_offending(error), reading, words)
-        self._told = False
-        return None
+            self.refusal(_offending(error), reading, words)
+        else:
+            self._told = False
 
     def _require_targets(self, slots: Sequence[int], cycle: int) -> None:
         """What is given back in an open mode has to be a number, whosever axis it is."""

@@ -55,6 +55,7 @@ class OpenMode(ABC):
         Raises:
             GuardError: they cannot.
         """
+        self.lost = 0  # what was sent in an earlier interval is no longer asked for
         held = reading.held
         self.require_holdable(held, held | reading.ready, cycle)
         commanded[0] = np.where(held, measured[0], np.nan)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 
 from identification.errors import ModelError
 from identification.urdf_faults import closed_chain, urdf_fault
+from identification.urdf_text import refusal
 
 Array = NDArray[np.float64]
 
 # Where our ten parameters stand in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, ...
 FROM_PINOCCHIO = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)
+
+MOST_JOINTS: Final = 64
+"""Time and memory of a model grow faster than their square: a minute and 1.5 GB for 100."""
 
 _LINK = "link "
 
@@ -83,13 +87,18 @@ def chain_from_urdf(urdf: str, locked: Mapping[str, float] | None = None) -> Cha
         locked: joints held at a position [rad or m], by name; they become fixed joints.
 
     Raises:
-        ModelError: the text is no URDF, has no moving joint, has a joint that is neither
-            revolute (or continuous) nor prismatic, or no joint of a name in `locked`; the
-            message names the joint.
+        ModelError: the text is no URDF, has no moving joint or more than `MOST_JOINTS`, has a
+            joint that is neither revolute (or continuous) nor prismatic, or no joint of a name
+            in `locked`; the message names the joint.
     """
     model = pinocchio_model(urdf, locked)
     if model.njoints < 2:
         raise ModelError("the robot description has no revolute or prismatic joint")
+    if model.njoints > 1 + MOST_JOINTS:
+        raise ModelError(
+            f"the robot description has {model.njoints - 1} joints that move; at most "
+            f"{MOST_JOINTS} can be identified together: lock the others"
+        )
     indices = range(1, model.njoints)
     axes, revolute = zip(*(_axis(model, i) for i in indices), strict=True)
     return Chain(
@@ -118,8 +127,11 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
     """Return pinocchio's model of URDF text, without the joints that are locked.
 
     Raises:
-        ModelError: the text is no URDF of an open chain, or has no joint of a name in `locked`.
+        ModelError: the text is no URDF of an open chain or none that may be read
+            (:func:`identification.urdf_text.refusal`), or has no joint of a name in `locked`.
     """
+    if (refused := refusal(urdf)) is not None:
+        raise ModelError(f"the robot description is not a readable URDF: {refused}")
     try:
         model = pin.buildModelFromXML(urdf)
     except (ValueError, RuntimeError) as error:

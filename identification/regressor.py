@@ -203,7 +203,8 @@ class _Workspace:
         n = plan.chain.n_joints
         self.rows = np.zeros((n, max(own.response for own in plan.own) + 1, size))
         self.size = size
-        self._plan = plan
+        # Not the plan itself, which keeps this: large memory would wait for the cycle collector.
+        self._own, self._joint_friction = plan.own, plan.friction
         self._motion = LinkMotion(plan.chain, plan.gravity, size)
         self._primitives = np.empty((n, N_PRIMITIVES, size))
         self._friction = self._friction_parts()
@@ -214,10 +215,13 @@ class _Workspace:
             inertia = [s for s in kept if s < N_INERTIA]
             for symbols, moments_only in ((inertia, True), (kept[len(inertia) :], False)):
                 if symbols:
-                    self._add(link, symbols, moments_only, first)
+                    joints = _as_slice(plan.chain.ancestors(link))
+                    self._add(link, joints, symbols, moments_only, first)
                     first += len(symbols)
 
-    def _add(self, link: int, symbols: Sequence[int], moments_only: bool, first: int) -> None:
+    def _add(
+        self, link: int, joints: Rows, symbols: Sequence[int], moments_only: bool, first: int
+    ) -> None:
         """Prepare the columns of one link: inertia makes no force, so half the work."""
         size = self.rows.shape[2]
         twists = self._motion.twists[link]
@@ -226,7 +230,6 @@ class _Workspace:
         used = ROTATIONAL if moments_only else slice(None)
         matrix = np.concatenate([wrench_matrix(symbol)[:length, used] for symbol in symbols])
         wrenches = np.empty((len(matrix), size))
-        joints = _as_slice(self._plan.chain.ancestors(link))
         columns = slice(first, first + len(symbols))
         contiguous = isinstance(joints, slice)
         self._contractions.append(
@@ -243,29 +246,29 @@ class _Workspace:
 
     def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array]]:
         """Return laws, the speeds that they read, and the rows that they write."""
-        plan, velocity = self._plan, self._motion.velocity
-        if plan.friction is None:
+        velocity = self._motion.velocity
+        if self._joint_friction is None:
             return []
-        if (one := plan.friction.one_law) is not None:
-            rows = self.rows[:, plan.own[0].friction]
+        if (one := self._joint_friction.one_law) is not None:
+            rows = self.rows[:, self._own[0].friction]
             return [(one, velocity, rows.transpose(1, 0, 2))]
         return [
-            (law, velocity[j], self.rows[j, plan.own[j].friction])
-            for j, law in enumerate(plan.friction.laws)
+            (law, velocity[j], self.rows[j, self._own[j].friction])
+            for j, law in enumerate(self._joint_friction.laws)
         ]
 
     def _drive_parts(self) -> list[tuple[Array, Array]]:
         """Return accelerations and the rows of rotors and coupling inertias that they go to."""
         acceleration = self._motion.acceleration
-        places = {own.rotor for own in self._plan.own}
+        places = {own.rotor for own in self._own}
         parts = []
         if len(places) == 1 and None not in places:  # one step for all joints
             parts.append((acceleration, self.rows[:, next(iter(places))]))
         else:
-            for joint, own in enumerate(self._plan.own):
+            for joint, own in enumerate(self._own):
                 if own.rotor is not None:
                     parts.append((acceleration[joint], self.rows[joint, own.rotor]))
-        for joint, own in enumerate(self._plan.own):
+        for joint, own in enumerate(self._own):
             for other, row in own.couplings.items():
                 parts.append((acceleration[other], self.rows[joint, row]))
         return parts
@@ -276,13 +279,13 @@ class _Workspace:
             speed = share @ self._motion.velocity
             column = {"f0": friction.laws[motor].sign(speed), "f1": speed}
             for joint in np.flatnonzero(share):
-                for (index, symbol), row in self._plan.own[joint].motors.items():
+                for (index, symbol), row in self._own[joint].motors.items():
                     if index == motor:
                         np.multiply(share[joint], column[symbol], out=self.rows[joint, row])
 
     def update(self, q: Array, qd: Array, qdd: Array) -> None:
         """Make all columns for k <= size samples (k, n); those behind mean nothing."""
-        motion, plan = self._motion, self._plan
+        motion = self._motion
         motion.update(q, qd, qdd)
         write_primitives(motion.motion, self._primitives)
         for c in self._contractions:
@@ -295,8 +298,8 @@ class _Workspace:
             law.columns(velocity, target)
         for source, target in self._drives:
             np.copyto(target, source)
-        if plan.friction is not None and plan.friction.motors:
-            self._write_motor_friction(plan.friction)
+        if self._joint_friction is not None and self._joint_friction.motors:
+            self._write_motor_friction(self._joint_friction)
 
 
 class _Contraction(NamedTuple):

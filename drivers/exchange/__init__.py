@@ -7,6 +7,7 @@ from drivers.exchange.errors import ExchangeError
 from drivers.exchange.event_log import EventReader, EventWriter
 from drivers.exchange.loop import exchange
 from drivers.exchange.notices import (
+    NO_ARCHIVE,
     NO_SUPERVISOR,
     EventsLost,
     ExchangeEnded,
@@ -29,6 +30,7 @@ from drivers.exchange.shared_ring import (
 )
 
 __all__ = [
+    "NO_ARCHIVE",
     "NO_SUPERVISOR",
     "ArchiveState",
     "ControlBlock",

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.exchange.listening import listens_to_all
-from drivers.packets import AXIS_LENGTH, HEADER_LENGTH, LAST_NUMBER, N_ARMS, is_init
+from drivers.packets import (
+    AXIS_LENGTH,
+    HEADER_LENGTH,
+    LAST_NUMBER,
+    MAX_AXES,
+    N_ARMS,
+    cyclic_length,
+    is_init,
+)
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS
 from drivers.transports.base import Stamped, Transport
@@ -125,7 +133,8 @@ class Intake:
     def _newest(self, first: Arrival, period: float) -> tuple[Arrival, ...]:
         """Of a packet and those that wait behind it, the newest of each kind."""
         transport = self._transport
-        pile = _Pile()
+        init = self._session.init
+        pile = _Pile(MAX_AXES if init is None else init.n_axes)
         pile.add(first)
         for _ in range(MOST_WAITING):
             before = transport.now
@@ -162,12 +171,17 @@ class Intake:
 class _Pile:
     """The newest packet of each kind, in the order of their arrival.
 
+    Args:
+        n_axes: slots of a packet that mean something. Some controllers send more bytes, and what
+            stands in those makes no kind.
+
     Attributes:
         left_out: packets that were not kept; repetitions of one that was do not count.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, n_axes: int) -> None:
         self.left_out = 0
+        self._modes = slice(HEADER_LENGTH, cyclic_length(n_axes), AXIS_LENGTH)
         self._kinds: dict[tuple[int, int, bytes], Arrival] = {}
         self._sessions = 0
 
@@ -183,7 +197,7 @@ class _Pile:
             self._sessions += 1
         status = packet[4 : 4 + N_ARMS]
         # The lowest byte tells the modes there are from each other.
-        modes = packet[HEADER_LENGTH::AXIS_LENGTH]
+        modes = packet[self._modes]
         kind = (self._sessions, len(packet), status + modes)
         earlier = self._kinds.get(kind)
         if earlier is None:

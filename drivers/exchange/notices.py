@@ -10,6 +10,8 @@ from drivers.exchange.realtime import RealTimeReport
 
 NO_SUPERVISOR: Final = "the supervisor gives no sign of life"
 """Why the exchange leaves that missed the heartbeats of the process that started it."""
+NO_ARCHIVE: Final = "the archive process gives no sign of life"
+"""Why a motion is stopped during which that process did not get on."""
 
 
 @dataclass(frozen=True)

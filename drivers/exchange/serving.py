@@ -18,6 +18,7 @@ from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import Inbox
 from drivers.exchange.latency import bin_of
 from drivers.exchange.notices import (
+    NO_ARCHIVE,
     NO_SUPERVISOR,
     ExchangeEvent,
     HoldRefused,
@@ -172,7 +173,7 @@ class Serving:
         if self._control.archive_state != ArchiveState.READY:
             return "the archive cannot be written"
         if now - self._control.archive_heartbeat > STALE:
-            return "the archive process gives no sign of life"
+            return NO_ARCHIVE
         return ""
 
     def _change_override(self, fraction: float) -> None:

@@ -254,6 +254,23 @@ class TestHeldUp:
         assert source.advances <= advances + 2
         assert rig.session.counters.discarded == {"late": waiting - 1}
 
+    @pytest.mark.parametrize("waiting", [2, 3, 30])
+    def test_what_follows_the_axes_is_garbage_and_no_reason_for_an_answer(self, waiting):
+        """Some controllers send 732 bytes whatever the number of axes."""
+        chance = np.random.default_rng(5178)
+        rig, source = self.moving()
+
+        def long_packet():
+            packet = rig.packet()
+            return packet + chance.bytes(732 - len(packet))
+
+        on_time = long_packet()
+        late = [long_packet() for _ in range(waiting)]
+        advances = source.advances
+        assert len(self.serve(rig, on_time, late)) == 2
+        assert source.advances <= advances + 2
+        assert rig.session.counters.discarded == {"late": waiting - 1}
+
     def test_with_closed_axes_too(self):
         rig = Rig()
         rig.close()
@@ -381,6 +398,7 @@ class Mute:
 
     state = State.OPEN
     period = PERIOD
+    init = None
     deadline = 1e9
 
     def __init__(self):

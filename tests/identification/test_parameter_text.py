@@ -98,9 +98,7 @@ def test_standard_parameters_are_a_table_of_joints(fit: Fit) -> None:
     assert all(float(row["margin"]) > 0.0 for row in rows)
 
 
-@pytest.mark.parametrize(
-    "evil", ["=HYPERLINK('http://a')", "@SUM(1)", "-1+1", "+1", " =1", "a&#10;#b"]
-)
+@pytest.mark.parametrize("evil", ["=HYPERLINK('http://a')", "@SUM(1)", "-1+1", "+1", " =1", "a;#b"])
 def test_no_name_is_a_formula_to_a_spreadsheet_or_breaks_its_row(fit: Fit, evil: str) -> None:
     _, _, consistent = fit
     model = RobotModel.from_urdf(URDF.replace("shoulder", evil), friction=FrictionLaw(third=None))

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -138,3 +141,16 @@ def test_standard_symbols_are_the_ten_of_a_rigid_body() -> None:
 def test_lists_are_taken_as_arrays() -> None:
     (array,) = joint_arrays(2, q=[[0, 1], [2, 3]])  # type: ignore[arg-type]
     assert array.dtype == np.float64
+
+
+def test_the_working_arrays_go_with_their_model() -> None:
+    """Not when the cycle collector comes: in a process with many objects that takes minutes."""
+    model = RobotModel.from_urdf(urdf_text())
+    model.regressor(*states(CHUNK))
+    plan = weakref.ref(model.plan)
+    gc.disable()
+    try:
+        del model
+        assert plan() is None
+    finally:
+        gc.enable()

@@ -87,7 +87,8 @@ class ClassicCodec:
             CanModeError: a mode without a code.
         """
         codes = [_code(mode, slot) for slot, mode in enumerate(words[:, 0].tolist())]
-        numbers = words.view(np.float32).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a signalling NaN is one like any other
+            numbers = words.view(np.float32).astype(np.float64)
         target = _counts(numbers[:, 1], COUNTS_PER_REVOLUTION)
         actual = _counts(numbers[:, 3], COUNTS_PER_REVOLUTION)
         current = _counts(numbers[:, 5], COUNTS_PER_AMPERE)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, NamedTuple
+from xml.etree import ElementTree
 
 import coal
 import numpy as np
@@ -72,7 +75,7 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
 
     Raises:
         MissingMeshError: a mesh is not to be found.
-        CollisionModelError: a mesh cannot be read, or no moving link has a shape.
+        CollisionModelError: a shape cannot be read, or no moving link has one.
     """
     try:
         shapes = pin.buildGeomFromUrdfString(
@@ -82,13 +85,12 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
         missing = _MISSING_MESH.search(str(error))
         if missing:
             raise MissingMeshError(missing[1]) from error
-        raise CollisionModelError(f"collision shapes cannot be loaded: {error}") from error
+        why = " ".join(str(error).split())
+        raise CollisionModelError(f"collision shapes cannot be loaded: {why}") from error
+    _require_all(model, urdf, shapes)
     bodies = []
     for item in shapes.geometryObjects:
-        shape = item.geometry
-        if isinstance(shape, coal.BVHModelBase):
-            shape.buildConvexHull(True, "Qt")
-            shape = shape.convex
+        shape = _body(item.geometry, model.frames[item.parentFrame].name)
         rotation, translation = item.placement.rotation, item.placement.translation
         bodies.append(
             Body(
@@ -103,6 +105,38 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     if not any(body.joint >= 0 for body in bodies):
         raise CollisionModelError("no moving link of the robot description has a collision shape")
     return sorted(bodies, key=lambda body: body.joint)
+
+
+def _require_all(model: pin.Model, urdf: str, shapes: pin.GeometryModel) -> None:
+    """Refuse a description of which the reader left a shape out, as it does without an error."""
+    read = Counter(model.frames[item.parentFrame].name for item in shapes.geometryObjects)
+    for link in ElementTree.fromstring(urdf).findall("link"):
+        written, name = len(link.findall("collision")), link.get("name", "")
+        if read[name] != written:
+            raise CollisionModelError(
+                f"of the {written} collision shapes of link {name!r} {read[name]} could be read: "
+                "correct its <collision> elements (sizes are numbers with single spaces between)"
+            )
+
+
+def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
+    """The shape itself, or the convex hull of a mesh.
+
+    Raises:
+        CollisionModelError: it is no body: turned inside out, flat, or without finite corners.
+    """
+    if isinstance(shape, coal.BVHModelBase):
+        if np.all(np.isfinite(shape.vertices())):
+            with suppress(ValueError, RuntimeError):
+                shape.buildConvexHull(True, "Qt")
+                return shape.convex
+        raise CollisionModelError(
+            f"a collision mesh of link {link!r} is no body: flat, or its corners no points"
+        )
+    sides = [getattr(shape, name, 0.0) for name in ("halfSide", "radius", "halfLength")]
+    if min(float(np.min(side)) for side in sides) < 0.0:
+        raise CollisionModelError(f"a collision shape of link {link!r} has a negative size")
+    return shape
 
 
 def obstacles(workspace: Workspace) -> list[Body]:

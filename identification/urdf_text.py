@@ -1,0 +1,138 @@
+"""What a robot description must keep to before its readers see it: it may be anybody's file.
+
+Readers written in C++ end the process on some texts, take minutes for others, and leave out the
+whole inertia of a link where they cannot read one number of it, without an error.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Final
+from xml.parsers import expat
+
+LONGEST: Final = 20_000_000
+"""Characters of the longest description that is read; one of a whole cell has some 100 000."""
+MOST_LINKS: Final = 1000
+"""A chain of some thousands overflows the stack of the reader, which ends the process."""
+_DEEPEST: Final = 50  # a description needs seven
+_MOST_ATTRIBUTES: Final = 100  # of one element; the reader's time grows with their square
+
+_NUMBERS: Final[Mapping[str, Mapping[str, int]]] = {
+    "origin": {"xyz": 3, "rpy": 3},
+    "mass": {"value": 1},
+    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 1),
+}
+"""How many numbers there are in the attributes of what an <inertial> holds."""
+# As the reader takes them: it knows no blanks but spaces, and none behind a single number.
+_NUMBER: Final = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_FORMS: Final = {
+    1: re.compile(rf" *{_NUMBER}"),
+    3: re.compile(rf" *{_NUMBER} +{_NUMBER} +{_NUMBER} *"),
+}
+_TAG: Final = re.compile(rb"""<[^"'>]*(?:(?:"[^"]*"|'[^']*')[^"'>]*)*>""")
+_QUOTED: Final = re.compile(rb""""[^"]*"|'[^']*'""")
+_BLANKS: Final = (b"\t", b"\n", b"\r")
+"""XML makes spaces of them in attributes; the reader does not."""
+
+
+class _RefusedError(Exception):
+    """The description is refused; its argument says why."""
+
+
+def refusal(text: str) -> str | None:
+    """Return why a robot description is given to no reader, in words; None if it may be.
+
+    It must be XML without entities of its own, which readers expand differently or without end;
+    of a size, depth and number of links that readers bear; its links and joints must have names
+    that can be printed; and each number of an inertia must be one.
+    """
+    if len(text) > LONGEST:
+        return f"it has {len(text)} characters; at most {LONGEST} are read"
+    found = _Reading()
+    try:
+        found.read(text)
+    except _RefusedError as refused:
+        return str(refused)
+    except UnicodeEncodeError as problem:
+        return f"it is no text ({problem.reason})"
+    except expat.ExpatError as problem:
+        return f"it is no XML ({problem})"
+    return None
+
+
+class _Reading:
+    """One way through the elements."""
+
+    def __init__(self) -> None:
+        self._path: list[str] = []
+        self._link = ""
+        self._links = 0
+        self._data = b""
+        self._parser = expat.ParserCreate()
+        self._parser.StartElementHandler = self._begin
+        self._parser.EndElementHandler = self._end
+        self._parser.EntityDeclHandler = self._entity
+
+    def read(self, text: str) -> None:
+        """Go through all of it.
+
+        Raises:
+            _RefusedError: it is none that may be read.
+            expat.ExpatError: it is no XML.
+            UnicodeEncodeError: it is no text.
+        """
+        self._data = text.encode()
+        try:
+            self._parser.Parse(self._data, True)
+        finally:
+            del self._parser  # it knows this object: both would wait for the cycle collector
+
+    def _entity(self, name: str, *_: object) -> None:
+        raise _RefusedError(f"it declares the entity {name!r}; write its text where it is used")
+
+    def _begin(self, tag: str, attributes: Mapping[str, str]) -> None:
+        self._path.append(tag)
+        if len(self._path) > _DEEPEST:
+            raise _RefusedError(f"its elements are nested more than {_DEEPEST} deep")
+        if len(attributes) > _MOST_ATTRIBUTES:
+            raise _RefusedError(f"its <{tag[:40]}> has more than {_MOST_ATTRIBUTES} attributes")
+        if len(self._path) == 2 and tag in ("link", "joint"):
+            self._named(tag, attributes.get("name", ""))
+        elif self._path[1:3] == ["link", "inertial"] and tag in _NUMBERS:
+            self._numbers(tag, attributes)
+
+    def _end(self, _: str) -> None:
+        self._path.pop()
+
+    def _named(self, tag: str, name: str) -> None:
+        if not name.isprintable():
+            raise _RefusedError(f"the name of {tag} {name!r} has characters that cannot be printed")
+        if tag == "link":
+            self._link = name
+            self._links += 1
+            if self._links > MOST_LINKS:
+                raise _RefusedError(f"it has more than {MOST_LINKS} links")
+
+    def _numbers(self, tag: str, attributes: Mapping[str, str]) -> None:
+        for key, count in _NUMBERS[tag].items():
+            text = attributes.get(key)
+            if text is not None and not (_FORMS[count].fullmatch(text) and _finite(text)):
+                shown = text if len(text) <= 40 else f"{text[:40]}..."
+                wanted = "one number" if count == 1 else f"{count} numbers"
+                raise _RefusedError(
+                    f"link {self._link!r} has {key}={shown!r} in the <{tag}> of its <inertial>; "
+                    f"write {wanted}, with nothing before or behind"
+                )
+        written = _TAG.match(self._data, self._parser.CurrentByteIndex)
+        values = [] if written is None else _QUOTED.findall(written[0])
+        if any(blank in value for value in values for blank in _BLANKS):
+            raise _RefusedError(
+                f"link {self._link!r} has a tab or line end within an attribute of the <{tag}> of "
+                "its <inertial>; put spaces there"
+            )
+
+
+def _finite(text: str) -> bool:
+    return all(math.isfinite(float(word)) for word in text.split())

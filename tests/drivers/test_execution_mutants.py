@@ -1,0 +1,339 @@
+"""How long a source may take, what it is granted, and what of it is believed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers import Mode, SourceFailed
+from drivers.execution import CorrectionExecution, Execution, MotionExecution, execution_of
+
+N = 2
+SETTLE, STOP = 3, 5
+HERE = np.array([0.5, -0.25])
+
+
+class Motion:
+    """Steps of `step` rad in joint 1 until told otherwise."""
+
+    def __init__(self, step=0.01):
+        self.step = step
+        self.position = HERE
+        self.finished = False
+        self.bounds = "plan"
+        self.told = []
+
+    def begin(self, position):
+        self.position = position
+
+    def advance(self):
+        self.position = self.position + np.array([self.step, 0.0])
+        return self.position, np.array([self.step / 0.002, 0.0])
+
+    def stop(self):
+        self.told.append("stop")
+
+    def hold(self):
+        self.told.append("hold")
+
+    def resume(self):
+        self.told.append("resume")
+
+    def override(self, fraction):
+        self.told.append(fraction)
+
+    def feed_forward(self):
+        return np.full(N, 0.25), np.full(N, 0.5)
+
+
+class Correction:
+    def __init__(self):
+        self.finished = False
+        self.rows = (np.array([0.1, 0.0]), np.array([0.0, 2.0]))
+
+    def begin(self):
+        pass
+
+    def advance(self):
+        return self.rows
+
+    def stop(self):
+        pass
+
+    def hold(self):
+        pass
+
+    def resume(self):
+        pass
+
+
+def begun(source) -> Execution:
+    mode = Mode.POSITION if isinstance(source, Motion) else Mode.VELOCITY
+    execution = execution_of(source, mode, N, SETTLE, STOP)
+    assert isinstance(execution, Execution)
+    execution.begin(HERE, 0)
+    return execution
+
+
+def fails(execution: Execution, words: str) -> None:
+    with pytest.raises(SourceFailed, match=words) as caught:
+        execution.advance(7)
+    assert caught.value.cycle == 7
+
+
+class TestEnd:
+    def test_the_end_is_held_for_as_long_as_was_asked(self):
+        source = Motion()
+        execution = begun(source)
+        execution.advance(1)
+        source.finished = True
+        position, _, _ = execution.advance(2)
+        for cycle in range(SETTLE):
+            assert not execution.settled
+            held, velocity, bounds = execution.advance(3 + cycle)
+            np.testing.assert_array_equal(held, position)
+            np.testing.assert_array_equal(velocity, np.zeros(N))
+            assert bounds == "plan"
+        assert execution.settled
+
+    def test_after_its_end_a_correction_is_zero_for_as_long(self):
+        source = Correction()
+        execution = begun(source)
+        source.finished = True
+        np.testing.assert_array_equal(execution.advance(1), source.rows)
+        for cycle in range(SETTLE):
+            assert not execution.settled
+            np.testing.assert_array_equal(execution.advance(2 + cycle), np.zeros((2, N)))
+        assert execution.settled
+
+    def test_what_goes_with_it_is_zero_from_then_on(self):
+        source = Motion()
+        execution = begun(source)
+        execution.advance(1)
+        np.testing.assert_array_equal(execution.feed_forward(1), [[0.25] * N, [0.5] * N])
+        source.finished = True
+        execution.advance(2)
+        np.testing.assert_array_equal(execution.feed_forward(2), [[0.25] * N, [0.5] * N])
+        execution.advance(3)
+        np.testing.assert_array_equal(execution.feed_forward(3), np.zeros((2, N)))
+
+    def test_what_was_not_asked_to_leave_does_not(self):
+        execution = begun(Motion())
+        assert not execution.leaving
+        assert (execution.outcome, execution.fraction, execution.held) == ("completed", None, False)
+
+
+@pytest.mark.parametrize("kind", [Motion, Correction])
+class TestStop:
+    def test_it_may_take_so_many_cycles_and_no_more(self, kind):
+        execution = begun(kind())
+        execution.advance(1)
+        execution.stop("enough", 1)
+        for cycle in range(STOP):
+            execution.advance(2 + cycle)
+        fails(execution, f"did not come to rest in the {STOP} cycles")
+
+    def test_the_first_reason_stays_and_it_is_told_once(self, kind):
+        source = kind()
+        told = []
+        source.stop = lambda: told.append("stop")
+        execution = begun(source)
+        execution.stop("first", 1)
+        execution.stop("second", 2)
+        assert (execution.outcome, execution.reason, told) == ("stopped", "first", ["stop"])
+
+    def test_one_that_came_to_its_end_is_not_stopped(self, kind):
+        source = kind()
+        execution = begun(source)
+        source.finished = True
+        execution.advance(1)
+        execution.stop("late", 2)
+        assert execution.outcome == "completed"
+        assert execution.hold() is None
+        assert not execution.held
+
+    def test_nor_is_one_that_stops_held_or_resumed(self, kind):
+        execution = begun(kind())
+        assert execution.hold() is None
+        assert execution.held
+        execution.stop("enough", 1)
+        assert not execution.held
+        assert execution.hold() is None
+        assert not execution.held
+        assert execution.resume() == "the motion was told to stop"
+
+
+class TestHold:
+    @pytest.mark.parametrize("kind", [Motion, Correction])
+    def test_one_that_goes_on_for_as_long_as_a_stop_may_take_is_stopped(self, kind):
+        execution = begun(kind())
+        execution.hold()
+        for cycle in range(STOP):
+            execution.advance(1 + cycle)
+            assert execution.outcome == "completed"
+        execution.advance(9)
+        assert execution.outcome == "stopped"
+        assert execution.reason == f"it did not come to rest in {STOP} cycles of a hold"
+
+    def test_a_second_hold_is_no_new_time(self):
+        execution = begun(Motion())
+        execution.hold()
+        for cycle in range(STOP):
+            execution.advance(1 + cycle)
+            execution.hold()
+        execution.advance(9)
+        assert execution.outcome == "stopped"
+
+    def test_one_that_rests_may_rest_for_ever(self):
+        source = Motion()
+        execution = begun(source)
+        execution.hold()
+        execution.advance(1)
+        source.step = 0.0
+        for cycle in range(5 * STOP):
+            execution.advance(2 + cycle)
+        assert execution.outcome == "completed"
+        assert execution.held
+
+    @pytest.mark.parametrize("what", ["step", "speed"])
+    def test_rest_is_neither_a_step_nor_a_velocity(self, what):
+        """Seen over one cycle; what rounding leaves is none."""
+        source = Motion(step=0.0)
+        execution = begun(source)
+        execution.hold()
+        tiny = {"step": 0.9e-9, "speed": 0.9e-9}
+        large = {"step": 0.0, "speed": 0.0, what: 1.1e-9}
+
+        def give(sizes):
+            def advance():
+                source.position = source.position + np.array([sizes["step"], 0.0])
+                return source.position, np.array([-sizes["speed"], 0.0])
+
+            source.advance = advance
+
+        give(large)
+        for cycle in range(STOP):
+            execution.advance(1 + cycle)
+        give(tiny)
+        execution.advance(8)
+        give(large)
+        for cycle in range(2 * STOP):
+            execution.advance(9 + cycle)
+        assert execution.outcome == "completed"
+
+    def test_rest_without_a_hold_is_none_of_it(self):
+        source = Motion(step=0.0)
+        execution = begun(source)
+        execution.advance(1)
+        source.step = 0.01
+        execution.hold()
+        for cycle in range(STOP + 1):
+            execution.advance(2 + cycle)
+        assert execution.outcome == "stopped"
+
+    def test_before_the_beginning_the_source_is_told_only_when_it_begins(self):
+        source = Motion()
+        execution = execution_of(source, Mode.POSITION, N, SETTLE, STOP)
+        assert isinstance(execution, MotionExecution)
+        assert execution.hold() is None
+        assert (execution.held, source.told, execution.granted) == (True, [], "plan")
+        assert execution.resume() is None
+        assert (execution.held, source.told) == (False, [])
+        execution.hold()
+        execution.begin(HERE, 0)
+        assert (source.told, execution.granted) == (["hold"], "stop")
+        for cycle in range(STOP + 1):
+            execution.advance(1 + cycle)
+        assert execution.outcome == "stopped"
+
+    def test_resuming_ends_the_count(self):
+        source = Motion()
+        execution = begun(source)
+        execution.hold()
+        execution.advance(1)
+        assert execution.resume() is None
+        assert not execution.held
+        for cycle in range(3 * STOP):
+            execution.advance(2 + cycle)
+        assert execution.outcome == "completed"
+
+
+class TestBounds:
+    def test_each_is_granted_from_the_first_call_that_needs_it(self):
+        source = Motion()
+        execution = begun(source)
+        for needs, call in (
+            ("override", lambda: execution.override(0.5)),
+            ("stop", execution.hold),
+        ):
+            source.bounds = needs
+            fails(execution, f"named bounds '{needs}'")
+            assert call() is None
+            assert execution.granted == needs
+            assert execution.advance(2)[2] == needs
+        source.bounds = "override"
+        assert execution.advance(3)[2] == "override"
+        assert execution.granted == "stop"
+
+    @pytest.mark.parametrize("wrong", ["wide", None, 7, ["plan"]])
+    def test_what_is_no_name_of_any_is_refused(self, wrong):
+        source = Motion()
+        execution = begun(source)
+        execution.override(0.5)
+        source.bounds = wrong
+        fails(execution, "not plan or override")
+
+    def test_a_correction_at_rest_has_those_of_a_stop_no_longer_unless_it_stops(self):
+        execution = begun(Correction())
+        assert isinstance(execution, CorrectionExecution)
+        execution.hold()
+        assert execution.granted == "stop"
+        execution.rested()
+        assert execution.granted == "plan"
+        execution.stop("enough", 3)
+        execution.rested()
+        assert execution.granted == "stop"
+
+    @pytest.mark.parametrize("fraction", [-0.01, 1.01, float("nan")])
+    def test_an_override_is_a_share(self, fraction):
+        execution = begun(Motion())
+        assert "is not one of 0..1" in execution.override(fraction)
+        assert execution.granted == "plan"
+        for share in (0.0, 1.0, 1):
+            assert execution.override(share) is None
+            assert execution.fraction == share
+
+
+class TestBelief:
+    @pytest.mark.parametrize(("part", "name"), [(0, "position"), (1, "velocity")])
+    def test_a_wrong_shape_is_named(self, part, name):
+        source = Motion()
+        rows = [HERE, HERE]
+        rows[part] = np.zeros(N + 1)
+        source.advance = lambda: tuple(rows)
+        fails(begun(source), rf"gave a {name} of shape \(3,\), not \(2,\)")
+
+    @pytest.mark.parametrize(("part", "name"), [(0, "correction"), (1, "current")])
+    def test_of_a_correction_too(self, part, name):
+        source = Correction()
+        rows = [HERE, HERE]
+        rows[part] = np.zeros((N, 1))
+        source.rows = tuple(rows)
+        fails(begun(source), rf"gave a {name} of shape \(2, 1\), not \(2,\)")
+
+    @pytest.mark.parametrize("kind", [Motion, Correction])
+    def test_numbers_of_any_kind_are_float64_afterwards(self, kind):
+        source = kind()
+        source.advance = lambda: ([1, 2], np.array([3, 4], np.float32))
+        first, second = begun(source).advance(1)[:2]
+        assert first.dtype == second.dtype == np.float64
+
+    @pytest.mark.parametrize("kind", [Motion, Correction])
+    def test_what_it_raises_is_why_it_failed(self, kind):
+        source = kind()
+        source.advance = lambda: 1 / 0
+        fails(begun(source), "^the motion source failed: ZeroDivisionError: division by zero")
+
+    def test_a_source_of_another_kind_is_named(self):
+        reason = execution_of(Correction(), Mode.POSITION, N, SETTLE, STOP)
+        assert reason == "a Correction is not the kind of source mode 4 needs"

@@ -1,0 +1,133 @@
+"""Run the whole real path for hours and watch what it takes: `python -m tests.endurance`.
+
+A simulated controller sends a packet each millisecond over UDP on this computer. The product's own
+exchange and archive process answer and record, and campaigns of short motions run on one link one
+after another, about 26 archives in half a minute. Every 5 s memory, descriptors, threads and
+processor time of each process and the exchange's own histogram of its latencies go to the journal;
+each archive is checked, and removed when three newer campaigns are there. Campaigns whose archives
+are not whole stay.
+
+Each call is a piece with processes of its own and appends to the journal; --merge only prints what
+all pieces together have shown. Ctrl-C or SIGTERM ends a piece properly, SIGKILL costs the last 5 s.
+Four hours in three pieces:
+
+    for piece in 1 2 3; do
+        python -m tests.endurance --minutes 80 --journal long.jsonl --folder /tmp/long
+    done
+    python -m tests.endurance --merge --journal long.jsonl
+
+The exit code is 1 if anything is wrong, 0 if not; what a run is too short for is said as a doubt.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from hil.campaign import stop_on_interrupt
+from hil.progress import reporter
+from tests.endurance.journal import read_journal
+from tests.endurance.piece import run_piece
+from tests.endurance.verdict import SHARES, Verdict, judge
+
+LONGEST = 90.0
+"""min of a piece."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a piece, or only merge; print the verdict over all pieces."""
+    given = _parser().parse_args(arguments)
+    if not given.merge:
+        if given.folder is None or given.minutes is None:
+            _parser().error("--minutes and --folder are needed to run a piece")
+        if not 0.0 < given.minutes <= LONGEST:
+            _parser().error(f"--minutes must be above 0 and at most {LONGEST:g}")
+        with stop_on_interrupt() as stop:
+            run_piece(
+                given.folder,
+                given.journal,
+                60.0 * given.minutes,
+                given.rate,
+                stop,
+                reporter(quiet=given.json),
+            )
+    pieces = read_journal(given.journal)
+    if not pieces:
+        sys.stderr.write(f"error: {given.journal} holds no piece; run one first\n")
+        return 2
+    verdict = judge(pieces)
+    if given.json:
+        facts = {"good": not verdict.faults, "faults": verdict.faults, "doubts": verdict.doubts}
+        sys.stdout.write(json.dumps({**facts, **verdict.figures}) + "\n")
+    else:
+        sys.stdout.write("\n".join(_lines(verdict)) + "\n")
+    return 1 if verdict.faults else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.endurance",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--journal", type=Path, required=True, help="JSON lines; appended to")
+    parser.add_argument("--minutes", type=float, help="how long this piece takes, 90 at most")
+    parser.add_argument("--folder", type=Path, help="where campaigns are made")
+    parser.add_argument(
+        "--rate", type=int, choices=(500, 1000), default=1000, help="packets per second"
+    )
+    parser.add_argument("--merge", action="store_true", help="run nothing, print the verdict")
+    parser.add_argument("--json", action="store_true", help="print one line of JSON")
+    return parser
+
+
+def _lines(verdict: Verdict) -> list[str]:
+    figures: dict[str, Any] = verdict.figures
+    archives, latency = figures["archives"], figures["latency"]
+    lines = [
+        f"{figures['minutes']:g} minutes in {figures['pieces']} pieces ({figures['killed']} killed)"
+        f", {', '.join(figures['scheduling'])}",
+        f"processor: {figures['processor_share']} of a core",
+        f"campaigns: {archives['campaigns']} ({archives['complete']} complete, "
+        f"{archives['restarts']} restarts), {archives['motions']} motions, "
+        f"{archives['archives']} archives {archives['outcomes']}, {archives['records']} records",
+        f"exchange: {latency['answered']} answered, {latency['missed']} missed, "
+        f"{latency['late']} late, longest {latency['worst_us']:.0f} µs",
+        "",
+        "memory        first MiB  last MiB   own memory, MiB/h (99 % interval)   resident, MiB/h",
+    ]
+    for name, one in figures["memory"].items():
+        growth = one["growth"]
+        lines.append(
+            f"{name:12} {one['first']:10.1f} {one['last']:9.1f} {growth['value']:9.3f}  "
+            f"({growth['low']:.3f} to {growth['high']:.3f}) {one['rss_growth']['value']:12.3f}"
+        )
+    lines += ["", f"descriptors, most in each half: {figures['descriptors']}", ""]
+    lines.append("latency, µs   first minute   last   least   median   most   rise of others")
+    for number, piece in enumerate(latency["pieces"], 1):
+        for name in SHARES:
+            one = piece[name]
+            lines.append(
+                f"{number:3} {name:8} {one['first_us']:13.0f} {one['last_us']:6.0f} "
+                f"{one['least_us']:7.0f} {one['median_us']:8.0f} {one['most_us']:6.0f} "
+                f"{one['rise_of_others'] - 1.0:12.0%}"
+            )
+    lines += ["", "blocks of 10 minutes, µs (load)   first          last"]
+    for number, piece in enumerate(latency["pieces"], 1):
+        for name in SHARES:
+            one = piece[name]
+            lines.append(
+                f"{number:3} {name:8} {one['first_block_us']:19.0f} "
+                f"({one['first_block_load']:.1f}) {one['last_block_us']:8.0f} "
+                f"({one['last_block_load']:.1f})"
+            )
+    lines += ["", *(f"doubt: {text}" for text in verdict.doubts)]
+    lines += [f"WRONG: {text}" for text in verdict.faults] or ["nothing is wrong"]
+    return lines
+
+
+if __name__ == "__main__":
+    sys.exit(main())

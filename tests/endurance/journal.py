@@ -1,0 +1,162 @@
+"""What a long run leaves behind: one line of JSON each, appended as soon as it is known.
+
+A line is written by one call, so that a process that is killed leaves whole lines and perhaps one
+torn one, which is passed over. `begin` and `end` enclose a piece; one without an end was killed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+SYNC_EVERY: Final = 60.0
+"""s between two waits for the disk."""
+
+
+@dataclass(frozen=True)
+class Use:
+    """What a process takes: bytes, descriptors, threads, processor time in s."""
+
+    rss: int
+    uss: int
+    fds: int
+    threads: int
+    cpu: float
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One look at everything.
+
+    Attributes:
+        t: s since the piece began.
+        load: average of the machine over a minute.
+        processes: by name.
+        shared: files in /dev/shm, of whoever.
+        counters: of the exchange, since it began.
+        latencies: answers by duration, in the bins of `drivers.exchange.latency`, likewise.
+    """
+
+    t: float
+    load: float
+    processes: Mapping[str, Use]
+    shared: int
+    counters: Mapping[str, float]
+    latencies: Sequence[int]
+
+
+@dataclass(frozen=True)
+class Ran:
+    """One campaign.
+
+    Attributes:
+        number: in its piece, from 0.
+        t: s since the piece began, at its end.
+        complete: whether everything of its plan was done.
+        stopped: whether it was stopped because the piece was over; otherwise one that is not
+            complete was given up after some restarts.
+        restarts: how often it was resumed, with the errors.
+        motions: that ended on the link meanwhile, as the exchange counted them.
+        archives: files.
+        faulty: those that do not keep the archive profile, with what is wrong.
+        outcomes: archives by outcome.
+        records: in them.
+        records_lost: as they state.
+        descriptors: open ones by process, with no archive open.
+    """
+
+    number: int
+    t: float
+    complete: bool
+    stopped: bool
+    restarts: Sequence[str]
+    motions: int
+    archives: int
+    faulty: Sequence[str]
+    outcomes: Mapping[str, int]
+    records: int
+    records_lost: int
+    descriptors: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One call of the command.
+
+    Attributes:
+        begun: what was known at its beginning.
+        samples: in order.
+        campaigns: in order.
+        ended: what was known at its end; None if it was killed.
+    """
+
+    begun: Mapping[str, Any]
+    samples: list[Sample] = field(default_factory=list)
+    campaigns: list[Ran] = field(default_factory=list)
+    ended: Mapping[str, Any] | None = None
+
+    @property
+    def seconds(self) -> float:
+        """How long it was seen to run."""
+        return self.samples[-1].t if self.samples else 0.0
+
+
+class Journal:
+    """Appends to a file; what was written stays, whatever becomes of the process."""
+
+    def __init__(self, path: Path) -> None:
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        self._fd = os.open(path, flags, 0o644)
+        self._synced = time.monotonic()
+        size = os.fstat(self._fd).st_size
+        if size and os.pread(self._fd, 1, size - 1) != b"\n":
+            os.write(self._fd, b"\n")  # after the torn line of a killed piece
+
+    def add(self, kind: str, **facts: Any) -> None:
+        """Append one line."""
+        line = json.dumps({"kind": kind, **facts}, separators=(",", ":")) + "\n"
+        os.write(self._fd, line.encode())
+        if time.monotonic() - self._synced > SYNC_EVERY:
+            os.fsync(self._fd)
+            self._synced = time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        os.fsync(self._fd)
+        os.close(self._fd)
+
+
+def read_journal(path: Path) -> list[Piece]:
+    """All pieces of a journal; none if there is no such file."""
+    pieces: list[Piece] = []
+    for line in path.read_bytes().splitlines() if path.exists() else ():
+        try:
+            facts = json.loads(line)
+        except ValueError:
+            continue  # torn by a kill
+        kind = facts.pop("kind")
+        if kind == "begin":
+            pieces.append(Piece(facts))
+        elif kind == "link":
+            pieces[-1] = replace(pieces[-1], begun={**pieces[-1].begun, **facts})
+        elif kind == "sample":
+            used = {name: Use(**use) for name, use in facts.pop("processes").items()}
+            pieces[-1].samples.append(Sample(processes=used, **facts))
+        elif kind == "campaign":
+            pieces[-1].campaigns.append(Ran(**facts))
+        elif kind == "end":
+            pieces[-1] = replace(pieces[-1], ended=facts)
+    return pieces

@@ -1,0 +1,173 @@
+"""Coverage-guided fuzzing of all that reads what others wrote: ``python -m tests.fuzz all``.
+
+Targets: `codec` (packets, CAN frames), `session` (a controller that does anything), `cell_file`,
+`archive`, `importers`, `urdf`, `documents` (plans, settings, results). Needs atheris, which the
+extra ``fuzz`` brings. The command goes on where an earlier one with the same journal ended, after
+a kill too, until each target has been fuzzed for --minutes.
+
+Beside the journal lie FILE.files/TARGET/corpus and findings; a finding is a folder with the input,
+its shortest form and the traceback. ``python -m tests.fuzz.child TARGET --once INPUT`` repeats it.
+
+Examples:
+  python -m tests.fuzz session --minutes 5 --journal runs/fuzz.jsonl
+  nice python -m tests.fuzz all --minutes 60 --jobs 2 --stop-after 85 --journal runs/fuzz.jsonl
+  python -m tests.fuzz all --keep --journal runs/fuzz.jsonl    the best inputs to the repository
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from hil.progress import Reporter, reporter
+from tests.fuzz import journal, keeping, targets
+from tests.fuzz.findings import known
+from tests.fuzz.lives import Places, live, shorten
+
+PIECE = 120.0  # s: what a kill loses of the figures, never of the inputs
+LEAST = 5.0  # s that are worth a start
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; the exit status is 1 if anything was found, 0 otherwise."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.fuzz",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("target", choices=(*targets.NAMES, "all"))
+    parser.add_argument("--minutes", type=float, default=1.0, help="of each target, in all pieces")
+    parser.add_argument("--stop-after", type=float, metavar="MIN", help="end this piece after that")
+    parser.add_argument("--jobs", type=int, default=1, help="targets at a time")
+    parser.add_argument("--journal", type=Path, required=True, help="JSON lines, added to")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    parser.add_argument("--keep", action="store_true", help="make the repository's corpora anew")
+    given = parser.parse_args(arguments)
+    names = targets.NAMES if given.target == "all" else (given.target,)
+    teller = reporter(quiet=given.json)
+    if given.keep:
+        for name in names:
+            teller.say(f"{name}: {keeping.keep(name, given.journal)}")
+        return 0
+    until = time.monotonic() + 60.0 * (given.stop_after or 1e6)
+    try:
+        Run(names, 60.0 * given.minutes, until, given.journal, teller).work(given.jobs)
+    except KeyboardInterrupt:
+        teller.say("stopped; the same command goes on from here")
+    report = reported(names, given.journal)
+    sys.stdout.write(json.dumps(report) + "\n" if given.json else told(report))
+    return int(any(target["findings"] for target in report["targets"].values()))
+
+
+class Run:
+    """Pieces of targets, the one that was fuzzed least before the others."""
+
+    def __init__(
+        self, names: tuple[str, ...], wanted: float, until: float, path: Path, teller: Reporter
+    ) -> None:
+        self._wanted, self._until, self._path, self._teller = wanted, until, path, teller
+        found = journal.pieces(path)
+        self._done = {name: journal.seconds_of(found, name) for name in names}
+        self._busy: set[str] = set()
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._failed: list[BaseException] = []
+
+    def work(self, jobs: int) -> None:
+        """Work until all have their time.
+
+        Raises:
+            RuntimeError: a target cannot be fuzzed at all.
+        """
+        left = sum(max(0.0, self._wanted - done) for done in self._done.values())
+        with self._teller.task("fuzzing", left) as task:
+            workers = [
+                threading.Thread(target=self._worker, args=(task,), daemon=True)
+                for _ in range(jobs)
+            ]
+            for worker in workers:
+                worker.start()
+            try:
+                while any(worker.is_alive() for worker in workers):
+                    time.sleep(0.2)
+            finally:
+                self._ended.set()
+        if self._failed:
+            raise self._failed[0]
+
+    def _worker(self, task: Any) -> None:
+        try:
+            while (given := self._next()) is not None:
+                name, seconds = given
+                piece = self._piece(name, seconds)
+                with self._lock:
+                    journal.append(self._path, piece)
+                    self._done[name] += piece.seconds
+                    self._busy.discard(name)
+                    note = f"{name}: {piece.inputs} inputs, {piece.features} features"
+                    task.advance(min(piece.seconds, seconds), note)
+        except BaseException as error:
+            self._failed.append(error)
+            self._ended.set()
+
+    def _next(self) -> tuple[str, float] | None:
+        with self._lock:
+            free = [name for name in self._done if name not in self._busy]
+            if not free or self._ended.is_set():
+                return None
+            name = min(free, key=lambda one: self._done[one])
+            left = min(self._wanted - self._done[name], self._until - time.monotonic())
+            if left < LEAST:
+                return None
+            self._busy.add(name)
+            return name, min(left, PIECE)
+
+    def _piece(self, name: str, seconds: float) -> journal.Piece:
+        target = targets.load(name)
+        places = Places.beside(self._path, name)
+        try:
+            if not any(places.corpus.iterdir()):
+                keeping.plant(places.corpus, target.seeds())
+            piece = live(name, seconds, target.most, places)
+            shorten(name, places)
+        finally:
+            shutil.rmtree(places.scratch, ignore_errors=True)
+        return piece
+
+
+def reported(names: tuple[str, ...], path: Path) -> dict[str, Any]:
+    """The figures of all pieces so far."""
+    totals = journal.summary(journal.pieces(path))
+    found = {
+        name: {**totals.get(name, {}), "findings": known(Path(f"{path}.files") / name / "findings")}
+        for name in names
+    }
+    return {
+        "inputs": sum(target.get("inputs", 0) for target in found.values()),
+        "seconds": round(sum(target.get("seconds", 0.0) for target in found.values()), 1),
+        "findings": sum(len(target["findings"]) for target in found.values()),
+        "targets": found,
+    }
+
+
+def told(report: dict[str, Any]) -> str:
+    """The same for a person."""
+    lines = [f"{'target':>10} {'inputs':>12} {'minutes':>8} {'edges':>7} {'features':>9} findings"]
+    for name, target in report["targets"].items():
+        lines.append(
+            f"{name:>10} {target.get('inputs', 0):>12,} {target.get('seconds', 0.0) / 60:>8.1f} "
+            f"{target.get('edges', 0):>7,} {target.get('features', 0):>9,} "
+            f"{len(target['findings'])}"
+        )
+        lines += [f"{'':>10} {count:>12,} × {cause}" for cause, count in target["findings"].items()]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

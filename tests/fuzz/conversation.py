@@ -1,0 +1,356 @@
+"""A conversation of a session with a controller, drawn from bytes and judged at every step.
+
+The arm, its place among other arms' axes, the open mode, cycle and bounds are drawn; the controller
+obeys or not, packets are lost, repeated, garbled, old, cut; the user asks, stops, overrides. What
+must hold is what the judge of the drivers' tests says (`judge`, `reception`, `oracle`), which
+shares nothing with the session but the records' layout and the drive train.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+# Shared with the tests of the drivers, whose modules stand beside one another.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
+
+import oracle
+from judge import POSITION_MODES, Conduct
+from reception import Reception
+from sources import FAULTS, WILD, Breaks, FedMotion, ScriptedCorrection, ScriptedMotion, smooth
+
+from drivers import (
+    CycleRing,
+    Guard,
+    InitReceived,
+    MotionEnded,
+    RequestError,
+    Session,
+)
+from tests.fuzz.draw import Draw
+from tests.fuzz.drawn_arm import Controller, arm_of
+
+WINDOW = 500
+STRANGE = (0, 10, 501, 3, 6, 11, 12, 14, 17, 500, 502, 504, 505, 506, 508, -1, 1 << 30, 99)
+FREE = ((16, 228), (388, 548), (708, 1040))
+"""Bytes of an init packet that may change without another layout or other limits."""
+STEPS = 60
+CYCLES = 200
+"""Of one conversation at most."""
+
+
+class Conversation:
+    """One session, one controller, one user; `play` lets them act."""
+
+    def __init__(self, draw: Draw) -> None:
+        self._draw = draw
+        # A motion's table is made for cycles of 2 ms; in shorter ones it would be too fast.
+        self.arm = arm = arm_of(
+            draw.choice((2, 6, 1, 3, 4, 5)), draw.choice((1, 2, 4)), draw.below(4), draw.below(4), 2
+        )
+        self.mode = draw.choice((4, 4, 5, 1, 2, 7, 8, 9))
+        self.max_gap = draw.choice((2, 0, 5))
+        self.ring = CycleRing(arm.n, 2 * CYCLES)
+        self.session = Session(
+            arm.train,
+            Guard(arm.limits, arm.period),
+            self.ring,
+            mode=self.mode,
+            max_gap=self.max_gap,
+            arm=arm.number,
+            settle_cycles=draw.choice((0, 3)),
+            other_axes={(owner, axis + 1) for owner, axis in arm.axes},
+        )
+        self.obedient = not draw.chance(64)
+        self.controller = Controller(arm)
+        self.reception = Reception(WINDOW)
+        self.conduct = Conduct(
+            arm.limits, arm.train, self.mode, arm.number, arm.slots, arm.arms,
+            threshold=np.full(arm.n, 2.0), current=np.full(arm.n, 20.0), period=arm.period,
+            max_gap=self.max_gap,
+        )  # fmt: skip
+        self.now = 0.0
+        self.last: tuple[bytes, bytes] | None = None
+        self.ages: np.ndarray | None = None
+        self.unanswered = 0
+        self.sent = 0
+
+    def play(self) -> None:
+        """Start, then step by step until the bytes run out.
+
+        Raises:
+            AssertionError: a law is broken.
+        """
+        draw = self._draw
+        if draw.chance(64):
+            for number in range(1, 10):
+                self.deliver(number.to_bytes(4, "little") + bytes(728))
+        self._init()
+        self.run(1)
+        for _ in range(STEPS):
+            if not draw.left or self.sent > CYCLES:
+                return
+            draw.choice(ACTS)(self)
+
+    # One packet ---------------------------------------------------------------------------
+
+    def deliver(self, packet: bytes, elapsed: float | None = None) -> bytes | None:
+        """One packet, and its answer judged."""
+        elapsed = self.arm.period if elapsed is None else elapsed
+        self.now += elapsed
+        self.sent += 1
+        if elapsed > 301.0:
+            self._silence_heard()
+        before, last = self.ring.slot, self.reception.last
+        kind = self.reception.expect(packet)
+        reply = self.session.reply(packet, self.now, self.ages)
+        self._events()
+        assert self.ring.slot - before == (kind == "cyclic"), "records"
+        if kind == "nothing":
+            assert reply is None, "an answer to what gets none"
+            self.unanswered += 1
+            return None
+        assert reply is not None, f"no answer to {kind}"
+        if kind == "again":
+            assert self.last is not None and reply == self.last[1], "a duplicate answered otherwise"
+            return reply
+        self.last = packet, reply
+        if kind in ("echo", "init"):
+            assert reply == oracle.echo(packet), "not an echo"
+            self.conduct.interrupted()
+        else:
+            self._cyclic(packet, reply, last)
+        return reply
+
+    def _cyclic(self, packet: bytes, reply: bytes, last: int) -> None:
+        record = self.ring.last(1)[0]
+        long_gap = record["gap"] + self.unanswered > self.max_gap
+        self.conduct.judge(packet, reply, record, bool(long_gap))
+        self.unanswered = 0
+        missed = (number_of(packet) - last) % 0x7FFF - 1
+        assert record["gap"] in (missed, 0), "the gap recorded"
+        slots = len(self.arm.axes)
+        if all(axis.mode == 504 for axis in oracle.parse(packet, slots).axes):
+            self.reception.ended = True
+
+    def _silence_heard(self) -> None:
+        if not self.reception.ended:
+            self.reception.silent = self.reception.n_axes is not None
+            self.conduct.interrupted()
+
+    def _events(self) -> None:
+        for event in self.session.events():
+            if isinstance(event, MotionEnded):
+                self.conduct.entitled = False
+                self.conduct.stopping = self.conduct.overridden = False
+            if isinstance(event, InitReceived):
+                self.conduct.usable = event.unusable is None
+                packet = event.init.encode()
+                if packet in (self.arm.init, self.arm.other):
+                    fits = packet == self.arm.init
+                    assert self.conduct.usable == fits, "which arms are moved"
+
+    def run(self, cycles: int) -> None:
+        """Cycles of a controller that goes on."""
+        for _ in range(cycles):
+            reply = self.deliver(self.controller.packet())
+            cyclic = reply is not None and len(reply) >= oracle.length(len(self.arm.axes))
+            if cyclic and self.obedient and self.reception.n_axes is not None:
+                self.controller.obey(reply or b"", self.mode)
+
+    # What the controller does -------------------------------------------------------------
+
+    def _init(self) -> None:
+        draw, packet = self._draw, self.arm.init
+        if draw.chance(24):
+            packet = self.arm.other
+        elif draw.chance(24):
+            changed = bytearray(packet)
+            first, last = draw.choice(FREE)
+            changed[first + draw.below(last - first)] ^= 1 << draw.below(8)
+            packet = bytes(changed)
+        self.deliver(packet)
+        self.controller.number = 10
+
+    def go_on(self) -> None:
+        self.run(self._draw.between(1, 30))
+
+    def open_properly(self) -> None:
+        draw = self._draw
+        self.controller.status[self.arm.number - 1] = oracle.DRIVE_ON
+        self.controller.home()
+        self.controller.wanted(0)
+        self.run(draw.between(1, 3))
+        stagger = draw.chance(64)
+        for slot in self.arm.slots:
+            self.controller.modes[slot] = self.mode
+            if stagger:
+                self.run(1)
+        self.run(draw.between(1, 40))
+
+    def all_modes(self) -> None:
+        draw = self._draw
+        mode = draw.integer() if draw.chance(16) else draw.choice((self.mode, *STRANGE))
+        self.controller.modes = [mode] * len(self.arm.axes)
+        self.run(1)
+
+    def one_mode(self) -> None:
+        slot = self._draw.below(len(self.arm.axes))
+        self.controller.modes[slot] = self._draw.choice((self.mode, *STRANGE))
+        self.run(self._draw.between(1, 2))
+
+    def drive(self) -> None:
+        self.controller.status[self._draw.below(4)] = self._draw.choice((5, 0, 1, 4, 255))
+        self.run(1)
+
+    def disturb(self) -> None:
+        draw = self._draw
+        slot, column = draw.below(len(self.arm.axes)), draw.below(8)
+        value = draw.float32() if draw.chance(64) else draw.choice((*WILD, 0.19, 0.21, 1.9, 2.1))
+        kept = self.controller.d[slot, column]
+        with np.errstate(all="ignore"):
+            added = kept + np.float32(value) if draw.chance(128) else np.float32(value)
+            self.controller.d[slot, column] = added
+        self.run(draw.between(1, 2))
+        self.controller.d[slot, column] = kept
+
+    def miss(self) -> None:
+        count = self._draw.between(1, 8)
+        for _ in range(count):
+            self.controller.packet()
+        self.now += count * self.arm.period
+        self.run(1)
+
+    def grow_old(self) -> None:
+        ages = [self._draw.below(4) for _ in range(8)]
+        self.ages = np.tile(np.uint16(ages), (len(self.arm.axes), 1))
+        self.run(1)
+        self.ages = None
+
+    # What the line does -------------------------------------------------------------------
+
+    def again(self) -> None:
+        if self.last is not None:
+            for _ in range(self._draw.between(1, 3)):
+                self.deliver(self.last[0])
+
+    def late(self) -> None:
+        packet = bytearray(self.controller.packet())
+        behind = self._draw.below(0x8000)
+        packet[:4] = ((number_of(bytes(packet)) - behind - 1) % 0x7FFF + 1).to_bytes(4, "little")
+        self.deliver(bytes(packet))
+        self.controller.number = self.reception.last
+
+    def cut(self) -> None:
+        packet = self.controller.packet() + self._draw.raw(16) * 80
+        self.deliver(packet[: self._draw.below(1300)])
+        self.controller.number = self.reception.last
+
+    def corrupt(self) -> None:
+        packet = bytearray(self.controller.packet())
+        for _ in range(self._draw.between(1, 3)):
+            packet[4 + self._draw.below(len(packet) - 4)] ^= self._draw.byte() or 1
+        self.deliver(bytes(packet))
+
+    def noise(self) -> None:
+        self.deliver(self._draw.raw(self._draw.choice((4, 12, 48, 84, 120, 2))))
+        self.controller.number = self.reception.last
+
+    def silence(self) -> None:
+        for _ in range(self._draw.below(3)):
+            self.now += 400.0
+            self.session.tick(self.now)
+            self._silence_heard()
+            self._events()
+        self.deliver(self.controller.packet(), elapsed=400.0)
+
+    def start_over(self) -> None:
+        self._init()
+        self.run(1)
+
+    def sync(self) -> None:
+        self.deliver(self._draw.between(1, 13).to_bytes(4, "little") + bytes(728))
+        self.controller.number = self.reception.last
+
+    # What the user does -------------------------------------------------------------------
+
+    def request(self) -> None:
+        draw = self._draw
+        fits = (self.mode in POSITION_MODES) != draw.chance(8)
+        source = self._motion() if fits == (self.mode in POSITION_MODES) else self._motion(True)
+        try:
+            self.session.request(source)
+        except RequestError:
+            return
+        of_positions = isinstance(source, ScriptedMotion)
+        assert of_positions == (self.mode in POSITION_MODES), "the wrong kind of source was taken"
+        assert self.conduct.usable or self.session.init is None
+        self.conduct.entitled = True
+        self.conduct.stopping = self.conduct.overridden = False
+
+    def _motion(self, other_kind: bool = False) -> ScriptedMotion | ScriptedCorrection:
+        draw, n = self._draw, self.arm.n
+        direction = np.array([draw.choice((1.0, 0.0, -1.0)) for _ in range(n)])
+        if draw.chance(128):
+            hold = draw.between(1, 45)
+            share = draw.choice((1.0, 0.5, 0.99999, 1.00001, 1.1, 2.5))
+            rows = _edge(hold, share) * direction
+        else:
+            rows = smooth(draw.between(1, 250), 0.1 * direction)
+        fault = draw.choice(FAULTS) if draw.chance(96) else ""
+        value = draw.choice(WILD) if draw.chance(128) else 0.01 * (draw.byte() / 128.0 - 1.0)
+        breaks = Breaks(fault, draw.below(31), draw.below(n), value)
+        if (self.mode in POSITION_MODES) != other_kind:
+            velocity = np.diff(rows, axis=0, prepend=rows[:1]) / self.arm.period
+            kind = FedMotion if draw.chance(96) else ScriptedMotion
+            return kind(rows, velocity, breaks, draw.choice(("plan", "stop")))
+        rows = np.vstack([rows, rows[::-1]])
+        motion = rows if self.mode != 9 else np.zeros_like(rows)
+        current = 20.0 * rows if self.mode in (2, 9) else np.zeros_like(rows)
+        return ScriptedCorrection(motion, current, breaks)
+
+    def request_and_open(self) -> None:
+        if not self.session.requested:
+            self.request()
+            self.open_properly()
+
+    def stop(self) -> None:
+        self.session.stop()
+        self._events()
+        self.conduct.stopping = self.conduct.entitled
+        self.run(1)
+
+    def override(self) -> None:
+        fraction = self._draw.choice((0.5, 0.0, 1.0, 1.0001, -0.1, float("nan"), float("inf")))
+        try:
+            self.session.override(fraction)
+        except RequestError:
+            return
+        assert 0.0 <= fraction <= 1.0
+        self.conduct.overridden = True
+
+
+@lru_cache(maxsize=512)
+def _edge(hold: int, share: float) -> np.ndarray:
+    """(m, 1) displacement with a jerk of `share` of the bound, +, -, -, +, from rest to rest."""
+    jerk = 100.0 * share * np.repeat([1.0, -1.0, -1.0, 1.0], hold)[:, None]
+    rows = np.cumsum(np.cumsum(np.cumsum(jerk, axis=0), axis=0), axis=0) * 0.002**3
+    return np.vstack([np.zeros((1, 1)), rows, rows[-1:]])
+
+
+def number_of(packet: bytes) -> int:
+    """As on the wire, signed."""
+    return int.from_bytes(packet[:4], "little", signed=True)
+
+
+_C = Conversation
+ACTS: tuple[Callable[[Conversation], None], ...] = (
+    _C.go_on, _C.request_and_open, _C.request, _C.open_properly, _C.stop, _C.override, _C.all_modes,
+    _C.one_mode, _C.drive, _C.disturb, _C.miss, _C.grow_old, _C.again, _C.late, _C.cut, _C.corrupt,
+    _C.noise, _C.silence, _C.start_over, _C.sync, _C.go_on, _C.request_and_open,
+)  # fmt: skip
+"""What may happen next."""

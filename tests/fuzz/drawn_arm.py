@@ -1,0 +1,146 @@
+"""Arms as a controller's init packet lays them out, and a controller that may obey."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+# Shared with the tests of the drivers, whose modules stand beside one another.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
+
+import oracle
+from arms_bench import train_of
+from judge import POSITION_MODES
+
+from drivers import DriveTrain, GuardLimits, InitPacket
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """An arm and where its axes stand in a packet.
+
+    Attributes:
+        n: joints.
+        number: of the arm, from 1.
+        axes: (arm from 1, axis from 0) of each slot.
+        period: of the controller [s].
+        train: drive train.
+        limits: of the guard.
+        init: the init packet that fits.
+        other: one whose gear ratios are another arm's.
+    """
+
+    n: int
+    number: int
+    axes: tuple[tuple[int, int], ...]
+    period: float
+    train: DriveTrain
+    limits: GuardLimits
+    init: bytes
+    other: bytes
+
+    @property
+    def slots(self) -> tuple[int, ...]:
+        """Slot of each joint."""
+        return tuple(self.axes.index((self.number, joint)) for joint in range(self.n))
+
+    @property
+    def arms(self) -> tuple[int, ...]:
+        """Arm of each slot."""
+        return tuple(arm for arm, _ in self.axes)
+
+
+@lru_cache(maxsize=64)
+def arm_of(n: int, number: int, order: int, foreign: int, cycle_ms: int) -> Arm:
+    """An arm of `n` joints among `foreign` axes that are not its own, in a drawn order."""
+    own = [(number, joint) for joint in range(n)]
+    strangers = [(number, 9), (number % 4 + 1, 0), (number % 4 + 1, 3)][:foreign]
+    mixed = np.random.default_rng(order).permutation(n + foreign) if order else range(n + foreign)
+    axes = tuple((own + strangers)[k] for k in mixed)
+    train = train_of(n)
+    limits = GuardLimits(
+        lower=np.full(n, -2.0),
+        upper=np.full(n, 2.0),
+        velocity=np.full(n, 2.0),
+        acceleration=np.full(n, 8.0),
+        jerk=np.full(n, 100.0),
+        following_error=np.full(n, 2.0),
+        current=np.full(n, 20.0),
+    )
+    made = [init_of(axes, number, train, n, cycle_ms, ratio) for ratio in (1.0, 1.5)]
+    return Arm(n, number, axes, cycle_ms / 1000, train, limits, *made)
+
+
+def init_of(
+    axes: tuple[tuple[int, int], ...],
+    number: int,
+    train: DriveTrain,
+    n: int,
+    cycle_ms: int,
+    ratio: float,
+) -> bytes:
+    """An init packet with these slots; `ratio` is that of its gears to the arm's."""
+    table = np.full((4, 10), 0xFF)
+    for slot, (arm, axis) in enumerate(axes):
+        table[arm - 1, axis] = slot
+    rows = {name: np.zeros((4, 10)) for name in ("gear_ratio", "calibration")}
+    rows["gear_ratio"][number - 1, :n] = ratio * train.gear_ratio
+    rows["calibration"][number - 1, :n] = train.calibration
+    influence = np.zeros((4, 10))
+    influence[number - 1, 3:6] = train.k54, train.k64, train.k65
+    init = InitPacket.build(
+        1, cycle_ms, {}, open_axes_map=table, kinematic_influence=influence,
+        following_error=np.full((4, 10), 2.0), current_limit=np.full((4, 10), 20.0), **rows,
+    )  # fmt: skip
+    init.record["n_axes"] = len(axes)
+    return init.encode()
+
+
+class Controller:
+    """Status, modes and axis data of the packets to come."""
+
+    def __init__(self, arm: Arm) -> None:
+        self._arm = arm
+        self.number = 0
+        self.status = [0, 0, 0, 0]
+        self.status[arm.number - 1] = oracle.DRIVE_ON
+        self.modes = [0] * len(arm.axes)
+        self.d = np.zeros((len(arm.axes), 8), np.float32)
+        self.home()
+
+    def home(self) -> None:
+        """The arm where it began, at rest."""
+        motor = self._arm.train.motor_revolutions(np.linspace(-0.5, 0.5, self._arm.n))
+        for slot, value in zip(self._arm.slots, motor, strict=True):
+            self.d[slot] = (value, 0.0, value, 0.0, 0.5, 0.0, 0.0, 0.0)
+
+    def wanted(self, mode: int) -> None:
+        """All axes of the arm in a mode."""
+        for slot in self._arm.slots:
+            self.modes[slot] = mode
+
+    def packet(self) -> bytes:
+        """The next one."""
+        self.number = oracle.answer_number(self.number)
+        axes = tuple(
+            oracle.Axis(mode, tuple(bytes(word) for word in row.view("V4")))
+            for mode, row in zip(self.modes, self.d, strict=True)
+        )
+        return oracle.build(oracle.Packet(self.number, bytes(self.status), bytes(4), axes))
+
+    def obey(self, reply: bytes, mode: int) -> None:
+        """Go where the answer says; close the axes if it asks for that."""
+        answer = oracle.parse(reply, len(self._arm.axes))
+        refused = any(axis.mode in (505, 508) for axis in answer.axes)
+        if refused or answer.status[self._arm.number - 1] == 1:
+            self.wanted(0)
+            self.d[:, [1, 3]] = 0.0
+        elif mode in POSITION_MODES:
+            for slot in self._arm.slots:
+                if self.modes[slot] == mode:
+                    position, step = answer.axes[slot].floats[:2]
+                    self.d[slot, :4] = position, step, position, step

@@ -1,0 +1,43 @@
+"""What is fuzzed: for each target a function of bytes that raises only where a law is broken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Protocol
+
+NAMES = ("codec", "session", "cell_file", "archive", "importers", "urdf", "documents")
+"""All targets, each a module of this package with a `TARGET`."""
+
+
+class Mutation(Protocol):
+    """Changes an input; the same seed makes the same change."""
+
+    def __call__(self, data: bytes, most: int, seed: int) -> bytes:
+        """An input of at most `most` bytes made of `data`."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One of them.
+
+    Attributes:
+        run: raises where a law is broken, and nothing where the input is refused as documented.
+        seeds: inputs to begin with, made by the product's own writers.
+        mutate: changes that get past checksums and grammars.
+        most: bytes of the longest input.
+        replayed: changed inputs that the test of the corpora tries.
+    """
+
+    run: Callable[[bytes], None]
+    seeds: Callable[[], list[bytes]]
+    mutate: Mutation
+    most: int = 1 << 14
+    replayed: int = 200
+
+
+def load(name: str) -> Target:
+    """The target of a name out of `NAMES`, whose packages are imported now."""
+    target: Target = import_module(f"tests.fuzz.targets.{name}").TARGET
+    return target

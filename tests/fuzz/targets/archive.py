@@ -1,0 +1,182 @@
+"""Archives of strangers: read, checked, repaired, drawn and recorded from, or refused by name."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "hil"))
+
+from fast_cell import CELL, URDF
+
+from drivers import InitPacket
+from drivers.record import cycle_dtype
+from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
+from hil.archive.check import check_archive
+from hil.archive.overview import overview
+from hil.archive.repair import repair
+from hil.errors import ArchiveError, ArchiveWriteError, InputError
+from hil.new import cell_of_urdf, from_archive
+from hil.plots.archive_view import view_of
+from hil.recordings import recording_of
+from tests.fuzz.mutate_mcap import mutate_mcap
+from tests.fuzz.targets import Target
+
+JOINTS = ("shoulder", "elbow")
+CYCLES = 13
+
+
+@lru_cache
+def folder() -> Path:
+    """Where the archive lies."""
+    return Path(tempfile.mkdtemp("archive"))
+
+
+def run(data: bytes) -> None:
+    """Everything that commands do with an archive that somebody sent."""
+    path = folder() / "excitation_003_a1.mcap"
+    path.write_bytes(data)
+    try:
+        archive = open_archive(path)
+    except ArchiveError as error:
+        assert error.path == path
+        assert error.problem
+        as_told(path)
+        return
+    as_read(archive)
+    as_told(path)
+    as_drawn(path)
+    as_repaired(path, archive)
+    as_a_cell_is_begun(path, archive)
+
+
+def as_read(archive: Archive) -> None:
+    """Columns fit one another; what is missing is said."""
+    for name, column in archive.columns.items():
+        assert len(column) == archive.n_samples, name
+        assert not (column.size and column.flags.writeable)
+    with suppress(ArchiveError):
+        archive.cycles()
+    for name in archive.attachments:
+        try:
+            archive.text(name)
+        except ArchiveError as error:
+            assert error.remedy
+    part = open_archive(archive.path, fields=("position",), start=0.0, stop=1e9)
+    assert part.n_samples <= max(archive.n_samples, part.n_samples)
+    try:
+        recording = recording_of(archive)
+    except ArchiveError as error:
+        assert error.remedy
+        return
+    assert recording.position.shape == (archive.n_samples, len(archive.joint_names))
+    assert len(recording.time) == archive.n_samples
+    assert np.isfinite(recording.time).all()
+    assert ("missing" in recording.provenance) == (archive.damage is not None)
+
+
+def as_told(path: Path) -> None:
+    """`hil archive check` and `info`."""
+    for tell in (check_archive, overview):
+        try:
+            told = tell(path)
+        except ArchiveError:
+            continue
+        if tell is overview:
+            json.dumps(told.to_dict())
+
+
+def as_drawn(path: Path) -> None:
+    """`hil plot`, without the seconds that drawing itself takes."""
+    try:
+        view_of(path, bins=8)
+    except InputError:
+        return
+
+
+def as_repaired(path: Path, archive: Archive) -> None:
+    """`hil archive repair`: what it writes is whole, and what it leaves out is said."""
+    target = path.with_name("repaired.mcap")
+    target.unlink(missing_ok=True)
+    try:
+        made = repair(path, target)
+    except (ArchiveError, ArchiveWriteError):
+        return
+    if made.output is None:
+        assert made.whole
+        return
+    again = open_archive(target)
+    assert again.complete, again.damage
+    assert again.n_samples == made.samples
+    assert again.n_samples >= archive.n_samples or made.losses
+    before = archive.columns.get("position")
+    if before is not None and not made.losses:
+        assert again.columns["position"].tobytes() == before.tobytes()
+
+
+def as_a_cell_is_begun(path: Path, archive: Archive) -> None:
+    """`hil new --from-archive`."""
+    try:
+        known = from_archive(path, archive.joint_names)
+    except InputError as error:
+        assert error.remedy
+        return
+    if archive.joint_names == JOINTS:
+        cell = cell_of_urdf(_urdf(), {}).with_known(known)
+        cell.text(path.with_name("cell.toml"))
+
+
+@lru_cache
+def _urdf() -> Path:
+    path = folder() / "fast.urdf"
+    path.write_text(URDF)
+    return path
+
+
+def seeds() -> list[bytes]:
+    """Cycles with events and all attachments; an imported one; one torn, one repaired."""
+    rows = np.zeros(CYCLES, cycle_dtype(2))
+    cycle = np.arange(CYCLES)
+    rows["cycle"], rows["number"] = 5000 + cycle, 10 + cycle
+    rows["position"] = np.sin(0.01 * cycle[:, None] + [0.0, 1.0])
+    rows["mode"], rows["status"] = 4, 5
+    attachments = {
+        "robot.urdf": URDF.encode(), "cell.toml": CELL.encode(),
+        "drive_train.json": b'{"current_limit": [20.0, 12.0], "following_error": [1.0, 1.0]}',
+        "init_packet.bin": InitPacket.build(2, 2, {"gear_ratio": [100.0, -80.0]}).encode(),
+    }  # fmt: skip
+    path = folder() / "excitation_000_a1.mcap"
+    with ArchiveWriter(
+        path, joint_names=JOINTS, period=0.01, metadata={"campaign": "c", "simulated": "yes"},
+        attachments=attachments, durable=False,
+    ) as archive:  # fmt: skip
+        archive.event(5000, "Refused", "a text", data={"joint": 1})
+        archive.write(rows, rows["target_current"])
+        archive.close("completed")
+    whole = path.read_bytes()
+    path.unlink()
+    bare = folder() / "imported.mcap"
+    stamps = np.arange(CYCLES) * 2_000_000
+    write_samples(
+        bare, Samples(stamps, position=rows["position"], torque=rows["position"]),
+        joint_names=JOINTS, attachments={"robot.urdf": URDF.encode()}, metadata={},
+    )  # fmt: skip
+    imported = bare.read_bytes()
+    bare.unlink()
+    torn = folder() / "torn.mcap"
+    torn.write_bytes(whole[: len(whole) * 3 // 4])
+    mended = folder() / "mended.mcap"
+    repair(torn, mended)
+    repaired = mended.read_bytes()
+    torn.unlink()
+    mended.unlink()
+    return [whole, imported, whole[: len(whole) * 3 // 4], repaired]
+
+
+TARGET = Target(run, seeds, mutate_mcap, most=24_000, replayed=50)

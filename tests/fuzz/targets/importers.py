@@ -1,0 +1,164 @@
+"""Foreign recordings: an archive that keeps the profile, or a `SourceError`, in bounded memory."""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+import tempfile
+from contextlib import closing
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import zstandard
+
+from hil.archive import open_archive
+from hil.archive.check import check_archive
+from hil.errors import ArchiveWriteError, InputError, SourceError
+from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
+from tests.fuzz.mutate_bytes import mutate_bytes
+from tests.fuzz.mutate_mcap import mutate_mcap
+from tests.fuzz.mutate_text import mutate_text
+from tests.fuzz.targets import Target
+from tests.hil.test_importers_mcap import STORE, mcap
+from tests.hil.test_importers_mcap import states as messages
+from tests.hil.test_importers_rosbag2 import STATE, URDF, bag, states
+
+TEXT, MAP, NPZ, NPY, MATLAB, SQLITE, BAG, MESSAGES, PACKED = range(9)
+"""First byte of an input: what the others are a file of."""
+SUFFIXES = {
+    TEXT: "log.csv", MAP: "map.toml", NPZ: "log.npz", NPY: "log.npy", MATLAB: "log.m",
+    SQLITE: "bag.db3", BAG: "bag.mcap", MESSAGES: "log.mcap", PACKED: "bag.db3.zstd",
+}  # fmt: skip
+COLUMNS = """[position]
+columns = ["q1", "q2"]
+[torque]
+columns = "tau{}"
+[time]
+column = "t"
+"""
+LINES = "t,q1,q2,tau1,tau2\n" + "".join(
+    f"{0.002 * k:.3f},{0.1 * k},{-0.2 * k},{k}.5,-{k}\n" for k in range(8)
+)
+ODD_MAP = """joints = ["ankle", "hip"]
+[position]
+columns = [1, 2]
+unit = "deg"
+offset = [0.1, 0.2]
+scale = -1.0
+[motor_current]
+columns = ["tau1", "tau2"]
+unit = "mA"
+[time]
+column = 0
+unit = "ms"
+[drive]
+gear_ratio = [100.0, -80.0]
+coupling = [[2, 1, 0.5]]
+joint_offset = [0.0, 0.1]
+torque_constant = [0.1, 0.2]
+[format]
+missing = "drop"
+decimal = "."
+"""
+ARRAYS = ColumnMap.model_validate({"position": {"columns": "q"}, "time": {"column": "t"}})
+ALONE = ColumnMap.model_validate({"position": {"joints_along": "columns"}, "sample_rate": 500.0})
+TOPICS = ColumnMap.model_validate(
+    {"position": {"columns": "/joint_states/position"}, "time": {"column": "/joint_states/stamp"}}
+)
+
+
+@lru_cache
+def folder() -> Path:
+    """Where the recording lies."""
+    return Path(tempfile.mkdtemp("log"))
+
+
+@lru_cache
+def robot() -> Robot:
+    """Whose it is."""
+    path = folder() / "two.urdf"
+    path.write_text(URDF)
+    return Robot.from_urdf(path)
+
+
+def run(data: bytes) -> None:
+    """Import it; look at what was written."""
+    kind = data[0] % len(SUFFIXES) if data else TEXT
+    source, output = folder() / SUFFIXES[kind], folder() / "out.mcap"
+    source.write_bytes(data[1:])
+    output.unlink(missing_ok=True)
+    try:
+        _imported(kind, source, output)
+    except (SourceError, ArchiveWriteError) as error:
+        assert not output.exists(), "refused, and left behind"
+        assert isinstance(error, InputError)
+        assert error.path is not None and error.problem, error
+        return
+    archive = open_archive(output)
+    assert archive.complete
+    kept = check_archive(output)
+    assert kept.keeps, kept.faults
+    assert archive.kind == "imported"
+    assert np.isfinite(archive.columns["position"]).all()
+
+
+def _imported(kind: int, source: Path, output: Path) -> None:
+    if kind in (SQLITE, BAG, PACKED):
+        import_rosbag2(source, output, robot=robot())
+    elif kind == MAP:
+        columns = ColumnMap.load(source)
+        log = folder() / "log.csv"
+        log.write_text(LINES)
+        import_log(log, output, robot=robot(), columns=columns)
+    else:
+        columns = {NPY: ALONE, MESSAGES: TOPICS, NPZ: ARRAYS, MATLAB: ARRAYS}.get(kind, _map())
+        import_log(source, output, robot=robot(), columns=columns)
+
+
+@lru_cache
+def _map() -> ColumnMap:
+    path = folder() / "fixed.toml"
+    path.write_text(COLUMNS)
+    return ColumnMap.load(path)
+
+
+def seeds() -> list[bytes]:
+    """One of each kind, well formed."""
+    q, t = np.arange(16.0).reshape(8, 2), np.arange(8) * 0.002
+    arrays, packed, one, typed = (io.BytesIO() for _ in range(4))
+    np.savez(arrays, q=q, t=t)
+    np.savez_compressed(packed, q=q, t=t)
+    np.save(one, q)
+    np.save(typed, np.zeros(8, [("q", "<f8"), ("t", "<M8[ns]")]))
+    matlab = "q = [" + "; ".join(f"{a} {b}" for a, b in q) + "];\nt = [0 1 2 3 4 5 6 7]';\n"
+    database = bag(folder() / "seed.db3", {"/joint_states": (STATE, states())})
+    with closing(sqlite3.connect(database)) as connection:
+        connection.execute("PRAGMA page_size = 512")
+        connection.execute("VACUUM")
+    sqlite = database.read_bytes()
+    database.unlink()
+    definition, _ = STORE.generate_msgdef(STATE, ros_version=2)
+    topics = {"/joint_states": (STATE, definition, "cdr", messages()[:12])}
+    foreign = mcap(folder() / "seed.mcap", topics).read_bytes()
+    (folder() / "seed.mcap").unlink()
+    made = {
+        TEXT: (LINES.encode(), LINES.replace(",", "\t").replace("t\t", "").encode()),
+        MAP: (COLUMNS.encode(), ODD_MAP.encode()), NPZ: (arrays.getvalue(), packed.getvalue()),
+        NPY: (one.getvalue(), typed.getvalue()), MATLAB: (matlab.encode(),), SQLITE: (sqlite,),
+        BAG: (foreign,), MESSAGES: (foreign,), PACKED: (zstandard.compress(sqlite),),
+    }  # fmt: skip
+    return [bytes((kind,)) + data for kind, files in made.items() for data in files]
+
+
+def mutate(data: bytes, most: int, seed: int) -> bytes:
+    """As the kind of file wants it."""
+    kind = data[0] % len(SUFFIXES) if data else TEXT
+    if kind in (TEXT, MAP, MATLAB):
+        change = mutate_text
+    else:
+        change = mutate_mcap if kind in (BAG, MESSAGES) else mutate_bytes
+    return bytes((kind,)) + change(data[1:], most - 1, seed)
+
+
+TARGET = Target(run, seeds, mutate, most=20_000, replayed=80)

@@ -1,0 +1,130 @@
+"""Robot descriptions: refused as documented, or a model made of finite numbers."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "hil"))
+
+from fast_cell import URDF
+
+from hil.arm import Arm
+from hil.errors import InputError
+from hil.importers import Robot
+from hil.new import cell_of_urdf
+from identification.errors import ModelError
+from identification.excitation import Workspace
+from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.errors import CollisionModelError
+from identification.kinematics import chain_from_urdf
+from identification.model import RobotModel
+from tests.fuzz.mutate_text import mutate_text
+from tests.fuzz.targets import Target
+
+TREE = URDF.replace(
+    "</robot>",
+    """<link name="hand"><inertial><mass value="1"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3"
+ ixy="0" ixz="0" iyz="0"/></inertial>
+ <collision><geometry><cylinder radius="0.05" length="0.1"/></geometry></collision>
+ <collision><geometry><sphere radius="0.05"/></geometry></collision>
+ <collision><geometry><mesh filename="package://other/hand.stl" scale="1 1 1"/></geometry>
+ </collision></link>
+<joint name="wrist" type="fixed"><parent link="fore"/><child link="hand"/>
+ <origin xyz="0.3 0 0" rpy="0 0.1 0"/></joint>
+<link name="finger"/>
+<joint name="slide" type="prismatic"><parent link="hand"/><child link="finger"/><axis xyz="0 1 0"/>
+ <limit lower="0" upper="0.05" effort="10" velocity="0.1"/><mimic joint="elbow"/></joint>
+<transmission name="t"><joint name="elbow"/></transmission></robot>""",
+)
+TURNING = URDF.replace('type="revolute"', 'type="continuous"')
+
+
+@lru_cache
+def folder() -> Path:
+    """Where the description lies."""
+    return Path(tempfile.mkdtemp("urdf"))
+
+
+def run(data: bytes) -> None:
+    """Read it as every command does that takes one."""
+    path = folder() / "robot.urdf"
+    path.write_bytes(data)
+    as_a_cell_is_begun(path)
+    as_an_import_takes_it(path)
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        return
+    as_a_model(text)
+
+
+def as_a_cell_is_begun(path: Path) -> None:
+    """`hil new`."""
+    try:
+        made = cell_of_urdf(path, {})
+        text, unknown = made.text(path.with_name("cell.toml"))
+    except InputError as error:
+        assert error.remedy, error
+        return
+    assert made.joint_names
+    assert unknown, "nobody has said all of a new cell"
+    assert text
+
+
+def as_an_import_takes_it(path: Path) -> None:
+    """`hil import`."""
+    try:
+        Robot.from_urdf(path)
+    except InputError as error:
+        assert error.path is not None
+
+
+def as_a_model(text: str) -> None:
+    """Chain, model, shapes and collisions."""
+    try:
+        chain = chain_from_urdf(text)
+    except ModelError:
+        assert refuses(RobotModel.from_urdf, text)
+        assert refuses(Arm.from_urdf, text)
+        return
+    n = chain.n_joints
+    for values in (chain.rotation, chain.translation, chain.axis, chain.inertial):
+        assert np.isfinite(values).all(), "a chain with numbers that are none"
+    assert np.allclose(np.linalg.norm(chain.axis, axis=1), 1.0)
+    if n > 12:  # only slower
+        return
+    try:
+        model = RobotModel.from_urdf(text)
+    except ModelError:
+        model = None
+    if model is not None:
+        motion = np.linspace(-1.0, 1.0, 3 * n).reshape(3, n)
+        assert np.isfinite(model.regressor(motion, motion, motion).dense(model.n_parameters)).all()
+    arm = Arm.from_urdf(text)
+    assert all(np.isfinite(corners).all() for corners in arm.corners(np.zeros((1, n))))
+    with suppress(CollisionModelError, ModelError):
+        CollisionChecker(text, Workspace(floor=0.0))
+
+
+def refuses(read: Callable[[str], object], text: str) -> bool:
+    """Whether a reader refuses a description."""
+    try:
+        read(text)
+    except ModelError:
+        return True
+    return False
+
+
+def seeds() -> list[bytes]:
+    """Two joints, a tree with a gripper, joints without limits."""
+    return [text.encode() for text in (URDF, TREE, TURNING)]
+
+
+TARGET = Target(run, seeds, mutate_text, most=8000, replayed=60)

@@ -1,0 +1,64 @@
+"""Every input that fuzzing kept, and some changes of each, break no law; atheris is not needed."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz import keeping, targets
+from tests.fuzz.lives import CORPORA
+
+
+def inputs(name: str) -> list[bytes]:
+    """Those in the repository, in one order everywhere."""
+    return [path.read_bytes() for path in sorted((CORPORA / name).iterdir())]
+
+
+@pytest.mark.parametrize("name", targets.NAMES)
+def test_the_corpus_is_small_and_breaks_no_law(name: str) -> None:
+    target, kept = targets.load(name), inputs(name)
+    assert 0 < len(kept) <= keeping.MOST_FILES
+    assert sum(map(len, kept)) <= keeping.MOST_BYTES
+    for data in kept:
+        target.run(data)
+
+
+@pytest.mark.parametrize("name", targets.NAMES)
+def test_changes_of_it_break_none_either(name: str) -> None:
+    target, kept = targets.load(name), inputs(name)
+    for seed in range(target.replayed):
+        target.run(target.mutate(kept[seed % len(kept)], target.most, seed))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", targets.NAMES)
+def test_many_changes_of_changes_break_none(name: str) -> None:
+    target, rng = targets.load(name), random.Random(name)
+    pool = inputs(name)
+    for _ in range(20 * target.replayed):
+        data = target.mutate(rng.choice(pool), target.most, rng.getrandbits(32))
+        target.run(data)
+        pool[rng.randrange(len(pool))] = data
+
+
+@pytest.mark.parametrize("name", targets.NAMES)
+def test_a_change_is_the_same_whenever_it_is_made(name: str) -> None:
+    target, kept = targets.load(name), inputs(name)
+    made = [target.mutate(kept[0], target.most, seed) for seed in range(20)]
+    assert made == [target.mutate(kept[0], target.most, seed) for seed in range(20)]
+    assert len({*made, kept[0]}) > 10
+    assert all(len(data) <= max(target.most, len(kept[0])) for data in made)
+
+
+def test_one_input_can_be_tried_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "input"
+    path.write_bytes(inputs("codec")[0])
+    tried = subprocess.run(
+        [sys.executable, "-m", "tests.fuzz.child", "codec", "--once", str(path)],
+        cwd=Path(__file__).parents[2], check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert tried.returncode == 0, tried.stderr

@@ -1,0 +1,184 @@
+"""The harness itself: laws that are broken are found, told apart, kept and counted once."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers import CyclicPacket, Guard, Session
+from drivers.transports.can import ends
+from hil.archive import foreign_json, open_archive
+from hil.errors import ArchiveError
+from tests.fuzz import __main__ as command
+from tests.fuzz import findings, journal, keeping, targets
+from tests.fuzz.child import main as child
+from tests.fuzz.draw import Draw
+from tests.fuzz.mutate_mcap import put_together, taken_apart
+from tests.fuzz.test_corpora import inputs
+
+PIECE = journal.Piece("codec", 10.0, 100, 5, 7, 3, 80)
+
+
+class TestDraw:
+    def test_one_changed_byte_changes_one_decision(self) -> None:
+        draw, other = Draw(bytes((7, 1, 9))), Draw(bytes((7, 2, 9)))
+        first, second = ([d.below(10), d.choice("abc"), d.between(2, 4)] for d in (draw, other))
+        assert first == [7, "b", 2]
+        assert [a == b for a, b in zip(first, second, strict=True)] == [True, False, True]
+
+    def test_without_bytes_everything_is_the_first_choice(self) -> None:
+        draw = Draw(b"")
+        assert draw.choice("abc") == "a"
+        assert (draw.below(300), draw.integer(), draw.float32(), draw.left) == (0, 0, 0.0, 0)
+        assert not draw.chance(255)
+
+
+class TestBrokenLawsAreFound:
+    """With a defect planted, some input of the corpus or a change of it shows it."""
+
+    def broken(self, name: str, changes: int = 150) -> set[str]:
+        target, kept, causes = targets.load(name), inputs(name), set()
+        for seed in range(-len(kept), changes):
+            data = kept[seed % len(kept)]
+            try:
+                target.run(data if seed < 0 else target.mutate(data, target.most, seed))
+            except Exception as error:
+                causes.add(findings.signature(error))
+        return causes
+
+    def test_a_guard_that_lets_everything_pass(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(Guard, "check_set_point", lambda *_: None)
+        assert any("judge" in cause for cause in self.broken("session", 0))
+
+    def test_an_exception_in_the_session(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(Session, "_cyclic", lambda *_: 1 // 0)
+        assert any(cause.startswith("ZeroDivision") for cause in self.broken("session", 0))
+
+    def test_a_codec_that_loses_a_byte(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        whole = CyclicPacket.encode
+        monkeypatch.setattr(CyclicPacket, "encode", lambda self: whole(self)[:-1] + b"\7")
+        assert self.broken("codec", 0)
+
+    def test_answers_by_can_to_another_packet(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        answer = ends.write_reply
+        monkeypatch.setattr(ends, "write_reply", lambda *a: b"\1\1" + answer(*a)[2:])
+        assert self.broken("codec", 0)
+
+    def test_a_table_of_a_stranger_that_is_taken_for_json(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(foreign_json, "loads", json.loads)
+        assert any(cause.startswith("JSONDecode") for cause in self.broken("archive", 60))
+
+
+class TestMcap:
+    def test_taken_apart_and_put_together_it_says_the_same(self) -> None:
+        for data in targets.load("archive").seeds():
+            records = taken_apart(data)
+            if records and all(one.opcode != 0x80 for one in records):
+                again = taken_apart(put_together(records, index=False)) or []
+                for one, other in zip(records, again, strict=True):
+                    assert (one.opcode, one.inside, one.times) == (
+                        other.opcode,
+                        other.inside,
+                        other.times,
+                    )
+                    assert one.inside is not None or one.body == other.body
+
+    def test_changes_get_past_the_checksums(self, tmp_path: Path) -> None:
+        target = targets.load("archive")
+        data = target.seeds()[0]
+        read = 0
+        for seed in range(60):
+            (tmp_path / "a.mcap").write_bytes(target.mutate(data, target.most, seed))
+            try:
+                read += open_archive(tmp_path / "a.mcap").complete
+            except ArchiveError:
+                continue
+        assert read > 15
+
+
+class TestFindings:
+    def raised(self, wrong: str) -> Exception:
+        try:
+            np.array([wrong], dtype=float)
+            raise AssertionError
+        except ValueError as error:
+            return error
+
+    def test_one_cause_is_one_folder_however_often_it_is_met(self, tmp_path: Path) -> None:
+        kept = findings.Findings(tmp_path)
+        name = findings.signature(self.raised("x"))
+        assert name == findings.signature(self.raised("y"))
+        assert [kept.keep(name, data, "story") for data in (b"1", b"2", b"3", b"4")].count(
+            True
+        ) == 1
+        assert findings.known(tmp_path) == {name: 4}
+        assert (tmp_path / name / findings.INPUT).read_bytes() == b"1"
+        assert not findings.Findings(tmp_path).keep(name, b"5", "story")
+
+    def test_the_shortest_input_has_the_same_cause(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def run(data: bytes) -> None:
+            if b"needle" in data:
+                raise ValueError(data)
+
+        target = targets.Target(run, list, lambda data, most, seed: data)
+        monkeypatch.setattr(targets, "load", lambda name: target)
+        monkeypatch.setattr("tests.fuzz.child._limit", lambda: None)
+        (tmp_path / findings.INPUT).write_bytes(b"hay" * 50 + b"needle" + b"stack" * 50)
+        assert child(["codec", "--shorten", str(tmp_path)]) == 0
+        assert (tmp_path / findings.SHORTEST).read_bytes() == b"needle"
+
+
+class TestJournal:
+    def test_pieces_add_up_and_a_torn_line_costs_itself_only(self, tmp_path: Path) -> None:
+        path = tmp_path / "j.jsonl"
+        journal.append(path, PIECE)
+        with path.open("a") as stream:
+            stream.write('{"target": "codec", "sec')  # killed while writing
+        journal.append(path, journal.Piece("codec", 5.0, 50, 9, 6, 4, 70, "timeout", False))
+        total = journal.summary(journal.pieces(path))["codec"]
+        assert (total["pieces"], total["seconds"], total["inputs"]) == (2, 15.0, 150)
+        assert (total["edges"], total["features"], total["not_reproduced"]) == (9, 7, 1)
+
+    def test_what_is_done_is_not_done_again(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        path = tmp_path / "j.jsonl"
+        journal.append(path, journal.Piece("codec", 61.0, 100, 5, 7, 3, 80))
+        arguments = ["codec", "--minutes", "1", "--journal", str(path), "--json"]
+        assert command.main(arguments) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert (report["inputs"], report["seconds"], report["findings"]) == (100, 61.0, 0)
+        findings.Findings(Path(f"{path}.files/codec/findings")).keep("a", b"", "")
+        assert command.main(arguments) == 1
+
+
+def test_inputs_worth_keeping_reach_most_with_few_bytes(tmp_path: Path) -> None:
+    for name, size in (("a", 10), ("b", 5), ("c", 5), ("d", 30)):
+        (tmp_path / name).write_bytes(bytes(size))
+    control = "\n".join(
+        ["4", "0", *(str(tmp_path / name) for name in "abcd"), "STARTED 0 10", "FT 0 1 2 3",
+         "COV 0 1", "FT 1 1 2", "FT 2 9", "FT 3 3 9 10 11"]
+    )  # fmt: skip
+    reached = keeping.features_of(control)
+    assert [path.name for path in keeping.chosen(reached, 3, 100)] == ["d", "b"]
+    assert [path.name for path in keeping.chosen(reached, 3, 20)] == ["a", "c"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
+def test_a_real_process_of_libfuzzer_is_understood(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "j.jsonl"
+    assert command.main(["codec", "--minutes", "0.15", "--journal", str(path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["targets"]["codec"]["features"] > 100
+    assert report["inputs"] > 50

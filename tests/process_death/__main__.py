@@ -1,0 +1,169 @@
+"""Kill the processes of a real campaign at random moments: `python -m tests.process_death`.
+
+Each round runs a short campaign over loopback UDP, with a controller, a supervisor, an exchange and
+an archive process of its own, kills one of them (or two, or three) by SIGKILL, and then asks: did
+the arm come to rest, was open mode left, is everything that was recorded readable, and does the
+next run complete the campaign? The number of a round is its seed.
+
+    python -m tests.process_death --rounds 1000 --jobs 2 --journal deaths.jsonl
+    python -m tests.process_death --rounds 1 --start 417      # this one again
+
+Rounds that the journal knows are not run again, so the first command may be interrupted and
+repeated. Exit status 1 if a law was broken; the folders of such rounds are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+# Before numpy is imported: the machine is small.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+from tests.process_death import journal  # noqa: E402
+from tests.process_death.controller import die_with_parent  # noqa: E402
+from tests.process_death.defects import DEFECTS, planted  # noqa: E402
+from tests.process_death.laws import PROMISED  # noqa: E402
+from tests.process_death.play import Stage, play  # noqa: E402
+from tests.process_death.rounds import VICTIMS, drawn  # noqa: E402
+
+_stage: Stage | None = None
+"""What rounds share; their processes are forked from one that has it."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run rounds, or what is missing of them."""
+    given = _parser().parse_args(arguments)
+    # Also where a shell has started this in the background, and ignores SIGINT.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    known = {} if given.journal is None else journal.read(given.journal)
+    numbers = range(given.start, given.start + given.rounds)
+    wanted = [n for n in numbers if given.only in (None, drawn(n).victims[0])]
+    results = [known[n] for n in wanted if n in known]
+    missing = [n for n in wanted if n not in known]
+    began = time.monotonic()
+    folder = Path(tempfile.mkdtemp(prefix="process_death_"))
+    try:
+        for result in _played(missing, given.jobs, folder, given.defect):
+            results.append(result)
+            if given.journal is not None:
+                journal.append(given.journal, result)
+            _tell(result, len(results), len(wanted), folder, quiet=given.json)
+    finally:
+        kept = sorted(str(path) for path in folder.glob("round_*"))
+        if not kept:
+            shutil.rmtree(folder)
+    report = summary(results) | {"wall_seconds": time.monotonic() - began, "kept": kept}
+    if given.json:
+        sys.stdout.write(json.dumps(report) + "\n")
+    else:
+        sys.stdout.writelines(f"{name:>16} {value}\n" for name, value in report.items())
+    return 1 if report["failed"] else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.process_death",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--rounds", type=int, default=50, help="how many (50)")
+    parser.add_argument("--start", type=int, default=0, help="number of the first (0)")
+    parser.add_argument("--jobs", type=int, default=1, help="rounds at a time (1)")
+    parser.add_argument(
+        "--only", choices=VICTIMS, help="of these rounds, those in which this process dies first"
+    )
+    parser.add_argument(
+        "--journal", type=Path, help="file of JSON lines with the results; made, and gone on with"
+    )
+    parser.add_argument("--json", action="store_true", help="print nothing but one JSON object")
+    parser.add_argument(
+        "--defect", choices=sorted(DEFECTS), help="break the product so, to see that it is found"
+    )
+    return parser
+
+
+def _played(
+    numbers: Sequence[int], jobs: int, folder: Path, defect: str | None
+) -> Iterator[dict[str, Any]]:
+    """Results of rounds, as they come."""
+    global _stage
+    if not numbers:
+        return
+    if sys.dont_write_bytecode:  # else each process of each round would compile everything anew
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        os.environ["PYTHONPYCACHEPREFIX"] = str(folder / "compiled")
+    _stage = Stage.set_up(folder, None if defect is None else planted(defect, folder))
+    context = multiprocessing.get_context("fork")
+    left = iter(numbers)
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=die_with_parent) as pool:
+        running: set[Future[dict[str, Any]]] = set()
+        try:
+            while True:
+                while len(running) < jobs and (number := next(left, None)) is not None:
+                    running.add(pool.submit(_play, number))
+                if not running:
+                    return
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _play(number: int) -> dict[str, Any]:
+    if _stage is None:
+        raise RuntimeError("this process was not forked from one that has set the stage")
+    return play(_stage, number)
+
+
+def _tell(result: dict[str, Any], done: int, of: int, folder: Path, *, quiet: bool) -> None:
+    """A line for each round where somebody looks; what was broken always, with how to repeat it."""
+    broken = result["broken"]
+    if broken:
+        lines = [
+            f"BROKEN {result['what']}",
+            *(f"  {text}" for text in broken),
+            f"  again: python -m tests.process_death --rounds 1 --start {result['round']}",
+            f"  kept: {folder}/round_{result['round']:05d}",
+        ]
+        sys.stderr.write("\n".join(lines) + "\n")
+    elif not quiet:
+        sys.stderr.write(f"{done}/{of} {result['what']}: {result['seconds']:.1f} s\n")
+
+
+def summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What all rounds came to."""
+    failed = sorted(one["round"] for one in results if one["broken"])
+    lost = sorted(one["lost"] for one in results if "lost" in one)
+    return {
+        "ran": len(results),
+        "failed": len(failed),
+        "seeds_failed": failed,
+        "killed": dict(Counter(victim for one in results for victim in one.get("killed", ()))),
+        "nobody_killed": sum(not one.get("killed") for one in results),
+        "archives_torn": len(lost),
+        "lost_at_most": lost[-1] if lost else 0,
+        "lost_within_promise": sum(count <= PROMISED for count in lost),
+        "estimates_apart_at_most": max((one.get("apart", 0.0) for one in results), default=0.0),
+        "seconds": sum(one["seconds"] for one in results),
+        "processor_seconds": sum(one["processor"] for one in results),
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,283 @@
+"""A simulated controller in a process of its own, which waits for a PC as long as that one lives.
+
+It writes down each of its cycles in memory that outlives it: an account of the session that no
+part of the product has touched.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import select
+import signal
+import time
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.packets import packet_number
+from hil.cell import Cell
+from hil.serving import Buttons, serve_session, undisturbed
+from hil.simulation import controller_settings, simulated_controller
+from sim_fixtures import SimulatedController
+from sim_fixtures.far_end import UdpFarEnd
+from sim_fixtures.program import Phase
+from sim_fixtures.serve import Wish
+from sim_fixtures.tally import Tally
+from tests.process_death.product import ArchivedSoFar, listening
+from tests.process_death.rounds import Round
+
+Rows = NDArray[np.void]
+
+ROW: Final = np.dtype(
+    [
+        ("number", "<i4"),
+        ("phase", "u1"),
+        ("replied", "?"),
+        ("deserted", "?"),
+        ("rejected", "<i4"),
+        ("position", "<f8", (2,)),
+        ("velocity", "<f8", (2,)),
+    ]
+)
+"""One cycle: wire number of its packet, phase after it, whether a valid answer came, whether the
+exchange process was found dead, answers rejected so far, and the plant's joints after it [rad,
+rad/s]."""
+CAPACITY: Final = 40_000
+_HEADER: Final = 128
+_ROWS, _FINISH, _GIVE_UP, _EXCHANGE, _ARCHIVE, _LAGGED = range(6)
+WAIT: Final = 60.0
+"""s that a living PC is waited for."""
+LAG: Final = 12
+"""Records that the archive process may be behind before the controller waits for it, too: it looks
+for records every 20 ms, which are 10."""
+LONGEST_LAG: Final = 0.7
+"""s that it is waited for in one cycle; to a session a longer silence is the end of the link."""
+REST: Final = 10
+"""Cycles of standing after which an arm is at rest."""
+_PDEATHSIG: Final = 1
+
+
+class Page:
+    """Memory shared by the controller's process and the one that watches."""
+
+    def __init__(self) -> None:
+        self._memory = mmap.mmap(-1, _HEADER + CAPACITY * ROW.itemsize)
+        self._words = memoryview(self._memory)[:_HEADER].cast("q")
+        self._all: Rows = np.frombuffer(self._memory, ROW, CAPACITY, _HEADER)
+
+    def add(self, row: tuple[object, ...]) -> None:
+        """Write a cycle down."""
+        count = self._words[_ROWS]
+        self._all[count % CAPACITY] = row
+        self._words[_ROWS] = count + 1
+
+    @property
+    def count(self) -> int:
+        """Cycles written down."""
+        return int(self._words[_ROWS])
+
+    def rows(self) -> Rows:
+        """A copy of all cycles."""
+        if self.count > CAPACITY:
+            raise RuntimeError("the session was longer than any of these rounds should be")
+        return self._all[: self.count].copy()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the controller's program is to end once the axes are closed."""
+        return bool(self._words[_FINISH])
+
+    def finish(self) -> None:
+        """Have it end so."""
+        self._words[_FINISH] = 1
+
+    @property
+    def given_up(self) -> bool:
+        """Whether the controller is to fall silent."""
+        return bool(self._words[_GIVE_UP])
+
+    def give_up(self) -> None:
+        """Have the controller fall silent."""
+        self._words[_GIVE_UP] = 1
+
+    @property
+    def exchange(self) -> int:
+        """Process id of the exchange, 0 as long as there is none."""
+        return int(self._words[_EXCHANGE])
+
+    @property
+    def archive(self) -> int:
+        """Process id of the archive process, likewise."""
+        return int(self._words[_ARCHIVE])
+
+    def tell(self, exchange: int, archive: int) -> None:
+        """Say whom the controller is to wait for."""
+        self._words[_ARCHIVE], self._words[_EXCHANGE] = archive, exchange
+
+    @property
+    def lagged(self) -> int:
+        """Cycles in which the archive process was waited for in vain."""
+        return int(self._words[_LAGGED])
+
+    def lag(self) -> None:
+        """Count such a cycle."""
+        self._words[_LAGGED] += 1
+
+
+class _Life:
+    """Whether a process lives, whoever its parent is; one that is not known yet counts as alive."""
+
+    def __init__(self) -> None:
+        self._descriptor = -1
+        self._dead = False
+
+    def over(self, pid: int) -> bool:
+        """Whether it has ended."""
+        if self._dead or not pid:
+            return self._dead
+        try:
+            if self._descriptor < 0:
+                self._descriptor = os.pidfd_open(pid)
+            self._dead = bool(select.select([self._descriptor], [], [], 0.0)[0])
+        except ProcessLookupError:
+            self._dead = True
+        return self._dead
+
+
+class WaitingEnd:
+    """A far end that waits for an answer as long as the exchange process lives, and no longer."""
+
+    def __init__(self, host: str, port: int, page: Page) -> None:
+        self.number = 0
+        self.deserted = False
+        self._link, self._port, self._page = UdpFarEnd(host, port), port, page
+        self._exchange, self._archive = _Life(), _Life()
+        self._began = False
+        self._progress: ArchivedSoFar | None = None
+
+    def send(self, packet: bytes) -> None:
+        """Send, once somebody listens and the archive process is not far behind."""
+        self.number = packet_number(packet)
+        while not (self._began or self._page.given_up):
+            self._began = listening(self._port)
+            time.sleep(0.005)
+        self._wait_for_archive()
+        self._link.send(packet)
+
+    def receive(self, timeout: float) -> bytes | None:
+        """The next packet of the PC, None if none came or none can come any more."""
+        until = time.monotonic() + timeout
+        while not self._page.given_up:
+            self.deserted = self._exchange.over(self._page.exchange)
+            if self.deserted:
+                return self._link.receive(0.0)
+            left = until - time.monotonic()
+            packet = self._link.receive(max(0.0, min(left, 0.02)))
+            if packet is not None or left <= 0.0:
+                return packet
+        return None
+
+    def close(self) -> None:
+        """Close the link."""
+        self._link.close()
+
+    def _wait_for_archive(self) -> None:
+        page = self._page
+        if not page.archive or self.deserted:
+            return
+        if self._progress is None:
+            with suppress(OSError):
+                self._progress = ArchivedSoFar(page.exchange)
+            return
+        until = time.monotonic() + LONGEST_LAG
+        while (
+            self._progress.begun
+            and self._progress.behind > LAG
+            and not self._archive.over(page.archive)
+        ):
+            if time.monotonic() > until or self._exchange.over(page.exchange):
+                page.lag()
+                return
+            time.sleep(0.0005)
+
+
+class _Wishes(Buttons):
+    """Ends program and session when the page says so."""
+
+    def __init__(self, page: Page) -> None:
+        super().__init__()
+        self._page = page
+
+    def wish(self) -> Wish:
+        if self._page.given_up:
+            return Wish.GIVE_UP
+        return Wish.END if self._page.finished else Wish.GO_ON
+
+
+def serve(cell: Cell, played: Round, page: Page) -> None:
+    """Be the controller of a round until the session has ended, or the page says so."""
+    end = WaitingEnd(cell.controller.host or "", cell.controller.port or 0, page)
+    settings = replace(
+        controller_settings(cell),
+        while_silent=played.while_silent,
+        missed_replies=played.missed_replies,
+        opening_stagger=played.stagger,
+        silence_limit=500,
+    )
+    cycles = replies = 0
+
+    def note(controller: SimulatedController, tally: Tally) -> None:
+        nonlocal cycles, replies
+        if tally.cycles < 2:  # the first packet is repeated until it is answered
+            cycles = replies = 0
+        if tally.cycles == cycles:
+            return
+        replied, cycles, replies = tally.replies > replies, tally.cycles, tally.replies
+        plant = controller.plant
+        rejected = controller.rejected_replies + tally.rejected
+        page.add((
+            end.number, controller.phase, replied, end.deserted, rejected,
+            plant.position, plant.velocity,
+        ))  # fmt: skip
+
+    with undisturbed(None):
+        serve_session(
+            lambda: simulated_controller(cell, settings=settings, seed=played.seed),
+            end,
+            _Wishes(page),
+            patience=WAIT,
+            stretch=WAIT,
+            watch=note,
+        )
+
+
+def die_with_parent(how: int = signal.SIGTERM) -> None:
+    """Have this process sent a signal when its parent dies."""
+    ctypes.CDLL(None).prctl(_PDEATHSIG, int(how))
+
+
+def forked(cell: Cell, played: Round, page: Page) -> int:
+    """Process id of the controller of a round; it does not outlive this process."""
+    pid = os.fork()
+    if pid:
+        return pid
+    status = 70
+    try:
+        die_with_parent(signal.SIGKILL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        serve(cell, played, page)
+        status = 0
+    finally:
+        os._exit(status)
+
+
+def at_rest(rows: Rows) -> bool:
+    """Whether the arm has stood, with axes closed, for the last cycles."""
+    last = rows[-REST:]
+    closed = ~np.isin(last["phase"], (Phase.OPENING, Phase.OPEN, Phase.CLOSING, Phase.TRIPPED))
+    return bool(len(last) == REST and closed.all() and np.abs(last["velocity"]).max() < 0.01)

@@ -1,0 +1,319 @@
+"""What must hold after a process died, judged by the controller's account and by what is left."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
+from numpy.typing import NDArray
+
+from drivers.states import State
+from hil.archive import Archive, ArchiveName, open_archive
+from hil.campaign import Campaign
+from hil.campaign.folder import Entry
+from hil.errors import ArchiveError
+from sim_fixtures.program import Phase
+from tests.process_death.controller import LAG, REST, at_rest
+from tests.process_death.rig import Seen
+
+Records = NDArray[np.void]
+
+PROMISED: Final = 52
+"""Cycles that a dead archive process may cost on a machine that does not keep it waiting: a chunk
+of 100 ms, and the one or two that come while it is written."""
+MOST: Final = PROMISED - 1 + 2 * LAG
+"""Cycles that it may cost on any machine: what came between its last two looks for records, and
+since the last one, the controller waits for it each time after `LAG` of them."""
+COMPARED: Final = ("number", "position", "target_current", "commanded_position", "state", "gap")
+NAMED: Final = {
+    "exchange": ("exchange process", "controller"),
+    "archive": ("archive process",),
+    "controller": ("controller", "link", "silent", "nothing heard", "packet"),
+}
+"""Words of which one at least stands in the error of a supervisor that survived one of these."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """One archive, as far as it can be read."""
+
+    path: Path
+    name: ArchiveName
+    archive: Archive
+    cycles: NDArray[np.int64]
+
+
+def broken_by(
+    seen: Seen, campaign: Campaign, earlier: frozenset[str] = frozenset()
+) -> tuple[list[str], dict[str, int]]:
+    """What was broken, in sentences, and figures that are measured on the way.
+
+    `earlier` names the archives that lay there before the run that was seen.
+    """
+    figures: dict[str, int] = {}
+    problems = [
+        *_ends(seen),
+        *_told(seen),
+        *_arm(seen),
+        *_link(seen),
+        *_entered(seen.entered, campaign),
+    ]
+    kept: list[Kept] = []
+    for path in sorted(campaign.folder.archives.iterdir()):
+        if path.name in earlier:
+            continue
+        name = ArchiveName.parse(path)
+        if name is None:
+            problems.append(f"{path.name} lies among the archives")
+            continue
+        try:
+            archive = open_archive(path)
+        except ArchiveError as error:
+            if not ("archive" in seen.killed and _is_newest(path)):
+                problems.append(f"{path.name} cannot be read: {error}")
+            continue
+        cycles = archive.columns.get("cycle", np.zeros(0))
+        kept.append(Kept(path, name, archive, np.asarray(cycles, np.int64)))
+    for one in kept:
+        problems += _readable(one, seen)
+        problems += _as_exchanged(one, seen.records)
+        problems += _outcome(one, seen)
+    problems += _archived(kept, seen, figures)
+    problems += _motions(kept, seen, campaign)
+    return problems, figures
+
+
+def _ends(seen: Seen) -> Iterator[str]:
+    if seen.left:
+        yield f"processes are left over: {seen.left}"
+    if seen.port_taken:
+        yield "the port is still taken"
+
+
+def _told(seen: Seen) -> Iterator[str]:
+    """A supervisor that lives says who died; whatever it says, it says in one of its own errors."""
+    if seen.status is None:
+        return
+    if seen.status not in (0, 2, 4) or not seen.said:
+        yield f"the supervisor ended with status {seen.status} and said {seen.said}"
+    text = seen.said.get("text", "")
+    if seen.deaths and text:
+        words = [word for victim in seen.killed for word in NAMED.get(victim, ())]
+        if not any(word in text for word in words):
+            yield f"{' and '.join(seen.killed)} died, and the supervisor said: {text}"
+
+
+def _arm(seen: Seen) -> Iterator[str]:
+    """The controller's account: nothing refused, nothing missed, and the arm at rest at the end."""
+    rows = seen.rows
+    if not len(rows):
+        return
+    if rows["rejected"][-1]:
+        yield f"the controller rejected {rows['rejected'][-1]} answers"
+    if "controller" not in seen.killed and not _stands(rows):
+        yield (
+            f"the arm did not come to rest with axes closed: {Phase(rows['phase'][-1]).name}, "
+            f"{np.abs(rows['velocity'][-1]).max():.3g} rad/s"
+        )
+    answered = rows[~rows["deserted"]]
+    # The one of the cycle in which the exchange ended is nobody's fault.
+    if not answered["replied"][:-1].all():
+        count = np.count_nonzero(~answered["replied"][:-1])
+        yield f"{count} packets were not answered while the exchange lived"
+    if np.isin(answered["phase"], (Phase.TRIPPED,)).any():
+        yield "the drive was lost while the exchange lived"
+    if "exchange" not in seen.killed and "controller" not in seen.killed and len(answered):
+        left_open = Phase(answered["phase"][-1])
+        if left_open in (Phase.OPENING, Phase.OPEN, Phase.CLOSING):
+            yield f"the exchange ended by itself in {left_open.name}"
+        if np.abs(answered["velocity"][-1]).max() > 0.01:
+            yield "the exchange ended by itself while the arm moved"
+
+
+def _stands(rows: Records) -> bool:
+    return at_rest(rows) or (len(rows) < REST and not np.abs(rows["velocity"]).max() > 0.01)
+
+
+def _link(seen: Seen) -> Iterator[str]:
+    """The exchange's records hold each packet that the controller saw answered, once."""
+    rows, records = seen.rows, seen.records
+    if not len(records):
+        return
+    if (np.diff(records["cycle"]) != 1).any() or records["gap"].any():
+        yield "packets are missing in the exchange's records"
+    cyclic = rows[(rows["phase"] > Phase.DRIVE_OFF) & rows["replied"]]
+    missing = np.setdiff1d(cyclic["number"], records["number"])
+    if missing.size:
+        yield f"{missing.size} answered packets are not in the exchange's records"
+    if "exchange" in seen.killed or "controller" in seen.killed:
+        return
+    commanded = records["commanded_velocity"]
+    sent = commanded[~np.isnan(commanded).any(axis=1)]
+    if len(sent) and np.abs(sent[-1]).max() > 0.0:
+        yield f"the last set-point has a speed of {np.abs(sent[-1]).max():.3g} rad/s"
+    if records["state"][-1] in (State.OPENING, State.OPEN, State.EXITING, State.FAULTED):
+        yield f"the session ended in {State(records['state'][-1]).name}"
+
+
+def _entered(entered: list[Entry], campaign: Campaign) -> Iterator[str]:
+    """What was entered in the manifest stays there as it was."""
+    there = {entry.name: entry for entry in campaign.folder.manifest()}
+    for entry in entered:
+        if there.get(entry.name) != entry:
+            yield f"the entry of {entry.name} is not what it was"
+        elif sha256(campaign.folder.archives / entry.name) != entry.sha256:
+            yield f"{entry.name} is not what was entered"
+
+
+def sha256(path: Path) -> str:
+    """Checksum of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _is_newest(path: Path) -> bool:
+    return path == max(path.parent.iterdir(), key=lambda one: one.stat().st_mtime_ns)
+
+
+def _readable(one: Kept, seen: Seen) -> Iterator[str]:
+    """A gap-free prefix, and the same for other people's readers."""
+    if one.cycles.size and (np.diff(one.cycles) != 1).any():
+        yield f"{one.path.name} has gaps"
+    if not one.archive.complete and "archive" not in seen.killed:
+        yield f"{one.path.name} is not complete: {one.archive.missing}"
+    found = _counted_plainly(one.path, whole=one.archive.complete)
+    if found != one.cycles.size:
+        yield f"{one.path.name}: {one.cycles.size} cycles, but {found} for the plain mcap reader"
+    outcome = one.archive.outcome
+    if outcome is not None and outcome.get("records_lost", "0") != "0":
+        yield f"{one.path.name} says that {outcome['records_lost']} records were lost"
+
+
+def _counted_plainly(path: Path, *, whole: bool) -> int:
+    """Cycles that the `mcap` package alone reads."""
+    with path.open("rb") as stream:
+        if whole:
+            reader = make_reader(stream, validate_crcs=True)
+            return sum(1 for _ in reader.iter_messages(topics=["/hil/cycle"]))
+        count, channels = 0, dict[int, str]()
+        try:
+            for record in StreamReader(stream, validate_crcs=True).records:
+                if isinstance(record, Channel):
+                    channels[record.id] = record.topic
+                elif isinstance(record, Message):
+                    count += channels[record.channel_id] == "/hil/cycle"
+        except (McapError, EOFError):
+            pass  # a torn file ends somewhere
+        return count
+
+
+def _as_exchanged(one: Kept, records: Records) -> Iterator[str]:
+    """What is in the file is what was exchanged."""
+    if not one.cycles.size:
+        return
+    rows = _rows_of(one, records)
+    if rows is None:
+        yield f"{one.path.name} holds cycles that were never exchanged"
+        return
+    columns = one.archive.columns
+    for name in COMPARED:
+        if not np.array_equal(columns[name], rows[name], equal_nan=name != "state"):
+            yield f"{name} in {one.path.name} is not what was exchanged"
+
+
+def _outcome(one: Kept, seen: Seen) -> Iterator[str]:
+    """A file that was completed says how its motion ended, and no less than what happened."""
+    if one.archive.outcome is None:
+        return
+    outcome = one.archive.outcome["outcome"]
+    if int(one.archive.outcome["samples"]) != one.cycles.size:
+        yield f"{one.path.name} has {one.cycles.size} cycles and says {one.archive.outcome}"
+    if outcome not in ("completed", "stopped", "void", "lost", "refused"):
+        yield f"the outcome of {one.path.name} is {outcome}"
+    alone = "exchange" not in seen.killed and "controller" not in seen.killed
+    if outcome == "lost" and alone:
+        yield f"{one.path.name} is said to be lost, and neither end of the link had died"
+    if outcome == "void" and one.cycles.size and _moving(one.archive.columns).any():
+        yield f"{one.path.name} is said to be void, and holds motion"
+
+
+def _moving(columns: Mapping[str, NDArray[Any]] | Records) -> NDArray[np.bool_]:
+    """Cycles in which a set-point with a speed was sent."""
+    commanded = np.asarray(columns["commanded_velocity"])
+    moving: NDArray[np.bool_] = np.nan_to_num(np.abs(commanded)).max(axis=1) > 0.0
+    return moving
+
+
+def _rows_of(one: Kept, records: Records) -> Records | None:
+    """The exchange's records of the cycles of an archive."""
+    if not len(records):
+        return None
+    first = int(one.cycles[0] - records["cycle"][0])
+    rows = records[max(first, 0) : first + one.cycles.size]
+    return rows if len(rows) == one.cycles.size else None
+
+
+def _archived(kept: list[Kept], seen: Seen, figures: dict[str, int]) -> Iterator[str]:
+    """Every cycle of motion is archived, but for what a dead archive process may cost."""
+    records = seen.records
+    if not len(records):
+        return
+    moving = records["cycle"][_moving(records)]
+    there = np.concatenate([np.zeros(0, np.int64), *(one.cycles for one in kept)])
+    if np.unique(there).size != there.size:
+        yield "a cycle is in two archives"
+    missing = np.setdiff1d(moving, there)
+    death = next((one for one in seen.deaths if one.victim == "archive"), None)
+    if death is None:
+        if missing.size:
+            yield f"{missing.size} cycles of motion are in no archive"
+        return
+    lost = int(np.count_nonzero(missing < records["cycle"][0] + death.written))
+    if any(not one.archive.complete for one in kept) or lost:
+        figures["lost"] = lost
+    if lost > MOST and not seen.lagged:
+        yield f"{lost} cycles of motion were lost with the archive process"
+
+
+def _motions(kept: list[Kept], seen: Seen, campaign: Campaign) -> Iterator[str]:
+    """Every set-point of a repetition or validation motion lies on its planned path."""
+    for one in kept:
+        plan = campaign.plan
+        match one.name.kind:
+            case "excitation":
+                motion: Any = plan.excitation.trajectory
+            case "validation":
+                motion = plan.validation[one.name.index].trajectory
+            case _:
+                continue
+        rows = _rows_of(one, seen.records) if one.cycles.size else None
+        if rows is None or (interval := int(rows["interval"].max())) < 0:
+            continue
+        every = seen.records[seen.records["interval"] == interval]
+        commanded = every["commanded_position"]
+        commanded = commanded[~np.isnan(commanded).any(axis=1)]
+        if not len(commanded):
+            continue
+        if not _on_path(motion, commanded):
+            yield f"the motion of {one.path.name} left its path"
+        ends = motion.sample(np.array([0.0, motion.duration]))[0]
+        short = np.abs(commanded[-1] - commanded[0] - (ends[1] - ends[0])).max() > 1e-6
+        if short and (one.archive.outcome or {}).get("outcome") == "completed":
+            yield f"{one.path.name} is said to be completed, and its motion was not"
+
+
+def _on_path(motion: Any, commanded: NDArray[np.float64]) -> bool:
+    """Whether set-points lie on a planned path, from whose begin they may be off by rounding."""
+    step = 2e-4  # s
+    path, velocity, _ = motion.sample(np.arange(0.0, motion.duration + step, step))
+    offset = commanded[0] - path[0]
+    near = 0.5 * step * np.abs(velocity).max() + 1e-9
+    apart = np.abs(path[np.newaxis] + offset - commanded[::5, np.newaxis]).max(axis=2).min(axis=1)
+    return bool(np.abs(offset).max() < 1e-5 and apart.max() <= near)

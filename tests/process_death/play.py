@@ -1,0 +1,199 @@
+"""One round from its number to what was broken in it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from drivers.transports import SimulatedTransport
+from hil.archive import ArchiveName, open_archive
+from hil.campaign import Campaign, CampaignPlan, Link, Stop
+from hil.campaign.quick_design import design
+from hil.cell import Cell
+from hil.cell.text import replaced_value
+from hil.identify import identify_campaign
+from hil.progress import Silent
+from hil.simulation import simulated_controller
+from tests.hil.fast_cell import fast_cell
+from tests.process_death.laws import broken_by
+from tests.process_death.rig import Seen, made, run
+from tests.process_death.rounds import Round, drawn
+
+SHORT: Final = {
+    "repetitions": 2,
+    "validation_runs": 1,
+    "n_via": 2,
+    "standstill_s": 0.1,
+    "settle_s": 0.15,
+    "candidates": 6,
+}
+"""Of the cell's `[campaign]`: a campaign of four seconds."""
+NOISE: Final = 0.004
+"""A, of the simulated currents. With the cell's own the arm trembles at rest about as fast as what
+still counts as standstill, and some runs are refused for it without anybody having died."""
+ESTIMATED: Final = 3
+"""In every so many rounds the campaign is estimated from when it is complete."""
+UNLIKELY: Final = 1e-9
+"""Chance that two estimates of one arm differ by more than is let pass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """Parameters, and their covariance."""
+
+    values: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def apart(self, other: Estimated) -> float:
+        """The squared distance of two independent estimates in their own measure."""
+        difference = self.values - other.values
+        both = self.covariance + other.covariance
+        return float(difference @ np.linalg.solve(both, difference))
+
+    @property
+    def bound(self) -> float:
+        """What that distance exceeds by chance `UNLIKELY`."""
+        return float(chi2.isf(UNLIKELY, len(self.values)))
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What all rounds share.
+
+    Attributes:
+        folder: of the rounds.
+        cell: of the small arm.
+        plan: of its campaign.
+        undisturbed: what is found where nobody dies.
+        planted: folder of a planted defect, None for none.
+    """
+
+    folder: Path
+    cell: Cell
+    plan: CampaignPlan
+    undisturbed: Estimated
+    planted: Path | None = None
+
+    @classmethod
+    def set_up(cls, folder: Path, planted: Path | None = None) -> Stage:
+        """Design the campaign, and run it undisturbed in virtual time."""
+        loud = fast_cell(folder, **SHORT)
+        quiet = replaced_value(loud.text, "simulation", "current_noise", NOISE)
+        cell = Cell.from_texts(quiet, loud.urdf, loud.path)
+        plan = design(cell, Silent())
+        campaign = made(folder / "undisturbed", cell, plan)
+        finish_in_virtual_time(campaign, seed=0)
+        return cls(folder, cell, plan, estimate_of(campaign), planted)
+
+
+def finish_in_virtual_time(campaign: Campaign, seed: int) -> None:
+    """Run what is missing, with an arm that somebody jogged home."""
+    cell = campaign.cell
+    home = replaced_value(cell.text, "simulation", "initial_deg", str(list(cell.campaign.home_deg)))
+    at_home = Cell.from_texts(home, cell.urdf, cell.path)
+    controller = simulated_controller(at_home, seed=seed)
+    Campaign.open(campaign.folder.root).run(
+        Link.over(SimulatedTransport(controller), cell, finish=controller.finish),
+        Stop(),
+        Silent(),
+        durable=False,
+        unrehearsed=True,
+    )
+
+
+def estimate_of(campaign: Campaign) -> Estimated:
+    """What is found in the archives of a campaign."""
+    pooled = identify_campaign(campaign.folder.root, Silent()).estimate.pooled
+    return Estimated(np.asarray(pooled.values), np.asarray(pooled.covariance))
+
+
+def play(stage: Stage, number: int) -> dict[str, Any]:
+    """Play a round; what is worth writing down of it, `broken` among it.
+
+    Its folder is kept if something was broken.
+    """
+    played, began = drawn(number), time.monotonic()
+    used = os.times()
+    folder = stage.folder / f"round_{number:05d}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    broken: list[str]
+    result: dict[str, Any] = {"round": number, "what": str(played)}
+    campaign = made(folder, stage.cell, stage.plan)
+    try:
+        seen = run(campaign, played, played.victims, folder / "said.json", stage.planted)
+        broken, figures = broken_by(seen, campaign)
+        result |= {
+            "killed": list(seen.killed),
+            "status": seen.status,
+            "said": seen.said.get("text", ""),
+            "cycles": len(seen.rows),
+            "lagged": seen.lagged,
+            **figures,
+        }
+        broken += _finished(campaign, played, seen, folder)
+        if not broken and number % ESTIMATED == 0:
+            apart = estimate_of(campaign).apart(stage.undisturbed)
+            result["apart"] = apart
+            if apart > stage.undisturbed.bound:
+                broken.append(f"the estimate is another one (squared distance {apart:.1f})")
+    except (
+        Exception
+    ) as error:  # whatever it is, this round is to be looked at, and the others go on
+        broken = [f"{type(error).__name__}: {error}"]
+        (folder / "error.txt").write_text(traceback.format_exc())
+    now = os.times()
+    processor = sum(now[:4]) - sum(used[:4])
+    result |= {"broken": broken, "seconds": time.monotonic() - began, "processor": processor}
+    if not broken:
+        shutil.rmtree(folder)
+    return result
+
+
+def _finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> list[str]:
+    """Finish the campaign; what was broken."""
+    earlier = frozenset(path.name for path in campaign.folder.archives.iterdir())
+    before = campaign.folder.manifest()
+    problems: list[str] = []
+    if played.over_sockets:
+        again = run(campaign, played, (), folder / "said-again.json")
+        if again.status != 0:
+            problems.append(f"the next run failed with status {again.status}: {again.said}")
+        problems += broken_by(again, campaign, earlier)[0]
+    else:
+        finish_in_virtual_time(campaign, seed=played.seed)
+    after = campaign.folder.manifest()
+    if after[: len(before)] != before:
+        problems.append("the next run changed entries of the one before")
+    return [*problems, *_whole(campaign, seen)]
+
+
+def _whole(campaign: Campaign, seen: Seen) -> Iterator[str]:
+    """Each interval of the plan is entered once as completed, and is whole."""
+    settings = campaign.cell.campaign
+    wanted = {"standstill": 1, "excitation": settings.repetitions, "validation": 1}
+    entered = Counter(
+        (name.kind, name.index)
+        for entry in campaign.folder.manifest()
+        if entry.outcome == "completed" and (name := ArchiveName.parse(entry.name)) is not None
+    )
+    for kind, count in wanted.items():
+        for index in range(count):
+            if entered[kind, index] != 1:
+                yield f"{kind} {index} is entered {entered[kind, index]} times"
+        for path in campaign.folder.completed(kind):
+            if not open_archive(path).complete:
+                yield f"{path.name} is entered and not complete"
+    if damaged := campaign.folder.damaged():
+        yield f"after {seen.killed}: {damaged}"

@@ -1,0 +1,404 @@
+"""The real campaign of a round: a controller, a supervisor, what it starts, and who gets killed.
+
+Controller and supervisor are forked from a process that has everything imported; exchange and
+archive process are started by the product itself, as in any run. What is seen of them is seen from
+outside: their memory, their files, and the controller's own account.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from socket import AF_INET, SOCK_DGRAM, socket
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.record import cycle_dtype
+from drivers.states import State
+from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
+from hil.campaign.folder import Entry
+from hil.cell import Cell
+from hil.demo_link import LOOPBACK, free_port
+from hil.errors import HilError
+from hil.progress import Silent
+from tests.process_death import product
+from tests.process_death.controller import REST, Page, Rows, at_rest, forked
+from tests.process_death.rounds import Round, Trigger, Victim
+
+PATIENCE: Final = 90.0
+"""s for anything that has to happen, on a machine that does other things as well."""
+LOOK: Final = 0.001
+"""s between two looks."""
+NOTICED: Final = 100
+"""Cycles within which an exchange has noticed the death of its supervisor."""
+MAY_MOVE: Final = (State.OPENING, State.OPEN, State.EXITING)
+MARK: Final = "HIL_PROCESS_DEATH"
+"""Variable in the environment of every process that a supervisor starts."""
+
+
+class NeverHappenedError(AssertionError):
+    """Something that has to happen did not."""
+
+
+@dataclass(eq=False)
+class Death:
+    """One kill.
+
+    Attributes:
+        victim: who died.
+        pid: its process.
+        written: records that the exchange had written just before.
+    """
+
+    victim: Victim
+    pid: int
+    written: int
+
+
+@dataclass(eq=False)
+class Seen:
+    """What was seen of one run of a campaign.
+
+    Attributes:
+        deaths: in order.
+        status: exit status of the supervisor, None if it was killed.
+        said: what it said, see `supervise`.
+        rows: the controller's account up to when everything else had ended.
+        records: the exchange's, from its memory.
+        entered: manifest as it was before the first kill.
+        lagged: cycles in which the controller waited for the archive process in vain.
+        left: process ids that were still there when all should have ended.
+        port_taken: whether nobody else could have had the port afterwards.
+    """
+
+    deaths: list[Death]
+    status: int | None
+    said: dict[str, Any]
+    rows: Rows
+    records: NDArray[np.void]
+    entered: list[Entry]
+    lagged: int
+    left: list[int] = field(default_factory=list)
+    port_taken: bool = False
+
+    @property
+    def killed(self) -> tuple[Victim, ...]:
+        """Who was killed."""
+        return tuple(death.victim for death in self.deaths)
+
+
+def made(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
+    """A campaign in a new folder, on a port of the loopback device that is free."""
+    local = cell.with_link(transport="udp", host=LOOPBACK, bind=LOOPBACK, port=free_port())
+    return Campaign.create(folder / "campaign", local, plan)
+
+
+def supervise(campaign: Path, said: Path, planted: Path | None) -> int:
+    """Be the supervisor: run what is missing; the exit status.
+
+    `said` tells what came of it: `complete`, or the name and the text of the error.
+    """
+    os.environ[MARK] = str(campaign)
+    if planted is not None:  # what this process can import, those that it starts can
+        sys.path.insert(0, str(planted))
+    told: dict[str, object]
+    try:
+        with stop_on_interrupt() as stop:
+            result = Campaign.open(campaign).run(None, stop, Silent(), unrehearsed=True)
+        told, status = {"complete": result.complete, "rejected": len(result.rejected)}, 0
+    except HilError as error:
+        told = {"error": type(error).__name__, "text": str(error)}
+        status = error.exit_code
+    said.write_text(json.dumps(told))
+    return status
+
+
+def _forked_supervisor(campaign: Path, said: Path, planted: Path | None) -> int:
+    pid = os.fork()
+    if pid:
+        return pid
+    status = 70
+    try:
+        os.setsid()
+        words = os.open(said.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        for ours, standard in ((nothing, 0), (words, 1), (words, 2)):
+            os.dup2(ours, standard)
+        status = supervise(campaign, said, planted)
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        with suppress(Exception):
+            sys.stderr.flush()
+        os._exit(status)
+
+
+class _Watched:
+    """The processes of one run while it goes on."""
+
+    def __init__(self, page: Page, supervisor: int, controller: int, *, loops: bool) -> None:
+        self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
+        self.status: dict[int, int] = {}
+        self.memory: product.Memory | None = None
+        self._page, self._loops = page, loops
+        self._ends: dict[int, int] = {}
+        self._leaving: int | None = None
+        self._watch(supervisor)
+        self._watch(controller)
+
+    def _watch(self, pid: int) -> None:
+        with suppress(ProcessLookupError):
+            self._ends[pid] = os.pidfd_open(pid)
+
+    def over(self, victim: Victim) -> bool:
+        """Whether a process has ended; one that never began counts as ended."""
+        pid = self.pids.get(victim, 0)
+        if pid not in self._ends:
+            return True
+        if not select.select([self._ends[pid]], [], [], 0.0)[0]:
+            return False
+        if victim in ("supervisor", "controller") and pid not in self.status:
+            self.status[pid] = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        return True
+
+    def look(self) -> None:
+        """Find what the supervisor has started meanwhile."""
+        modules: tuple[tuple[Victim, str], ...] = (
+            ("exchange", product.EXCHANGE),
+            ("archive", product.ARCHIVE),
+        )
+        for victim, module in modules:
+            if victim not in self.pids and (
+                pid := product.started_by(self.pids["supervisor"], module)
+            ):
+                self._watch(pid)
+                self.pids[victim] = pid
+                self._page.tell(self.pids.get("exchange", 0), self.pids.get("archive", 0))
+        if self.memory is None and "exchange" in self.pids:
+            with suppress(OSError):
+                self.memory = product.Memory(self.pids["exchange"])
+        if not self._loops and self._left_alone():
+            self._page.finish()  # as whoever stands at the cabinet would
+
+    def _left_alone(self) -> bool:
+        """Whether nobody wants anything to move any more, and nothing does.
+
+        An exchange may take some cycles to notice that its supervisor is dead, and begin a motion
+        meanwhile. A controller that is told to end closes its axes as soon as their targets stand,
+        which they also do at the begin of a motion.
+        """
+        control = None if self.memory is None else self.memory.control
+        if not (self.over("supervisor") or (control is not None and control.finish)):
+            return False
+        if self._leaving is None:
+            self._leaving = self._page.count
+        moves = control is not None and control.state in MAY_MOVE and not self.over("exchange")
+        return not moves and self._page.count - self._leaving > NOTICED
+
+    def wait(self, *victims: Victim) -> None:
+        """Until they have ended.
+
+        Raises:
+            NeverHappenedError: one did not.
+        """
+        deadline = time.monotonic() + PATIENCE
+        for victim in victims:
+            while not self.over(victim):
+                self.look()
+                if time.monotonic() > deadline:
+                    raise NeverHappenedError(f"the {victim} never ended")
+                time.sleep(5 * LOOK)
+
+    def kill(self, victim: Victim) -> Death:
+        """SIGKILL."""
+        written = 0 if self.memory is None else self.memory.written
+        with suppress(ProcessLookupError):
+            os.kill(self.pids[victim], signal.SIGKILL)
+        return Death(victim, self.pids[victim], written)
+
+    def close(self) -> None:
+        """End whatever is left, and let go."""
+        for victim, pid in self.pids.items():
+            if not self.over(victim):
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        for victim in ("supervisor", "controller"):
+            pid = self.pids[victim]
+            if pid not in self.status:
+                self.status[pid] = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        for end in self._ends.values():
+            os.close(end)
+        if self.memory is not None:
+            self.memory.close()
+
+
+class _Due:
+    """Whether the moment of a trigger has come."""
+
+    def __init__(self, trigger: Trigger, campaign: Campaign, page: Page) -> None:
+        self._trigger, self._page = trigger, page
+        self._archives, self._manifest = campaign.folder.archives, campaign.folder
+        self._begun = self._modified()
+        self._entered = 0
+        self._state, self._times = -1, 0
+
+    def _modified(self) -> int:
+        return (self._manifest.root / "manifest.json").stat().st_mtime_ns
+
+    def now(self, memory: product.Memory | None) -> bool:
+        """Look."""
+        trigger = self._trigger
+        match trigger.moment:
+            case "start":
+                return True
+            case "cycle":
+                return self._page.count >= trigger.count
+            case "archive":
+                return sum(1 for _ in self._archives.iterdir()) >= trigger.count
+            case "entered":
+                modified = self._modified()
+                self._entered += modified != self._begun
+                self._begun = modified
+                return self._entered >= trigger.count
+        if memory is None:
+            return False
+        control = memory.control
+        if trigger.moment == "motion":
+            ended, going_on = control.ended_count, control.program_accepted
+            on_the_way = going_on == trigger.count and control.motion_time >= trigger.way
+            return on_the_way or ended >= trigger.count
+        state = control.state
+        self._times += state == trigger.state and state != self._state
+        self._state = state
+        return self._times >= trigger.count
+
+
+@contextmanager
+def _started(
+    campaign: Campaign, played: Round, page: Page, said: Path, planted: Path | None
+) -> Iterator[_Watched]:
+    controller = forked(campaign.cell, played, page)
+    supervisor = _forked_supervisor(campaign.folder.root, said, planted)
+    watched = _Watched(page, supervisor, controller, loops=played.loops)
+    try:
+        yield watched
+    finally:
+        watched.close()
+        for pid in product.marked(MARK, str(campaign.folder.root)):
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def run(
+    campaign: Campaign,
+    played: Round,
+    victims: tuple[Victim, ...],
+    said: Path,
+    planted: Path | None = None,
+) -> Seen:
+    """Run a campaign with a controller of its own, and kill those `victims` when it is time.
+
+    Raises:
+        NeverHappenedError: something did not end.
+    """
+    page = Page()
+    with _started(campaign, played, page, said, planted) as watched:
+        deaths: list[Death] = []
+        entered = _killed(watched, campaign, played, page, victims, deaths)
+        watched.wait("supervisor", "exchange", "archive")
+        _let_the_arm_rest(watched, page)
+        memory = watched.memory
+        records = np.zeros(0, cycle_dtype(product.JOINTS)) if memory is None else memory.records()
+        rows = page.rows()
+        page.give_up()
+        watched.wait("controller")
+        supervisor = watched.pids["supervisor"]
+        return Seen(
+            deaths,
+            None if "supervisor" in {one.victim for one in deaths} else watched.status[supervisor],
+            json.loads(said.read_text()) if said.exists() else {},
+            rows,
+            records,
+            campaign.folder.manifest() if entered is None else entered,
+            page.lagged,
+            left=_left(campaign),
+            port_taken=_port_taken(campaign.cell.controller.port or 0),
+        )
+
+
+def _killed(
+    watched: _Watched,
+    campaign: Campaign,
+    played: Round,
+    page: Page,
+    victims: tuple[Victim, ...],
+    deaths: list[Death],
+) -> list[Entry] | None:
+    """Wait for the moment and kill; the manifest as it was before, None if it never came."""
+    due = _Due(played.trigger, campaign, page)
+    deadline = time.monotonic() + PATIENCE
+    while not (watched.over("supervisor") or (victims and due.now(watched.memory))):
+        watched.look()
+        if time.monotonic() > deadline:
+            raise NeverHappenedError("the campaign came neither to its end nor to the kill")
+        time.sleep(LOOK)
+    if watched.over("supervisor"):
+        return None
+    entered = campaign.folder.manifest()
+    until = time.monotonic() + played.trigger.delay
+    while (left := until - time.monotonic()) > 0.0:
+        watched.look()
+        time.sleep(min(left, LOOK))
+    for place, victim in enumerate(victims):
+        if place:
+            time.sleep(played.apart)
+        while victim not in watched.pids and not watched.over("supervisor"):
+            watched.look()
+            time.sleep(LOOK)
+        if victim in watched.pids and not watched.over(victim):
+            deaths.append(watched.kill(victim))
+    return entered
+
+
+def _let_the_arm_rest(watched: _Watched, page: Page) -> None:
+    """Nobody answers any more: until the controller alone has brought its arm to rest."""
+    deadline = time.monotonic() + PATIENCE
+    # A controller that nobody ever answered has not begun; one that ended its session is done.
+    while not watched.over("controller") and page.count and not at_rest(page.rows()[-REST:]):
+        if time.monotonic() > deadline:
+            return  # the laws will say so
+        time.sleep(5 * LOOK)
+
+
+def _left(campaign: Campaign) -> list[int]:
+    """Processes that should have ended; a child that plans a motion may take a moment."""
+    deadline = time.monotonic() + 10.0
+    while left := product.marked(MARK, str(campaign.folder.root)):
+        if time.monotonic() > deadline:
+            break
+        time.sleep(20 * LOOK)
+    return left
+
+
+def _port_taken(port: int) -> bool:
+    with socket(AF_INET, SOCK_DGRAM) as probe:
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            return True
+    return False

@@ -1,0 +1,142 @@
+"""One round of the campaign of kills, drawn from its number: who dies, when, and what follows."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from drivers.states import State
+from sim_fixtures.settings import WHILE_SILENT, WhileSilent
+
+Victim = Literal["exchange", "archive", "supervisor", "controller"]
+Moment = Literal["start", "cycle", "motion", "archive", "entered", "state"]
+
+VICTIMS: Final[tuple[Victim, ...]] = ("exchange", "archive", "supervisor", "controller")
+OVER_SOCKETS: Final = 10
+"""Every so many rounds the campaign is finished over sockets again, and not in virtual time."""
+LOOPS: Final = 0.04
+"""Share of the rounds in which the exchange has to end by its own patience, which takes it 10 s."""
+EARLY: Final = ("start", "cycle")
+MINUTES: Final = 0.1
+"""Share of the early deaths of a controller that are played: a supervisor waits a minute for a
+drive to be switched on."""
+CYCLES: Final = 150
+"""Cycles within which the controller has begun, and switched its drive on."""
+LONGEST: Final = 0.8
+"""s that the longest motion of the small cell takes."""
+REPORTED: Final = 0.07
+"""s between two moments at which the exchange says how far a motion has come."""
+ARCHIVES: Final = 6
+"""Archives of a whole campaign of it: two ways, standstill, two repetitions, validation."""
+STATES: Final = (State.CLOSED, State.OPENING, State.OPEN, State.EXITING)
+
+
+@dataclass(frozen=True)
+class Trigger:
+    """When the first victim dies.
+
+    Attributes:
+        moment: what is waited for: the `start` of the supervisor, a `cycle` of the controller, an
+            `archive` that is created, one that is `entered` in the manifest, a `state` of the
+            exchange.
+        count: which cycle, or which archive, entry or time that the state was entered.
+        delay: s from then to the kill.
+        state: of the session, where one is waited for.
+    """
+
+    moment: Moment
+    count: int
+    delay: float
+    way: float = 0.0
+    state: State = State.CLOSED
+
+    def __str__(self) -> str:
+        what = {
+            "start": "the start",
+            "cycle": f"cycle {self.count}",
+            "motion": f"{self.way:.2f} s of motion {self.count}",
+            "archive": f"archive {self.count} was created",
+            "entered": f"archive {self.count} was entered",
+            "state": f"{self.state.name.lower()} for the {self.count}. time",
+        }[self.moment]
+        return f"{1e3 * self.delay:.1f} ms after {what}"
+
+
+@dataclass(frozen=True)
+class Round:
+    """What happens in one round.
+
+    Attributes:
+        number: of the round, and its seed.
+        victims: who is killed, in this order.
+        apart: s between two kills.
+        trigger: when the first of them comes.
+        over_sockets: whether the campaign is finished over sockets, with a new controller.
+        loops: whether the controller's program goes on opening the axes when nobody wants it to.
+        while_silent, missed_replies, stagger: how the controller behaves; see
+            `sim_fixtures.ControllerSettings`.
+    """
+
+    number: int
+    victims: tuple[Victim, ...]
+    apart: float
+    trigger: Trigger
+    over_sockets: bool
+    loops: bool
+    while_silent: WhileSilent
+    missed_replies: int
+    stagger: int
+
+    @property
+    def seed(self) -> int:
+        """Of the controller's noise and of what its model has wrong; never 0.
+
+        One controller keeps its model: repetitions made with another would not agree.
+        """
+        return 1 + self.number
+
+    def __str__(self) -> str:
+        return f"round {self.number}: {' and '.join(self.victims)} killed {self.trigger}"
+
+
+def drawn(number: int) -> Round:
+    """The round of that number; the victims come in turn, everything else by chance."""
+    chance = random.Random(f"process death {number}")
+    first = VICTIMS[number % len(VICTIMS)]
+    others = [one for one in VICTIMS if one != first]
+    more = chance.choices((0, 1, 2), (8, 2, 1))[0]
+    victims = (first, *chance.sample(others, more))
+    trigger = _trigger(chance)
+    while "controller" in victims and trigger.moment in EARLY and chance.random() > MINUTES:
+        trigger = _trigger(chance)
+    return Round(
+        number=number,
+        victims=victims,
+        apart=chance.choice((0.0, chance.uniform(0.0, 0.05), chance.uniform(0.0, 0.6))),
+        trigger=trigger,
+        over_sockets=number % OVER_SOCKETS == 0,
+        loops=chance.random() < LOOPS,
+        while_silent=chance.choice(WHILE_SILENT),
+        missed_replies=chance.choice((1, 5, 50)),
+        stagger=chance.randrange(6),
+    )
+
+
+def _trigger(chance: random.Random) -> Trigger:
+    moment: Moment = chance.choices(
+        ("start", "cycle", "motion", "archive", "entered", "state"), (1, 1, 8, 4, 3, 5)
+    )[0]
+    if moment == "start":
+        return Trigger(moment, 0, chance.uniform(0.0, 1.5))
+    if moment == "cycle":
+        return Trigger(moment, chance.randrange(CYCLES), chance.uniform(0.0, 0.002))
+    if moment == "motion":
+        way = chance.uniform(0.0, LONGEST)
+        return Trigger(moment, chance.randint(1, ARCHIVES), chance.uniform(0.0, REPORTED), way)
+    if moment == "archive":
+        return Trigger(moment, chance.randint(1, ARCHIVES), chance.expovariate(10.0))
+    if moment == "entered":
+        return Trigger(moment, chance.randint(1, ARCHIVES - 1), chance.expovariate(100.0))
+    count, delay = chance.randint(1, ARCHIVES), chance.expovariate(50.0)
+    return Trigger(moment, count, delay, state=chance.choice(STATES))

@@ -1,0 +1,152 @@
+"""Play campaigns on a simulated cell with everything that goes wrong, and judge them by laws."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from pathlib import Path
+
+from hil.progress import reporter
+from tests.simulate.judging import judged
+from tests.simulate.many import Journal, JournalError, played, stage_folder
+from tests.simulate.observed import Observed
+from tests.simulate.script import GRAMMAR
+from tests.simulate.verdicts import Stage, Tally, Verdict, runs_of
+
+EPILOG = f"""\
+One seed is one arm, plan, person and script of faults, and always the same run:
+  python -m tests.simulate --seed 17                    play it and tell all of it
+  python -m tests.simulate --seed 17 --script FILE      the same arm and plan, another script
+  python -m tests.simulate --seeds 10000 --jobs 2 --journal seeds.jsonl
+The last may be killed and typed again: what the journal knows is not played again. A journal
+belongs to one state of the code; after a change of it name another.
+The exit code is 1 if a law was broken. A script has lines of `hil simulate`'s faults, and of
+
+{GRAMMAR}
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    options = _parser().parse_args(arguments)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the children
+    try:
+        return _one(options) if options.seed is not None else _many(options)
+    except (JournalError, ValueError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped; what a journal has is kept\n")
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.simulate",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--seed", type=_count, metavar="S", help="play this one and tell all of it")
+    what.add_argument("--seeds", type=_count, metavar="N", help="play N of them")
+    parser.add_argument("--start", type=_count, default=0, help="the first of N (0)")
+    parser.add_argument("--script", type=Path, metavar="FILE", help="of --seed: instead of its own")
+    parser.add_argument("--jobs", type=_jobs, default=1, help="child processes (1)")
+    parser.add_argument("--journal", type=Path, metavar="FILE", help="JSON lines, one a seed")
+    parser.add_argument("--no-shrink", action="store_true", help="leave scripts of failures as is")
+    parser.add_argument("--json", action="store_true", help="end with one JSON object")
+    return parser
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of 0 or more")
+    return int(text)
+
+
+def _jobs(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of 1 or more")
+    return int(text)
+
+
+def _one(options: argparse.Namespace) -> int:
+    lines = None
+    if options.script is not None:
+        try:
+            lines = options.script.read_text("utf-8").splitlines()
+        except OSError as error:
+            raise ValueError(f"{options.script}: {error.strerror}; name a script") from error
+    with stage_folder() as root:
+        stage = Stage(root)
+        seen = stage.observed(options.seed, lines)
+        broken = judged(seen)
+        told = [f"seed {options.seed}: {stage.twin(options.seed).scene.words}", *_story(seen)]
+    told += [f"BROKEN {law}: {text}" for law, text in broken]
+    told += [] if broken else ["all laws hold"]
+    if not options.json:
+        sys.stdout.write("\n".join(told) + "\n")
+    else:
+        found = {
+            "ran": 1,
+            "failed": int(bool(broken)),
+            "seeds_failed": [options.seed] if broken else [],
+            "script": list(seen.schedule),
+            "struck": list(seen.struck),
+            "runs": list(runs_of(seen)),
+            "broken": [list(one) for one in broken],
+        }
+        sys.stdout.write(json.dumps(found) + "\n")
+    return int(bool(broken))
+
+
+def _story(seen: Observed) -> list[str]:
+    """What was drawn and what happened, for a person."""
+    told = [
+        f"  {line}{'' if line in seen.struck else '   (never struck)'}" for line in seen.schedule
+    ]
+    for number, (life, how) in enumerate(zip(seen.runs, runs_of(seen), strict=True), start=1):
+        why = "" if life.error is None else f": {life.error}"
+        told.append(
+            f"run {number}, cycles {life.first_cycle}..{life.last_cycle}: {how}{why}"
+            f" [{', '.join(life.archives) or 'no archive'}]"
+        )
+    if seen.unidentified:
+        told.append(f"not identified: {seen.unidentified}")
+    return told
+
+
+def _many(options: argparse.Namespace) -> int:
+    journal = Journal(options.journal)
+    seeds = range(options.start, options.start + options.seeds)
+    tally, out = Tally(), sys.stderr if options.json else sys.stdout
+    with redirect_stdout(out):
+        told = reporter()
+        with told.task("playing seeds", len(seeds)) as task:
+            for verdict in played(seeds, journal, options.jobs, shrink=not options.no_shrink):
+                tally.add(verdict)
+                task.advance(1, f"{len(tally.failed)} failed")
+                if verdict.broken:
+                    told.say(_failure(verdict))
+    summary = tally.to_dict()
+    if options.json:
+        sys.stdout.write(json.dumps(summary) + "\n")
+    else:
+        sys.stdout.writelines(f"{name}: {value}\n" for name, value in summary.items())
+    return int(bool(tally.failed))
+
+
+def _failure(verdict: Verdict) -> str:
+    lines = [f"FAILED seed {verdict.seed} ({verdict.scene})"]
+    lines += [f"  {law}: {text}" for law, text in verdict.broken[:6]]
+    lines += ["  script, made small:", *(f"    {line}" for line in verdict.shrunk)]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,328 @@
+"""Every archive tells what crossed the wire, all of it up to what it states as lost.
+
+`docs/archive-format.md`: one interval of motion in one file, records as they were exchanged, cycles
+that grow, what is missing counted; a file that was not closed is readable to its last whole chunk.
+Each record is held against the packet and the answer that it was made of, decoded here.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader
+from numpy.typing import NDArray
+
+from drivers.events import MotionEnded, MotionStarted
+from hil.archive import open_archive
+from hil.errors import ArchiveError
+from tests.simulate.observed import Broken, Life, Observed
+
+from .archived import Archived, read
+from .conversation import Talk, heard
+from .open_mode import modes_of
+from .wire import Array, Gears
+
+LAW: Final = "archives"
+_EPS: Final = float(np.finfo(np.float64).eps)
+_FLUSHED: Final = 0.1
+"""s of the controller's time in a chunk."""
+_DRAINED: Final = 100
+"""Cycles after which records in memory are handed to the archive (`hil.campaign.link`)."""
+_SAME: Final = ("arrival", "number", "gap", "interval", "state", "status", "mode", "age")
+_SI: Final = (
+    *("target_position", "target_velocity", "position", "velocity"),
+    *("target_current", "model_current", "diagonal_inertia", "extra3"),
+)
+"""The wire's D1..D5, extra1..3 as they are called in a record."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """An archive, and the session that its records are of.
+
+    Attributes:
+        archived: as read.
+        life: that wrote it.
+        talk: the session; None where no record is in the file, or none fits.
+        rows: (k,) rows of the session that its records were made of.
+    """
+
+    archived: Archived
+    life: Life
+    talk: Talk | None
+    rows: NDArray[np.intp]
+
+
+@lru_cache(maxsize=2)
+def placed(observed: Observed) -> tuple[Placed, ...]:
+    """The archives of all lives that are in the folder."""
+    found = []
+    for life, one in zip(observed.runs, heard(observed), strict=True):
+        for name in life.archives:
+            path = observed.folder / "archives" / name
+            if path.exists():
+                archived = read(path)
+                found.append(Placed(archived, life, *_place(archived, one.talks)))
+    return tuple(found)
+
+
+def _place(archived: Archived, talks: tuple[Talk, ...]) -> tuple[Talk | None, NDArray[np.intp]]:
+    rows = archived.cycles
+    nothing = np.zeros(0, np.intp)
+    if not len(rows):
+        return None, nothing
+    for talk in talks:
+        records = talk.records
+        at = np.searchsorted(records["cycle"], rows["cycle"])
+        if len(records) and at[-1] < len(records):
+            there = records[at]
+            same = (there["cycle"] == rows["cycle"]) & (there["number"] == rows["number"])
+            if (same & (there["arrival"] == rows["arrival"])).all():
+                return talk, at
+    return None, nothing
+
+
+def archives(observed: Observed) -> Iterator[Broken]:
+    """See above."""
+    gears = Gears.of(observed.cell.drive_table)
+    constants = np.array(observed.cell.drive_table.torque_constant, float)
+    one_asked = observed.seed
+    all_placed = placed(observed)
+    for number, one in enumerate(all_placed):
+        name = one.archived.path.name
+        texts = [
+            *_readable(one, by_library=number == one_asked % len(all_placed)),
+            *_columns(one.archived, observed.cell.period),
+            *_stated(one),
+            *_made_of(one, gears, constants),
+        ]
+        for text in texts:
+            yield Broken(LAW, f"{name}: {text}")
+    for text in _each_interval(observed, all_placed):
+        yield Broken(LAW, text)
+
+
+def _readable(one: Placed, *, by_library: bool) -> Iterator[str]:
+    archived, life = one.archived, one.life
+    name = archived.path.name
+    may_be_torn = life.died or bool(life.disk) or any(name in later for later in [life.torn])
+    if not archived.whole and not may_be_torn:
+        yield f"is not whole ({archived.problem}), though nobody tore it"
+    if not archived.whole or by_library:
+        yield from _as_the_product_reads(archived)
+    if by_library:
+        yield from _as_the_library_reads(archived)
+
+
+def _as_the_product_reads(archived: Archived) -> Iterator[str]:
+    """The same rows; and what is torn is told to be."""
+    try:
+        archive = open_archive(archived.path, fields=("cycle", "position"))
+    except ArchiveError as error:
+        if len(archived.cycles):
+            yield f"{len(archived.cycles)} records are whole, and it is refused ({error})"
+        return
+    if archive.complete is not archived.whole:
+        yield f"complete is {archive.complete}, but whole is {archived.whole}"
+    columns = archive.columns
+    if len(archived.cycles):
+        same = np.array_equal(columns["cycle"], archived.cycles["cycle"])
+        if not same or not np.array_equal(columns["position"], archived.cycles["position"]):
+            yield f"{len(columns['cycle'])} records are read, {len(archived.cycles)} are whole"
+
+
+def _as_the_library_reads(archived: Archived) -> Iterator[str]:
+    """As many messages, with the same times, from the `mcap` library's own reader."""
+    stamps = []
+    try:
+        reader = NonSeekingReader(io.BytesIO(archived.path.read_bytes()), validate_crcs=True)
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.topic == "/hil/cycle":
+                stamps.append(message.log_time)
+    except (McapError, ValueError, struct.error) as error:  # the last: torn within an index
+        if archived.whole:
+            yield f"the mcap library cannot read it: {type(error).__name__}: {error}"
+            return
+    if not np.array_equal(stamps, archived.stamps):
+        yield f"the mcap library finds {len(stamps)} cycles, {len(archived.stamps)} are there"
+
+
+def _columns(archived: Archived, period: float) -> Iterator[str]:
+    """What the channels say of one another."""
+    rows = archived.cycles
+    if not len(rows):
+        return
+    cycle = rows["cycle"]
+    if not (np.diff(cycle) > 0).all():
+        yield "cycles do not grow"
+    stamps = np.rint(cycle * (period * 1e9)).astype(np.int64)
+    told = rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"]
+    if not (np.array_equal(stamps, archived.stamps) and np.array_equal(stamps, told)):
+        yield "times are not cycle times period"
+    if not np.array_equal(archived.sequences, np.arange(len(rows))):
+        yield "messages are not numbered without a hole"
+    state = np.concatenate([rows[name] for name in ("position", "velocity", "torque")], axis=1)
+    sent = np.concatenate([rows[f"commanded_{name}"] for name in ("position", "velocity")], axis=1)
+    same = np.array_equal(state, archived.states, equal_nan=True)
+    if not (same and np.array_equal(sent, archived.commanded, equal_nan=True)):
+        yield "the JointState channels do not repeat the records"
+    # An unknown number of packets is missing after a silence, and the cycles do not count them.
+    if np.any(np.diff(cycle) < 1 + rows["gap"][1:]):
+        yield "more packets are missing before a cycle than there is room for"
+
+
+def _stated(one: Placed) -> Iterator[str]:
+    """The outcome's own figures."""
+    archived, outcome = one.archived, one.archived.outcome
+    if outcome is None or not archived.whole:
+        return
+    rows = archived.cycles
+    expected = {"samples": len(rows), "events": len(archived.events)}
+    if len(rows):
+        expected["lost_packets"] = int(rows["gap"].sum())
+        expected["first_cycle"], expected["last_cycle"] = (
+            int(rows["cycle"][0]),
+            int(rows["cycle"][-1]),
+        )
+    for key, value in expected.items():
+        if outcome.get(key) != str(value):
+            yield f"{key} is stated as {outcome.get(key)}, and is {value}"
+
+
+def _made_of(one: Placed, gears: Gears, constants: Array) -> Iterator[str]:
+    """Each record is of one packet and its answer."""
+    archived, talk, rows = one.archived, one.talk, one.rows
+    cycles = archived.cycles
+    if not len(cycles):
+        return
+    if talk is None:
+        yield "its records never crossed the wire of the run that wrote it"
+        return
+    init = talk.life.exchanged[talk.at].packet
+    if archived.attachments.get("init_packet.bin") != init:
+        yield "its init packet is not the session's"
+    lost = int(rows[-1] - rows[0] + 1 - len(rows))
+    stated = int((archived.outcome or {}).get("records_lost", 0))
+    if archived.whole and lost != stated:
+        yield f"{lost} cycles in between were exchanged and not archived, {stated} are stated lost"
+    if not archived.whole and lost:
+        yield f"what survives has a hole of {lost} cycles"
+    records = talk.records[rows]
+    for name in _SAME:
+        if not np.array_equal(records[name], cycles[name]):
+            yield f"{name} is not that of the cycle exchanged"
+    if talk.safe is not None and talk.init.slots:
+        yield from _decoded(talk, rows, cycles, gears, constants)
+
+
+def _decoded(
+    talk: Talk, rows: NDArray[np.intp], cycles: NDArray[np.void], gears: Gears, constants: Array
+) -> Iterator[str]:
+    slots = list(talk.init.slots or ())
+    d = talk.received.d[rows][:, slots].astype(np.float64)
+    period = talk.init.period
+    finite = np.isfinite(d).all(axis=(1, 2))  # a garbled packet may hold any number
+    size = np.abs(np.linalg.inv(gears.matrix)).sum(axis=1).max() * (
+        1.0 + np.abs(d[finite, :, 0:4:2]).max(initial=0.0)
+    )
+    bound = 16.0 * len(slots) * _EPS * size
+    for column, name in enumerate(_SI):
+        told = cycles[name][finite]
+        if column in (0, 2):
+            good = np.abs(told - gears.joint(d[finite, :, column])) <= bound
+        elif column in (1, 3):
+            expected = gears.joint_step(d[finite, :, column]) / period
+            good = np.abs(told - expected) <= bound / period
+        else:
+            good = told == d[finite, :, column]
+        if not good.all():
+            yield f"{name} is not what the packets say"
+    torque = (cycles["target_current"][finite] * constants) @ (2.0 * np.pi * gears.matrix)
+    scale = np.abs(cycles["target_current"][finite] * constants) @ np.abs(
+        2.0 * np.pi * gears.matrix
+    )
+    if np.any(np.abs(cycles["torque"][finite] - torque) > 16.0 * len(slots) * _EPS * (scale + 1.0)):
+        yield "torque is not that of the current"
+    modes = modes_of(talk)
+    sent = cycles["commanded_position"]
+    led = (modes.all_ready & ~modes.refused)[rows]
+    if talk.usable and not np.array_equal(np.isfinite(sent).all(axis=1) & led, led):
+        yield "a set-point was sent that its record does not have"
+    given = np.isfinite(sent) & led[:, np.newaxis]
+    motor = gears.motor(np.where(given, sent, 0.0))
+    on_wire = talk.answer.d[rows][:, slots, 0]
+    # Recorded in joint angles, sent as float32: half a step of those, and the conversion.
+    allowed = np.spacing(np.abs(on_wire)).astype(np.float64) + 32.0 * len(slots) * _EPS * (
+        1.0 + np.abs(motor)
+    )
+    if np.any(given & (np.abs(motor - on_wire) > allowed)):
+        yield "a recorded set-point is not the one that was sent"
+    held = np.isfinite(sent) & ~talk.safe.on[rows][:, slots] if talk.safe is not None else given
+    if held.any() or np.isfinite(sent[modes.refused[rows]]).any():
+        yield "a set-point is recorded where none may have been sent"
+
+
+def _each_interval(observed: Observed, all_placed: tuple[Placed, ...]) -> Iterator[str]:
+    """Each motion is in one archive of its life, whole, and with its true outcome."""
+    for number, (life, one) in enumerate(zip(observed.runs, heard(observed), strict=True), 1):
+        mine = [p for p in all_placed if p.life is life and p.talk is not None]
+        for talk in one.talks:
+            intervals = talk.records["interval"]
+            for first in _motions(talk):
+                rows = np.flatnonzero(intervals == first)
+                if len(rows):
+                    for text in _interval(life, talk, first, rows, mine, observed.cell.period):
+                        yield f"life {number}, interval {first}: {text}"
+        taken: set[tuple[int, int]] = set()
+        for p in mine:
+            cells = {(id(p.talk), int(row)) for row in p.rows}
+            if taken & cells:
+                yield f"life {number}: {len(taken & cells)} records are in two archives"
+            taken |= cells
+
+
+def _motions(talk: Talk) -> list[int]:
+    """Intervals of a session in which a motion began."""
+    return [event.interval for event in talk.events if isinstance(event, MotionStarted)]
+
+
+def _interval(
+    life: Life, talk: Talk, interval: int, rows: NDArray[np.intp], mine: list[Placed], period: float
+) -> Iterator[str]:
+    holding = [p for p in mine if p.talk is talk and np.isin(rows, p.rows).any()]
+    survived = not (life.died or life.disk)
+    if len(holding) != 1:
+        if len(holding) > 1 or (survived and not _cut_short(life)):
+            yield f"its {len(rows)} cycles are in {len(holding)} archives"
+        return
+    archived = holding[0].archived
+    ends = [e for e in talk.events if isinstance(e, MotionEnded) and e.interval == interval]
+    cycles = talk.records["cycle"]
+    if ends and archived.whole:
+        ended = ends[-1]
+        told = {ended.outcome, *(("rejected",) if ended.outcome == "completed" else ())}
+        if archived.ended not in told and archived.ended != "interrupted":
+            yield f"it ended {ended.outcome}, and {archived.path.name} says {archived.ended!r}"
+        rows = rows[cycles[rows] <= ended.cycle]
+    missing = rows[~np.isin(rows, holding[0].rows)]
+    stated = int((archived.outcome or {}).get("records_lost", 0))
+    if archived.whole and archived.ended != "interrupted" and len(missing) > stated:
+        yield f"{len(missing)} of its cycles are not in {archived.path.name}, which states {stated}"
+    torn = archived.path.name in life.torn
+    if not archived.whole and life.died and not torn and len(rows):
+        # A chunk that was not full, and what had not been handed over yet.
+        most = round(_FLUSHED / period) + _DRAINED
+        if cycles[missing[-1]] - cycles[missing[0]] >= most if len(missing) else False:
+            yield f"its death cost {len(missing)} cycles, at most {most} are to be lost"
+
+
+def _cut_short(life: Life) -> bool:
+    """Whether the run unwound on something that is no error of ours: Ctrl-C twice."""
+    return isinstance(life.error, KeyboardInterrupt)

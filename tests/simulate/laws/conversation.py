@@ -1,0 +1,277 @@
+"""What was said on the link, sorted: which packet got which kind of answer, session by session."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from itertools import pairwise
+
+import numpy as np
+import oracle
+from numpy.typing import NDArray
+from reception import LAST, Kind, Reception, number_of
+
+from drivers.events import Event, InitReceived
+from tests.simulate.observed import Exchanged, Life, Observed
+
+from .wire import CLOSED, PAUSES, Flags, Init, Packets, SafeAnswers, safe_answers
+
+INIT_TIMEOUT = 300.0
+SILENCE_TIMEOUT = 1.0
+"""s; defaults of a session, until its settings say otherwise."""
+_RECENT = 200
+"""Packets among which one that came twice is looked for."""
+_END = (504).to_bytes(4, "little")
+_PAUSED = tuple(mode.to_bytes(4, "little") for mode in PAUSES)
+_KNOWN = {*oracle.OPEN, *CLOSED, *PAUSES}
+
+
+@dataclass(frozen=True, eq=False)
+class Talk:
+    """The cyclic packets of one session with the controller, up to the next init packet.
+
+    Attributes:
+        life: the process life it belongs to.
+        init: the init packet, decoded.
+        usable: whether the arm may be moved at all.
+        events: of this session, in order, from the one that it began on.
+        at: index of the init packet in `life.exchanged`.
+        index: (m,) index of each packet there.
+        silent: (m,) whether nothing had been heard for too long before it.
+        received, answer: the packets and what they were answered.
+        safe: the safe answers; None where the axis map is impossible.
+    """
+
+    life: Life
+    init: Init
+    usable: bool
+    events: tuple[Event, ...]
+    at: int
+    index: NDArray[np.intp]
+    silent: Flags
+    received: Packets
+    answer: Packets
+    safe: SafeAnswers | None
+
+    @cached_property
+    def record(self) -> NDArray[np.intp]:
+        """(m,) row of each packet in `life.records`."""
+        return np.array([self.life.exchanged[i].record for i in self.index], np.intp)
+
+    @cached_property
+    def records(self) -> NDArray[np.void]:
+        """(m,) the record that each packet made."""
+        return self.life.records[self.record]
+
+    def at_cycle(self, cycle: int) -> int:
+        """Index among the exchanged of the packet of a cycle of this session, or the next one."""
+        row = int(np.searchsorted(self.records["cycle"], cycle))
+        return int(self.index[row]) if row < len(self.index) else len(self.life.exchanged)
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """One process life, sorted.
+
+    Attributes:
+        talks: its sessions.
+        kinds: of the answer that each packet had to get.
+        wrong: index of a packet and what is wrong with its answer.
+        left_out: indices of packets that were not handed to the session, for a newer one.
+        fates: how many packets of each kind there were.
+        repeated: packets among these that had come before, byte for byte.
+        missed: packets that the numbers show never to have arrived, or to have had no answer.
+    """
+
+    talks: tuple[Talk, ...]
+    kinds: tuple[Kind, ...]
+    wrong: tuple[tuple[int, str], ...]
+    left_out: tuple[int, ...]
+    fates: Counter[Kind]
+    repeated: int
+    missed: int
+
+
+@lru_cache(maxsize=2)
+def heard(observed: Observed) -> tuple[Heard, ...]:
+    """Every process life of a campaign."""
+    n_joints = len(observed.cell.joint_names)
+    return tuple(_Sorting(life, n_joints).done() for life in observed.runs)
+
+
+def talks_of(observed: Observed) -> Iterator[Talk]:
+    """All sessions of all lives."""
+    for one in heard(observed):
+        yield from one.talks
+
+
+@dataclass
+class _Part:
+    init: bytes
+    at: int
+    index: list[int] = field(default_factory=list)
+    silent: list[bool] = field(default_factory=list)
+
+
+class _Sorting:
+    """Goes through a life packet by packet, as `Reception` has it."""
+
+    def __init__(self, life: Life, n_joints: int) -> None:
+        self._life, self._n_joints = life, n_joints
+        self._arm = int(life.settings.get("arm", 1))
+        self._silence = float(life.settings.get("silence_timeout", SILENCE_TIMEOUT))
+        self._reception = Reception(LAST // 2)
+        self._deadline = np.inf
+        self._reply = b""
+        self._parts: list[_Part] = []
+        self._kinds: list[Kind] = []
+        self._wrong: list[tuple[int, str]] = []
+        self._left_out: list[int] = []
+        self._missed = self._repeated = 0
+        self._slots: tuple[int, ...] = ()
+        self._ticks = [act.before for act in life.acts if act.name == "tick"]
+
+    def done(self) -> Heard:
+        for index, exchanged in enumerate(self._life.exchanged):
+            self._hear(index, exchanged)
+        told = _by_session(self._life)
+        talks = tuple(
+            self._talk(part, told[number] if number < len(told) else ())
+            for number, part in enumerate(self._parts)
+        )
+        fates = Counter(self._kinds)
+        return Heard(
+            talks,
+            tuple(self._kinds),
+            tuple(self._wrong),
+            tuple(self._left_out),
+            fates,
+            self._repeated,
+            self._missed,
+        )
+
+    def _hear(self, index: int, one: Exchanged) -> None:
+        reception = self._reception
+        if self._fell_silent(index, one.now) and not reception.ended:
+            reception.silent = reception.n_axes is not None
+        if not one.given:
+            recent = self._life.exchanged[max(0, index - _RECENT) : index]
+            self._repeated += any(one.packet == other.packet for other in recent)
+            self._kinds.append("nothing")
+            self._left_out.append(index)
+            return
+        last, silent = reception.last, reception.silent
+        kind = reception.expect(one.packet)
+        self._kinds.append(kind if one.replies else "nothing")
+        if not one.replies:
+            # Whoever dies, or whose link is closed, may not come to answer the last one.
+            if kind != "nothing" and index < len(self._life.exchanged) - 1:
+                self._wrong.append((index, f"got no answer that was due ({kind})"))
+            return
+        if len(one.replies) > 1:
+            self._wrong.append((index, f"{len(one.replies)} answers"))
+        self._judge(index, one, kind)
+        if kind in ("echo", "init", "cyclic"):
+            self._reply = one.replies[0]
+        if kind == "init":
+            self._begin(index, one)
+        if kind == "cyclic" and self._parts:
+            ahead = (number_of(one.packet) - last) % LAST
+            if 1 <= ahead <= reception.window:
+                self._missed += ahead - 1
+            self._parts[-1].index.append(index)
+            self._parts[-1].silent.append(silent)
+        if kind in ("echo", "init", "cyclic"):
+            self._deadline = one.now + self._patience(one.packet, kind)
+
+    def _fell_silent(self, index: int, now: float) -> bool:
+        """Whether the session took the link for lost before this packet.
+
+        Told while nothing came, or found out when this one came after too long.
+        """
+        fell = False
+        while self._ticks and self._ticks[0] <= index + (now >= self._deadline):
+            self._ticks.pop(0)
+            self._deadline, fell = np.inf, True
+        return fell
+
+    def _judge(self, index: int, one: Exchanged, kind: Kind) -> None:
+        """Against the answer that needs no knowledge of what went before but the last one."""
+        reply = one.replies[0]
+        if kind == "nothing":
+            self._wrong.append((index, "was answered, and had to get no answer"))
+        elif kind == "again" and reply != self._reply:
+            self._wrong.append((index, "came twice, and was answered otherwise the second time"))
+        elif kind in ("echo", "init") and reply != oracle.echo(one.packet):
+            self._wrong.append((index, "was not echoed byte for byte with its number plus one"))
+        elif kind == "cyclic":
+            n_axes = self._reception.n_axes
+            assert n_axes is not None
+            if len(reply) != oracle.length(n_axes):
+                self._wrong.append((index, f"was answered by {len(reply)} bytes"))
+            if _END in one.packet and {*_modes(one.packet, range(n_axes))} == {504}:
+                self._reception.ended = True
+        if kind != "cyclic" and one.record >= 0:
+            self._wrong.append((index, f"left a record though it is no cyclic packet ({kind})"))
+        if kind == "cyclic" and one.record < 0:
+            self._wrong.append((index, "is a fresh cyclic packet and left no record"))
+
+    def _begin(self, index: int, one: Exchanged) -> None:
+        init = Init.of(one.packet, self._arm, self._n_joints)
+        self._parts.append(_Part(one.packet, index))
+        self._slots = init.slots or ()
+        window = self._silence / max(init.period, 1e-3)
+        self._reception.window = max(1, min(int(window), LAST // 2))
+
+    def _patience(self, packet: bytes, kind: Kind) -> float:
+        """s of silence from this packet on that are none."""
+        if self._reception.ended:
+            return np.inf
+        if self._reception.n_axes is None:
+            return INIT_TIMEOUT
+        on = kind == "cyclic" and packet[3 + self._arm] == oracle.DRIVE_ON
+        if on and (_PAUSED[0] in packet or _PAUSED[1] in packet):
+            modes = {*_modes(packet, self._slots)}
+            if modes & {*PAUSES} and modes <= _KNOWN:
+                return INIT_TIMEOUT
+        return self._silence
+
+    def _talk(self, part: _Part, events: tuple[Event, ...]) -> Talk:
+        life = self._life
+        init = Init.of(part.init, self._arm, self._n_joints)
+        told = events[0] if events else None
+        usable = isinstance(told, InitReceived) and told.unusable is None
+        rows = [life.exchanged[i] for i in part.index]
+        # An answer too short was reported above, and would stop the decoding here.
+        fit = [k for k, one in enumerate(rows) if len(one.replies[0]) >= oracle.length(init.n_axes)]
+        received = Packets.of([rows[k].packet for k in fit], init.n_axes)
+        answer = Packets.of([rows[k].replies[0] for k in fit], init.n_axes)
+        return Talk(
+            life,
+            init,
+            usable,
+            events,
+            part.at,
+            np.array([part.index[k] for k in fit], np.intp),
+            np.array([part.silent[k] for k in fit], np.bool_),
+            received,
+            answer,
+            None if init.arms is None else safe_answers(received, init.arms),
+        )
+
+
+def _by_session(life: Life) -> list[tuple[Event, ...]]:
+    """The events of each session; those before the first init packet are of none.
+
+    The session tells them when it is asked, which may be many packets later: their order counts.
+    """
+    events = [event for _, event in life.events]
+    begins = [at for at, event in enumerate(events) if isinstance(event, InitReceived)]
+    return [tuple(events[a:b]) for a, b in pairwise([*begins, len(events)])]
+
+
+def _modes(packet: bytes, slots: Iterable[int]) -> Iterator[int]:
+    for slot in slots:
+        yield int.from_bytes(packet[12 + 36 * slot : 16 + 36 * slot], "little", signed=True)

@@ -1,0 +1,171 @@
+"""The folder: a manifest that names what counts, nothing whole overwritten, redone or lost.
+
+`docs/campaign.md`: every step is gone on with by typing the same command again; nothing that is
+whole is done twice or overwritten; `manifest.json` holds the checksums.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from hil import Campaign
+from tests.simulate.observed import Broken, Observed
+
+from .archived import read
+
+LAW: Final = "folder"
+WANTED: Final = ("standstill", "excitation", "validation")
+"""Kinds of which a plan says how many there are; each of them is done once."""
+NAME: Final = re.compile(r"([a-z]+)_(\d{3,})_a([1-9]\d*)\.mcap")
+_OUTCOMES: Final = ("completed", "stopped", "refused", "lost", "rejected")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the manifest, and whether the file is still what was entered."""
+
+    name: str
+    outcome: str
+    sha256: str
+    reason: str
+    unchanged: bool
+
+    @property
+    def motion(self) -> tuple[str, int]:
+        """Kind and index."""
+        kind, index, _ = parsed(self.name)
+        return kind, index
+
+
+def parsed(name: str) -> tuple[str, int, int]:
+    """Kind, index and attempt of a file name."""
+    match = NAME.fullmatch(name)
+    if match is None:
+        return "", -1, -1
+    return match[1], int(match[2]), int(match[3])
+
+
+def manifest_of(observed: Observed) -> tuple[dict[str, Any], list[Entry]]:
+    """Checksums of the inputs, and what is entered."""
+    content = json.loads((observed.folder / "manifest.json").read_text("utf-8"))
+    entries = []
+    for one in content["archives"]:
+        path = observed.folder / "archives" / one["name"]
+        same = path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() == one["sha256"]
+        entries.append(
+            Entry(one["name"], one["outcome"], one["sha256"], one.get("reason", ""), same)
+        )
+    return content["inputs"], entries
+
+
+def folder(observed: Observed) -> Iterator[Broken]:
+    """See above."""
+    for text in _texts(observed):
+        yield Broken(LAW, text)
+
+
+def _texts(observed: Observed) -> Iterator[str]:
+    try:
+        inputs, entries = manifest_of(observed)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        yield f"manifest.json cannot be read: {type(error).__name__}: {error}"
+        return
+    for name in ("cell.toml", "robot.urdf", "plan.json"):
+        found = hashlib.sha256((observed.folder / name).read_bytes()).hexdigest()
+        if inputs.get(name) != found:
+            yield f"{name} is not the one in the manifest"
+    torn = {name for life in observed.runs for name in life.torn}
+    names = [entry.name for entry in entries]
+    if len(set(names)) < len(names):
+        yield "an archive is entered twice"
+    for entry in entries:
+        yield from _entry(observed, entry, torn)
+    yield from _kept(observed, torn)
+    yield from _once(observed, entries)
+    yield from _left_over(observed, names)
+    yield from _told(observed, entries)
+
+
+def _entry(observed: Observed, entry: Entry, torn: set[str]) -> Iterator[str]:
+    path = observed.folder / "archives" / entry.name
+    if not path.exists():
+        yield f"{entry.name} is in the manifest and not in the folder"
+        return
+    if not entry.unchanged:
+        if entry.name not in torn:
+            yield f"{entry.name} is not what was entered, though nobody tore it"
+        return
+    archived = read(path)
+    if entry.outcome not in _OUTCOMES:
+        yield f"{entry.name} is entered as {entry.outcome!r}"
+    if not archived.whole:
+        yield f"{entry.name} is torn ({archived.problem}), and entered as {entry.outcome}"
+    elif archived.ended != entry.outcome and archived.ended != "interrupted":
+        yield f"{entry.name} says {archived.ended!r}, and is entered as {entry.outcome!r}"
+    if entry.outcome == "rejected" and (archived.outcome or {}).get("reason") != entry.reason:
+        yield f"{entry.name} was rejected for another reason than the manifest says"
+
+
+def _kept(observed: Observed, torn: set[str]) -> Iterator[str]:
+    """No file ever vanishes or changes, but for a rejection, which is written into it."""
+    for number, life in enumerate(observed.runs, 1):
+        for name, digest in life.before.items():
+            if not NAME.fullmatch(name):
+                continue
+            now = life.after.get(name)
+            if now is None:
+                yield f"life {number}: {name} is gone"
+            elif now != digest and name not in torn:
+                path = observed.folder / "archives" / name
+                if not path.exists() or read(path).ended != "rejected":
+                    yield f"life {number}: {name} was changed"
+    for earlier, later in zip(observed.runs, observed.runs[1:], strict=False):
+        if dict(earlier.after) != dict(later.before):
+            yield "the folder changed while no process lived"
+
+
+def _once(observed: Observed, entries: list[Entry]) -> Iterator[str]:
+    """What counts was done once, and not again once it was there."""
+    counting: dict[tuple[str, int], list[str]] = {}
+    for entry in entries:
+        if entry.outcome == "completed" and entry.unchanged and entry.motion[0] in WANTED:
+            counting.setdefault(entry.motion, []).append(entry.name)
+    for motion, names in counting.items():
+        if len(names) > 1:
+            yield f"{motion} counts {len(names)} times: {', '.join(names)}"
+    begun = [(number, name) for number, life in enumerate(observed.runs) for name in life.archives]
+    for number, name in begun:
+        for other_number, other in begun:
+            if other_number < number and other in counting.get(parsed(name)[:2], ()):
+                yield f"{name} was done although {other} was whole by then"
+
+
+def _left_over(observed: Observed, entered: list[str]) -> Iterator[str]:
+    """What lies there and is not entered is of a run that did not live to enter it."""
+    lives = {name: life for life in observed.runs for name in life.archives}
+    for path in sorted((observed.folder / "archives").glob("*.mcap")):
+        if path.name in entered:
+            continue
+        life = lives.get(path.name)
+        if life is None:
+            yield f"{path.name} is of no run"
+        elif life.result is not None:
+            yield f"{path.name} was not entered by a run that came to its end"
+
+
+def _told(observed: Observed, entries: list[Entry]) -> Iterator[str]:
+    """What is torn, damaged, of no use or left behind is named to whoever asks."""
+    good = {entry.name for entry in entries if entry.outcome == "completed" and entry.unchanged}
+    there = {path.name for path in (observed.folder / "archives").glob("*.mcap")}
+    of_no_use = ({entry.name for entry in entries} | there) - good
+    if not of_no_use:
+        return
+    notes = Campaign.open(observed.folder).status().notes
+    for name in sorted(of_no_use):
+        if not any(note.startswith(name) for note in notes):
+            yield f"hil status does not name {name}, which does not count"

@@ -1,0 +1,281 @@
+"""No set-point ever passed the guard's bounds, and none left where none may.
+
+By differences of what was really sent, twice: of the float64 set-points in the records, and of the
+float32 numbers on the wire with the bound of their rounding. Bounds are the cell's; wider ones of
+a change of override or a stop count only once something asked for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.events import AnswersLost, MotionEnded
+from tests.simulate.observed import Broken, Observed
+
+from .conversation import talks_of
+from .open_mode import Stretch, stretches
+from .wire import Array, Flags, Gears
+
+LAW: Final = "guard"
+_TOLERANCE: Final = 1e-6
+"""Relative: how well planners keep their limits (`docs/interpolator.md`, `drivers.guard`)."""
+_EPS: Final = float(np.finfo(np.float64).eps)
+_STANDSTILL: Final = 5e-4
+"""Motor revolutions per cycle: two increments of a 12-bit encoder (`drivers.guard_limits`)."""
+_FLOAT32: Final = float(np.finfo(np.float32).eps)
+"""Motor revolutions per cycle: more than float32 leaves open of a step, which is far below 1."""
+_FIRST: Final = 0.1
+"""Share of the following-error threshold that target and arm may differ by at first."""
+_LEAP: Final = 0.25
+"""Share that the controller's target may ever be off the set-point sent last."""
+_ORDERS: Final = ("velocity", "acceleration", "jerk")
+
+
+def guard(observed: Observed) -> Iterator[Broken]:
+    """See above."""
+    gears = Gears.of(observed.cell.drive_table)
+    limits = _Limits.of(observed.cell)
+    for talk in talks_of(observed):
+        life = 1 + observed.runs.index(talk.life)
+        for stretch in stretches(talk):
+            for text in _in_stretch(stretch, limits, gears, observed.cell.period):
+                at = stretch.at
+                yield Broken(LAW, f"life {life}, packets {at[0]} to {at[-1]}: {text}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Limits:
+    """Of the cell file: (n,) each, and (acceleration, jerk) factors by what was asked for."""
+
+    lower: Array
+    upper: Array
+    rates: Array
+    following: Array
+    current: Array
+    override: tuple[float, float]
+    stop: tuple[float, float]
+
+    @classmethod
+    def of(cls, cell: Any) -> _Limits:
+        limits, bounds, drives = cell.joint_limits, cell.file.bounds, cell.drive_table
+        return cls(
+            np.array(limits.lower),
+            np.array(limits.upper),
+            np.array([limits.velocity, limits.acceleration, limits.jerk]),
+            np.array(drives.following_error, float),
+            np.array(drives.current_limit, float),
+            (bounds.override.acceleration, bounds.override.jerk),
+            (bounds.stop.acceleration, bounds.stop.jerk),
+        )
+
+    def factors(self, stopping: Flags, overridden: Flags) -> Array:
+        """(k, 3) on velocity, acceleration and jerk."""
+        plain = np.ones((len(stopping), 3))
+        plain[overridden, 1:] = self.override
+        plain[stopping, 1:] = self.stop
+        return plain
+
+
+def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) -> Iterator[str]:
+    threshold = np.fmin(limits.following, stretch.talk.init.threshold)
+    current = np.fmin(limits.current, stretch.talk.init.current)
+    yield from _first(stretch, threshold)
+    yield from _feedback(stretch, threshold, current)
+    led = slice(0, stretch.leading)
+    factors = limits.factors(*_asked_for(stretch))
+    q = stretch.talk.records["commanded_position"][stretch.rows][led]
+    if not np.isfinite(q).all():
+        yield "a set-point was sent, and its record has none"
+        return
+    yield from _sent_as_recorded(stretch, q, gears)
+    span = 0.5 * (limits.upper - limits.lower) * _TOLERANCE
+    if np.any(q > limits.upper + span) or np.any(q < limits.lower - span):
+        yield f"a set-point outside the joints' range: {q.min(axis=0)} to {q.max(axis=0)}"
+    # What is held afterwards ends the motion: nobody may be brought to rest by a jump.
+    held = np.concatenate((q, q[-1:].repeat(min(3, len(stretch.sent) - len(q)), axis=0)))
+    record_rounding = np.full_like(held, 8.0 * _EPS) * np.abs(held).max(axis=0)
+    yield from _rates(held, limits.rates, factors, record_rounding, period, "recorded")
+    wire = gears.joint(stretch.sent[led])
+    ulps = 0.5 * np.spacing(np.abs(stretch.sent[led]).astype(np.float32)).astype(np.float64)
+    wire_rounding = ulps @ np.abs(np.linalg.inv(gears.matrix)).T
+    yield from _rates(wire, limits.rates, factors, wire_rounding, period, "float32")
+    yield from _only_when_requested(stretch, q)
+    yield from _after_long_gaps(stretch)
+    yield from _held_at_the_end(stretch)
+
+
+def _rates(
+    q: Array, rates: Array, factors: Array, rounding: Array, period: float, what: str
+) -> Iterator[str]:
+    """Differences of set-points (k, n), each known to `rounding` (k, n) [rad]."""
+    rows = np.concatenate((q[:1].repeat(3, axis=0), q))  # before the first one it stands
+    worst = rounding.max(axis=0)
+    for order, (name, bound) in enumerate(zip(_ORDERS, rates, strict=True), 1):
+        found = np.abs(np.diff(rows, order, axis=0)[3 - order :]) / period**order
+        allowed = factors[: len(found), order - 1 : order] * bound * (1.0 + _TOLERANCE)
+        if len(allowed) < len(found):  # rows held after the motion
+            more = allowed[-1:].repeat(len(found) - len(allowed), axis=0)
+            allowed = np.concatenate((allowed, more))
+        over = found > allowed + 2.0**order * worst / period**order
+        if over.any():
+            row, joint = (int(index[0]) for index in np.nonzero(over))
+            yield (
+                f"{name} of joint {joint + 1} in the {what} set-points is {found[row, joint]:.9g}, "
+                f"allowed is {allowed[row, joint]:.9g} (row {row})"
+            )
+
+
+def _asked_for(stretch: Stretch) -> tuple[Flags, Flags]:
+    """Rows from which on a stop or a hold, or a change of override, was asked for, (k,) each.
+
+    A stop is asked for by a person, or by the session itself after a long gap or lost answers.
+    """
+    life, talk, at = stretch.talk.life, stretch.talk, stretch.at
+    requests = [a.before for a in life.acts if a.name == "request" and a.before <= at[-1]]
+    begun = max(requests, default=0)
+    stopping, overridden = np.zeros(len(at), np.bool_), np.zeros(len(at), np.bool_)
+    for act in life.acts:
+        if begun <= act.before:
+            if act.name in ("stop", "hold", "resume"):
+                stopping |= at >= act.before
+            elif act.name == "override":
+                overridden |= at >= act.before
+    most = int(life.settings.get("max_gap", 2))
+    stopping |= np.logical_or.accumulate(_unanswered_before(stretch) > most)
+    lost = np.zeros(len(at))
+    first = int(talk.records["cycle"][stretch.rows][0])
+    for event in talk.events:
+        if isinstance(event, AnswersLost) and event.cycle >= first:
+            lost += np.where(at >= talk.at_cycle(event.cycle), event.count, 0)
+    return stopping | (lost > most), overridden
+
+
+def _unanswered_before(stretch: Stretch) -> NDArray[np.intp]:
+    """(k,) packets before each that never came or got no answer."""
+    talk = stretch.talk
+    gaps = talk.records["gap"][stretch.rows].astype(np.intp)
+    start = stretch.rows.start
+    before = talk.index[start - 1] if start else talk.at
+    # Whatever came in between and left no record was not answered afresh.
+    silent = np.diff(stretch.at, prepend=before) - 1
+    return np.asarray(gaps + silent)
+
+
+def _first(stretch: Stretch, threshold: Array) -> Iterator[str]:
+    """The first set-point is the target received, at rest, where the arm is."""
+    target, velocity, actual, actual_velocity = stretch.received[:4, 0]
+    if np.any(stretch.sent[0] != target) or np.any(stretch.step[0] != 0.0):
+        yield "the first set-point is not the target received at zero velocity"
+    if np.any(np.abs(target - actual) > _FIRST * threshold * (1.0 + _TOLERANCE)):
+        yield f"the first set-point is {np.abs(target - actual)} off the arm"
+    if np.any(np.abs(np.array((velocity, actual_velocity))) > _STANDSTILL):
+        yield "the first set-point was sent to an arm or a target in motion"
+
+
+def _feedback(stretch: Stretch, threshold: Array, current: Array) -> Iterator[str]:
+    """Set-points go on only to an arm that follows, and a controller that takes them."""
+    led = slice(1, stretch.leading)
+    target, _, actual, _, amperes = stretch.received[:, led]
+    last = stretch.sent[: stretch.leading - 1]
+    wide = threshold * (1.0 + 2.0 * _TOLERANCE)
+    if np.any(np.abs(actual - target) > wide) or np.any(np.abs(actual - last) > wide):
+        yield "a set-point was sent to an arm that does not follow"
+    if np.any(np.abs(amperes) > current * (1.0 + 2.0 * _TOLERANCE)):
+        yield "a set-point was sent to a motor beyond its current limit"
+    if np.any(np.abs(target - last) > _LEAP * wide):
+        yield "a set-point was sent although the controller's target is elsewhere"
+    nearest = _distance_to_last(stretch)
+    if np.any(nearest > _FIRST * wide):
+        row = int(np.argmax((nearest > _FIRST * wide).any(axis=1)))
+        yield f"a set-point was sent to a target that is none of the last (row {row + 1})"
+
+
+def _after_long_gaps(stretch: Stretch) -> Iterator[str]:
+    """After more than `max_gap` packets missed, set-points only if the controller carried on."""
+    talk, k = stretch.talk, stretch.leading
+    most = int(talk.life.settings.get("max_gap", 2))
+    records = talk.records[stretch.rows][:k]
+    long = np.flatnonzero(records["gap"][1:] > most) + 1
+    if not long.size:
+        return
+    step, standstill = stretch.step[long - 1], _STANDSTILL
+    allowed = np.maximum(0.5 * np.abs(step), standstill) * (1.0 + _TOLERANCE) + _FLOAT32
+    _, velocity, _, measured, _ = stretch.received[:, long]
+    stands = np.abs(measured) <= standstill
+    held = np.abs(velocity - step) > allowed
+    held |= stands & (np.abs(measured - step) > allowed)
+    if held.any():
+        yield "a motion went on after a long gap though the controller had not carried it on"
+
+
+def _distance_to_last(stretch: Stretch) -> Array:
+    """(k-1, n) from each target received to the nearest set-point it may be."""
+    depth = int(stretch.talk.life.settings.get("max_gap", 2)) + 1
+    k = stretch.leading
+    sent = stretch.sent[:k]
+    target = stretch.received[0, 1:k]
+    nearest = np.full(target.shape, np.inf)
+    for back in range(1, depth + 1):
+        rows = np.maximum(np.arange(1, k) - back, 0)
+        nearest = np.fmin(nearest, np.abs(target - sent[rows]))
+    missed = np.minimum(_unanswered_before(stretch)[1:k], depth - 1)
+    step = sent[:-1] - sent[np.maximum(np.arange(k - 1) - 1, 0)]
+    for ahead in range(1, depth):
+        carried = np.abs(target - (sent[:-1] + ahead * step))
+        nearest = np.where((missed >= ahead)[:, np.newaxis], np.fmin(nearest, carried), nearest)
+    return nearest
+
+
+def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]:
+    """D1 is the recorded set-point, D2 the step from the one before, to rounding."""
+    motor = gears.motor(q)
+    # The conversion is a sum of n products, made twice, here and there.
+    rounding = 8.0 * _EPS * np.maximum(1.0, np.abs(motor))
+    low, high = np.float32(motor - rounding), np.float32(motor + rounding)
+    sent = stretch.sent[: len(q)]
+    if np.any(sent < low) or np.any(sent > high):
+        yield "the set-point on the wire is not the recorded one"
+    step = np.diff(motor, axis=0, prepend=motor[:1])
+    told = stretch.step[: len(q)]
+    slack = 3.0 * rounding + np.spacing(np.abs(told).astype(np.float32))
+    if np.any(np.abs(told - step) > slack):
+        yield "D2 is not the step from one set-point to the next"
+
+
+def _only_when_requested(stretch: Stretch, q: Array) -> Iterator[str]:
+    """Nothing moves but what was requested and has not ended."""
+    moves = np.flatnonzero((np.diff(q, axis=0, prepend=q[:1]) != 0.0).any(axis=1))
+    if not moves.size:
+        return
+    at = stretch.at[moves]
+    talk, acts = stretch.talk, stretch.talk.life.acts
+    requests = np.array([a.before for a in acts if a.name == "request"], np.intp)
+    told = [event.cycle for event in talk.events if isinstance(event, MotionEnded)]
+    ends = np.array([talk.at_cycle(cycle) for cycle in told], np.intp)
+    asked = np.searchsorted(requests, at, side="right") - 1
+    if (asked < 0).any():
+        yield "set-points move before any motion was requested"
+        return
+    last_end = np.searchsorted(ends, at, side="left") - 1
+    ended = (last_end >= 0) & (ends[last_end] >= requests[asked]) if len(ends) else asked < 0
+    if ended.any():
+        yield f"set-points move after the motion had ended (packet {int(at[np.argmax(ended)])})"
+
+
+def _held_at_the_end(stretch: Stretch) -> Iterator[str]:
+    """On the way out an axis that stayed open keeps the last set-point, at zero velocity."""
+    talk, led = stretch.talk, stretch.leading
+    if led == len(stretch.sent):
+        return
+    slots = list(talk.init.slots or ())
+    rows = slice(stretch.rows.start + led, stretch.rows.stop)
+    mode = int(talk.life.settings.get("mode", 4))
+    kept = np.logical_and.accumulate(talk.received.mode[rows][:, slots] == mode, axis=0)
+    moved = (stretch.sent[led:] != stretch.sent[led - 1]) | (stretch.step[led:] != 0.0)
+    if np.any(kept & moved):
+        yield "an axis is not held while open mode is being left"

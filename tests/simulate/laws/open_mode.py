@@ -1,0 +1,120 @@
+"""Where axes are open: what each packet of a session says, and the stretches with set-points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import oracle
+from numpy.typing import NDArray
+
+from .conversation import Talk
+from .wire import CLOSED, D1, MODE, PAUSES, REFUSALS, Array, Flags
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """What the packets of a session say of the axes that are to be moved, (m,) or (m, n).
+
+    Attributes:
+        ready: (m, n) joints in the mode wanted, with the drive on.
+        all_ready: (m,) all of them.
+        is_open: some wanted axis is in any open mode, with the drive on.
+        paused, closed: some wanted axis in a pause; all closed; both with the drive on.
+        no_target: an axis that is held, of whichever arm, has a target that is no number.
+        refused: answered by 505 or 508, which is no echo of what was received.
+        asked_out: answered with the request for the end of open mode.
+    """
+
+    ready: Flags
+    all_ready: Flags
+    is_open: Flags
+    paused: Flags
+    closed: Flags
+    no_target: Flags
+    refused: Flags
+    asked_out: Flags
+
+
+@lru_cache(maxsize=64)
+def modes_of(talk: Talk) -> Modes:
+    """Work it out; the session's axis map must be possible."""
+    safe, slots = talk.safe, list(talk.init.slots or ())
+    assert safe is not None and slots
+    arm = int(talk.life.settings.get("arm", 1))
+    wanted = talk.received.mode[:, slots]
+    on = talk.received.status[:, arm - 1] == oracle.DRIVE_ON
+    ready = (wanted == int(talk.life.settings.get("mode", 4))) & on[:, np.newaxis]
+    target = talk.received.d[:, :, D1 - 1]
+    answered, echoed = talk.answer.words[:, slots, MODE], safe.words[:, slots, MODE]
+    return Modes(
+        ready=ready,
+        all_ready=ready.all(axis=1),
+        is_open=on & np.isin(wanted, oracle.OPEN).any(axis=1),
+        paused=on & np.isin(wanted, PAUSES).any(axis=1),
+        closed=on & np.isin(wanted, CLOSED).all(axis=1),
+        no_target=np.asarray((safe.held & ~np.isfinite(target)).any(axis=1)),
+        refused=(np.isin(answered, REFUSALS) & (answered != echoed)).any(axis=1),
+        asked_out=talk.answer.status[:, arm - 1] != safe.status[:, arm - 1],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Packets in a row from the first set-point on, as long as any axis is open and none refused.
+
+    Attributes:
+        talk: the session.
+        rows: those of the session.
+        leading: how many rows of these have set-points in all axes and no end of open mode was
+            asked for before.
+        sent: (k, n) D1 of the answers, motor revolutions.
+        step: (k, n) D2 of the answers.
+        received: (5, k, n) D1..D5 of the packets.
+    """
+
+    talk: Talk
+    rows: slice
+    leading: int
+    sent: Array
+    step: Array
+    received: Array
+
+    @property
+    def at(self) -> NDArray[np.intp]:
+        """Index of each packet among those exchanged."""
+        return self.talk.index[self.rows]
+
+
+@lru_cache(maxsize=64)
+def stretches(talk: Talk) -> tuple[Stretch, ...]:
+    """All of a session, where it can be moved."""
+    if talk.safe is None or not talk.usable or not talk.init.slots:
+        return ()
+    modes = modes_of(talk)
+    going = modes.is_open & ~modes.refused & ~modes.paused
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], going, [False])).astype(np.int8)))
+    found = []
+    for start, stop in edges.reshape(-1, 2).tolist():
+        first = start + int(np.argmax(modes.all_ready[start:stop]))
+        if modes.all_ready[first]:
+            found.append(_stretch(talk, modes, slice(first, stop)))
+    return tuple(found)
+
+
+def _stretch(talk: Talk, modes: Modes, rows: slice) -> Stretch:
+    slots = list(talk.init.slots or ())
+    led = modes.all_ready[rows].copy()
+    led[1:] &= ~np.logical_or.accumulate(modes.asked_out[rows])[:-1]
+    leading = len(led) if led.all() else int(np.argmin(led))
+    answers = talk.answer.d[rows][:, slots].astype(np.float64)
+    received = talk.received.d[rows][:, slots].astype(np.float64)
+    return Stretch(
+        talk,
+        rows,
+        leading,
+        answers[:, :, 0],
+        answers[:, :, 1],
+        np.moveaxis(received[:, :, :5], 2, 0),
+    )

@@ -1,0 +1,121 @@
+"""The campaign comes to its end, or says why a person is needed.
+
+`docs/campaign.md`, "When it says no": each of these sentences tells what to do. Anything else that
+ends a run is a defect, whatever befell it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from hil.errors import HilError
+from planner import FourierSeries, PiecewiseCubic
+from tests.simulate.observed import Broken, Life, Observed
+
+from .archived import Archived, read
+from .folders import WANTED, manifest_of
+from .wire import Array
+
+LAW: Final = "resume"
+PERSON_NEEDED: Final = {
+    "ControllerFault": "the drive is off, or what the controller announces is not the cell's",
+    "MotionFailedError": "the guard, the link or a stop ended a motion",
+    "MotionRefusedError": "the way from where the arm stands is not free: jog it",
+    "RepetitionsRejectedError": "something touches the arm, slips, or was changed",
+    "ArmChangedError": "the same, for certain",
+    "DryRunError": "somebody has to look at the dry run and accept it",
+    "AgainstGravityError": "somebody has to accept a torque by the joint's name",
+    "OperatorStopError": "a person stopped it",
+    "ArchiveWriteError": "the disk is full or broken: make room",
+    "CampaignFolderError": "the folder cannot be written: make room",
+    "OutputError": "what was found cannot be written: make room",
+}
+"""Errors that may end a run, and what for."""
+_DEATHS: Final = ("Killed", "PowerCut", "KeyboardInterrupt")
+_OFF_PATH: Final = 1e-4
+"""rad between set-point and plan that is rounding of the wire (`hil.campaign.quality`)."""
+
+
+def resume(observed: Observed) -> Iterator[Broken]:
+    """See above."""
+    for text in _texts(observed):
+        yield Broken(LAW, text)
+
+
+def _texts(observed: Observed) -> Iterator[str]:
+    for number, life in enumerate(observed.runs, 1):
+        yield from _ended(number, life)
+    whole = _whole(observed)
+    wanted = _wanted(observed)
+    missing = [f"{kind} {index}" for kind, index in wanted if (kind, index) not in whole]
+    if observed.complete and missing:
+        yield f"the last run says that it is complete, and {', '.join(missing)} are missing"
+    if not observed.complete and not missing:
+        yield f"nothing is missing, and the last run ended {observed.ended}"
+    for (kind, index), archived in whole.items():
+        motion = _motion(observed, kind, index)
+        if motion is not None:
+            problem = _played(archived, motion, observed.cell.period)
+            if problem:
+                yield f"{archived.path.name} counts, and {problem}"
+
+
+def _ended(number: int, life: Life) -> Iterator[str]:
+    error = life.error
+    if error is None:
+        if life.result is None:
+            yield f"life {number} ended without a result and without an error"
+        return
+    name = type(error).__name__
+    if name in _DEATHS:
+        return
+    if not isinstance(error, HilError) or name not in PERSON_NEEDED:
+        yield f"life {number} ended with {name}: {error}"
+
+
+def _wanted(observed: Observed) -> list[tuple[str, int]]:
+    counts = (1, observed.cell.campaign.repetitions, len(observed.plan.validation))
+    return [
+        (kind, index) for kind, count in zip(WANTED, counts, strict=True) for index in range(count)
+    ]
+
+
+def _whole(observed: Observed) -> dict[tuple[str, int], Archived]:
+    """What counts, by kind and index."""
+    found = {}
+    for entry in manifest_of(observed)[1]:
+        if entry.outcome == "completed" and entry.unchanged and entry.motion[0] in WANTED:
+            found[entry.motion] = read(observed.folder / "archives" / entry.name)
+    return found
+
+
+def _motion(observed: Observed, kind: str, index: int) -> PiecewiseCubic | FourierSeries | None:
+    if kind == "excitation":
+        return observed.plan.excitation.trajectory
+    return observed.plan.validation[index].trajectory if kind == "validation" else None
+
+
+def _played(
+    archived: Archived, motion: PiecewiseCubic | FourierSeries, period: float
+) -> str | None:
+    """Why the recording is not that of the whole motion at full speed; None if it is."""
+    if archived.ended != "completed":
+        return f"it ended {archived.ended!r}"
+    q: Array = archived.cycles["commanded_position"]
+    q = q[np.isfinite(q).all(axis=1)]
+    count = int(np.ceil(motion.duration / period)) + 1
+    times: Array = np.arange(count, dtype=np.float64) * period
+    planned = motion.sample(times)[0]
+    moves = np.flatnonzero((np.diff(q, axis=0) != 0.0).any(axis=1))
+    if not moves.size:
+        return "nothing moves in it"
+    # The first steps of a motion may be smaller than what can be told from rest.
+    for first in range(max(0, int(moves[0]) - 5), int(moves[0]) + 1):
+        part = q[first : first + len(planned)]
+        off = np.abs(part - planned[: len(part)]).max()
+        if len(part) >= len(planned) - 1 and off <= _OFF_PATH:
+            return None
+    return "it is not the motion as it was planned"

@@ -1,0 +1,203 @@
+"""The wire read a second time, many packets at once, from the facts alone.
+
+Layout, codes and the safe answer are those of `tests/drivers/oracle.py`, which knows nothing of the
+package under test; here they are arrays, so that a law may look at every packet of a campaign.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import oracle
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Words = NDArray[np.int32]
+
+INIT_LENGTH: Final = 1200
+N_ARMS: Final = 4
+PER_ARM: Final = 10
+REFUSALS: Final = (oracle.DRIVE_OFF_REQUEST, oracle.FOLLOWING_ERROR)
+CLOSED: Final = (0, 10, 501)
+PAUSES: Final = (500, 502)
+MODE, D1, D2, D3, D4, D5 = range(6)
+"""Columns of an axis block."""
+_WORDS: Final = 9
+_ECHOED: Final = {0: (D1, D2), 501: (D1, D2), 10: (D1, D2, D3, D4, D5)}
+_KEPT: Final = _ECHOED | dict.fromkeys(oracle.HOLDS_A_POSITION, (D1,))
+
+
+@dataclass(frozen=True, eq=False)
+class Packets:
+    """Cyclic packets of one length, decoded.
+
+    Attributes:
+        number: (m,) sequence numbers.
+        status: (m, 4) status bytes.
+        function: (m,) the four function bytes as one number.
+        words: (m, n, 9) axis blocks as 4-byte words: mode, D1..D5, extra1..3.
+    """
+
+    number: NDArray[np.int32]
+    status: NDArray[np.uint8]
+    function: NDArray[np.int32]
+    words: Words
+
+    @classmethod
+    def of(cls, packets: Sequence[bytes], n_axes: int) -> Packets:
+        """The first `n_axes` slots of each, which must be as long as that at least."""
+        length = oracle.length(n_axes)
+        joined = b"".join(packet[:length] for packet in packets)
+        rows: Words = np.frombuffer(joined, "<i4").reshape(len(packets), length // 4)
+        status = np.frombuffer(joined, np.uint8).reshape(len(packets), length)[:, 4:8]
+        blocks = rows[:, 3:].reshape(len(packets), n_axes, _WORDS)
+        return cls(rows[:, 0], status, rows[:, 2], blocks)
+
+    @property
+    def mode(self) -> Words:
+        """(m, n) mode of each slot."""
+        return self.words[:, :, MODE]
+
+    @property
+    def d(self) -> NDArray[np.float32]:
+        """(m, n, 8) the numbers of each slot."""
+        floats: NDArray[np.float32] = np.ascontiguousarray(self.words[:, :, D1:]).view(np.float32)
+        return floats
+
+
+def next_number(number: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The number of the answer to each packet."""
+    return np.where(number == 0x7FFF, 1, number + 1).astype(np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class SafeAnswers:
+    """What packets are answered where nobody moves an axis.
+
+    Attributes:
+        status: (m, 4) bytes.
+        words: (m, n, 9).
+        on: (m, n) whether the drive of each slot's arm is on.
+        held: (m, n) slots that are open with their drive on and given back their target.
+    """
+
+    status: NDArray[np.uint8]
+    words: Words
+    on: Flags
+    held: Flags
+
+
+def safe_answers(received: Packets, arms: Sequence[int]) -> SafeAnswers:
+    """The safe answers; `arms` is the arm of each slot, from 1."""
+    arm = np.array(arms, np.intp) - 1
+    arm_on = received.status == oracle.DRIVE_ON
+    on = arm_on[:, arm]
+    mode = received.mode
+    known = np.zeros(mode.shape, np.bool_)
+    keep = np.zeros((*mode.shape, _WORDS), np.bool_)
+    held = np.zeros(mode.shape, np.bool_)
+    for value in np.unique(mode).tolist():
+        here = mode == value
+        if value in oracle.TAKES_INCREMENTS:
+            known |= here
+            continue
+        known |= here & (~on | (value in _KEPT))
+        keep[here & ~on, D1:] = True
+        if value in _KEPT:
+            for column in _KEPT[value]:
+                keep[:, :, column] |= here & on
+            if value in oracle.HOLDS_A_POSITION:
+                held |= here & on
+    words = np.where(keep, received.words, np.int32(0))
+    words[:, :, MODE] = np.where(known, mode, 0)
+    of_an_arm = np.isin(np.arange(N_ARMS), arm)
+    status = np.where(arm_on | ~of_an_arm, 0, received.status).astype(np.uint8)
+    return SafeAnswers(status, words, on, held)
+
+
+@dataclass(frozen=True, eq=False)
+class Init:
+    """What an init packet announces of one arm's joints; own decoding, offsets of the facts.
+
+    Attributes:
+        n_axes: slots of a cyclic packet.
+        period: s.
+        arms: arm of each slot, from 1; None where the map is impossible.
+        slots: slot of each joint of the arm that is moved; None likewise.
+        threshold: (n,) following error, motor revolutions.
+        current: (n,) limit, A.
+    """
+
+    n_axes: int
+    period: float
+    arms: tuple[int, ...] | None
+    slots: tuple[int, ...] | None
+    threshold: Array
+    current: Array
+
+    @classmethod
+    def of(cls, packet: bytes, arm: int, n_joints: int) -> Init:
+        """Decode it for an arm (from 1) of so many joints."""
+        ints = np.frombuffer(packet, "<i4")
+        table = ints[57:97].reshape(N_ARMS, PER_ARM)
+        n_axes = int(ints[3])
+        place = {
+            int(slot): (row + 1, axis)
+            for row in range(N_ARMS)
+            for axis, slot in enumerate(table[row].tolist())
+            if slot not in (0xFF, -1)
+        }
+        count = int(np.count_nonzero((table != 0xFF) & (table != -1)))
+        arms = slots = None
+        if sorted(place) == list(range(n_axes)) and count == n_axes:
+            arms = tuple(place[slot][0] for slot in range(n_axes))
+            found = {axis: slot for slot, (row, axis) in place.items() if row == arm}
+            if all(joint in found for joint in range(n_joints)):
+                slots = tuple(found[joint] for joint in range(n_joints))
+        row = slice(PER_ARM * (arm - 1), PER_ARM * (arm - 1) + n_joints)
+        floats = np.frombuffer(packet, "<f4").astype(np.float64)
+        return cls(
+            n_axes, int(ints[56]) / 1000.0, arms, slots, floats[260:300][row], floats[137:177][row]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Gears:
+    """Motor revolutions from joint angles, by the formulas of the facts (section 8).
+
+    Attributes:
+        matrix: (n, n) motor revolutions per rad.
+        offset: (n,) motor revolutions where every joint angle is zero.
+    """
+
+    matrix: Array
+    offset: Array
+
+    @classmethod
+    def of(cls, table: Any) -> Gears:
+        """From the cell's `[drive_train]`, as written in the file."""
+        kr, sign = np.array(table.gear_ratio, float), np.array(table.joint_sign, float)
+        shift = np.radians(np.array(table.joint_offset_deg, float))
+        k54, k64, k65 = table.k54 or 0.0, table.k64 or 0.0, table.k65 or 0.0
+        turned = np.eye(len(kr))  # of the controller's angles
+        if len(kr) >= 6:
+            turned[4, 3] = -k54
+            turned[5, 4], turned[5, 3] = -k65, k65 * k54 - k64
+        turned *= kr[:, np.newaxis] / (2.0 * np.pi)
+        return cls(turned * sign, np.array(table.calibration, float) + turned @ shift)
+
+    def motor(self, q: Array) -> Array:
+        """Joint angles (m, n) [rad] to motor revolutions."""
+        return np.asarray(q @ self.matrix.T + self.offset)
+
+    def joint(self, motor: Array) -> Array:
+        """Motor revolutions (m, n) to joint angles [rad]."""
+        return np.asarray(np.linalg.solve(self.matrix, (motor - self.offset).T).T, np.float64)
+
+    def joint_step(self, motor: Array) -> Array:
+        """Differences of motor revolutions (m, n) to those of joint angles [rad]."""
+        return np.asarray(np.linalg.solve(self.matrix, motor.T).T, np.float64)

@@ -1,0 +1,191 @@
+"""Many seeds, in child processes, kept in a journal so that none is played twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import cache
+from itertools import groupby
+from multiprocessing.connection import wait
+from pathlib import Path
+from time import monotonic
+from typing import Any, Final
+
+from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
+from planner.isolation import PlanningChild
+from tests.simulate.scenes import NEIGHBOURS
+from tests.simulate.verdicts import Stage, Verdict
+
+SEEDS_PER_CHILD: Final = 400
+"""After which it gives its memory back."""
+LONGEST: Final = 1200.0
+"""s that a seed may take, made small included, on a busy machine."""
+DIED: Final = "the process lives"
+"""Name of the law that a seed breaks which takes its process with it, or never ends."""
+
+
+_PREFIX: Final = "hil_simulate_"
+
+
+class JournalError(Exception):
+    """A journal that cannot be used; one sentence."""
+
+
+class Journal:
+    """A file of JSON lines, one a seed. A line that a killed process left half is played again.
+
+    Args:
+        path: of the file; None keeps nothing.
+
+    Attributes:
+        known: verdicts by seed.
+
+    Raises:
+        JournalError: it is another file, or cannot be written.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.known: dict[int, Verdict] = {}
+        self._descriptor = -1
+        if path is None:
+            return
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            whole = self._read(path.read_bytes(), path)
+            os.ftruncate(self._descriptor, whole)
+            os.lseek(self._descriptor, 0, os.SEEK_END)
+        except OSError as error:
+            raise JournalError(f"{path}: {error.strerror}; name another --journal") from error
+
+    def _read(self, content: bytes, path: Path) -> int:
+        """Take whole lines in; returns how many bytes they are."""
+        whole = content.rfind(b"\n") + 1
+        for number, line in enumerate(content[:whole].splitlines(), start=1):
+            try:
+                verdict = Verdict.from_dict(json.loads(line))
+            except (ValueError, KeyError, TypeError) as error:
+                raise JournalError(
+                    f"{path}, line {number}: no verdict on a seed ({error}); name another --journal"
+                ) from error
+            self.known[verdict.seed] = verdict
+        return whole
+
+    def add(self, verdict: Verdict) -> None:
+        """Keep one more."""
+        self.known[verdict.seed] = verdict
+        if self._descriptor >= 0:
+            os.write(self._descriptor, (json.dumps(verdict.to_dict()) + "\n").encode())
+
+
+@contextmanager
+def stage_folder() -> Iterator[Path]:
+    """A folder in memory where there is one, taken away afterwards.
+
+    One that a killed process left behind is taken away by the next.
+    """
+    shared = Path("/dev/shm")
+    where = shared if os.access(shared, os.W_OK) else Path(tempfile.gettempdir())
+    for left in where.glob(f"{_PREFIX}*"):
+        owner = left.name.removeprefix(_PREFIX).partition("_")[0]
+        if owner.isdecimal() and not Path("/proc", owner).exists():
+            shutil.rmtree(left, ignore_errors=True)
+    root = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_", dir=where))
+    try:
+        yield root
+    finally:
+        shutil.rmtree(root, ignore_errors=True)
+
+
+def played(
+    seeds: Sequence[int], journal: Journal, jobs: int, *, shrink: bool = True
+) -> Iterator[Verdict]:
+    """Verdicts as they come, those first that the journal knows; new ones are entered there.
+
+    Children end with this process, however it ends.
+    """
+    yield from (journal.known[seed] for seed in seeds if seed in journal.known)
+    missing = [seed for seed in seeds if seed not in journal.known]
+    groups = deque(deque(group) for _, group in groupby(missing, lambda seed: seed // NEIGHBOURS))
+    with stage_folder() as root, ExitStack() as children:
+        desks = [_Desk(groups, str(root), shrink) for _ in range(min(jobs, len(groups)))]
+        for desk in desks:
+            children.callback(desk.close)
+        busy = {desk: desk for desk in desks if desk.begin()}
+        while busy:
+            left = min(desk.deadline for desk in busy) - monotonic()
+            ready = wait([desk.connection for desk in busy], max(0.0, left))
+            for desk in list(busy):
+                if desk.connection in ready or desk.deadline <= monotonic():
+                    if (verdict := desk.fetch()) is not None:
+                        journal.add(verdict)
+                        yield verdict
+                    if not desk.begin():
+                        del busy[desk]
+
+
+class _Desk:
+    """One child process, and the seeds of one group that wait for it."""
+
+    def __init__(self, groups: deque[deque[int]], root: str, shrink: bool) -> None:
+        self._groups, self._root, self._shrink = groups, root, shrink
+        self._child = PlanningChild(timeout=LONGEST)
+        self._seeds: deque[int] = deque()
+        self._again: set[int] = set()
+        self._seed = -1
+        self._played = 0
+
+    @property
+    def connection(self) -> Any:
+        """Becomes readable when there is something to fetch."""
+        return self._child.connection
+
+    @property
+    def deadline(self) -> float:
+        """When the child must have answered, on the monotonic clock [s]."""
+        return self._child.deadline
+
+    def begin(self) -> bool:
+        """Give the child the next seed; whether there was one."""
+        if not self._seeds:
+            if not self._groups:
+                return False
+            self._seeds = self._groups.popleft()
+        self._seed = self._seeds.popleft()
+        self._played += 1
+        if self._played % SEEDS_PER_CHILD == 0:
+            self._child.close()
+        self._child.send(play_one, self._seed, self._root, self._shrink)
+        return True
+
+    def fetch(self) -> Verdict | None:
+        """The verdict; None where the child died, and the seed is tried once more."""
+        try:
+            found: Verdict = self._child.receive()
+        except (PlannerCrashed, PlannerNotStarted, PlanningTimedOut) as error:
+            if self._seed in self._again:
+                return Verdict(self._seed, "", (), (), (), (), 0, ((DIED, str(error)),))
+            self._again.add(self._seed)
+            self._seeds.appendleft(self._seed)
+            return None
+        return found
+
+    def close(self) -> None:
+        """End the child."""
+        self._child.close()
+
+
+@cache
+def _stage(root: str) -> Stage:
+    own = Path(root) / str(os.getpid())
+    own.mkdir()
+    return Stage(own)
+
+
+def play_one(seed: int, root: str, shrink: bool) -> Verdict:
+    """The verdict on a seed, in a child process."""
+    return _stage(root).verdict(seed, shrink=shrink)

@@ -1,0 +1,178 @@
+"""A simulation that finds nothing proves nothing: defects planted in the product are found.
+
+Each is one that a person could make in good faith. The same seed, without the defect, keeps all
+laws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.exchange.intake import Intake
+from drivers.guard import Guard
+from drivers.machine import Machine
+from drivers.sequence import Sequence
+from hil.archive.recorder import Recorder
+from hil.campaign.execution_runner import Runner
+from hil.campaign.folder import CampaignFolder, Entry
+from planner import TrajectoryPlayer
+from tests.simulate.judging import judged
+from tests.simulate.many import stage_folder
+from tests.simulate.verdicts import Stage
+
+SEED = 6
+"""Its controller goes on at the last velocity where answers are missing, up to eight of them."""
+Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    with stage_folder() as root:
+        yield Stage(Path(root))
+
+
+def answers_duplicates_anew(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Sequence, "is_duplicate", lambda self, number: False)
+    patch.setattr(Sequence, "is_stale", lambda self, number: False)
+
+
+def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
+    """After a gap the motion makes up for it, and the guard does not look at speeds."""
+    advance, gap = TrajectoryPlayer.advance, [0]
+    note_gap = Machine.note_gap
+
+    def noted(self: Machine, missed: int, unanswered: int, max_gap: int) -> None:
+        gap[0] = missed
+        note_gap(self, missed, unanswered, max_gap)
+
+    def advanced(self: TrajectoryPlayer) -> Any:
+        for _ in range(gap[0]):
+            advance(self)
+        gap[0] = 0
+        return advance(self)
+
+    patch.setattr(Machine, "note_gap", noted)
+    patch.setattr(TrajectoryPlayer, "advance", advanced)
+    patch.setattr(Guard, "check_set_point", lambda *arguments: None)
+
+
+def goes_on_after_a_gap(patch: pytest.MonkeyPatch) -> None:
+    """The motion is not stopped however many packets were missed."""
+    note_gap = Machine.note_gap
+    patch.setattr(
+        Machine, "note_gap", lambda self, missed, unanswered, most: note_gap(self, missed, 0, most)
+    )
+
+
+def answers_what_piled_up(patch: pytest.MonkeyPatch) -> None:
+    """Every packet of a pile is answered, so that the motion runs ahead of the arm."""
+    newest = Intake._newest
+
+    def all_of_them(self: Intake, first: Any, period: float) -> Any:
+        arrivals = [first]
+        while (packet := self._transport.receive(0.0)) is not None:
+            arrivals.append(first._replace(packet=packet))
+        return tuple(arrivals)
+
+    assert newest is not all_of_them
+    patch.setattr(Intake, "_newest", all_of_them)
+
+
+def loses_a_record(patch: pytest.MonkeyPatch) -> None:
+    """The last record of each batch is left out, and nobody says so."""
+    write = Recorder._write
+    patch.setattr(Recorder, "_write", lambda self, records: write(self, records[:-1]))
+
+
+def takes_stopped_motions_for_whole(patch: pytest.MonkeyPatch) -> None:
+    """What a manifest says of a stopped motion is that it completed."""
+    add = CampaignFolder.add
+
+    def added(self: CampaignFolder, name: str, outcome: str, reason: str = "") -> None:
+        add(self, name, "completed" if outcome == "stopped" else outcome, reason)
+
+    patch.setattr(CampaignFolder, "add", added)
+
+
+def does_whole_motions_again(patch: pytest.MonkeyPatch) -> None:
+    """A run does not believe what the one before it has entered."""
+    whole, begun = CampaignFolder.whole, []
+    play = Runner.play
+
+    def believed(self: CampaignFolder, kind: str, index: int) -> str | None:
+        return whole(self, kind, index) if begun else None
+
+    def played(self: Runner, *arguments: Any) -> str:
+        begun.append(True)
+        return play(self, *arguments)
+
+    unchanged = CampaignFolder.require_unchanged
+
+    def begins(self: CampaignFolder) -> None:
+        begun.clear()
+        unchanged(self)
+
+    patch.setattr(CampaignFolder, "whole", believed)
+    patch.setattr(CampaignFolder, "require_unchanged", begins)
+    patch.setattr(Runner, "play", played)
+
+
+def believes_the_manifest(patch: pytest.MonkeyPatch) -> None:
+    """Archives are not compared with their checksums."""
+
+    def there(self: CampaignFolder, entry: Entry) -> bool:
+        return (self.archives / entry.name).is_file()
+
+    patch.setattr(CampaignFolder, "_unchanged", there)
+
+
+def smooths_what_it_archives(patch: pytest.MonkeyPatch) -> None:
+    """Positions in archives are not those of the wire."""
+    write = Recorder._write
+
+    def written(self: Recorder, records: Any) -> None:
+        records = records.copy()
+        position = records["position"]
+        position[1:] = 0.5 * (position[1:] + position[:-1])
+        write(self, records)
+
+    patch.setattr(Recorder, "_write", written)
+
+
+DEFECTS: dict[str, tuple[Plant, tuple[str, ...]]] = {
+    "a duplicate is answered anew": (answers_duplicates_anew, ("duplicate@300x40",)),
+    "a motion catches up, unguarded": (catches_up_unguarded, ("lose@{moving}x2", "kill@9999")),
+    "a motion goes on after a gap": (goes_on_after_a_gap, ("lose@{moving}x4",)),
+    "what piled up is answered": (answers_what_piled_up, ("stall@{moving}:7ms",)),
+    "records are lost unsaid": (loses_a_record, ()),
+    "a stopped motion counts": (takes_stopped_motions_for_whole, ("stop@{moving}",)),
+    "whole motions are done again": (does_whole_motions_again, ("stop@{late}",)),
+    "a torn archive counts": (believes_the_manifest, ("power-cut@{late}x2:keep=0.6",)),
+    "archives are smoothed": (smooths_what_it_archives, ()),
+}
+
+
+def script(stage: Stage, lines: tuple[str, ...]) -> list[str]:
+    moving = stage.twin(SEED).story.moving
+    middle = int(np.median([cycle for cycle in moving if cycle < moving[len(moving) // 2]]))
+    return [line.format(moving=middle, late=moving[-len(moving) // 5]) for line in lines]
+
+
+FAST = "a motion catches up, unguarded"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if name != FAST else []) for name in DEFECTS],
+)
+def test_it_is_found(name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant, lines = DEFECTS[name]
+    wanted = script(stage, lines)
+    assert judged(stage.observed(SEED, wanted)) == []
+    plant(monkeypatch)
+    assert judged(stage.observed(SEED, wanted)) != []

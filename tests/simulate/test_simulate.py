@@ -1,0 +1,165 @@
+"""The simulation itself: seeds are replayable, scripts are read and made small, journals resume."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.simulate.__main__ import main
+from tests.simulate.drawing import DRAWS, Story, draw_script
+from tests.simulate.many import Journal, JournalError, stage_folder
+from tests.simulate.script import kind_of, parse_script, simpler
+from tests.simulate.shrinking import shrunk
+from tests.simulate.verdicts import Stage, Tally, Verdict
+
+STORY = Story(900, tuple(range(100, 800)), 3, 120, 40, 6, 6)
+
+
+class TestScript:
+    def test_whatever_is_drawn_can_be_read_and_every_kind_is_drawn(self) -> None:
+        drawn = {
+            kind_of(line)
+            for seed in range(600)
+            for line in parse_script(draw_script(random.Random(seed), STORY)).lines
+        }
+        assert drawn >= set(DRAWS) - {"stalls"}
+
+    @pytest.mark.parametrize("kind", sorted(DRAWS))
+    def test_each_kind_alone_can_be_read(self, kind: str) -> None:
+        for seed in range(20):
+            parse_script(DRAWS[kind][1](random.Random(seed), STORY).splitlines())
+
+    def test_what_a_line_says_is_kept(self) -> None:
+        script = parse_script(["# a note", "", "stall@1200:12ms:answering", "lose@3x2"])
+        (stall,) = script.mishaps
+        assert (stall.at, stall.value, stall.word) == (1200, pytest.approx(0.012), "answering")
+        assert [line for line, _ in script.faults] == ["lose@3x2"]
+
+    @pytest.mark.parametrize("line", ["stall@x", "kill@3:softly", "lose@", "nothing", "kill 3"])
+    def test_what_cannot_be_read_is_refused_with_the_grammar(self, line: str) -> None:
+        with pytest.raises(ValueError, match="lines are"):
+            parse_script([line])
+
+
+class TestShrinking:
+    def test_only_the_line_that_matters_is_left_and_its_numbers_are_small(self) -> None:
+        lines = ("kill@3", "lose@1234x9", "stop@70", "e-stop@5", "hold@8x2")
+
+        def fails(candidate: tuple[str, ...]) -> bool:
+            return any(line.startswith("lose@") and "x1" not in line for line in candidate)
+
+        assert shrunk(lines, fails) == ("lose@1200x2",)
+
+    def test_two_lines_that_fail_only_together_are_kept(self) -> None:
+        lines = tuple(f"kill@{at}" for at in range(100, 900, 100))
+        both = {"kill@200", "kill@700"}
+        assert set(shrunk(lines, lambda candidate: both <= set(candidate))) == both
+
+    def test_it_gives_up_after_so_many_tries(self) -> None:
+        tried: list[tuple[str, ...]] = []
+        lines = tuple(f"kill@{at}" for at in range(100, 900, 100))
+        shrunk(lines, lambda candidate: bool(tried.append(candidate)), tries=5)
+        assert len(tried) == 5
+
+    def test_a_plainer_line_can_be_read(self) -> None:
+        for line in ("lose@1234x9:to_controller", "stall@987:37ms", "delay@55x4:30ms"):
+            assert simpler(line)
+            parse_script(simpler(line))
+
+
+def verdict(seed: int, *broken: tuple[str, str]) -> Verdict:
+    met = ("the process died",)
+    return Verdict(seed, "an arm", ("kill@3",), ("kill",), met, ("Killed", "complete"), 900, broken)
+
+
+class TestJournal:
+    def test_it_knows_what_it_was_told_after_a_half_line(self, tmp_path: Path) -> None:
+        path = tmp_path / "seeds.jsonl"
+        journal = Journal(path)
+        for seed in (3, 4):
+            journal.add(verdict(seed, ("guard", "too fast")))
+        whole = path.read_bytes()
+        path.write_bytes(whole + b'{"seed": 5, "scr')
+        again = Journal(path)
+        assert again.known == {
+            3: verdict(3, ("guard", "too fast")),
+            4: verdict(4, ("guard", "too fast")),
+        }
+        assert path.read_bytes() == whole
+        again.add(verdict(5))
+        assert set(Journal(path).known) == {3, 4, 5}
+
+    def test_another_file_is_refused_and_left_as_it_is(self, tmp_path: Path) -> None:
+        path = tmp_path / "notes.txt"
+        path.write_text("milk\nbread\n")
+        with pytest.raises(JournalError, match="line 1: no verdict"):
+            Journal(path)
+        assert path.read_text() == "milk\nbread\n"
+
+    def test_a_tally_counts_kinds_ends_and_failures(self) -> None:
+        tally = Tally()
+        tally.add(verdict(1))
+        tally.add(verdict(2, ("guard", "a"), ("guard", "b"), ("rest", "c")))
+        told = tally.to_dict()
+        assert (told["ran"], told["failed"], told["seeds_failed"]) == (2, 1, [2])
+        assert told["laws_broken"] == {"guard": 1, "rest": 1}
+        assert told["struck"] == {"kill": 2}
+        assert "push" in told["never_struck"]
+        assert "kill" not in told["never_struck"]
+        assert told["met"] == {"the process died": 2}
+        assert "motion lost" in told["never_met"]
+        assert told["campaigns_ended"] == {"complete": 2}
+
+
+def test_a_seed_is_the_same_campaign_again_to_the_last_byte() -> None:
+    """On the wire and in the folder, whatever the host's clock says."""
+    played = []
+    for _ in range(2):
+        with stage_folder() as root:
+            played.append(Stage(root).observed(1))
+    first, second = played
+    assert first.schedule == second.schedule
+    assert first.arm.sent == second.arm.sent
+    for one, other in zip(first.runs, second.runs, strict=True):
+        assert one.exchanged == other.exchanged
+        assert one.after == other.after
+    assert np.ptp(first.arm.position) > 0.0
+
+
+class TestCommand:
+    def test_a_seed_tells_what_was_drawn_and_that_all_laws_hold(self, capsys) -> None:
+        assert main(["--seed", "4", "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert (told["ran"], told["failed"], told["seeds_failed"]) == (1, 0, [])
+        assert set(told["struck"]) <= set(told["script"])
+
+    def test_another_script_takes_the_place_of_the_drawn_one(self, tmp_path, capsys) -> None:
+        path = tmp_path / "script"
+        path.write_text("kill@300\n")
+        assert main(["--seed", "4", "--script", str(path)]) == 0
+        out = capsys.readouterr().out
+        assert "  kill@300\n" in out
+        assert "run 1, cycles 0..300: Killed: kill@300" in out
+        assert "run 2" in out
+        assert "complete" in out
+
+    def test_many_are_played_once_and_then_read_from_the_journal(self, tmp_path, capsys) -> None:
+        journal = str(tmp_path / "seeds.jsonl")
+        for _ in range(2):
+            assert main(["--seeds", "2", "--start", "6", "--journal", journal, "--json"]) == 0
+            told = json.loads(capsys.readouterr().out.splitlines()[-1])
+            assert (told["ran"], told["failed"], told["seeds_failed"]) == (2, 0, [])
+        assert len(Path(journal).read_text().splitlines()) == 2
+
+    @pytest.mark.parametrize("text", ["-3", "many", ""])
+    def test_what_is_no_number_is_refused(self, text: str) -> None:
+        with pytest.raises(SystemExit):
+            main(["--seeds", text])
+
+    def test_a_script_that_is_not_there_is_named(self, capsys) -> None:
+        assert main(["--seed", "1", "--script", "/nowhere/script"]) == 2
+        assert "/nowhere/script" in capsys.readouterr().err

@@ -1,0 +1,326 @@
+"""Controller and link of a simulated campaign, with everything that passes written down."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.transports import SimulatedTransport
+from drivers.transports.faults import Fault as LinkFault
+from hil.campaign import Link
+from sim_fixtures import Phase, SimulatedController
+from sim_fixtures.controller_faults import ControllerFault
+from tests.simulate.observed import Act, ArmHistory, Exchanged
+from tests.simulate.script import Mishap, Script
+
+Array = NDArray[np.float64]
+LONGEST_STALL = 1.0
+"""s; a longer one is a loss."""
+
+
+class WatchedController:
+    """A peer that outlives the PC's processes, inflicts its faults, and keeps its history.
+
+    Attributes:
+        cycle: cycles begun so far, over all lives.
+        struck: lines that came to pass.
+    """
+
+    def __init__(self, controller: SimulatedController, script: Script) -> None:
+        self.controller = controller
+        self.period = controller.period
+        self.cycle = 0
+        self.struck: list[str] = []
+        self._faults: dict[int, list[tuple[str, ControllerFault]]] = {}
+        for line, fault in script.faults:
+            if not isinstance(fault, LinkFault):
+                self._faults.setdefault(fault.cycle, []).append((line, fault))
+        self._sent: list[bytes] = []
+        self._delivered: list[bytes | None] = []
+        self._position: list[Array] = []
+        self._velocity: list[Array] = []
+        self._phase: list[str] = []
+        self._open: list[bool] = []
+        self._pressed: list[int] = []
+
+    @property
+    def ended(self) -> bool:
+        """Whether the controller's session is over."""
+        return self.controller.phase is Phase.ENDED
+
+    def next_packet(self) -> bytes | None:
+        """See `drivers.transports.simulated.Peer`."""
+        for line, fault in self._faults.get(self.cycle, ()):
+            fault.inflict(self.controller)
+            self.struck.append(line)
+        packet = self.controller.next_packet()
+        if packet is None:
+            return None
+        self.cycle += 1
+        plant = self.controller.plant
+        self._sent.append(packet)
+        self._delivered.append(None)
+        self._position.append(plant.position.copy())
+        self._velocity.append(plant.velocity.copy())
+        self._phase.append(self.controller.phase.name)
+        self._open.append(any(self.controller._program.open_axes))
+        return packet
+
+    def accept(self, reply: bytes | None) -> None:
+        """See `drivers.transports.simulated.Peer`."""
+        if reply is not None:
+            self._delivered[-1] = reply
+        self.controller.accept(reply)
+
+    def alone(self, cycles: int) -> None:
+        """Let time pass with nobody at the other end."""
+        for _ in range(cycles):
+            if self.next_packet() is None:
+                return
+            self.accept(None)
+
+    def press(self, *, restart: bool, warm: bool) -> None:
+        """Somebody restarts the controller, or not, and switches the drive on."""
+        if restart:
+            self.controller.restart(warm=warm)
+        self.controller.drive_on()
+        self._pressed.append(self.cycle)
+
+    def history(self) -> ArmHistory:
+        """All of it."""
+        n = self.controller.plant.position.size
+        return ArmHistory(
+            sent=tuple(self._sent),
+            delivered=tuple(self._delivered),
+            position=np.array(self._position).reshape(-1, n),
+            velocity=np.array(self._velocity).reshape(-1, n),
+            phase=tuple(self._phase),
+            open_axes=np.array(self._open, dtype=bool),
+            drive_on=tuple(self._pressed),
+        )
+
+
+class Clock:
+    """The PC's clock, which jumps by what the script says; it goes on through all lives."""
+
+    def __init__(self, script: Script) -> None:
+        jumps = sorted((one.at, one.value, one.line) for one in script.of("cycle") if _jump(one))
+        self._at = [at for at, _, _ in jumps]
+        self._offset: list[float] = [0.0, *accumulate(value for _, value, _ in jumps)]
+        self._lines = [line for _, _, line in jumps]
+        self.struck: list[str] = []
+
+    def offset(self, cycle: int) -> float:
+        """What has been added to it by this cycle [s]."""
+        if not self._at:
+            return 0.0
+        passed = bisect_right(self._at, cycle)
+        if passed > len(self.struck):
+            self.struck = self._lines[:passed]
+        return self._offset[passed]
+
+
+def _jump(mishap: Mishap) -> bool:
+    return mishap.kind == "clock"
+
+
+class WatchedTransport(SimulatedTransport):
+    """The PC's end of the link, with its stalls, its clock, and all packets written down.
+
+    It is one in virtual time by what it carries packets through, another one inside it.
+
+    Args:
+        peer: the controller.
+        script: what goes wrong on the link, and when the PC stalls.
+        clock: of the PC.
+        look: asked before each packet is waited for, with the present cycle; may raise.
+
+    Attributes:
+        seen: packets as they were received: time, cycle, bytes and answers.
+        answering: which of them the session has in hand.
+    """
+
+    def __init__(
+        self,
+        peer: WatchedController,
+        script: Script,
+        clock: Clock,
+        look: Callable[[int], None],
+    ) -> None:
+        faults = [fault for _, fault in script.faults if isinstance(fault, LinkFault)]
+        self._inner = SimulatedTransport(peer, faults)
+        self._inner.cycle = peer.cycle
+        self._clock, self._look = clock, look
+        self._period = peer.period
+        self._stalls = deque(
+            sorted(
+                (one for one in script.of("cycle") if one.kind == "stall" and one.at >= peer.cycle),
+                key=lambda one: one.at,
+            )
+        )
+        self._held: deque[tuple[float, bytes]] = deque()
+        self._arrival = -math.inf
+        self.struck: list[str] = []
+        self.answering = -1
+        self.seen: list[tuple[float, int, bytes, list[bytes]]] = []
+
+    @property
+    def now(self) -> float:
+        """Time on the PC's clock."""
+        return self._inner.now + self._clock.offset(self._inner.cycle)
+
+    @property
+    def at(self) -> int:
+        """The controller's cycle."""
+        return self._inner.cycle
+
+    def receive(self, timeout: float) -> bytes | None:
+        """See `Transport.receive`."""
+        self._look(self._inner.cycle)
+        self._stall("")
+        if self._held:
+            self._arrival, packet = self._held.popleft()
+        else:
+            found = self._inner.receive(timeout)
+            if found is None:
+                return None
+            self._arrival, packet = self._inner.now, found
+        self.seen.append((self.now, self._inner.cycle - 1, packet, []))
+        return packet
+
+    def send(self, packet: bytes) -> None:
+        """See `Transport.send`."""
+        self.seen[self.answering][3].append(packet)
+        self._stall("answering")
+        self._inner.send(packet)
+
+    def close(self) -> None:
+        """Give the link up."""
+        self._inner.close()
+
+    def _stall(self, where: str) -> None:
+        """Let time pass with nothing done, if it is time for that; packets pile up."""
+        if not self._stalls or self._stalls[0].at > self._inner.cycle:
+            return
+        if self._stalls[0].word != where:
+            return
+        stall = self._stalls.popleft()
+        self.struck.append(stall.line)
+        until = self._inner.now + min(stall.value, LONGEST_STALL)
+        while (left := until - self._inner.now) > 0.0:
+            packet = self._inner.receive(left)
+            if packet is not None:
+                self._held.append((self._inner.now, packet))
+
+
+class StampedWatchedTransport(WatchedTransport):
+    """The same of a link that knows when a packet arrived, as UDP does."""
+
+    @property
+    def arrived(self) -> float:
+        """See `drivers.transports.base.Stamped`."""
+        return min(self.now, self._arrival + self._clock.offset(self._inner.cycle))
+
+
+class SessionLog:
+    """What a link's session was told to do, and every record that it made.
+
+    Args:
+        link: just made.
+        transport: its own.
+    """
+
+    def __init__(self, link: Link, transport: WatchedTransport) -> None:
+        self._transport, self._seen = transport, transport.seen
+        self.acts: list[Act] = []
+        self.events: list[tuple[int, Any]] = []
+        self._rows: list[bytes] = []
+        self._of: dict[int, int] = {}
+        self._given: set[int] = set()
+        self._dtype = link.ring.rows.dtype
+        self._link = link
+        self._tap_ring()
+        session = link.session
+        for name in ("request", "stop", "override", "hold", "resume", "discarded"):
+            self._tap(session, name)
+        self._tap_tick()
+        self._tap_reply()
+        taken = session.events
+
+        def events() -> list[Any]:
+            fresh = taken()
+            self.events += [(transport.answering, event) for event in fresh]
+            return fresh
+
+        session.events = events  # type: ignore[method-assign]
+
+    def _tap_ring(self) -> None:
+        ring, commit = self._link.ring, self._link.ring.commit
+
+        def committed() -> None:
+            slot = ring.slot
+            self._of[self._transport.answering] = len(self._rows)
+            self._rows.append(ring.rows[slot : slot + 1].tobytes())
+            commit()
+
+        ring.commit = committed  # type: ignore[method-assign]
+
+    def _tap(self, session: Any, name: str) -> None:
+        called = getattr(session, name)
+
+        def noted(*arguments: Any) -> None:
+            called(*arguments)
+            act = Act(self._transport.answering + 1, name, arguments)
+            if not (self.acts and name == "stop" and self.acts[-1][1:] == act[1:]):
+                self.acts.append(act)
+
+        setattr(session, name, noted)
+
+    def _tap_tick(self) -> None:
+        session, tick = self._link.session, self._link.session.tick
+
+        def ticked(now: float) -> None:
+            before = session.deadline
+            tick(now)
+            if math.isfinite(before) and not math.isfinite(session.deadline):
+                self.acts.append(Act(self._transport.answering + 1, "tick", (now,)))
+
+        session.tick = ticked  # type: ignore[method-assign]
+
+    def _tap_reply(self) -> None:
+        """Of a pile the session gets some: find out which of those received it has in hand."""
+        session, reply = self._link.session, self._link.session.reply
+        seen, transport = self._seen, self._transport
+
+        def replied(packet: bytes, *arguments: Any) -> bytes | None:
+            row = transport.answering + 1
+            while row < len(seen) and seen[row][2] is not packet:
+                row += 1
+            assert row < len(seen), "the session was given a packet that was not received"
+            transport.answering = row
+            self._given.add(row)
+            return reply(packet, *arguments)
+
+        session.reply = replied  # type: ignore[method-assign, assignment]
+
+    @property
+    def exchanged(self) -> tuple[Exchanged, ...]:
+        """All packets with their answers."""
+        return tuple(
+            Exchanged(
+                now, cycle, packet, tuple(replies), self._of.get(index, -1), index in self._given
+            )
+            for index, (now, cycle, packet, replies) in enumerate(self._seen)
+        )
+
+    @property
+    def records(self) -> NDArray[np.void]:
+        """All records."""
+        return np.frombuffer(b"".join(self._rows), self._dtype)

@@ -1,0 +1,184 @@
+"""A stranger on the network of the controller: what is sent to the PC, from where, and how often.
+
+``python -m tests.strangers.attacker --to 10.0.0.1:1000 --as 10.0.0.2:4000 init`` sends init packets
+under another's address (raw sockets: root). Only for networks of one's own making.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import random
+import signal
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+Address = tuple[str, int]
+LENGTH = struct.Struct("<I")
+_UDP = 17
+_MORE_FRAGMENTS = 0x2000
+_EVERYTHING = 0x0003  # what leaves is shown to no narrower protocol
+
+
+def checksum(data: bytes) -> int:
+    """That of RFC 1071."""
+    if len(data) % 2:
+        data += b"\0"
+    total: int = sum(struct.unpack(f"!{len(data) // 2}H", data))
+    while total >> 16:
+        total = (total & 0xFFFF) + (total >> 16)
+    return 0xFFFF - total & 0xFFFF
+
+
+def datagram(source: Address, target: Address, body: bytes, *, fragment: int = 0) -> bytes:
+    """An IPv4 datagram with a UDP packet in it; `fragment` is its flags and offset."""
+    udp = struct.pack("!4H", source[1], target[1], 8 + len(body), 0) + body
+    addresses = socket.inet_aton(source[0]) + socket.inet_aton(target[0])
+    head = struct.pack("!BBHHHBBH", 0x45, 0, 20 + len(udp), 7, fragment, 64, _UDP, 0) + addresses
+    return head[:10] + struct.pack("!H", checksum(head)) + head[12:] + udp
+
+
+def recorded(path: Path) -> list[bytes]:
+    """Packets of a recorded session: each with its length in front."""
+    data, found, at = path.read_bytes(), [], 0
+    while at < len(data):
+        (size,) = LENGTH.unpack_from(data, at)
+        found.append(data[at + 4 : at + 4 + size])
+        at += 4 + size
+    return found
+
+
+def record(port: int, seconds: float, path: Path) -> int:
+    """Record what goes to a port past this host's network devices."""
+    over = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: over.set())
+    end = time.monotonic() + seconds
+    count = 0
+    with (
+        socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_EVERYTHING)) as wire,
+        path.open("wb") as file,
+    ):
+        wire.settimeout(0.2)
+        while time.monotonic() < end and not over.is_set():
+            try:
+                data = wire.recv(65535)
+            except TimeoutError:
+                continue
+            head = 4 * (data[0] & 15)
+            if (
+                data[0] >> 4 == 4
+                and data[9] == _UDP
+                and struct.unpack_from("!H", data, head + 2)[0] == port
+            ):
+                body = data[head + 8 :]
+                file.write(LENGTH.pack(len(body)) + body)
+                file.flush()
+                count += 1
+    return count
+
+
+def odd(rng: random.Random) -> Iterator[bytes]:
+    """Datagrams of every length, the longest ones in fragments."""
+    for size in itertools.cycle((0, 1, 11, 12, 48, 1200, 1471, 1472, 1500, 1501, 9000, 65507)):
+        yield rng.randbytes(size)
+
+
+def bodies(what: str, session: list[bytes], rng: random.Random) -> Iterator[bytes]:
+    """What is sent, without end."""
+    if what == "odd":
+        return odd(rng)
+    if what == "init":
+        return itertools.cycle([next(body for body in session if len(body) == 1200)])
+    if what == "sync":
+        return itertools.cycle([session[0]])
+    if what == "cyclic":
+        return itertools.cycle([body for body in session[20:] if len(body) != 1200])
+    return itertools.cycle(session)  # "replay": the whole session, from its beginning
+
+
+class Sender:
+    """Sends from this host's own address, or under another's; counts what is answered."""
+
+    def __init__(self, target: Address, source: Address | None) -> None:
+        self._target, self._source = target, source
+        self.answered = 0
+        if source is None:
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        else:
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
+        self._socket.setblocking(False)
+
+    def send(self, body: bytes) -> None:
+        """Send one packet; what the system does not take is lost, as on any network."""
+        with suppress(OSError):
+            if self._source is None:
+                self._socket.sendto(body, self._target)
+            else:
+                packet = datagram(self._source, self._target, body[:1472])
+                self._socket.sendto(packet, (self._target[0], 0))
+
+    def listen(self) -> None:
+        """Count what came back, if that can come to this host."""
+        if self._source is None:
+            with suppress(OSError):
+                while self._socket.recv(2048):
+                    self.answered += 1
+
+
+def attack(
+    sender: Sender, packets: Iterator[bytes], rate: float, seconds: float
+) -> dict[str, float]:
+    """Send at a rate [1/s] for some seconds, or until told to end."""
+    over = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: over.set())
+    begin = time.monotonic()
+    sent = 0
+    while (elapsed := time.monotonic() - begin) < seconds and not over.is_set():
+        for _ in range(max(0, min(200, int(rate * elapsed) - sent))):
+            sender.send(next(packets))
+            sent += 1
+        sender.listen()
+        if sent >= rate * elapsed:
+            time.sleep(min(0.001, 1.0 / rate))
+    return {"sent": sent, "answered": sender.answered, "rate": sent / (time.monotonic() - begin)}
+
+
+def address(text: str) -> Address:
+    host, _, port = text.rpartition(":")
+    return host, int(port)
+
+
+def main() -> int:
+    """Record or attack."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("record", "init", "sync", "cyclic", "replay", "odd"))
+    parser.add_argument("--to", type=address, required=True, help="HOST:PORT of the PC")
+    parser.add_argument("--as", dest="source", type=address, help="HOST:PORT to send under")
+    parser.add_argument("--port", action="store_true", help="read the port to send under first")
+    parser.add_argument("--session", type=Path, help="a recorded session (made by `record`)")
+    parser.add_argument("--rate", type=float, default=500.0, help="packets per second")
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    if asked.what == "record":
+        told: dict[str, float] = {"recorded": record(asked.to[1], asked.seconds, asked.session)}
+    else:
+        session = recorded(asked.session) if asked.session is not None else []
+        packets = bodies(asked.what, session, random.Random(asked.seed))
+        said = sys.stdin.readline()  # whoever started this says when
+        source = (asked.source[0], int(said)) if asked.port else asked.source
+        told = attack(Sender(asked.to, source), packets, asked.rate, asked.seconds)
+    sys.stdout.write(json.dumps(told) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,302 @@
+"""A campaign folder that came from somebody else: nothing outside it is touched, nothing waits.
+
+Whatever lies in the place of one of its files, the answer is an error of ours or the file is not
+needed; links and pipes are not followed where we write.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import signal
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hil.archive import open_archive
+from hil.archive.check import check_archive
+from hil.batch.cache import Store, decoded, encoded
+from hil.campaign import Campaign, CampaignFolderError
+from hil.campaign.folder import LOCK
+from hil.cell import Cell
+from hil.cli import app
+from hil.errors import ArchiveError, HilError, InputError
+from hil.files import write_atomically, write_together
+from hil.outcome import SERIES, rewrite_report
+from hil.reading import json_of, opened, text_of, toml_of
+from hil.results import Results
+from identification import IdentificationError
+from planner import PlannerError
+from tests.hil.fast_cell import fast_campaign, fast_cell
+
+DEEP = "[" * 100_000 + "]" * 100_000
+NAMED = (HilError, IdentificationError, PlannerError)
+
+
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Fail what waits for ever, such as for somebody who writes into a pipe."""
+
+    def over(*_: object) -> None:
+        raise TimeoutError("it waits")
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("designed")
+    return fast_campaign(folder / "campaign", fast_cell(folder)).folder.root
+
+
+@pytest.fixture
+def folder(designed: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(designed, tmp_path / "campaign")
+
+
+def put(path: Path, what: str) -> None:
+    """Have something else in the place of a file."""
+    path.unlink(missing_ok=True)
+    if what == "a pipe":
+        os.mkfifo(path)
+    elif what == "a device":
+        path.symlink_to("/dev/zero")
+    elif what == "a folder":
+        path.mkdir()
+    elif what == "a link to itself":
+        path.symlink_to(path)
+    elif what == "a sparse terabyte":
+        path.touch()
+        os.truncate(path, 1 << 40)
+    else:
+        path.write_text(what)
+
+
+THINGS = (
+    *("a pipe", "a device", "a folder", "a link to itself", "a sparse terabyte", DEEP),
+    *("{}", "[]", "null", "1", "NaN", "1e999", "9" * 5000, '{"a":' * 50_000, "a=" + "[" * 50_000),
+    "",
+)
+FILES: dict[str, Callable[[Path], object]] = {
+    "manifest.json": lambda root: Campaign.open(root).status(),
+    "plan.json": lambda root: Campaign.open(root).status(),
+    "cell.toml": lambda root: Campaign.open(root).status(),
+    "robot.urdf": lambda root: Campaign.open(root).status(),
+    "rehearsal.json": lambda root: Campaign.open(root).status(),
+    "dry_run.json": lambda root: Campaign.open(root).status(),
+    "warmup.json": lambda root: Campaign.open(root).status(),
+    "results.json": lambda root: Results.load(root / "results.json"),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_whatever_lies_in_the_place_of_a_file_is_named(name: str, folder: Path) -> None:
+    kept = (folder / name).read_bytes() if (folder / name).exists() else None
+    for thing in THINGS:
+        put(folder / name, thing)
+        try:
+            with within(20.0):
+                FILES[name](folder)
+        except NAMED as error:
+            assert "\n" not in str(error)
+        shutil.rmtree(folder / name) if thing == "a folder" else (folder / name).unlink()
+    if kept is not None:
+        (folder / name).write_bytes(kept)
+        FILES[name](folder)
+
+
+@pytest.mark.parametrize("away", ["../elsewhere_000_a1.mcap", "../../excitation_000_a1.mcap",
+                                  "/tmp/excitation_000_a1.mcap", "", "..", "a/b.mcap"])  # fmt: skip
+def test_a_manifest_names_files_of_its_own_folder_only(away: str, folder: Path) -> None:
+    path = folder / "manifest.json"
+    content = json.loads(path.read_text())
+    content["archives"] = [{"name": away, "outcome": "completed", "sha256": "0"}]
+    path.write_text(json.dumps(content))
+    with pytest.raises(CampaignFolderError, match="is no name of a file in archives/"):
+        Campaign.open(folder).folder.manifest()
+
+
+@pytest.mark.parametrize("suffix", ["", ".tmp"])
+def test_what_is_written_goes_through_no_link(suffix: str, folder: Path) -> None:
+    """Neither where the file stands nor where it is written first."""
+    own = folder.parent / "profile"
+    own.write_text("mine")
+    target = folder / "manifest.json"
+    (folder / f"{target.name}{suffix}").unlink(missing_ok=True)
+    (folder / f"{target.name}{suffix}").symlink_to(own)
+    write_atomically(target, "new")
+    write_together(folder, {"results.json": "new"})
+    assert own.read_text() == "mine"
+    assert not target.is_symlink()
+    assert target.read_text() == "new"
+
+
+def test_nor_does_it_wait_for_a_pipe(folder: Path) -> None:
+    os.mkfifo(folder / "manifest.json.tmp")
+    with within(20.0):
+        write_atomically(folder / "manifest.json", "new")
+    assert (folder / "manifest.json").read_text() == "new"
+
+
+def test_a_link_is_no_lock(folder: Path) -> None:
+    campaign = Campaign.open(folder)
+    own = folder.parent / "not_made"
+    (folder / LOCK).unlink(missing_ok=True)
+    (folder / LOCK).symlink_to(own)
+    with pytest.raises(CampaignFolderError, match=f"{LOCK} cannot be written"), \
+            campaign.folder.locked():  # fmt: skip
+        pass
+    assert not own.exists()
+    assert not campaign.folder.busy
+
+
+@pytest.mark.parametrize("read", [open_archive, check_archive], ids=["open", "check"])
+@pytest.mark.parametrize("thing", ["a pipe", "a device", "a folder"])
+def test_an_archive_is_a_file(read: Callable[[Path], object], thing: str, tmp_path: Path) -> None:
+    put(tmp_path / "excitation_000_a1.mcap", thing)
+    with within(20.0), pytest.raises(ArchiveError):
+        read(tmp_path / "excitation_000_a1.mcap")
+
+
+@pytest.mark.parametrize("named", ["/dev/zero", "pipe", ".", "/etc/shadow\0", "missing.urdf"])
+def test_a_cell_file_that_names_no_description(named: str, tmp_path: Path) -> None:
+    """A path may leave the folder (an arm's description often lies elsewhere); it is only read."""
+    cell = fast_cell(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    shown = named.replace("\0", "\\u0000")
+    cell.path.write_text(cell.text.replace('urdf = "fast.urdf"', f'urdf = "{shown}"'))
+    with within(20.0), pytest.raises(InputError, match=r"cell\.urdf"):
+        Cell.load(cell.path)
+
+
+def series(members: dict[str, bytes]) -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return content.getvalue()
+
+
+def claiming(shape: tuple[int, ...]) -> bytes:
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        head, {"descr": "<f8", "fortran_order": False, "shape": shape}
+    )
+    return head.getvalue()
+
+
+class Opens:
+    """Leaves a trace where somebody unpickles it."""
+
+    def __init__(self, trace: Path) -> None:
+        self._trace = trace
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self._trace,)
+
+
+def test_the_series_of_a_report_are_numbers_and_not_too_many(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trace = folder.parent / "unpickled"
+    pickled = io.BytesIO()
+    np.save(pickled, np.array([Opens(trace)], dtype=object), allow_pickle=True)
+    bombs = {
+        "nothing": b"",
+        "a pickle": pickled.getvalue(),
+        "a pickle as a member": series({"time.npy": pickled.getvalue()}),
+        "a claim of terabytes": series({"time.npy": claiming((1 << 40,))}),
+        "much out of little": series({f"{i}.npy": bytes(1 << 18) for i in range(17)}),
+    }
+    monkeypatch.setattr(Results, "load", lambda _: None)
+    monkeypatch.setattr("hil.outcome._LARGEST", 1 << 22)
+    for data in bombs.values():
+        (folder / SERIES).write_bytes(data)
+        with pytest.raises(InputError, match="does not hold the series of a report"):
+            rewrite_report(folder)
+    assert not trace.exists()
+
+
+KEY = "ab" * 32
+
+
+FORGED: tuple[object, ...] = (
+    *([["a", "|O", [1]]], [["a", "<f8", [1 << 40]]], [["a", "?!", []]], [["a", "<f8", [-1]]]),
+    *([["a", "<f8", [1 << 62, 4]]], [[]], 3, [["a", 7, {}]]),
+)
+
+
+@pytest.mark.parametrize("arrays", FORGED)
+def test_a_kept_sum_that_somebody_forged_badly_counts_as_absent(
+    arrays: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dumps = json.dumps
+    monkeypatch.setattr(
+        "hil.batch.cache.json.dumps", lambda found: dumps(found | {"arrays": arrays})
+    )
+    assert decoded(encoded(KEY, {}, {}), KEY) is None
+    store = Store(tmp_path)
+    store.put(KEY, {}, {})
+    assert store.get(KEY) is None
+
+
+@pytest.mark.parametrize("thing", ["a pipe", "a device", DEEP])
+def test_what_is_no_text_of_ours_is_said_in_one_kind_of_error(thing: str, tmp_path: Path) -> None:
+    put(tmp_path / "it", thing)
+    with within(20.0), pytest.raises((OSError, ValueError)):
+        json_of(text_of(tmp_path / "it"))
+
+
+def test_a_text_that_is_one_is_read_as_ever(tmp_path: Path) -> None:
+    (tmp_path / "it").write_bytes("a = 1\r\nb = 'ä'\r".encode())
+    assert text_of(tmp_path / "it") == (tmp_path / "it").read_text("utf-8")
+    assert toml_of(text_of(tmp_path / "it")) == {"a": 1, "b": "ä"}
+    with opened(tmp_path / "it") as stream:
+        assert stream.read().startswith(b"a = 1\r\n")
+
+
+NAMES = {
+    "a\x1b]0;title\x07\x1b[31mb": r"a\x1b]0;title\x07\x1b[31mb",
+    "a\nerror: all is well": r"a\nerror: all is well",
+    "a\u202eb": r"a\u202eb",
+    "a\udcffb": r"a\udcffb",
+    "a\\[bold]b[/]": r"a\[bold]b[/]",
+    "[link=http://x]a[/link]": "[link=http://x]a[/link]",
+    ":smile:": ":smile:",
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_is_printed_and_does_not_steer_the_terminal(
+    name: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hil.cli import main
+
+    monkeypatch.setattr("sys.argv", ["hil", "status", name])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    told = capfd.readouterr().err
+    assert told.startswith(f"error: {NAMES[name].split('/')[0]}")
+    assert told.rstrip("\n").isprintable()
+
+
+def test_a_campaign_with_an_odd_name_is_shown_as_it_is(folder: Path, tmp_path: Path) -> None:
+    odd = folder.rename(tmp_path / "[bold]c\x1b[31m[]")
+    shown = CliRunner().invoke(app, ["status", str(odd)])
+    assert shown.exit_code == 0, shown.output
+    assert "\x1b" not in shown.output
+    assert "[bold]c" in shown.output
