@@ -128,7 +128,10 @@ def _described(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> tupl
         return ()
     solids = []
     for item in shapes.geometryObjects:
-        vertices = surface_points(item.geometry)
+        try:
+            vertices = surface_points(item.geometry)
+        except (ValueError, RuntimeError):  # a mesh that is no body
+            continue
         if vertices is not None:
             pose = item.placement
             placed = vertices @ pose.rotation.T + pose.translation

@@ -27,9 +27,13 @@ HilError                   exit status 1
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import ClassVar
+from types import MappingProxyType
+from typing import ClassVar, Self
+
+from hil.printable import printable
 
 
 class HilError(Exception):
@@ -37,9 +41,16 @@ class HilError(Exception):
 
     Attributes:
         exit_code: exit status of the command line when this error ends it.
+        figures: what a script is told beside the sentence, of work that was done until then.
     """
 
     exit_code: ClassVar[int] = 1
+    figures: Mapping[str, object] = MappingProxyType({})
+
+    def beside(self, figures: Mapping[str, object]) -> Self:
+        """This error with figures."""
+        self.figures = dict(figures)
+        return self
 
 
 class InputError(HilError):
@@ -66,7 +77,7 @@ class InputError(HilError):
         self.field = field
         self.problem = problem
         self.remedy = remedy
-        place = [str(part) for part in (self.path, field) if part]
+        place = [printable(str(part), keep="") for part in (self.path, field) if part]
         sentence = ": ".join([*place, problem])
         super().__init__(f"{sentence}; {remedy}" if remedy else sentence)
 

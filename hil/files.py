@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -52,6 +52,23 @@ def write_or_tell(path: Path, content: str | bytes) -> None:
     except OSError as error:
         problem = f"{path.name} cannot be written ({error.strerror or error})"
         raise OutputError(path.parent, problem) from error
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Tell in words what a disk refuses meanwhile.
+
+    Raises:
+        InputError: a file could not be written; files written before it stay.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            folder,
+            f"cannot be written to ({os.strerror(error.errno) if error.errno else error})",
+            remedy="make room, or name another folder",
+        ) from error
 
 
 def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
@@ -116,8 +133,13 @@ def _keep(path: Path, copy: Path) -> None:
 
 
 def _write_through(path: Path, content: str | bytes) -> None:
-    """Write a file and have it on the disk."""
-    with path.open("wb") as file:
+    """Write a new file and have it on the disk.
+
+    What lies there is taken away before: in a folder that came from elsewhere it may be a link to
+    a file of the user's, or a pipe.
+    """
+    path.unlink(missing_ok=True)
+    with path.open("xb") as file:
         file.write(content.encode() if isinstance(content, str) else content)
         file.flush()
         os.fsync(file.fileno())

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from hil.printable import printable
+
 
 def put(console: Console, text: str) -> None:
-    """Print one line as it is, without markup; broken between words where a person reads it."""
+    """Print one line as it is, without markup; broken between words where a person reads it.
+
+    What steers a terminal is written out.
+    """
     whole = not console.is_terminal
-    console.print(text, markup=False, emoji=False, highlight=False, soft_wrap=whole)
+    console.print(printable(text), markup=False, emoji=False, highlight=False, soft_wrap=whole)
 
 
 def say(text: str, *, err: bool = False) -> None:

@@ -6,7 +6,7 @@ import zipfile
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import numpy as np
 
@@ -15,11 +15,15 @@ from hil.files import write_together
 from hil.identify import Identification
 from hil.identify.exports import exports_of, provenance_of
 from hil.progress import Reporter
+from hil.reading import opened
 from hil.report import ReportSeries, report_bytes
 from hil.results import Results
 
 RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
 _NAME: Final = "example_archive"
+_LARGEST: Final = 1 << 30
+"""Bytes of series that are read; those of a campaign of 30 repetitions have a hundredth of it."""
+_UNREADABLE: Final = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 
 
 def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
@@ -73,12 +77,23 @@ def _series_bytes(series: ReportSeries) -> bytes:
 
 def _load_series(path: Path) -> ReportSeries:
     try:
-        with np.load(path) as found:
-            arrays = {name: found[name] for name in found.files}
+        with opened(path) as stream:
+            _require_bounded(stream)
+            with np.load(stream, allow_pickle=False) as found:
+                arrays = {name: found[name] for name in found.files}
         return ReportSeries(**(arrays | {_NAME: str(arrays[_NAME])}))
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (*_UNREADABLE, MemoryError) as error:
         raise InputError(
             path,
             f"does not hold the series of a report ({error})",
             remedy="identify again from the archives (`hil identify`)",
         ) from error
+
+
+def _require_bounded(stream: BinaryIO) -> None:
+    """Refuse a file that would become much larger than any of ours."""
+    with zipfile.ZipFile(stream) as members:
+        size = sum(member.file_size for member in members.infolist())
+    if size > _LARGEST:
+        raise ValueError(f"it would take {size} bytes")
+    stream.seek(0)

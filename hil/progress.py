@@ -21,6 +21,8 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
+from hil.printable import printable
+
 # Columns that a bar takes at least.
 _NARROWEST = 8
 
@@ -69,7 +71,7 @@ class Plain:
 
     def say(self, text: str) -> None:
         """Print the line at once."""
-        self._out.write(text + "\n")
+        self._out.write(printable(text) + "\n")
         self._out.flush()
 
     @contextmanager
@@ -100,7 +102,7 @@ class Bar:
 
     def say(self, text: str) -> None:
         """Print the line above the bar."""
-        self._console.print(text, highlight=False, markup=False)
+        self._console.print(printable(text), highlight=False, markup=False)
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
@@ -141,7 +143,8 @@ class _BarTask:
 
     def advance(self, units: float, note: str = "") -> None:
         self._done += units
-        self._progress.update(self._task, completed=round(self._done), note=note)
+        shown = printable(note, keep="")
+        self._progress.update(self._task, completed=round(self._done), note=shown)
 
 
 def reporter(*, quiet: bool = False) -> Reporter:

@@ -12,6 +12,7 @@ from os import PathLike
 from pathlib import Path
 
 from hil.archive import description, schema
+from hil.archive.amend import REJECTED
 from hil.archive.check_messages import message_faults
 from hil.archive.description import DescriptionError
 from hil.archive.names import KINDS, ArchiveName
@@ -34,7 +35,7 @@ ASPECTS = {
 }
 """What is checked, and of what it consists."""
 
-OUTCOMES = ("completed", "stopped", "refused", "lost", "void", "interrupted", "unknown")
+OUTCOMES = ("completed", REJECTED, "stopped", "refused", "lost", "void", "interrupted", "unknown")
 _MOST = 5  # faults of one aspect that are listed
 
 

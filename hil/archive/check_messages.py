@@ -17,6 +17,7 @@ from hil.archive.container import ChannelRecord, Damage, Record
 from hil.archive.description import Description
 from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
 from hil.archive.survey import Survey
+from hil.reading import opened
 
 Fault = tuple[str, str]
 
@@ -43,7 +44,7 @@ def message_faults(found: Survey) -> Iterator[Fault]:
         Aspect of the profile, and what is wrong.
     """
     checker = _Checker(found)
-    with found.path.open("rb") as stream:
+    with opened(found.path) as stream:
         yield from checker.run(stream)
 
 

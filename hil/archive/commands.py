@@ -97,6 +97,7 @@ class Closed:
         missed: packets that never arrived.
         late: answers that were late or left out.
         untaken: answers that the controller did not take.
+        disk_waited: longest time that the disk took at once [s].
     """
 
     job: int
@@ -109,6 +110,7 @@ class Closed:
     missed: int
     late: int
     untaken: int
+    disk_waited: float
 
 
 @dataclass(frozen=True)

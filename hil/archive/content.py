@@ -2,7 +2,8 @@
 
 A chunk counts whole or not at all. MCAP numbers the messages of each channel, so a chunk that
 vanished (a damaged opcode makes a reader skip it) is noticed by the next one; one that vanished at
-the end by the counts in the outcome.
+the end by the counts in the outcome. A whole chunk of another archive, numbered as ours was, is
+noticed by its cycles: they must grow, from the first to the last that the outcome names.
 """
 
 from __future__ import annotations
@@ -36,6 +37,14 @@ class _Waiting(NamedTuple):
 
     offset: int
     data: bytes
+
+
+class _Strange(Damage):
+    """Cycles that do not belong together: of those from `since` [ns] on none is believed."""
+
+    def __init__(self, offset: int, reason: str, since: int) -> None:
+        super().__init__(offset, reason)
+        self.since = since
 
 
 class Content:
@@ -83,7 +92,15 @@ class Content:
                 self._check_counts(size)
         except Damage as found:  # in an earlier record
             damage = found
+        if isinstance(damage, _Strange):
+            self._forget(damage.since)
         return damage
+
+    def _forget(self, since: int) -> None:
+        """Drop what was read of a time [ns] that two chunks claim."""
+        for channel in self._channels.values():
+            channel.forget(since)
+        self.events = [event for event in self.events if event.time < since * 1e-9]
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns read, all of the same length."""
@@ -111,6 +128,10 @@ class Content:
         if claimed != schema.checksum(entries):
             raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
         if name == schema.OUTCOME:
+            if not schema.belong_together(self.metadata, entries):
+                reason = f"(metadata {name!r}) is that of another recording"
+                raise _Strange(record.offset, reason, 0)
+            entries.pop(schema.DESCRIPTION, None)
             self.outcome = entries
             return
         if self.metadata is not None:
@@ -186,7 +207,9 @@ class Content:
                 layout = self._layout(topic, messages)
             except LayoutError as error:
                 raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-            self._channels[topic] = _Channel(layout, self._selection, gapless=self._gapless)
+            self._channels[topic] = _Channel(
+                layout, self._selection, gapless=self._gapless, growing=topic == schema.CYCLE
+            )
         return self._channels[topic]
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout:
@@ -240,6 +263,18 @@ class Content:
         for key, count in counts.items():
             if self.outcome.get(key) != str(count):
                 raise Damage(size, f"is missing: {self.outcome.get(key)} {key} were written")
+        self._check_ends(size)
+
+    def _check_ends(self, size: int) -> None:
+        """Compare the first and the last cycle with those that the writer names."""
+        assert self.description is not None and self.outcome is not None
+        cycles, period = self._channels.get(schema.CYCLE), self.description.period
+        if cycles is None or not cycles.read or period is None or "repaired" in self.outcome:
+            return
+        for word, stamp in (("first", cycles.oldest), ("last", cycles.newest)):
+            written = self.outcome.get(f"{word}_cycle")
+            if written not in (None, str(round(stamp / (1e9 * period)))):
+                raise _Strange(size, f"is missing: the {word} cycle written was {written}", 0)
 
 
 class _Channel:
@@ -247,10 +282,15 @@ class _Channel:
 
     Attributes:
         read: messages read so far, whether their time is wanted or not.
+        oldest, newest: stamps of the first and the last of them [ns], where they must grow.
     """
 
-    def __init__(self, layout: MessageLayout, selection: Selection, *, gapless: bool) -> None:
+    def __init__(
+        self, layout: MessageLayout, selection: Selection, *, gapless: bool, growing: bool
+    ) -> None:
         self.read = 0
+        self.oldest = self.newest = -1
+        self._growing = growing
         self._layout = layout
         self._times = selection.times if selection.bounded else None
         self._gapless = gapless
@@ -264,15 +304,28 @@ class _Channel:
         data = messages.matrix(self._layout.size)
         if data is None or not self._layout.is_kept_by(data):
             raise Damage(offset, "(chunk) has messages that differ from those before")
+        if self._growing:
+            stamps = self._columns.stamps(data)
+            if (np.diff(stamps, prepend=self.newest) <= 0).any():
+                reason = "(chunk) has cycles that do not follow those before"
+                raise _Strange(offset, reason, int(stamps.min()))
         return data
 
     def append(self, data: Bytes, expected: int) -> None:
         """Append verified messages; `expected` is a guess at the final count."""
+        if self._growing and len(data):
+            ends = self._columns.stamps(data[[0, -1]])
+            self.oldest = self.oldest if self.read else int(ends[0])
+            self.newest = int(ends[1])
         self.read += len(data)
         if self._times is not None:
             stamp = self._columns.stamps(data)
             data = data[(stamp >= self._times[0]) & (stamp < self._times[1])]
         self._columns.append(data, expected)
+
+    def forget(self, since: int) -> None:
+        """Drop the messages stamped `since` [ns] or later."""
+        self._columns.cut(since)
 
     def finished(self) -> dict[str, NDArray[Any]]:
         """The columns by our names."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -12,6 +14,7 @@ import numpy as np
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.messages import LogMessage, encode_log
 from hil.archive.schema import (
+    DESCRIPTION,
     EVENT_CHANNEL,
     FORMAT_VERSION,
     METADATA,
@@ -41,6 +44,7 @@ class _Sink:
         self._descriptor = descriptor
         self._durable = durable
         self._parts: list[bytes] = []
+        self.slowest = 0.0
 
     def write(self, data: bytes) -> None:
         self._parts.append(data)
@@ -48,10 +52,12 @@ class _Sink:
     def flush(self) -> None:
         data = memoryview(b"".join(self._parts))
         self._parts.clear()
+        begin = time.monotonic()
         while data:
             data = data[os.write(self._descriptor, data) :]
         if self._durable:
             os.fdatasync(self._descriptor)
+        self.slowest = max(self.slowest, time.monotonic() - begin)
 
 
 class ArchiveFile:
@@ -88,6 +94,7 @@ class ArchiveFile:
         self._written = 0
         self._events = 0
         self._packets = 0
+        self._description = ""
         self._sink = _Sink(self._descriptor, durable=durable)
         self._writer = McapWriter(self._sink.write)
         with self._guarded():
@@ -112,6 +119,11 @@ class ArchiveFile:
     def packets(self) -> int:
         """Number of raw packets written so far."""
         return self._packets
+
+    @property
+    def slowest_flush(self) -> float:
+        """Longest time that the disk took for what was handed to it at once [s]."""
+        return self._sink.slowest
 
     @property
     def closed(self) -> bool:
@@ -157,10 +169,10 @@ class ArchiveFile:
             return
         with self._guarded():
             self._writer.flush()
-            self._add_metadata(OUTCOME, outcome)
+            self._add_metadata(OUTCOME, {**outcome, DESCRIPTION: self._description})
             self._writer.finish()
             self._sink.flush()
-        self._close()
+            self._close()  # some file systems tell only now that they did not take everything
 
     def _add(self, channels: Sequence[int], first: int, batch: Batch) -> None:
         numbers = (first + np.arange(len(batch.stamp))) % _MOST_NUMBERS
@@ -173,7 +185,9 @@ class ArchiveFile:
             "format_version": str(FORMAT_VERSION),
             "attachments": json.dumps(sorted(attachments)),
         }
-        self._add_metadata(METADATA, {**metadata, **own})
+        described = {**metadata, **own}
+        self._description = checksum(described)
+        self._add_metadata(METADATA, described)
         for name, data in sorted(attachments.items()):
             media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
             self._writer.add_attachment(name, media_type, data)
@@ -210,11 +224,13 @@ class _DiskGuard:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if isinstance(error, OSError):
-            self._file._close()
+            with suppress(OSError):
+                self._file._close()
             raise ArchiveWriteError(
                 self._file.path,
                 f"cannot be written further: {error.strerror}",
-                remedy="what was flushed before can be read; free space and record again",
+                remedy="what was flushed before can be read; make room or mend the disk, "
+                "and record again",
             ) from error
 
 
@@ -226,7 +242,12 @@ def _create(path: Path) -> int:
             path, "exists already", remedy="archives are never overwritten; choose another name"
         ) from error
     except OSError as error:
-        raise ArchiveWriteError(path, f"cannot be created: {error.strerror}") from error
+        raise ArchiveWriteError(
+            path,
+            f"cannot be created: {error.strerror}",
+            remedy="see that its folder is there and writable and its disk has room, "
+            "and record again",
+        ) from error
 
 
 def sync_folder(folder: Path) -> None:

@@ -337,6 +337,7 @@ class ArchiveProcess:
                 missed=recorder.missed,
                 late=recorder.late,
                 untaken=recorder.untaken,
+                disk_waited=recorder.writer.slowest_flush,
             )
         )
 

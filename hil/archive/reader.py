@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +24,15 @@ from hil.archive.index import Summary
 from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, LATER_FIELDS, METADATA
 from hil.archive.selection import Selection
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
+from hil.reading import opened
 
 _UNREAD = frozenset((container.MESSAGE_INDEX,))
 """Records that only other programs need."""
+_REMEDIES: Final = {
+    errno.ENOENT: "see whether it was moved or removed",
+    errno.EACCES: "make it readable for yourself",
+    errno.EIO: "its disk fails: restore it from a copy",
+}
 
 
 @dataclass(frozen=True)
@@ -178,8 +186,8 @@ def open_archive(
     path = Path(path)
     selection = Selection(fields, topics, start, stop)
     try:
-        with path.open("rb") as stream:
-            size = path.stat().st_size
+        with opened(path) as stream:
+            size = os.fstat(stream.fileno()).st_size
             content = _by_index(stream, size, selection) if selection.partial else None
             damage = None
             if content is None:
@@ -187,7 +195,8 @@ def open_archive(
                 content = Content(selection)
                 damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
     except OSError as error:
-        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+        remedy = _REMEDIES.get(error.errno or 0, "")
+        raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
     except MemoryError as error:
         raise ArchiveError(
             path, "does not fit into memory", remedy="read a part of its time, or fewer columns"

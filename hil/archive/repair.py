@@ -25,7 +25,7 @@ from hil.archive.index import IndexBuilder, MessageHead
 from hil.archive.reader import open_archive
 from hil.archive.survey import HEADER, Piece, Survey, announced_attachments, survey
 from hil.archive.written_anew import write_anew
-from hil.errors import ArchiveWriteError, NotAnArchiveError
+from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 
 _DIGITS = 18  # of a count
 _SEQUENCE_AT = container.RECORD.size + 2  # in a message record
@@ -84,6 +84,9 @@ def repair(
     if not _is_described(found):
         open_archive(path, fields=())  # says why it is none
         raise NotAnArchiveError(path, "is not an archive")
+    if found.mixed:
+        problem = "its begin and its end are of two recordings, and the samples of either"
+        raise ArchiveError(path, problem, remedy="restore it from a copy, or record again")
     target = path.resolve() if in_place else Path(output) if output else repaired_name(path)
     if not in_place and os.path.lexists(target):
         raise ArchiveWriteError(target, "exists already", remedy="choose another name with -o")
@@ -232,6 +235,7 @@ def _outcome(found: Survey) -> dict[str, str]:
     earlier = foreign_json.names(before.get("repaired.losses", "[]")) or ()
     return {
         **before,
+        schema.DESCRIPTION: schema.checksum(_description(found)),
         "samples": str(found.samples),
         "events": str(found.events),
         **({"packets": str(found.counts.get(schema.PACKETS, 0))} if "packets" in before else {}),

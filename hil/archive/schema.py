@@ -25,6 +25,8 @@ FORMAT_VERSION = 1
 PROFILE = "ros2"
 METADATA = "hil"
 OUTCOME = "hil.outcome"
+DESCRIPTION = "description"
+"""Entry of the outcome: checksum of the ``hil`` record it belongs to. Older files have none."""
 CONTROLLERS_OWN = "controller"
 """Metadata entry ``motion`` of an archive whose motion was made by the controller's own program."""
 
@@ -204,6 +206,13 @@ def checksum(entries: Mapping[str, str]) -> str:
     """CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
     text = json.dumps(dict(entries), sort_keys=True, separators=(",", ":"))
     return f"{zlib.crc32(text.encode()):08x}"
+
+
+def belong_together(metadata: Mapping[str, str] | None, outcome: Mapping[str, str] | None) -> bool:
+    """Whether an outcome is that of the recording which the ``hil`` record describes, if known."""
+    if metadata is None or outcome is None:
+        return True
+    return outcome.get(DESCRIPTION) in (None, checksum(metadata))
 
 
 def _stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:

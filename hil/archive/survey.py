@@ -6,6 +6,7 @@ keeps has passed the same checks: checksums, and numbers of messages that count 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from os import PathLike
@@ -18,6 +19,7 @@ from hil.archive import container, foreign_json, index, schema
 from hil.archive.container import Damage, Record
 from hil.archive.index import IndexBuilder, MessageHead, Summary
 from hil.errors import ArchiveError
+from hil.reading import opened
 
 HEADER = index.record(container.HEADER, index.text(schema.PROFILE) + index.text("hil"))
 _NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
@@ -97,6 +99,11 @@ class Survey:
         return [fault.text for fault in self.faults if fault.loss or fault.aspect == "container"]
 
     @property
+    def mixed(self) -> bool:
+        """Whether begin and end are of two recordings, and the samples of nobody knows which."""
+        return not schema.belong_together(self.metadata, self.outcome)
+
+    @property
     def samples(self) -> int:
         """Samples that stand."""
         return max((self.counts.get(topic, 0) for topic in _NUMBERS), default=0)
@@ -115,8 +122,9 @@ def survey(path: str | PathLike[str]) -> Survey:
     """
     path = Path(path)
     try:
-        with path.open("rb") as stream:
-            surveyor = _Surveyor(stream, Survey(path, path.stat().st_size))
+        with opened(path) as stream:
+            size = os.fstat(stream.fileno()).st_size
+            surveyor = _Surveyor(stream, Survey(path, size))
             surveyor.run()
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
@@ -358,6 +366,8 @@ class _Surveyor:
         if outcome is None:
             self._fault("outcome", "the outcome is missing", loss=True)
             return
+        if self.survey.mixed:
+            self._fault("outcome", "the outcome is that of another recording", loss=True)
         counts = {"samples": self.survey.samples, "events": self.survey.events}
         if "packets" in outcome:
             counts["packets"] = self.survey.counts.get(schema.PACKETS, 0)

@@ -105,6 +105,11 @@ class ArchiveWriter:
         return (self._cycles_per_chunk - begun % self._cycles_per_chunk) * self._period
 
     @property
+    def slowest_flush(self) -> float:
+        """Longest time that the disk took for what was handed to it at once [s]."""
+        return self._file.slowest_flush
+
+    @property
     def with_packets(self) -> bool:
         """Whether the archive keeps raw packets."""
         return self._packet_encoder is not None

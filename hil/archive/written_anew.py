@@ -43,7 +43,12 @@ def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, IO[bytes]],
             Path(output.name).replace(target)
         sync_folder(target.parent)
     except OSError as error:
-        raise ArchiveWriteError(target, f"cannot be written: {error.strerror}") from error
+        raise ArchiveWriteError(
+            target,
+            f"cannot be written: {error.strerror}",
+            remedy="what was there is as it was: make room or make its folder writable, "
+            "and do it again",
+        ) from error
 
 
 @contextlib.contextmanager

@@ -27,6 +27,8 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
+from hil.reading import json_of, opened, text_of
+
 from .errors import CacheError
 from .keys import text_digest
 
@@ -82,7 +84,8 @@ class Store:
     def get(self, key: str) -> Entry | None:
         """What is kept under a key; None if nothing, or nothing whole."""
         try:
-            data = self._path(key).read_bytes()
+            with opened(self._path(key)) as file:
+                data = file.read()
         except OSError:
             return None
         return decoded(data, key)
@@ -109,7 +112,7 @@ class Store:
     def note(self, name: str) -> Any:
         """The note about a file of the archives' folder; None if there is none."""
         try:
-            return json.loads((self.folder / f"{name}.json").read_bytes())
+            return json_of(text_of(self.folder / f"{name}.json"))
         except (OSError, ValueError):
             return None
 
@@ -165,16 +168,21 @@ def decoded(data: bytes, key: str) -> Entry | None:
     if magic != _MAGIC or length != len(body) or checksum != crc32(body):
         return None
     (size,) = _TEXT.unpack_from(body)
-    content = json.loads(bytes(body[_TEXT.size : _TEXT.size + size]))
-    if content["key"] != key:
+    try:
+        content = json_of(bytes(body[_TEXT.size : _TEXT.size + size]))
+        if content["key"] != key:
+            return None
+        arrays, at = {}, _TEXT.size + size
+        for name, code, shape in content["arrays"]:
+            dtype = np.dtype(code)
+            count = int(np.prod(shape, dtype=np.int64))
+            if count < 0:
+                return None
+            arrays[name] = np.frombuffer(body, dtype, count, at).reshape(shape)
+            at += count * dtype.itemsize
+        return Entry(content["header"], arrays)
+    except (ValueError, KeyError, TypeError, IndexError):  # sealed, and none of ours
         return None
-    arrays, at = {}, _TEXT.size + size
-    for name, code, shape in content["arrays"]:
-        dtype = np.dtype(code)
-        count = int(np.prod(shape, dtype=np.int64))
-        arrays[name] = np.frombuffer(body, dtype, count, at).reshape(shape)
-        at += count * dtype.itemsize
-    return Entry(content["header"], arrays)
 
 
 @lru_cache(maxsize=1024)

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from sys import intern
 from typing import Final, NamedTuple
 
+from hil.archive import ArchiveName
+from hil.archive.names import KINDS
 from hil.errors import ArchiveError
 from hil.progress import Reporter, Silent, Task
 
@@ -28,6 +30,7 @@ _NOT_ENTERED: Final = (
     "next one takes it in)"
 )
 _COMPLETED: Final = "completed"
+_NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
 
 
 class Discovery(NamedTuple):
@@ -111,20 +114,27 @@ def _examined(
 
 def _sorted_out(places: Sequence[Place], found: Sequence[Examined | Broken]) -> Discovery:
     refs: list[ArchiveRef] = []
-    broken: list[Broken] = []
+    harmed: list[tuple[Place, Broken]] = []
     skipped: list[Broken] = []
     manifests = Manifests()
     read: list[tuple[Place, Examined]] = []
     for place, one in zip(places, found, strict=True):
         if isinstance(one, Broken):
-            broken.append(one)
+            harmed.append((place, one))
         elif reason := manifests.objection(place, one.facts.sha256):
-            broken.append(Broken(place.location, reason))
+            harmed.append((place, Broken(place.location, reason)))
         elif one.facts.use in USES and manifests.not_entered(place):
             skipped.append(Broken(place.location, _NOT_ENTERED))
         else:
             read.append((place, _with_outcome(one, manifests.outcome(place))))
     sieve = _Sieve(read)
+    broken: list[Broken] = []
+    for place, harm in harmed:
+        reason = sieve.replaced(place)
+        if reason:
+            skipped.append(Broken(harm.path, reason))
+        else:
+            broken.append(harm)
     for place, one in read:
         reason = sieve.objection(place, one.facts)
         if reason:
@@ -155,6 +165,20 @@ class _Sieve:
             if facts.attempt and facts.outcome == _COMPLETED:
                 key = (place.folder, facts.kind, facts.number)
                 self._latest[key] = max(self._latest.get(key, 0), facts.attempt)
+
+    def replaced(self, place: Place) -> str:
+        """Why nothing is missing with an archive that cannot be used; "" if something is.
+
+        A run that was killed, or whose disk was full, leaves torn ones, and the next run makes the
+        motion again.
+        """
+        name = ArchiveName.parse(place.name)
+        if name is None:
+            return ""
+        if name.kind in _NEVER_FITTED:
+            return f"is a {name.kind}"
+        last = self._latest.get((place.folder, name.kind, name.index), 0)
+        return f"attempt {last} took the place of this unusable one" if name.attempt < last else ""
 
     def objection(self, place: Place, facts: Facts) -> str:
         """Why an archive is not meant to be fitted; "" if it is."""

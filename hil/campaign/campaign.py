@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 from hil.archive.live_view import LiveView
 from hil.cell import Cell
 from hil.design.folder import DESIGN_FILES
-from hil.errors import InputError
+from hil.errors import InputError, OutputError
 from hil.files import make_folder, write_atomically
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
@@ -65,6 +65,7 @@ class Campaign:
             MotionRefusedError: the plan can never run on the cell; no folder was made.
             NoExcitationError: no validation motion keeps the constraints of the cell.
             WrongObjectError: it was given something that is no cell or no excitation.
+            OutputError: the disk refuses; the folder is as it was.
         """
         root = _path(folder)
         _require(cell, "cell", (Cell,), "give one that was loaded (`hil.Cell.load(path)`)")
@@ -91,11 +92,14 @@ class Campaign:
             for path, text in files.items():
                 write_atomically(path, text)
             made.seal()
-        except OSError:
-            for path in files:
-                path.unlink(missing_ok=True)
-            made.archives.rmdir()
-            raise
+        except (OSError, CampaignFolderError) as error:
+            with suppress(OSError):
+                for path in files:
+                    path.unlink(missing_ok=True)
+                made.archives.rmdir()
+            if isinstance(error, CampaignFolderError):  # of the manifest
+                raise OutputError(root, error.problem) from error
+            raise OutputError(root, f"cannot be written to ({error.strerror})") from error
         return cls(made, own, plan)
 
     @classmethod

@@ -15,6 +15,7 @@ import numpy as np
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.files import write_or_tell
+from hil.reading import json_of, text_of
 
 from .errors import CampaignFolderError
 from .folder import CampaignFolder
@@ -100,7 +101,7 @@ class DryRun:
         if not path.exists():
             return None
         try:
-            content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+            content: dict[str, Any] = json_of(text_of(path))
             version = content.pop("format_version")
             if version != FORMAT_VERSION:
                 raise ValueError(f"format version {version}, this is {FORMAT_VERSION}")

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 from hil.archive import ArchiveName
 from hil.archive.amend import REJECTED
 from hil.files import write_atomically
+from hil.reading import json_of, opened, text_of
 
 from .errors import CampaignFolderError, NotRehearsedError
 from .sealed import MESH, MISSING, as_text, checksums, combined
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 LOCK = "campaign.lock"
 LOCK_PATIENCE = 0.5
 """s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
+_LOCKING: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+"""The folder may come from elsewhere: neither a link nor a pipe is taken for the lock."""
 _ANOTHER: Final = "{} is not the one this campaign began with"
 _RESTORE: Final = "restore it, or begin a new campaign"
 
@@ -156,7 +159,7 @@ class CampaignFolder:
             CampaignFolderError: another run is at work on it, or the disk refuses.
         """
         try:
-            lock = os.open(self.root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            lock = os.open(self.root / LOCK, _LOCKING | os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise CampaignFolderError(
                 self.root, f"{LOCK} cannot be written ({error.strerror})", "make it writable"
@@ -175,7 +178,7 @@ class CampaignFolder:
     def busy(self) -> bool:
         """Whether a run is at work on the folder at this moment."""
         try:
-            lock = os.open(self.root / LOCK, os.O_RDONLY | os.O_CLOEXEC)
+            lock = os.open(self.root / LOCK, _LOCKING | os.O_RDONLY)
         except OSError:  # nobody ever was, or it is not ours to look
             return False
         try:
@@ -235,6 +238,10 @@ class CampaignFolder:
             entries = [Entry(**entry) for entry in self._content()["archives"]]
             if not all(isinstance(text, str) for e in entries for text in asdict(e).values()):
                 raise TypeError("an entry is not made of words")
+            if away := [
+                e.name for e in entries if Path(e.name).name != e.name or not e.name.strip(".")
+            ]:
+                raise TypeError(f"{away[0]!r} is no name of a file in {self.archives.name}/")
             return entries
         except (KeyError, TypeError) as error:
             raise self._damaged(error) from error
@@ -318,9 +325,22 @@ class CampaignFolder:
         return path.is_file() and _sha256(path) == entry.sha256
 
     def _contents(self) -> dict[str, bytes]:
-        """Cell, plan and URDF by file name, each read once."""
-        files = [self.cell, self.plan, self.urdf]
-        return {file.name: file.read_bytes() for file in files if file.exists()}
+        """Cell, plan and URDF by file name, each read once.
+
+        Raises:
+            CampaignFolderError: one is there and cannot be read.
+        """
+        contents = {}
+        for file in (self.cell, self.plan, self.urdf):
+            try:
+                with opened(file) as stream:
+                    contents[file.name] = stream.read()
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                problem = f"{file.name} cannot be read ({error.strerror})"
+                raise CampaignFolderError(self.root, problem, _RESTORE) from error
+        return contents
 
     def _inputs(self) -> dict[str, str]:
         """Checksums of cell, plan, URDF and meshes by name."""
@@ -340,14 +360,17 @@ class CampaignFolder:
         if not self._manifest.exists():
             return {"inputs": {}, "archives": []}
         try:
-            content = json.loads(self._manifest.read_text("utf-8"))
+            content = json_of(text_of(self._manifest))
             return {"inputs": dict(content["inputs"]), "archives": list(content["archives"])}
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self._damaged(error) from error
 
     def _save(self, content: dict[str, Any]) -> None:
+        # A line an archive. With `indent` each call leaves a reference cycle, motion by motion.
+        archives = ",\n".join(map(json.dumps, content["archives"]))
+        text = f'{{"inputs": {json.dumps(content["inputs"])},\n"archives": [\n{archives}\n]}}\n'
         try:
-            write_atomically(self._manifest, json.dumps(content, indent=1) + "\n")
+            write_atomically(self._manifest, text)
         except OSError as error:
             raise CampaignFolderError(
                 self.root, f"manifest.json cannot be written ({error})", "make room and run again"

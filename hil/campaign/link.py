@@ -30,7 +30,15 @@ from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
 from hil.cell import Cell
 from hil.errors import ControllerFault, OperatorStopError
 
-from .motion_link import Connection, Progress, Recorded, Watch, described, unwatched
+from .motion_link import (
+    Connection,
+    Progress,
+    Recorded,
+    Watch,
+    described,
+    not_ready,
+    unwatched,
+)
 from .motion_watch import MotionWatch, unwatched_motion
 from .sight import Counted, Sight, duration_of
 from .steering import ASKED_EVERY, NOT_BEGUN, Polite, Steering
@@ -129,10 +137,7 @@ class Link:
         if stop.requested:
             raise ControllerFault("stopped by the operator before anything moved")
         if self.session.state is not State.CLOSED or last is None:
-            raise ControllerFault(
-                f"the controller did not reach drive-on within {timeout:g} s "
-                f"(state {self.session.state.name}); switch the drive on and try again"
-            )
+            raise not_ready(self.session.state, timeout + self.transport.now - deadline)
         return last
 
     def run(

@@ -37,7 +37,15 @@ from .exchange_view import ExchangeView
 from .heartbeat import Heartbeat
 from .live_motion import LiveMotion
 from .live_recording import LiveRecording
-from .motion_link import Connection, Recorded, Watch, described, drives_in_force, unwatched
+from .motion_link import (
+    Connection,
+    Recorded,
+    Watch,
+    described,
+    drives_in_force,
+    not_ready,
+    unwatched,
+)
 from .motion_watch import MotionWatch, unwatched_motion
 from .stop import Stop
 
@@ -93,6 +101,7 @@ class LiveLink:
     view: ExchangeView = field(init=False)
     job: int = 0
     open_path: str = ""
+    _late_path: str = ""
     _closed: bool = False
 
     def __post_init__(self) -> None:
@@ -177,6 +186,7 @@ class LiveLink:
     def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
         """See `MotionLink.connect`."""
         deadline = time.monotonic() + timeout
+        self._await_late(stop)
         reader = self.reader()
         last: Array | None = None
         while not stop.requested and time.monotonic() < deadline:
@@ -193,10 +203,7 @@ class LiveLink:
             time.sleep(POLL)
         if stop.requested:
             raise ControllerFault("stopped by the operator before anything moved")
-        raise ControllerFault(
-            f"the controller did not reach drive-on within {timeout:g} s "
-            f"(state {self.view.state.name}); switch the drive on and try again"
-        )
+        raise not_ready(self.view.state, timeout)
 
     def run(
         self,
@@ -277,6 +284,7 @@ class LiveLink:
             raise ControllerFault(f"{failure}; nothing was sent, and {spec.path} is not recorded")
         # Should it come to it after all, it is to be closed at once.
         self.archive.send(Close(self.job, "void", "nothing was sent: it was opened too late"))
+        self._late_path = str(spec.path)
         late = f"did not open {spec.path} within {OPEN_TIMEOUT:g} s"
         raise ControllerFault(f"the archive process {late}; nothing was sent")
 
@@ -324,6 +332,19 @@ class LiveLink:
         self.cycles += closed.records
         self.late += closed.late
         self.untaken += closed.untaken
+
+    def _await_late(self, stop: Stop) -> None:
+        """Until an archive that was opened too late is closed; only then are free names known."""
+        deadline = time.monotonic() + OPEN_TIMEOUT
+        while self._late_path and not stop.requested:
+            answer = self.archive.answer(POLL, self.job)
+            if isinstance(answer, Closed | Failed):
+                self._late_path = ""
+            elif (failure := self.archive.failure()) is not None:
+                raise ControllerFault(f"{failure}; nothing was sent")
+            elif time.monotonic() > deadline:
+                waits = f"the archive process still waits for the disk to open {self._late_path}"
+                raise ControllerFault(f"{waits}; nothing was sent, look after that disk")
 
     def _serve(self, view: LiveView) -> None:
         """Have the archive process let viewers look."""

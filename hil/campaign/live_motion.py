@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, get_args
 
 from drivers.errors import DriverError, RequestError
 from drivers.events import MotionEnded, Outcome
+from drivers.exchange import NO_ARCHIVE
 from drivers.motion_source import MotionSource
 from hil.archive import ArchiveSpec
 from hil.archive.commands import Closed, Failed
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 POLL: Final = 0.02
 """s between two looks at everything while a motion runs."""
+SLOW_DISK: Final = 1.0
+"""s at once that a disk takes for a flush when something is wrong with it."""
 REST_TIMEOUT: Final = 30.0
 """s for an arm that was told to stop to rest, and for the archive of a motion that has ended."""
 
@@ -152,14 +155,21 @@ class LiveMotion:
         self._view.look()
         if self._view.ended is not None:
             ended = self._view.ended
-            return replace(ended, reason=self._link.heart.explained(ended.reason))
+            return replace(ended, reason=self._explained(ended.reason, closed))
         if closed.outcome in get_args(Outcome) and self._view.motion_ended:
             outcome: Outcome = closed.outcome  # type: ignore[assignment]
-            reason = self._link.heart.explained(closed.reason)
+            reason = self._explained(closed.reason, closed)
             return MotionEnded(outcome, reason, closed.interval, -1)
         failure = self._view.failure() or closed.reason
         alone = "the controller gets no answers and acts by its own watch"
         raise ControllerFault(f"{failure}; {alone}; the archive ({closed.outcome}) is whole so far")
+
+    def _explained(self, reason: str, closed: Closed) -> str:
+        """Why a motion ended, with the cause where a process of ours did not get on."""
+        if reason == NO_ARCHIVE and closed.disk_waited > SLOW_DISK:
+            waited = f"its disk kept it waiting for {closed.disk_waited:.1f} s"
+            return f"{reason} ({waited}: look after that disk)"
+        return self._link.heart.explained(reason)
 
     def _give_up(self, why: str) -> MotionEnded:
         """A motion that has not begun is dropped; without an archive it cannot begin any more."""

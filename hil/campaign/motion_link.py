@@ -136,6 +136,29 @@ class Connection:
         raise ControllerFault(f"the controller cannot be used: {self.unusable}{remedy}")
 
 
+def not_ready(state: State, waited: float) -> ControllerFault:
+    """What is told where a controller did not come so far that a motion may be asked for.
+
+    Args:
+        state: of the session.
+        waited: for how long [s].
+    """
+    after = f"within {waited:.3g} s (state {state.name})"
+    if state is State.SYNC:
+        return ControllerFault(
+            f"the controller did not begin a session {after}: it is silent, or still in one that "
+            "began before this program; start the program on the controller anew and try again"
+        )
+    if state is State.ENDED:
+        return ControllerFault(
+            f"the controller ended the session {after} before its drive was on; start the program "
+            "on the controller anew and try again"
+        )
+    return ControllerFault(
+        f"the controller did not reach drive-on {after}; switch the drive on and try again"
+    )
+
+
 class MotionLink(Protocol):
     """One connection to a controller: motions are run on it and archived."""
 

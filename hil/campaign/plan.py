@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from hil.errors import InputError
 from hil.files import write_atomically
+from hil.reading import json_of, text_of
 from identification.excitation import Excitation
 from identification.excitation.excitation import trajectory_from_dict
 from planner import FourierSeries, PiecewiseCubic, PlanFile
@@ -104,7 +105,7 @@ class CampaignPlan:
             InputError: the file is not a plan.
         """
         try:
-            return cls.from_text(path.read_text("utf-8"))
+            return cls.from_text(text_of(path))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(
                 path, f"is not a campaign plan ({error})", remedy="design the excitation again"
@@ -117,7 +118,7 @@ class CampaignPlan:
         Raises:
             ValueError, KeyError, TypeError, AttributeError: it is none.
         """
-        content: dict[str, Any] = json.loads(text)
+        content: dict[str, Any] = json_of(text)
         version = content["format_version"]
         if version not in READ:
             raise ValueError(f"format version {version}")

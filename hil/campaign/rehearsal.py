@@ -11,6 +11,7 @@ from typing import Final, Literal, Self
 from pydantic import StrictBool, ValidationError, model_validator
 
 from hil.files import write_or_tell
+from hil.reading import text_of
 from hil.results.frozen import Frozen
 
 from .errors import CampaignFolderError
@@ -81,10 +82,10 @@ class Rehearsal(Frozen):
         """
         path = folder.rehearsal
         try:
-            return cls.model_validate_json(path.read_bytes())
+            return cls.model_validate_json(text_of(path))
         except FileNotFoundError:
             return None
-        except (OSError, ValidationError) as error:
+        except (OSError, ValueError) as error:
             raise CampaignFolderError(
                 folder.root,
                 f"{path.name} cannot be read ({_why(error)})",
@@ -131,9 +132,11 @@ class Rehearsal(Frozen):
         return f"the rehearsal failed: {'; '.join(self.failures)}"
 
 
-def _why(error: OSError | ValidationError) -> str:
+def _why(error: OSError | ValueError) -> str:
     if isinstance(error, OSError):
         return error.strerror or str(error)
+    if not isinstance(error, ValidationError):
+        return str(error)
     first = error.errors()[0]
     place = ".".join(map(str, first["loc"]))
     return f"{place}: {first['msg']}" if place else str(first["msg"])

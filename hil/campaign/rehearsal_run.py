@@ -146,7 +146,8 @@ def _campaign(root: Path, like: Campaign) -> Campaign:
         there = Campaign.open(root)
         expected = like.cell.with_urdf(there.folder.cell, there.folder.urdf.name)
         same = there.cell.text == expected.text and there.cell.urdf == expected.urdf
-        if same and there.plan.to_text() == like.plan.to_text():
+        whole = there.folder.sealed  # else whoever made it was killed, or its disk was full
+        if same and whole and there.plan.to_text() == like.plan.to_text():
             return there
     shutil.rmtree(root, ignore_errors=True)
     make_folder(root.parent)

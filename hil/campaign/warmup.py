@@ -27,6 +27,7 @@ from scipy.stats import theilslopes
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.files import write_or_tell
+from hil.reading import json_of, text_of
 from planner import FourierSeries, PiecewiseCubic
 
 from .errors import CampaignFolderError
@@ -111,7 +112,7 @@ class WarmUp:
         if not path.exists():
             return None
         try:
-            content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+            content: dict[str, Any] = json_of(text_of(path))
             motions, earlier = (
                 tuple(WarmMotion(one["archive"], tuple(one["friction"])) for one in content[key])
                 for key in ("motions", "earlier")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -14,6 +13,7 @@ from hil.archive import ArchiveName, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 from hil.motion_checks import MotionChecks
+from hil.reading import json_of
 from identification.excitation.excitation import trajectory_from_dict
 
 from .folder import CampaignFolder
@@ -93,7 +93,7 @@ def seen_in_dry_run(folder: CampaignFolder) -> list[Ends]:
             continue
         with suppress(ArchiveError, ValueError, KeyError, TypeError):  # not seen, then
             archive = open_archive(folder.archives / entry.name, fields=())
-            motion = trajectory_from_dict(json.loads(archive.text("plan.json"))["trajectory"])
+            motion = trajectory_from_dict(json_of(archive.text("plan.json"))["trajectory"])
             start, end = motion.sample(np.array([0.0, motion.duration]))[0]
             found.append((start, end))
     return found

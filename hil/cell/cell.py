@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drivers.drive_train import DriveTrain
 from drivers.guard import GuardLimits
+from hil.reading import text_of, toml_of
 from identification.excitation import Box, Workspace
 from identification.model import RobotModel
 from planner import JointLimits
@@ -86,7 +86,7 @@ class Cell:
         """
         path = Path(path)
         try:
-            text = path.read_text(encoding="utf-8")
+            text = text_of(path)
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else error
             raise CellError(
@@ -95,11 +95,11 @@ class Cell:
         file = _parse(path, text)
         urdf_path = path.parent / file.cell.urdf
         try:
-            urdf = urdf_path.read_text(encoding="utf-8")
+            urdf = text_of(urdf_path)
         except (OSError, UnicodeDecodeError) as error:
-            raise CellError(
-                path, "cell.urdf", file.cell.urdf, "cannot be read", f"put a URDF at {urdf_path}"
-            ) from error
+            why = error.strerror if isinstance(error, OSError) else error
+            problem, remedy = f"cannot be read ({why})", f"put a URDF at {urdf_path}"
+            raise CellError(path, "cell.urdf", file.cell.urdf, problem, remedy) from error
         return cls.from_texts(text, urdf, path)
 
     @classmethod
@@ -371,8 +371,8 @@ class Cell:
 
 def _parse(path: Path, text: str) -> CellFile:
     try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        raw = toml_of(text)
+    except ValueError as error:
         raise CellError(path, "", None, f"is not TOML ({error})", "correct that line") from error
     require_known(path, raw, CellFile)
     try:

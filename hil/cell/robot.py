@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from identification.coupling import Coupling
 from identification.errors import ModelError
 from identification.friction import FrictionLaw
-from identification.kinematics import Chain, chain_from_urdf
+from identification.kinematics import Chain, chain_from_urdf, pinocchio_model
 from identification.model import RobotModel
 from identification.payload import Payload
 
@@ -65,12 +65,7 @@ def robot_model(
 
 def _all_names(urdf: str) -> tuple[str, ...]:
     """Every joint that moves, also of kinds that the model knows only when they are locked."""
-    import pinocchio
-
-    try:
-        return tuple(pinocchio.buildModelFromXML(urdf).names)[1:]
-    except (ValueError, RuntimeError) as error:
-        raise ModelError(f"the robot description is not a readable URDF: {error}") from error
+    return tuple(pinocchio_model(urdf).names)[1:]
 
 
 def _override(friction: FrictionTable, name: str) -> FrictionTable:

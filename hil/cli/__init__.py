@@ -14,9 +14,11 @@ from typing import Any
 
 import typer
 from rich.console import Console
+from rich.text import Text
 from typer.core import TyperGroup
 
 from hil.errors import HilError, OperatorStopError
+from hil.printable import printable
 from identification import IdentificationError
 from planner import PlannerError
 
@@ -99,18 +101,13 @@ def main() -> None:
 
 def _fail(text: str, status: int, *, stopped: bool = False) -> None:
     """End with one sentence; what a person stopped is no error."""
-    word = "[bold yellow]stopped:[/]" if stopped else "[bold red]error:[/]"
+    word = ("stopped:", "bold yellow") if stopped else ("error:", "bold red")
     console = Console(stderr=True)
     try:
-        console.print(
-            f"{word} {_escaped(text)}", highlight=False, soft_wrap=not console.is_terminal
-        )
+        line = Text.assemble(word, " ", printable(text))
+        console.print(line, highlight=False, soft_wrap=not console.is_terminal)
     except OSError:  # the terminal is gone; the status still counts
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (1, 2):
             os.dup2(nowhere, stream)
     sys.exit(status)
-
-
-def _escaped(text: str) -> str:
-    return text.replace("[", "\\[")

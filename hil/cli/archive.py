@@ -14,6 +14,7 @@ from hil.archive.overview import Overview, overview
 from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
 from hil.errors import ArchiveError, InputError
+from hil.printable import printable
 
 app = typer.Typer(help="Look into archives, check and repair them.", no_args_is_help=True)
 
@@ -124,10 +125,7 @@ def _say_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
 
 def _shown(lines: Sequence[str]) -> str:
     """Lines for a terminal, which texts of a stranger must not steer."""
-    return "\n".join(
-        "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
-        for line in lines
-    )
+    return "\n".join(printable(line, keep="") for line in lines)
 
 
 def _check_lines(found: Check) -> list[str]:

@@ -13,6 +13,7 @@ from hil.compare import compare_campaigns, gather
 from hil.compare.record import to_dict
 from hil.compare.words import caveat, told, verdict
 from hil.files import make_folder, write_together
+from hil.printable import printable
 from hil.progress import reporter as make_reporter
 
 CHANGED: Final = 5
@@ -60,10 +61,10 @@ def compare(
     else:
         if not quiet:
             for one in told(found):
-                typer.echo(f"{one.words} {one.next_step}".rstrip(), err=True)
+                typer.echo(printable(f"{one.words} {one.next_step}".rstrip()), err=True)
             for doubt in found.doubts:
-                typer.echo(f"note: {doubt}", err=True)
+                typer.echo(printable(f"note: {doubt}"), err=True)
             typer.echo(f"note: {caveat(found)}", err=True)
-        typer.echo(f"{verdict(found)}.")
+        typer.echo(printable(f"{verdict(found)}."))
     if fail_on_change and found.changed:
         raise typer.Exit(CHANGED)

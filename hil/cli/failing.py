@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from hil.errors import InputError, OperatorStopError
+from hil.errors import HilError, InputError, OperatorStopError
 from identification import IdentificationError
 from planner import PlannerError
 
@@ -39,10 +39,13 @@ def as_json(error: BaseException) -> dict[str, Any]:
 
     Returns:
         `error`: the sentence; `kind`: name of its class; `exit_code`; of an `InputError` also
-        `path`, `field`, `problem` and `remedy`, null or "" where there is none.
+        `path`, `field`, `problem` and `remedy`, null or "" where there is none; and the figures of
+        what was done before.
     """
     sentence = error.format_message() if hasattr(error, "format_message") else str(error)
-    told = {
+    figures = error.figures if isinstance(error, HilError) else {}
+    told: dict[str, Any] = {
+        **figures,
         "error": sentence or type(error).__name__,
         "kind": type(error).__name__,
         "exit_code": exit_code_of(error),

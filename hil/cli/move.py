@@ -21,6 +21,7 @@ from hil.cell_link import cell_link
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
 from hil.move import THERE, Way, posture, send, straight_way, turned
+from hil.printable import printable
 from hil.progress import Task
 from hil.progress import reporter as make_reporter
 from hil.recording import archive_path
@@ -130,17 +131,22 @@ def move(
             checks=checks_in_force(cell, link.connection),
         )
         if not json:
-            typer.echo(_described(way, cell, link))
+            typer.echo(printable(_described(way, cell, link)))
         _confirm(cell, link, yes=yes, json=json)
         with _archive(campaign, output) as (path, ended_as):
             ended, stopped = _sent(way, cell, link, path, quiet=json)
             ended_as.append(ended)
-        _report(ended, path, way, cell, link, json=json)
+        figures = _figures(ended, path, way, cell, link)
+        if ended.outcome == "completed" or not json:
+            said = f"{ended.outcome}: {ended.reason or 'the arm is there'}; archived in {path}"
+            _tell(said, figures, json=json)
         link.close()
     if ended.outcome == "stopped" and stopped:
-        raise OperatorStopError(f"the arm was stopped on its way; {path} is whole.")
+        how = f"the arm was stopped on its way; {path} is whole."
+        raise OperatorStopError(how).beside(figures)
     if ended.outcome != "completed":
-        raise ControllerFault(f"the move ended {ended.outcome}: {ended.reason}; {path} is whole.")
+        why = f"the move ended {ended.outcome}: {ended.reason}; {path} is whole."
+        raise ControllerFault(why).beside(figures)
 
 
 def _sent(
@@ -270,10 +276,10 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
     return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
 
 
-def _report(
-    ended: MotionEnded, path: Path, way: Way, cell: Cell, link: MotionLink, *, json: bool
-) -> None:
-    figures = {
+def _figures(
+    ended: MotionEnded, path: Path, way: Way, cell: Cell, link: MotionLink
+) -> dict[str, object]:
+    return {
         "archive": str(path),
         "outcome": ended.outcome,
         "reason": ended.reason,
@@ -281,12 +287,7 @@ def _report(
         "duration": way.duration,
         "target_deg": AngleFrame.of(cell).shown(way.target).tolist(),
     }
-    _tell(
-        f"{ended.outcome}: {ended.reason or 'the arm is there'}; archived in {path}",
-        figures,
-        json=json,
-    )
 
 
 def _tell(text: str, figures: dict[str, object], *, json: bool) -> None:
-    typer.echo(json_format.dumps(figures) if json else text)
+    typer.echo(json_format.dumps(figures) if json else printable(text))

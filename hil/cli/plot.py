@@ -16,6 +16,7 @@ from hil.plots.archive_panels import BINS as PAGE_BINS
 from hil.plots.archive_picture import draw_archive
 from hil.plots.archive_view import BINS, view_of
 from hil.plots.plan_picture import FORMATS
+from hil.printable import printable
 
 PAGE = ".html"
 
@@ -94,6 +95,7 @@ def plot(
         return
     for problem in (view.facts.damage, view.facts.lost):
         if problem:
-            typer.echo(f"note: {problem}")
+            typer.echo(printable(f"note: {problem}"))
     shown = f"{view.start:.6g} s to {view.stop:.6g} s of {view.facts.duration:.6g} s"
-    typer.echo(f"{target}: {view.facts.title}, {shown}, {len(view.events)} events")
+    told = f"{target}: {view.facts.title}, {shown}, {len(view.events)} events"
+    typer.echo(printable(told))

@@ -18,7 +18,8 @@ from hil.campaign import Progress, Stop, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
-from hil.errors import ControllerFault, OperatorStopError
+from hil.errors import ControllerFault, HilError, OperatorStopError
+from hil.printable import printable
 from hil.recording import archive_path
 from hil.recording import record as record_motion
 
@@ -105,35 +106,46 @@ def record(
             link, loaded, path,
             kind=kind, stop=stop, duration=duration, wait=wait, watch=view.show,
         )  # fmt: skip
-    _report(path, done, loaded, json=json)
+    early = _early_end(path, done, duration)
+    figures = _figures(path, done, loaded)
+    if not json:
+        _report(path, done, loaded)
+    elif early is None:
+        typer.echo(json_format.dumps(figures))
+    if early is not None:
+        raise early.beside(figures)
+
+
+def _early_end(path: Path, done: Recorded, duration: float | None) -> HilError | None:
+    """What to say of a recording that is not what was asked for."""
     if done.outcome == "completed":
-        if duration is not None and done.seconds < duration:
-            raise ControllerFault(
-                f"{done.reason} after {done.seconds:.1f} s of {duration:g} s; {path} is whole."
-            )
-        return
+        if duration is None or done.seconds >= duration:
+            return None
+        return ControllerFault(
+            f"{done.reason} after {done.seconds:.1f} s of {duration:g} s; {path} is whole."
+        )
     if done.outcome == "stopped" and done.reason == "ended by the operator":
-        raise OperatorStopError(f"the recording was ended early; {path} is whole.")
-    raise ControllerFault(f"{done.reason}; {path} is whole up to there.")
+        return OperatorStopError(f"the recording was ended early; {path} is whole.")
+    return ControllerFault(f"{done.reason}; {path} is whole up to there.")
 
 
-def _report(path: Path, done: Recorded, cell: Cell, *, json: bool) -> None:
+def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
+    return {
+        "archive": str(path),
+        "outcome": done.outcome,
+        "reason": done.reason,
+        "cycles": done.records,
+        "duration": done.records * cell.period,
+        "missed": done.missed,
+        "late": done.late,
+        "not_taken": done.untaken,
+        "records_lost": done.records_lost,
+        "events_lost": done.events_lost,
+    }
+
+
+def _report(path: Path, done: Recorded, cell: Cell) -> None:
     seconds = done.records * cell.period
-    if json:
-        summary = {
-            "archive": str(path),
-            "outcome": done.outcome,
-            "reason": done.reason,
-            "cycles": done.records,
-            "duration": seconds,
-            "missed": done.missed,
-            "late": done.late,
-            "not_taken": done.untaken,
-            "records_lost": done.records_lost,
-            "events_lost": done.events_lost,
-        }
-        typer.echo(json_format.dumps(summary))
-        return
     lost = f", {done.records_lost} records LOST" if done.records_lost else ""
     lost += f", {done.events_lost} events LOST" if done.events_lost else ""
     typer.echo(
@@ -166,7 +178,7 @@ class View:
     def say(self, text: str) -> None:
         """A line that stays."""
         if not self._quiet:
-            typer.echo(text)
+            typer.echo(printable(text))
             sys.stdout.flush()
 
     def show(self, progress: Progress) -> None:

@@ -19,7 +19,8 @@ from hil.batch.types import BatchEstimator, BatchResult, Choices
 from hil.batch.workers import Workers
 from hil.cli import reidentify_words as words
 from hil.cli.identify import LONGEST_DELAY, bandwidth_from
-from hil.files import make_folder
+from hil.files import make_folder, writing_to
+from hil.printable import printable
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from identification.preprocessing import Smoother
@@ -116,7 +117,10 @@ def reidentify(
     with _workers(dask, workers, places) as hands:
         result = run.reidentify(places, plan, hands, reporter)
     found = trends(result)
-    written = [] if output is None else [*write_tables(output, result), write_trend(output, found)]
+    written: list[Path] = []
+    if output is not None:
+        with writing_to(output):
+            written = [*write_tables(output, result), write_trend(output, found)]
     if json:
         typer.echo(json_module.dumps(words.as_dict(result, found, written)))
     else:
@@ -145,11 +149,11 @@ def _say(
     result: BatchResult, found: Trends, written: Sequence[Path], reporter: Reporter, *, quiet: bool
 ) -> None:
     for line in words.alarm_lines(found) if quiet else words.lines(result, found):
-        typer.echo(line)
+        typer.echo(printable(line))
     if written:
         reporter.say(words.written_line(written))
     for line in words.broken_lines(result.broken):
-        typer.echo(line, err=True)
+        typer.echo(printable(line), err=True)
     if result.skipped and not quiet:
-        typer.echo(words.skipped_line(result.skipped))
-    typer.echo(words.last_line(result))
+        typer.echo(printable(words.skipped_line(result.skipped)))
+    typer.echo(printable(words.last_line(result)))

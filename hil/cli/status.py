@@ -13,6 +13,7 @@ from rich.text import Text
 
 from hil.campaign import Campaign
 from hil.campaign.status import CampaignStatus
+from hil.printable import printable
 
 _MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("waits", "dim")}
 
@@ -34,9 +35,8 @@ def status(
         return
     console = Console()
     console.print(_table(found))
-    for note in found.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
-    console.print(_last(found), markup=False, highlight=False, soft_wrap=True)
+    for line in (*(f"note: {note}" for note in found.notes), _last(found)):
+        console.print(printable(line), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def _last(found: CampaignStatus) -> str:
@@ -50,11 +50,11 @@ def _last(found: CampaignStatus) -> str:
 
 
 def _table(found: CampaignStatus) -> Table:
-    table = Table(title=found.root, title_justify="left", box=None, pad_edge=False)
+    table = Table(title=Text(printable(found.root)), title_justify="left", box=None, pad_edge=False)
     table.add_column("step", no_wrap=True)
     table.add_column("", no_wrap=True)
     table.add_column("what is known", overflow="fold")
     for step in found.steps:
         word, style = _MARKS[step.state]
-        table.add_row(step.name, Text(word, style=style), Text(step.sentence))
+        table.add_row(step.name, Text(word, style=style), Text(printable(step.sentence)))
     return table

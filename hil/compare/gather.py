@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from hil.archive import ArchiveName, open_archive
+from hil.archive import open_archive
 from hil.batch import run
 from hil.batch.factors import cell_in, local_file, opened
 from hil.batch.types import ArchiveRef, Arm, Broken, LevelEstimate
 from hil.batch.workers import Workers
-from hil.campaign import CampaignFolder
 from hil.cell import Cell
-from hil.errors import HilError, InputError
+from hil.errors import InputError
 from hil.progress import Reporter
 
 _TWO: Final = "name two campaigns or more of one arm"
@@ -60,10 +59,9 @@ def gather(
     result = run.reidentify(
         roots, plan or run.Plan(), workers, reporter, check=_require_campaigns_of_one_arm
     )
-    broken = [one for one in result.broken if not _superseded(one)]
     campaigns = list(result.campaigns)
     if len(campaigns) < 2:
-        why = "".join(f"; {one.path}: {one.reason}" for one in broken[:1])
+        why = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
         only = campaigns[0].campaign if campaigns else None
         raise InputError(only, f"is the only campaign that can be estimated{why}", remedy=_TWO)
     dated = all(one.when for one in campaigns)
@@ -82,7 +80,7 @@ def gather(
             for one in campaigns
         ),
         dated=dated,
-        broken=tuple(broken),
+        broken=result.broken,
         simulated=_simulated(result.repetitions[0]),
     )
 
@@ -109,21 +107,6 @@ def _in_order(roots: Sequence[str]) -> Callable[[LevelEstimate], tuple[int, str]
         return (found[0] if found else len(absolute), own)
 
     return key
-
-
-def _superseded(broken: Broken) -> bool:
-    """Whether it is an attempt that a killed run left behind, and a later run made good."""
-    name, path = ArchiveName.parse(broken.path), Path(broken.path)
-    if name is None or "://" in broken.path:
-        return False
-    try:
-        whole = [one.name for one in CampaignFolder(path.parent.parent).completed(name.kind)]
-    except HilError:
-        return False
-    return any(
-        other is not None and other.index == name.index and other.attempt > name.attempt
-        for other in map(ArchiveName.parse, whole)
-    )
 
 
 def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:

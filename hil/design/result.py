@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import write_atomically
+from hil.reading import text_of
 from hil.version import software
 from identification.excitation import (
     Design,
@@ -195,7 +196,7 @@ class DesignResult:
         """
         path = path / RESULT if path.is_dir() else path
         try:
-            text = path.read_text("utf-8")
+            text = text_of(path)
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else error
             raise InputError(
@@ -208,7 +209,8 @@ class DesignResult:
             if data.get("version") != VERSION:
                 raise ValueError(f"version is {data.get('version')!r:.60}, this reads {VERSION}")
             seal = data.pop("seal")
-            if seal["sha256"] != _seal(text):
+            digest, motion = seal["sha256"], seal["motion_sha256"]
+            if digest != _seal(text):
                 raise InputError(
                     path, "was changed after it was written", remedy=f"restore it, or {_REMEDY}"
                 )
@@ -221,7 +223,7 @@ class DesignResult:
             raise InputError(
                 path, f"is not a designed excitation ({error})", remedy=_REMEDY
             ) from error
-        if motion_digest(result.excitation.trajectory) != seal["motion_sha256"]:
+        if motion_digest(result.excitation.trajectory) != motion:
             result._require_alike(path, np.array(seal["positions"], dtype=np.float64))
         return result
 

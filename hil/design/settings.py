@@ -25,6 +25,7 @@ from pydantic import (
 
 from hil.cell.errors import first_error
 from hil.errors import InputError
+from hil.reading import text_of, toml_of
 
 Method = Literal["a", "b", "balanced", "front"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
@@ -301,12 +302,12 @@ def load_settings(path: Path) -> DesignSettings:
         SettingsError: names file, field, value and remedy.
     """
     try:
-        raw = tomllib.loads(path.read_text("utf-8"))
+        raw = toml_of(text_of(path))
     except OSError as error:
         raise SettingsError(
             path, f"cannot be read ({error.strerror})", remedy="name a TOML file"
         ) from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise SettingsError(
             path, f"is not TOML ({error})", remedy="see `hil design --show-settings front`"
         ) from error

@@ -41,7 +41,10 @@ def from_text(text: str) -> dict[str, Any]:
     Raises:
         ValueError: the text is not TOML, or an angle is no number.
     """
-    return dict(_items(tomllib.loads(text, parse_float=Decimal)))
+    try:
+        return dict(_items(tomllib.loads(text, parse_float=Decimal)))
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
 
 
 def _table(path: str, data: Mapping[str, Any], comments: Mapping[str, str]) -> list[str]:

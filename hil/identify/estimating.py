@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from hil.errors import InputError
+from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
 from identification.consistent import consistent_estimate
 from identification.endogeneity import EndogeneityTest
-from identification.estimation import Estimate
+from identification.estimation import Estimate, nothing_usable
 from identification.least_squares import Weighting, fit_least_squares
 from identification.losses import Huber, Loss, Tukey
 from identification.phase_factor import PhaseFactor
@@ -78,9 +79,10 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
 
     Raises:
         InputError: the estimator needs something that the archives do not have.
-        IdentificationError: a recording without a usable row.
+        ArchiveError: a recording without a usable row.
     """
     model = prepared.sources.cell.model
+    _require_usable(prepared, model)
     with reporter.task("estimating", 4) as task:
         # The test is of the very samples that least squares reads.
         fitted = prepared.fitted
@@ -106,6 +108,16 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         ),
         doubts=(*doubts, *_conditioning(result.pooled), *_bias(options.estimator, instrumental)),
     )
+
+
+def _require_usable(prepared: Prepared, model: RobotModel) -> None:
+    """Refuse a recording of which nothing can be fitted, such as the beginning of a torn one."""
+    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
+        if not samples.usable.any():
+            lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
+            raise ArchiveError(
+                Path(source.name), f"{nothing_usable(model)} ({lasts})", remedy="leave it out"
+            )
 
 
 def _least_squares(weighting: Weighting) -> Callable[[_Case], _Found]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.archive import foreign_json
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.results import (
@@ -110,11 +112,20 @@ def summarise(
 
 
 def planted_in(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
-    """What was planted in the simulated arm (p,): as the archive says, or else its cell."""
+    """What was planted in the simulated arm (p,): as the archive says, or else its cell.
+
+    None where neither says it, and where the archive does not say it of each parameter.
+    """
     if "planted" in metadata:
-        told = json.loads(metadata["planted"])
-        return np.array([told[name] for name in cell.model.parameter_names])
+        told, names = foreign_json.loads(metadata["planted"]), cell.model.parameter_names
+        if not isinstance(told, dict) or not all(_is_number(told.get(name)) for name in names):
+            return None
+        return np.array([told[name] for name in names], dtype=np.float64)
     return planted_values(cell) if cell.file.simulation else None
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _period(samples: Samples) -> float:

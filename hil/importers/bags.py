@@ -165,7 +165,7 @@ def _connected(file: Path) -> Iterator[sqlite3.Connection]:
             if absent:
                 raise sqlite3.DatabaseError(f"it has no table {absent[0]}")
             yield bag
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:
         raise SourceError(
             file,
             f"is not a rosbag2 in sqlite3 storage, or damaged ({error})",

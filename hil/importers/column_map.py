@@ -6,7 +6,6 @@ It is a small TOML file, or the same built in Python. `docs/archive-format.md` d
 
 from __future__ import annotations
 
-import tomllib
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -15,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from hil.errors import SourceError
+from hil.reading import text_of, toml_of
 
 ANGLES = {
     "rad": 1.0,
@@ -198,15 +198,15 @@ class ColumnMap(_Table):
         """
         path = Path(path)
         try:
-            return cls.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise SourceError(
-                path, f"cannot be read ({error})", remedy="name a TOML file"
-            ) from error
+            return cls.model_validate(toml_of(text_of(path)))
         except ValidationError as error:
             place, problem = _complaint(error)
             raise SourceError(
                 path, problem, field=place, remedy="see the column map in docs/archive-format.md"
+            ) from error
+        except (OSError, ValueError) as error:
+            raise SourceError(
+                path, f"cannot be read ({error})", remedy="name a TOML file"
             ) from error
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from decimal import Decimal
 from os import PathLike
 from pathlib import Path
 
@@ -132,7 +133,7 @@ class _Log:
         if max(times) - origin >= _LATEST:
             raise SourceError(
                 file.path,
-                f"spans {(max(times) - min(times)) * 1e-9:.3g} s",
+                f"spans {Decimal(max(times) - min(times)).scaleb(-9):.3g} s",
                 field="time",
                 remedy="give the unit of its time: s, ms, us or ns",
             )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.errors import SourceError
+from hil.reading import text_of
 from identification import FrictionLaw
 from planner.toml_value import toml_value
 
@@ -58,7 +59,7 @@ class Robot:
         """
         path = Path(path)
         try:
-            urdf = path.read_text(encoding="utf-8")
+            urdf = text_of(path)
         except (OSError, UnicodeDecodeError) as error:
             raise SourceError(
                 path, f"cannot be read ({error})", remedy="name a URDF file"

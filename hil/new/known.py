@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
@@ -13,11 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drivers.drive_train import WRIST_AXES
-from drivers.packets import InitPacket
-from hil.archive import open_archive
+from drivers.errors import PacketError
+from drivers.packets import N_ARMS, InitPacket
+from hil.archive import Archive, open_archive
 from hil.cell.unknown import UNKNOWN
 from hil.cell.urdf import urdf_limits
 from hil.errors import ArchiveError
+from hil.reading import toml_of
 
 _DECIMALS: Final = 3
 """Of degrees: rounding stays below what a cell may exceed its URDF's limits by."""
@@ -127,16 +128,19 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
             remedy=f"those of the URDF are {', '.join(joint_names)}",
         )
     known = Known()
-    text = archive.attachments.get("cell.toml")
-    if text is not None:
-        values = _flat(tomllib.loads(text.decode("utf-8")))
+    if "cell.toml" in archive.attachments:
+        values = _cell_values(archive)
         for name in ("cell.urdf", "cell.mesh_folders"):  # of the computer it was recorded on
             values.pop(name, None)
         known = Known.said_by(f"from {archive.path.name}", values)
     packet = archive.attachments.get("init_packet.bin")
     if packet is not None:
         arm = known.values.get("controller.arm", 1)
-        known |= from_init(InitPacket.decode(packet), len(joint_names), arm)
+        arm = arm if arm in range(1, N_ARMS + 1) else 1
+        try:
+            known |= from_init(InitPacket.decode(packet), len(joint_names), arm)
+        except PacketError as error:
+            raise _unusable(archive, "init_packet.bin", f"is no init packet ({error})") from error
     if not known.values:
         raise ArchiveError(
             archive.path,
@@ -147,6 +151,22 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
         note = f"{archive.path.name} was recorded from a simulated controller"
         known |= Known(notes=(note,))
     return known
+
+
+def _cell_values(archive: Archive) -> dict[str, Any]:
+    """What the cell file says that travels in an archive, by dotted field."""
+    try:
+        tables = toml_of(archive.text("cell.toml"))
+    except ValueError as error:
+        raise _unusable(archive, "cell.toml", f"is no TOML ({error})") from error
+    loose = [name for name, entries in tables.items() if not isinstance(entries, Mapping)]
+    if loose:
+        raise _unusable(archive, "cell.toml", f"is no cell file: {loose[0]!r} is no table")
+    return _flat(tables)
+
+
+def _unusable(archive: Archive, name: str, problem: str) -> ArchiveError:
+    return ArchiveError(archive.path, problem, field=name, remedy="name an archive that hil wrote")
 
 
 def _flat(tables: Mapping[str, Any]) -> dict[str, Any]:

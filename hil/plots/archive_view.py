@@ -5,7 +5,6 @@ A long archive is read window by window, so that memory does not grow with its l
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
 from drivers.states import State
-from hil.archive import Archive, open_archive
+from hil.archive import Archive, foreign_json, open_archive
 from hil.archive.overview import Overview, overview
 from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
@@ -212,10 +211,10 @@ class _Scales:
             limits["velocity"] = _both(np.degrees(bounds.velocity))
             if cell.torque_limit is not None:
                 limits["torque"] = _both(cell.torque_limit)
-        table = json.loads(archive.attachments.get("drive_train.json", b"{}"))
+        table = foreign_json.loads(archive.attachments.get("drive_train.json", b"{}"))
         for name, key in (("current", "current_limit"), ("following", "following_error")):
-            if len(table.get(key, ())) == n:
-                limits[name] = _both(np.array(table[key], dtype=np.float64))
+            if (limit := _limit_in(table, key, n)) is not None:
+                limits[name] = _both(limit)
         motors = None
         if cell is not None and cell.file.drive_train is not None:
             motors = cell.drive_train.motor_from_joint
@@ -243,6 +242,15 @@ class _Scales:
 
 def _both(limit: Array) -> tuple[Array, Array]:
     return -limit, limit
+
+
+def _limit_in(table: Any, key: str, n: int) -> Array | None:
+    """Limits (n,) of a table that a stranger may have written; None where they are none."""
+    try:
+        limit = np.array(table[key], dtype=np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+    return limit if limit.shape == (n,) and np.all((limit > 0.0) & np.isfinite(limit)) else None
 
 
 def _cell(archive: Archive) -> Cell | None:

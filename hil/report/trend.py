@@ -23,6 +23,7 @@ from hil.batch.trend import (
     Watched,
 )
 from hil.batch.trend_words import Finding, campaign_folder, findings, summary
+from hil.files import write_atomically
 from hil.report import numbers
 from hil.report.figures.svg import Panel
 from hil.report.figures.trend import (
@@ -111,7 +112,7 @@ class ArmPart:
 
 def write_trend_report(path: Path, trends: Trends) -> None:
     """Write the page as one HTML file; the same input gives the same bytes."""
-    path.write_bytes(page_bytes(render_trend_report(trends)))
+    write_atomically(path, page_bytes(render_trend_report(trends)))
 
 
 def render_trend_report(trends: Trends) -> str:

@@ -7,7 +7,6 @@ Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +14,7 @@ from pydantic import ValidationError
 
 from hil.errors import InputError
 from hil.files import write_atomically
+from hil.reading import json_of, text_of
 from hil.results.conduct import ConductResult
 from hil.results.consistency import ConsistencyResult
 from hil.results.essential import EssentialResult
@@ -263,8 +263,8 @@ class Results(Frozen):
             InputError: the file is not of this schema.
         """
         try:
-            text = path.read_text(encoding="utf-8")
-            found = json.loads(text)
+            text = text_of(path)
+            found = json_of(text)
         except (OSError, ValueError) as error:
             raise InputError(
                 path, f"cannot be read as a result ({error})", remedy="name a results.json"

@@ -11,11 +11,13 @@ from typing import Final
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from hil.campaign.gravity_check import AGAINST
 from hil.campaign.operator import DryRunSummary
 from hil.campaign.stop import Stop
 from hil.counted import counted
+from hil.printable import printable
 
 from . import marks
 
@@ -53,7 +55,8 @@ def ask(console: Console, summary: DryRunSummary, stop: Stop) -> bool:
 
 
 def _table(summary: DryRunSummary) -> Table:
-    table = Table(title=f"Dry run of {summary.campaign}, {marks.clock(summary.duration)} long")
+    title = f"Dry run of {summary.campaign}, {marks.clock(summary.duration)} long"
+    table = Table(title=Text(printable(title)))
     table.add_column("joint")
     table.add_column("largest following error", justify="right")
     table.add_column("largest current", justify="right")
@@ -62,13 +65,13 @@ def _table(summary: DryRunSummary) -> Table:
         summary.joint_names, summary.following_error, summary.current_share, strict=True
     ):
         degrees = f"{math.degrees(error):.3f}°"
-        agree = "agree"
+        agree = Text("agree")
         if name in summary.against_gravity:
-            agree = "[bold red]contradict[/]"
+            agree = Text("contradict", style="bold red")
         elif name in summary.gravity_not_seen:
-            agree = "not seen"
-        table.add_row(name, degrees, f"{100.0 * share:.0f} % of its limit", agree)
+            agree = Text("not seen")
+        table.add_row(Text(printable(name)), degrees, f"{100.0 * share:.0f} % of its limit", agree)
     archives = ", ".join(summary.archives)
     link = f"{counted(summary.missed, 'packet')} missed, {counted(summary.late, 'answer')} late"
-    table.caption = f"{link}; {archives}"
+    table.caption = Text(printable(f"{link}; {archives}"))
     return table

@@ -16,6 +16,7 @@ from rich.text import Text
 
 from hil.campaign.motion_watch import MotionProgress, Wish
 from hil.campaign.operator import DriftCurve, RunStatus
+from hil.printable import printable
 
 from . import marks
 from .keys import HELP, SHORT_HELP
@@ -105,7 +106,9 @@ def _heading(shown: Shown, width: int) -> Text:
         where.append(f"  {status.phase} {status.number} of {status.total}", style="bold cyan")
         left = shown.left or f"{marks.clock(status.time_left)} left"
     room = max(0, width - len(left) - 2)
-    text = Text(shown.title, style="bold")  # gives way to where it is and what it is doing
+    text = Text(
+        printable(shown.title), style="bold"
+    )  # gives way to where it is and what it is doing
     text.truncate(max(min(_LEAST_TITLE, room), room - where.cell_len), overflow="ellipsis")
     text.append_text(where)
     text.truncate(room, overflow="ellipsis")
@@ -234,6 +237,7 @@ def _news(shown: Shown) -> list[str]:
 
 
 def _wrapped(line: str, width: int) -> list[str]:
+    line = printable(line, keep="")
     return textwrap.wrap(line, max(8, width), subsequent_indent="  ") or [""]
 
 

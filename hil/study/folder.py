@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hil.errors import InputError
-from hil.files import make_folder, write_atomically
+from hil.files import make_folder, write_or_tell
 
 from .settings import StudySettings
 
@@ -86,7 +86,7 @@ class StudyFolder:
                     "is not empty and holds no study",
                     remedy="name another folder (--output)",
                 )
-            write_atomically(self.settings, settings.to_json())
+            write_or_tell(self.settings, settings.to_json())
             return
         there = StudySettings.load(self.settings)
         for name in type(settings).model_fields:

@@ -21,6 +21,7 @@ from hil.compare.gather import apart
 from hil.errors import InputError
 from hil.identify.sources import cell_of
 from hil.identify.summary import planted_in
+from hil.reading import json_of
 from identification.excitation import Excitation
 
 from .analysis import Run, class_of
@@ -132,7 +133,7 @@ def _excitation(archive: Archive) -> Excitation | None:
 
 
 def _plan(archive: Archive) -> dict[str, Any]:
-    plan: dict[str, Any] = json.loads(archive.attachments.get("plan.json", b"{}"))
+    plan: dict[str, Any] = json_of(archive.attachments.get("plan.json", b"{}"))
     return plan
 
 

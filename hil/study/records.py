@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
 
-from hil.files import make_folder, write_atomically
+from hil.files import make_folder, write_or_tell
 from hil.results.frozen import Frozen
 
 from .forms import MotionForm
@@ -110,7 +110,7 @@ def kept(path: Path, kind: type[R], inputs: str) -> R | None:
 def keep(path: Path, record: Record) -> None:
     """Write a record."""
     make_folder(path.parent)
-    write_atomically(path, record.model_dump_json() + "\n")
+    write_or_tell(path, record.model_dump_json() + "\n")
 
 
 def digest(archives: Sequence[tuple[str, str]], others: Mapping[str, Any]) -> str:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
 import psutil
 from pydantic import Field, ValidationError
 
-from hil.files import write_atomically
+from hil.errors import OutputError
+from hil.files import write_or_tell
 from hil.results.frozen import Frozen
 
 TIMES: Final = "times.json"
@@ -48,7 +49,11 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Whatever happens until this is left belongs to a stage."""
+        """Whatever happens until this is left belongs to a stage.
+
+        Raises:
+            OutputError: its time cannot be written; an error of the stage itself goes first.
+        """
         before, begin = self._times, (time.perf_counter(), _processor())
         over = threading.Event()
 
@@ -63,20 +68,28 @@ class Stages:
 
         def keep() -> None:
             while not over.wait(_EVERY):
-                self._write(added())
+                with suppress(OutputError):  # the end of the stage tries again, and tells
+                    self._write(added())
 
         thread = threading.Thread(target=keep, daemon=True)
         thread.start()
-        try:
-            yield
-        finally:
+
+        def end() -> None:
             over.set()
             thread.join()
             self._times = added()
             self._write(self._times)
 
+        try:
+            yield
+        except BaseException:
+            with suppress(OutputError):
+                end()
+            raise
+        end()
+
     def _write(self, times: Times) -> None:
-        write_atomically(self._path, times.model_dump_json(indent=1) + "\n")
+        write_or_tell(self._path, times.model_dump_json(indent=1) + "\n")
 
 
 def _plus(before: dict[str, float], name: str, seconds: float) -> dict[str, float]:

@@ -233,6 +233,32 @@ def test_the_newest_whole_accepted_attempt_counts(tmp_path: Path, arm: Cell) -> 
     assert reasons == {rejected.name: "ended rejected", earlier.name: "attempt 2 took its place"}
 
 
+def test_a_torn_attempt_is_missed_only_where_no_later_one_took_its_place(
+    tmp_path: Path, arm: Cell
+) -> None:
+    # As a full disk leaves them; the last one says nothing but its name.
+    folder = tmp_path / "c" / "archives"
+    paths = {}
+    for index, number in ((0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2)):
+        name = f"imported_{index:03d}_a{number}.mcap"
+        numbers = {"index": str(index), "attempt": str(number)}
+        paths[index, number] = recording(folder / name, arm, numbers)
+    for key in ((0, 1), (1, 2)):
+        paths[key].write_bytes(paths[key].read_bytes()[:-200])
+    paths[2, 1].write_bytes(b"")
+    move = folder / "move_003_a1.mcap"
+    move.write_bytes(b"")
+    found = found_in(tmp_path)
+    assert [ref.name for ref in found.refs] == [paths[key].name for key in ((0, 2), (1, 1), (2, 2))]
+    assert {Path(one.path).name for one in found.broken} == {paths[1, 2].name}
+    reasons = {Path(one.path).name: one.reason for one in found.skipped}
+    assert reasons == {
+        paths[0, 1].name: "attempt 2 took the place of this unusable one",
+        paths[2, 1].name: "attempt 2 took the place of this unusable one",
+        move.name: "is a move",
+    }
+
+
 def test_a_damaged_manifest_is_told_and_does_not_stop_the_batch(folder: Path) -> None:
     manifest = folder / "manifest.json"
     manifest.write_text(manifest.read_text()[:-40])

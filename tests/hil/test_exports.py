@@ -248,7 +248,7 @@ def test_names_of_archives_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Pat
 
 
 def test_names_in_a_urdf_cannot_break_a_file(tmp_path: Path) -> None:
-    evil = "a---&gt;'&quot;&quot;&quot;&#10;&lt;script&gt;alert(1)&lt;/script&gt;#"
+    evil = "a---&gt;'&quot;&quot;&quot; &lt;script&gt;alert(1)&lt;/script&gt;#"
     urdf = TWO_LINK.replace("shoulder", evil).replace('"upper"', f'"{evil}"')
     arm = identified_arm(urdf)
     found = exported(arm, tmp_path)

@@ -197,7 +197,7 @@ def test_on_a_terminal_the_way_is_shown_and_no_means_no(tmp_path: Path, answer: 
     process = subprocess.Popen(
         [sys.executable, "-m", "hil", "move", str(CELL_PATH), "--to", "home", "-o", str(tmp_path)],
         stdin=slave, stdout=slave, stderr=slave, close_fds=True,
-        preexec_fn=lambda: os.login_tty(slave),
+        preexec_fn=lambda: (os.login_tty(slave), signal.signal(signal.SIGINT, signal.SIG_DFL)),
     )  # fmt: skip
     os.close(slave)
     said, answered = b"", False

@@ -302,10 +302,15 @@ def test_a_session_that_ends_before_the_duration_is_over_is_told(
     path, port = on_udp
     with (
         running(*own_motion(path, port, "--duration", "3")),
-        running(*HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "60") as recorder,
+        running(
+            *HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "60", "--json"
+        ) as recorder,
     ):
-        _, errors = recorder.communicate(timeout=60)
+        said, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 4
+    told = json.loads(said)  # one object: what was recorded, and why that is not all
+    assert (told["outcome"], told["kind"], told["exit_code"]) == ("completed", "ControllerFault", 4)
+    assert told["cycles"] > 0
     words = " ".join(errors.split())
     assert "the controller ended the session after" in words
     assert "of 60 s" in words

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from drivers.transports import SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.amend import amend_outcome
+from hil.archive.check import check_archive
 from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError
 from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import AgainstGravityError, DryRunError, RepetitionsRejectedError
@@ -391,6 +392,7 @@ def test_an_amended_archive_keeps_its_content(tmp_path: Path, undisturbed: Campa
     amend_outcome(path, "rejected", "something touched it")
     after = open_archive(path)
     assert after.complete
+    assert check_archive(path).keeps
     assert after.outcome == {
         **(before.outcome or {}), "outcome": "rejected", "reason": "something touched it"
     }  # fmt: skip

@@ -63,6 +63,10 @@ def stranger(
             name, entries = container.metadata(record)
             del entries["checksum"]
             entries |= given[name]
+            if name == "hil":
+                described = schema.checksum(entries)
+            elif schema.DESCRIPTION in entries:
+                entries[schema.DESCRIPTION] = described
             whole = index.metadata(name, {**entries, "checksum": schema.checksum(entries)})
             builder.add_metadata(len(data), len(whole), name)
             data.extend(whole)

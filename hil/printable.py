@@ -1,0 +1,22 @@
+"""Texts that may be a stranger's, for a terminal: names of files, joints, fields, events."""
+
+from __future__ import annotations
+
+
+def printable(text: str, *, keep: str = "\n") -> str:
+    """The text with whatever is not printed written out, as Python writes it in a string.
+
+    A terminal obeys control characters and turns lines round for others; what is no character at
+    all (bytes of a file name that are no UTF-8) cannot even be written.
+
+    Args:
+        text: anything.
+        keep: characters that stay nevertheless.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else _written_out(c) for c in text)
+
+
+def _written_out(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")

@@ -1,0 +1,78 @@
+"""Files that a stranger may have left in a folder: read only if they are files, and of a size.
+
+A pipe without a writer is waited for without end, and a device has none. What is refused is an
+`OSError` whose `strerror` says why, so that whoever reads has one kind of trouble to name.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+LONGEST_TEXT: Final = 1 << 28
+"""Bytes of the longest text that is read as a whole; the largest of ours has a hundredth of it."""
+
+
+def opened(path: Path) -> BinaryIO:
+    """A file of bytes, to be read.
+
+    Raises:
+        OSError: there is none, or it is a folder, a pipe or a device.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    except ValueError as error:  # a zero byte in its name
+        raise OSError(errno.EINVAL, f"it is no path: {error}", str(path)) from error
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "it is a pipe or a device, no file", str(path))
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def text_of(path: Path) -> str:
+    """A text file as a whole, any line ends as one.
+
+    Raises:
+        OSError: as `opened`; or it is longer than `LONGEST_TEXT`.
+        UnicodeDecodeError: it is no UTF-8.
+    """
+    with opened(path) as stream:
+        if os.fstat(stream.fileno()).st_size > LONGEST_TEXT:
+            raise OSError(errno.EFBIG, f"it has more than {LONGEST_TEXT} bytes", str(path))
+        text = stream.read().decode("utf-8")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def json_of(text: str | bytes) -> Any:
+    """What a JSON text holds.
+
+    Raises:
+        ValueError: it is no JSON, or nested deeper than anybody reads.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
+
+
+def toml_of(text: str) -> dict[str, Any]:
+    """What a TOML text holds.
+
+    Raises:
+        ValueError: it is no TOML, or nested deeper than anybody reads.
+    """
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error

@@ -1,0 +1,229 @@
+"""What must hold of an archive that was damaged, whatever reads it.
+
+Each reader gives a named error, or the numbers that were written, or fewer of them and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import Archive, open_archive
+from hil.archive.check import check_archive
+from hil.batch.run import Plan, reidentify
+from hil.batch.workers import Workers
+from hil.compare import gather
+from hil.errors import HilError
+from hil.identify import Identification, identify_archives, identify_campaign
+from hil.plots.archive_view import view_of
+from hil.progress import Silent
+
+Columns = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Undamaged:
+    """A finished campaign as it was before.
+
+    Attributes:
+        root: its folder.
+        files: bytes of its archives.
+        archives: what they hold, by path.
+        loose: the estimate from the archives by themselves.
+        batch: estimates of the batch by archive, "" for all; values and standard deviations.
+        rows: every sample of all archives, see `_rows`.
+    """
+
+    root: Path
+    files: Mapping[Path, bytes]
+    archives: Mapping[Path, Archive]
+    loose: Identification
+    batch: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+    rows: frozenset[bytes]
+
+    @property
+    def paths(self) -> list[Path]:
+        """Archives as identification takes them."""
+        return [p for p in sorted(self.files) if not p.name.startswith("move")]
+
+
+def undamaged(root: Path, workers: Workers | None) -> Undamaged:
+    """Read a campaign that is whole; without workers there is no batch of it."""
+    paths = sorted((root / "archives").glob("*.mcap"))
+    fitted = [path for path in paths if not path.name.startswith("move")]
+    archives = {path: open_archive(path) for path in paths}
+    return Undamaged(
+        root,
+        {path: path.read_bytes() for path in paths},
+        archives,
+        identify_archives(fitted, Silent()),
+        {} if workers is None else _by_archive(root, workers)[0],
+        frozenset().union(*(_rows(one.columns) for one in archives.values())),
+    )
+
+
+def broken(
+    truth: Undamaged, harmed: Sequence[Path], number: int, workers: Workers | None = None
+) -> Iterator[str]:
+    """Each law that does not hold, in a sentence.
+
+    Args:
+        truth: before the damage.
+        harmed: the archives that were damaged.
+        number: of the round: even ones identify the archives by themselves, odd ones the folder,
+            which knows their checksums.
+        workers: for a batch of the folder and its comparison with itself; None: without them.
+    """
+    for path in harmed:
+        yield from _named(lambda path=path: _reads(truth, path))  # type: ignore[misc]
+        yield from _named(lambda path=path: _checks(truth, path))  # type: ignore[misc]
+        yield from _named(lambda path=path: _looks(truth, path))  # type: ignore[misc]
+    identifies = _identifies_campaign if number % 2 else _identifies
+    if any(path in truth.paths for path in harmed):  # moves are never read for it
+        yield from _named(lambda: identifies(truth, harmed))
+    if workers is not None:
+        yield from _named(lambda: _pools(truth, harmed, workers))
+        yield from _named(lambda: _compares(truth, harmed, workers))
+
+
+def _named(what: Callable[[], Iterator[str]]) -> Iterator[str]:
+    """What a reader breaks; an error of ours that names the file or folder breaks nothing."""
+    try:
+        yield from what()
+    except HilError as error:
+        if ".mcap" not in str(error) and "/" not in str(error):
+            yield f"an error that names no file: {error}"
+    except Exception as error:
+        yield f"an undocumented {type(error).__name__}: {error}"
+
+
+def _reads(truth: Undamaged, path: Path) -> Iterator[str]:
+    archive = open_archive(path)
+    if archive.complete:
+        if not any(_same(archive, one) for one in truth.archives.values()):
+            yield f"{path.name}: opened as complete with other content"
+    elif not archive.missing:
+        yield f"{path.name}: incomplete without a word"
+    if not _written(archive.columns, truth):
+        yield f"{path.name}: holds a sample that was never written"
+
+
+def _checks(truth: Undamaged, path: Path) -> Iterator[str]:
+    if check_archive(path).keeps and not _same(open_archive(path), truth.archives[path]):
+        yield f"{path.name}: keeps the profile with other content"
+
+
+def _looks(truth: Undamaged, path: Path) -> Iterator[str]:
+    """A part of the time, found through the index; then what `hil plot` shows."""
+    if path.read_bytes() in truth.files.values():
+        return  # whole, under another's name
+    before = truth.archives[path].columns
+    stamp = before["stamp"]
+    start, stop = (float(np.quantile(stamp, share)) * 1e-9 for share in (0.3, 0.7))
+    part = open_archive(path, fields=("position", "target_current"), start=start, stop=stop)
+    if not _written(part.columns, truth):
+        yield f"{path.name}: a part of its time holds a sample that was never written"
+    view = view_of(path)
+    shown = float(stamp[-1] - stamp[0]) * 1e-9
+    if not view.facts.damage and abs(view.stop - shown) > 1e-9:
+        yield f"{path.name}: {view.stop} s of {shown} s are drawn without a word"
+
+
+def _identifies(truth: Undamaged, harmed: Sequence[Path]) -> Iterator[str]:
+    yield from _as_before(truth, harmed, identify_archives(truth.paths, Silent()), "identify")
+
+
+def _identifies_campaign(truth: Undamaged, harmed: Sequence[Path]) -> Iterator[str]:
+    found = identify_campaign(truth.root, Silent())
+    yield from _as_before(truth, harmed, found, "identify of the campaign")
+
+
+def _as_before(
+    truth: Undamaged, harmed: Sequence[Path], found: Identification, what: str
+) -> Iterator[str]:
+    before, now = truth.loose.estimate.pooled, found.estimate.pooled
+    if np.allclose(before.values, now.values, rtol=SAME, atol=0.0):
+        return
+    said = [*found.results.notes, *found.results.verdict.doubts]
+    if not any(path.name in text for path in harmed for text in said):
+        yield f"{what}: another estimate, and nothing is said of {harmed[0].name}"
+    yield from _within(before.values, before.std, now.values, now.std, what)
+
+
+def _within(
+    before: NDArray[Any], std: NDArray[Any], now: NDArray[Any], other: NDArray[Any], what: str
+) -> Iterator[str]:
+    """Damage takes samples away: what is left estimates the same parameters."""
+    if before.shape != now.shape:
+        return
+    apart = np.abs(now - before) / np.hypot(std, other)
+    if np.nanmax(apart) > APART:
+        yield f"{what}: an estimate {np.nanmax(apart):.1f} standard deviations from that before"
+
+
+SAME = 1e-9
+"""Relative difference of two sums of the same terms in another order."""
+APART = 5.0
+"""Standard deviations of the difference of two estimates that share most of their samples; these
+are correlated, so that 5 is generous, and a wrong sample moves an estimate by far more."""
+
+
+def _by_archive(
+    root: Path, workers: Workers
+) -> tuple[dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], list[str]]:
+    """Estimates of a batch by archive or "" for all, and what it says."""
+    result = reidentify([str(root)], Plan(keep=False), workers, Silent())
+    found = {Path(one.archive).name: (one.values, one.std) for one in result.repetitions}
+    found[""] = (result.pooled[0].values, result.pooled[0].std)
+    said = [f"{one.path}: {one.reason}" for one in (*result.broken, *result.skipped)]
+    levels = (*result.repetitions, *result.campaigns, *result.pooled)
+    said += [doubt for one in levels for doubt in one.doubts]
+    return found, said
+
+
+def _pools(truth: Undamaged, harmed: Sequence[Path], workers: Workers) -> Iterator[str]:
+    found, said = _by_archive(truth.root, workers)
+    same = found.keys() == truth.batch.keys() and all(
+        np.allclose(found[name][0], truth.batch[name][0], rtol=SAME, atol=0.0) for name in found
+    )
+    if not same and not any(path.name in text for path in harmed for text in said):
+        yield f"batch: another estimate, and nothing is said of {harmed[0].name}"
+    yield from _within(*truth.batch[""], *found[""], "batch")
+
+
+def _compares(truth: Undamaged, harmed: Sequence[Path], workers: Workers) -> Iterator[str]:
+    """Of one campaign alone `hil compare` makes nothing, and says what is broken in it."""
+    gather([str(truth.root)], workers, Silent())
+    yield "compare: one campaign was compared"
+
+
+def _same(one: Archive, other: Archive) -> bool:
+    return (
+        one.columns.keys() == other.columns.keys()
+        and all(
+            np.array_equal(one.columns[k], other.columns[k], equal_nan=True) for k in one.columns
+        )
+        and one.metadata == other.metadata
+        and one.outcome == other.outcome
+        and one.attachments == other.attachments
+        and one.events == other.events
+    )
+
+
+def _written(columns: Columns, truth: Undamaged) -> bool:
+    """Whether each sample is one of those that were written, with its own time."""
+    return _rows(columns) <= truth.rows
+
+
+def _rows(columns: Columns) -> set[bytes]:
+    """Time, position and current of each sample."""
+    names = ("stamp", "position", "target_current")
+    if not all(name in columns and len(columns[name]) for name in names):
+        return set()
+    parts = [columns[name].reshape(len(columns["stamp"]), -1).astype(float) for name in names]
+    return {row.tobytes() for row in np.hstack(parts)}

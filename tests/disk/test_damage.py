@@ -1,0 +1,123 @@
+"""Damaged archives of a finished campaign never give another estimate without a word."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hil.archive import open_archive
+from hil.archive.check import check_archive
+from hil.archive.repair import repair
+from hil.batch.local import LocalWorkers
+from hil.errors import ArchiveError
+from hil.identify import identify_archives
+from hil.progress import Silent
+from tests.disk.damage import campaign, main, play
+from tests.disk.harm import KINDS, chunks
+from tests.disk.laws import Undamaged, broken
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Undamaged:
+    return campaign(tmp_path_factory.mktemp("damage"), None, repetitions=2)
+
+
+def test_a_damage_of_each_kind_is_named_or_harmless(truth: Undamaged) -> None:
+    for number, kind in enumerate(sorted(KINDS)):
+        words, laws = play(truth, number, None, kind)
+        assert not laws, f"round {number}, {words}"
+
+
+@pytest.mark.slow
+def test_hundreds_of_damages_are_named_or_harmless(tmp_path: Path) -> None:
+    failed = {}
+    with LocalWorkers(1) as workers:
+        truth = campaign(tmp_path, workers)
+        for number in range(1000, 1300):
+            words, laws = play(truth, number, workers if number % 10 == 0 else None)
+            if laws:
+                failed[number] = (words, laws)
+    assert not failed
+
+
+def excitations(truth: Undamaged) -> list[Path]:
+    return [path for path in truth.paths if path.name.startswith("excitation")]
+
+
+@pytest.fixture
+def restored(truth: Undamaged) -> Iterator[Undamaged]:
+    yield truth
+    for path, data in truth.files.items():
+        path.write_bytes(data)
+
+
+@pytest.mark.parametrize("where", [0, 5, -1])
+def test_a_whole_chunk_of_another_repetition_is_noticed(restored: Undamaged, where: int) -> None:
+    # Its checksum is right and so is the number of its messages; its cycles are others.
+    path, other = excitations(restored)[:2]
+    data, strange = restored.files[path], restored.files[other]
+    (begin, end), (first, last) = chunks(data)[where], chunks(strange)[where]
+    path.write_bytes(data[:begin] + strange[first:last] + data[end:])
+    archive = open_archive(path)
+    assert not archive.complete
+    assert "do not follow" in str(archive.missing) or "cycle written was" in str(archive.missing)
+
+
+def test_the_content_of_another_recording_behind_a_whole_begin_is_noticed(
+    restored: Undamaged, tmp_path: Path
+) -> None:
+    # Every checksum and every count is right, and so is each cycle: they are another motion's.
+    path, other = excitations(restored)[:2]
+    data, strange = restored.files[path], restored.files[other]
+    path.write_bytes(data[: chunks(data)[0][0]] + strange[chunks(strange)[0][0] :])
+    archive = open_archive(path)
+    assert "another recording" in str(archive.missing)
+    assert archive.n_samples == 0, "nobody knows whose they are"
+    assert "outcome" in check_archive(path).faults
+    with pytest.raises(ArchiveError, match=r"two recordings.*copy"):
+        repair(path, tmp_path / "repaired.mcap")
+
+
+def test_a_repetition_torn_before_the_arm_moved_fast_is_named(restored: Undamaged) -> None:
+    path = excitations(restored)[1]
+    data = restored.files[path]
+    refused = []
+    for begin, _ in chunks(data)[1::2]:
+        path.write_bytes(data[:begin])
+        try:
+            identify_archives(restored.paths, Silent())
+            break
+        except ArchiveError as error:
+            refused.append(str(error))
+    assert all(path.name in text and "leave it out" in text for text in refused)
+    assert any("not one usable sample" in text for text in refused)
+
+
+def test_a_reader_that_believes_a_wrong_sample_is_found(
+    truth: Undamaged, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The laws can be broken: here by an archive that shows a current one step higher."""
+    path = excitations(truth)[0]
+
+    def wrong(where: Path, **how: object) -> object:
+        archive = open_archive(where, **how)  # type: ignore[arg-type]
+        if "target_current" not in archive.columns or where != path:
+            return archive
+        current = archive.columns["target_current"].copy()
+        current[len(current) // 2] += 0.002
+        return replace(archive, columns={**archive.columns, "target_current": current})
+
+    monkeypatch.setattr("tests.disk.laws.open_archive", wrong)
+    assert any("never written" in law for law in broken(truth, [path], 1))
+
+
+def test_rounds_in_the_journal_are_not_run_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    journal = tmp_path / "rounds.jsonl"
+    journal.write_text('{"round": 3, "harm": "cut in x", "broken": ["a law"]}\n{"rou')
+    assert main(["--rounds", "0", "--journal", str(journal), "--json"]) == 1
+    assert '"seeds_failed": [3]' in capsys.readouterr().out

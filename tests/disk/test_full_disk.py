@@ -1,0 +1,260 @@
+"""The operator's day on a disk that is full: each command says so, and goes on once there is room.
+
+The disk is a file system in memory of its own, which only root may mount.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from hil.campaign import Campaign
+from hil.cell import Cell
+from hil.cli import app
+from hil.errors import HilError, OutputError
+from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+
+SIZE = 64
+"""MiB of the disk."""
+
+
+@dataclass(frozen=True)
+class Disk:
+    """A small disk.
+
+    Attributes:
+        root: where it is mounted.
+    """
+
+    root: Path
+
+    @property
+    def ballast(self) -> Path:
+        return self.root / "ballast"
+
+    def fill(self, left: int) -> None:
+        """Leave `left` KiB."""
+        self.empty()
+        free = os.statvfs(self.root)
+        room = free.f_bavail * free.f_frsize - 1024 * left
+        with self.ballast.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, max(1, room))
+
+    def empty(self) -> None:
+        """Take the ballast away."""
+        self.ballast.unlink(missing_ok=True)
+
+
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
+    root = tmp_path_factory.mktemp("disk")
+    mount = shutil.which("mount")
+    if mount is None or os.geteuid() != 0:
+        pytest.skip("only root may mount a small file system")
+    done = subprocess.run(
+        [mount, "-t", "tmpfs", "-o", f"size={SIZE}m", "tmpfs", str(root)],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    if done.returncode:
+        pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
+    try:
+        yield Disk(root)
+    finally:
+        subprocess.run(["umount", "--lazy", str(root)], check=True)
+
+
+@pytest.fixture(scope="module")
+def campaign(disk: Disk, tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """A plan that may be run."""
+    cell = fast_cell(tmp_path_factory.mktemp("cell"), repetitions=3)
+    made = fast_campaign(disk.root / "campaign", cell)
+    pass_rehearsal(made.folder)
+    return made
+
+
+def hil(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def require_told(result: Result, disk: Disk, *places: str) -> None:
+    """An error of ours: a path on that disk, what is wrong with it, and a documented status."""
+    error = result.exception
+    if isinstance(error, SystemExit):  # of several files, said by the command itself
+        assert "No space left on device" in result.output
+        return
+    assert isinstance(error, HilError), f"{error!r}\n{result.output}"
+    assert error.exit_code in (1, 2)
+    assert "No space left on device" in str(error)
+    assert any(place in str(error) for place in places), str(error)
+
+
+def sums(campaign: Campaign) -> dict[str, str]:
+    """Of the archives that are entered in the manifest and whole."""
+    folder = campaign.folder.archives
+    return {
+        entry.name: hashlib.sha256((folder / entry.name).read_bytes()).hexdigest()
+        for entry in campaign.folder.manifest()
+        if (folder / entry.name).exists() and entry.outcome == "completed"
+    }
+
+
+@pytest.mark.parametrize("left", [0, 40, 400])
+def test_a_run_on_a_full_disk_keeps_what_is_whole_and_goes_on(
+    disk: Disk, campaign: Campaign, left: int
+) -> None:
+    # Of these fillings each lets the run come further than the one before.
+    before = sums(campaign)
+    disk.fill(left)
+    result = hil("run", campaign.folder.root, "--accept-dry-run", "--no-identify", "--quiet")
+    disk.empty()
+    require_told(result, disk, "campaign")
+    after = sums(campaign)
+    assert before.items() <= after.items()
+    for path in campaign.folder.archives.glob("*.mcap"):
+        checked = hil("archive", "check", path)
+        assert checked.exit_code == 0 or path.name not in after
+
+
+def test_with_room_again_the_run_completes(disk: Disk, campaign: Campaign) -> None:
+    disk.empty()
+    whole = sums(campaign)
+    result = hil("run", campaign.folder.root, "--accept-dry-run", "--no-identify", "--quiet")
+    assert result.exit_code == 0, result.output
+    assert whole.items() <= sums(campaign).items()
+    assert len(campaign.folder.completed("excitation")) == 3
+
+
+SHORT = {"population": 8, "generations": 1}
+"""Of a search that is only to write what a search writes."""
+STAGES: dict[str, tuple[str, ...]] = {
+    "design": (
+        "design",
+        "cell/cell.toml",
+        "--settings",
+        "short.toml",
+        "-o",
+        "designed",
+        "--workers",
+        "1",
+    ),
+    "compare": ("compare", "campaign", "second", "-o", "pages/compare.html"),
+    "study": (
+        "study",
+        "-o",
+        "study",
+        "--campaign",
+        "campaign",
+        "--campaign",
+        "second",
+        "--workers",
+        "1",
+    ),
+    "rehearse": ("rehearse", "campaign", "--again"),
+    "identify": ("identify", "campaign", "--quiet"),
+    "report": ("report", "campaign"),
+    "reidentify": ("reidentify", "campaign", "--output", "batch", "--quiet"),
+    "plot": ("plot", "campaign/archives/excitation_000_a1.mcap", "--output", "plot.png"),
+    "repair": ("archive", "repair", "excitation_000_a1.mcap"),
+    "new": ("new", "--urdf", "campaign/robot.urdf", "--output", "new.toml", "--force"),
+}
+"""What else leaves something on the disk: command and arguments, paths of which lie there."""
+
+
+@pytest.fixture(scope="module")
+def prepared(disk: Disk, campaign: Campaign) -> Campaign:
+    """The campaign done, a second one like it, a cell file, and settings of a short search."""
+    disk.empty()
+    campaign.run(accept_dry_run=True)
+    campaign.identify()
+    (disk.root / "cell").mkdir()
+    cell = fast_cell(disk.root / "cell", repetitions=3)
+    text = cell.text.replace("seed = 3", "seed = 4")
+    other = Cell.from_texts(text, cell.urdf, cell.path)
+    Campaign.create(disk.root / "second", other, campaign.plan).run(unrehearsed=True)
+    settings = hil("design", "--show-settings", "b").output
+    for key, value in SHORT.items():
+        settings, count = re.subn(rf"(?m)^{key} = \d+", f"{key} = {value}", settings)
+        assert count == 1, settings
+    (disk.root / "short.toml").write_text(settings)
+    return campaign
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("left", [0, 8])
+@pytest.mark.parametrize("stage", sorted(STAGES))
+def test_every_command_says_that_the_disk_is_full_and_works_once_it_is_not(
+    disk: Disk, prepared: Campaign, stage: str, left: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = prepared
+    monkeypatch.chdir(disk.root)
+    disk.empty()
+    torn = disk.root / "excitation_000_a1.mcap"
+    torn.write_bytes((campaign.folder.archives / torn.name).read_bytes()[:100_000])
+    (disk.root / "excitation_000_a1_repaired.mcap").unlink(missing_ok=True)
+    for made in ("designed", "pages", "study", "batch"):
+        shutil.rmtree(disk.root / made, ignore_errors=True)
+    whole = sums(campaign)
+    disk.fill(left)
+    full = hil(*STAGES[stage])
+    disk.empty()
+    assert sums(campaign) == whole
+    if full.exit_code or full.exception:
+        require_told(full, disk, "")
+    else:
+        assert left, "nothing can be written where nothing is left"
+    again = hil(*STAGES[stage], *_on_with_it(stage, disk, full))
+    expected = {"repair": 3}.get(stage, 0)  # what was torn off is lost
+    assert again.exit_code == expected, f"{again.exception!r} {again.output}"
+
+
+def _on_with_it(stage: str, disk: Disk, full: Result) -> tuple[str, ...]:
+    """A search that was begun is gone on with by an option, which its error names."""
+    if stage != "design" or not (disk.root / "designed" / "search.journal").exists():
+        return ()
+    assert "--resume" in f"{full.exception} {full.output}"
+    return ("--resume",)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["run", *sorted(STAGES)])
+def test_every_command_says_that_a_folder_is_read_only_and_changes_nothing(
+    disk: Disk, prepared: Campaign, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(disk.root)
+    disk.empty()
+    for made in ("designed", "pages", "study", "batch"):
+        shutil.rmtree(disk.root / made, ignore_errors=True)
+    torn = disk.root / "excitation_000_a1.mcap"
+    torn.write_bytes((prepared.folder.archives / torn.name).read_bytes()[:100_000])
+    (disk.root / "excitation_000_a1_repaired.mcap").unlink(missing_ok=True)
+    victim = prepared.folder.completed("excitation")[-1]
+    victim.rename(victim.with_suffix(".away"))  # so that there is something to run
+    command = ("run", "campaign", "--no-identify") if stage == "run" else STAGES[stage]
+    subprocess.run(["mount", "-o", "remount,ro", str(disk.root)], check=True)
+    try:
+        refused = hil(*command)
+    finally:
+        subprocess.run(["mount", "-o", "remount,rw", str(disk.root)], check=True)
+        victim.with_suffix(".away").rename(victim)
+    error = refused.exception
+    said = str(error) if isinstance(error, HilError) else refused.output
+    assert "Read-only file system" in said or "cannot be written to" in said, f"{error!r} {said}"
+    assert isinstance(error, HilError | SystemExit), f"{error!r}"
+    assert refused.exit_code or error, "a command that leaves nothing has failed"
+
+
+def test_a_campaign_that_cannot_be_made_leaves_nothing(disk: Disk, campaign: Campaign) -> None:
+    disk.fill(4)
+    with pytest.raises(OutputError, match=r"No space left on device.*make room"):
+        Campaign.create(disk.root / "other", campaign.cell, campaign.plan)
+    disk.empty()
+    Campaign.create(disk.root / "other", campaign.cell, campaign.plan)

@@ -1,0 +1,165 @@
+"""A real `hil run` over loopback UDP on a disk that hangs: borne, or the arm rests and says why."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.archive import open_archive
+from hil.campaign import Campaign
+from hil.cell import Cell
+from hil.demo_link import LOOPBACK, free_port, loopback_link
+from hil.errors import ControllerFault
+from hil.progress import Silent
+from tests.disk.faults import CREATE, SYNC, WRITE, Rule
+from tests.disk.mounted import Disk, NoFuseError, fuse_disk, processes_disk
+from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+
+PATIENCE = 120.0
+"""s for a process to get on, on a machine that does other things as well."""
+RUN = (sys.executable, "-m", "hil", "run")
+SIMULATE = (sys.executable, "-m", "hil", "simulate")
+
+
+MOUNTS: dict[str, Callable[[Path], AbstractContextManager[Disk]]] = {
+    "fuse": fuse_disk,
+    "planted": processes_disk,
+}
+
+
+@pytest.fixture(scope="module", params=sorted(MOUNTS))
+def disk(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Disk]:
+    try:
+        with MOUNTS[request.param](tmp_path_factory.mktemp(request.param)) as mounted:
+            yield mounted
+    except NoFuseError as error:
+        pytest.skip(str(error))
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a run ended: its exit status, what it printed, and what the controller told."""
+
+    status: int
+    said: str
+    arm: dict[str, object]
+
+
+def made(disk: Disk, name: str, folder: Path) -> Campaign:
+    cell = fast_cell(folder, repetitions=1, n_via=7)
+    text = cell.with_link(transport="udp", host=LOOPBACK, bind=LOOPBACK, port=free_port()).text
+    campaign = fast_campaign(disk.root / name, Cell.from_texts(text, cell.urdf, cell.path))
+    pass_rehearsal(campaign.folder)
+    return campaign
+
+
+def run(campaign: Campaign, disk: Disk, rule: Rule | None, after: str) -> Ended:
+    """Run it; once the file `after` was begun and holds something, the rule is in force."""
+    port = campaign.cell.controller.port
+    simulator = subprocess.Popen(
+        [*SIMULATE, str(campaign.folder.cell), "--udp", f"{LOOPBACK}:{port}", "--json",
+         "--patience", "0.5"],
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    process = subprocess.Popen(
+        [*RUN, str(campaign.folder.root), "--no-identify", "--accept-dry-run", "--quiet"],
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while rule is not None and process.poll() is None:
+            path = campaign.folder.archives / after
+            if path.exists() and path.stat().st_size > 30_000:
+                disk.do_wrong(rule)
+                break
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        said = process.communicate(timeout=PATIENCE)[0].decode()
+    finally:
+        process.kill()
+        simulator.terminate()
+        out, errors = simulator.communicate(timeout=PATIENCE)
+    assert out, errors.decode()
+    return Ended(process.returncode, said, json.loads(out.decode().splitlines()[-1]))
+
+
+def lost(campaign: Campaign) -> dict[str, str]:
+    """Archives that lack a cycle between their first and their last that the link answered."""
+    found = {}
+    for path in sorted(campaign.folder.archives.glob("*.mcap")):
+        archive = open_archive(path)
+        missed = int(np.diff(archive.columns["cycle"]).sum()) - (archive.n_samples - 1)
+        said = archive.outcome or {}
+        if (
+            not archive.complete
+            or said["records_lost"] != "0"
+            or missed != int(said["lost_packets"])
+        ):
+            found[path.name] = str(archive.missing or said)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hang", [1.0, 4.0])
+def test_a_disk_that_hangs_for_seconds_is_borne_and_nothing_is_lost(
+    disk: Disk, tmp_path: Path, hang: float
+) -> None:
+    campaign = made(disk, f"hang_{hang:g}", tmp_path)
+    rule = Rule((WRITE, SYNC), "*.mcap", hang=hang)
+    ended = run(campaign, disk, rule, "dryrun_000_a1.mcap")
+    assert "fsync dryrun_000_a1.mcap" in disk.do_wrong()
+    assert ended.status == 0, ended.said
+    assert "0 rejected" in ended.said
+    assert not lost(campaign)
+
+
+@pytest.mark.slow
+def test_a_disk_that_hangs_for_longer_stops_the_arm_on_its_path_and_is_named(
+    disk: Disk, tmp_path: Path
+) -> None:
+    campaign = made(disk, "hang_7", tmp_path)
+    rule = Rule((WRITE, SYNC), "*.mcap", hang=7.0)
+    ended = run(campaign, disk, rule, "dryrun_000_a1.mcap")
+    disk.do_wrong()
+    assert ended.status == 4
+    words = r"dryrun_000_a1\.mcap\) was stopped: .*\(its disk kept it waiting for [67]\.\d s"
+    assert re.search(words, " ".join(ended.said.split())), ended.said
+    assert ended.arm["ended"], "open mode was left, and the session ended"
+    assert (open_archive(campaign.folder.archives / "dryrun_000_a1.mcap").outcome or {})[
+        "outcome"
+    ] == "stopped"
+    assert not lost(campaign), "the ring held what the disk did not take"
+    again = run(campaign, disk, None, "")
+    assert again.status == 0, again.said
+    assert not lost(campaign)
+
+
+@pytest.mark.slow
+def test_after_an_archive_that_opened_too_late_the_same_link_goes_on(
+    disk: Disk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The file appears when the next run has looked for a free name, unless it waits for it.
+    campaign = made(disk, "late", tmp_path)
+    with loopback_link(campaign.cell) as link:
+        with monkeypatch.context() as short:
+            short.setattr("hil.campaign.live_link.OPEN_TIMEOUT", 1.0)
+            disk.do_wrong(Rule((CREATE,), "*.mcap", hang=8.0))
+            with pytest.raises(ControllerFault, match=r"did not open .*move_000_a1\.mcap.*nothing"):
+                campaign.run(link, None, Silent(), accept_dry_run=True)
+        result = campaign.run(link, None, Silent(), accept_dry_run=True)
+        disk.do_wrong()
+    assert result.complete
+    late = open_archive(campaign.folder.archives / "move_000_a1.mcap")
+    assert (late.outcome or {})["outcome"] == "void"

@@ -1,0 +1,179 @@
+"""A disk that refuses (EIO, EDQUOT, ENOSPC) at a drawn operation of a campaign.
+
+What was whole stays whole, the error names the file and what to do, and with the disk well again
+the same command completes. Each law is tried on a planted disk and on one mounted through FUSE.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.archive import open_archive
+from hil.campaign import Campaign, CampaignPlan
+from hil.cell import Cell
+from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
+from hil.progress import Silent
+from tests.disk.faults import CHANGES, REFUSALS, RENAME, SYNC, WRITE, Rule
+from tests.disk.mounted import Disk, NoFuseError, fuse_disk, planted_disk
+from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+
+Mount = Callable[[Path], AbstractContextManager[Disk]]
+MOUNTS: dict[str, Mount] = {"planted": planted_disk, "fuse": fuse_disk}
+WORDS = ("Input/output error", "Disk quota exceeded", "No space left on device")
+REMEDIES = ("make room", "mend the disk", "another folder", "record again", "writable")
+
+
+@pytest.fixture(scope="module", params=["planted", pytest.param("fuse", marks=pytest.mark.slow)])
+def disk(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Disk]:
+    mount = MOUNTS[request.param]
+    try:
+        with mount(tmp_path_factory.mktemp(request.param)) as mounted:
+            yield mounted
+    except NoFuseError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(autouse=True)
+def well_again(disk: Disk) -> Iterator[None]:
+    yield
+    disk.do_wrong()
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cell, CampaignPlan]:
+    folder = tmp_path_factory.mktemp("designed")
+    made = fast_campaign(folder / "campaign", fast_cell(folder, repetitions=2))
+    return made.cell, made.plan
+
+
+def drawn(rng: random.Random) -> Rule:
+    """A refusal somewhere in a run: of one operation, or of all from there on."""
+    operation = rng.choice(CHANGES)
+    most = {"create": 12, "write": 130, "fsync": 130, "rename": 7}[operation]
+    names = rng.choice(("*", "*.mcap", "manifest.json*"))
+    return Rule(
+        (operation,),
+        names,
+        after=rng.randrange(most if names == "*" else most // 2),
+        times=rng.choice((0, 0, 1)),
+        error=rng.choice(sorted(REFUSALS)),
+    )
+
+
+def entered(campaign: Campaign) -> dict[str, bytes]:
+    folder = campaign.folder
+    return {entry.name: (folder.archives / entry.name).read_bytes() for entry in folder.manifest()}
+
+
+def require_told(error: HilError, root: Path) -> None:
+    """A documented status, a path on that disk, what is wrong with it, and what to do."""
+    text = str(error)
+    assert error.exit_code in (1, 2, 4), text
+    assert root.name in text
+    assert any(word in text for word in WORDS), text
+    assert any(word in text for word in REMEDIES), text
+
+
+def require_readable(campaign: Campaign) -> None:
+    """Each file gives a prefix without gaps, or was torn before anything was in it."""
+    whole = {entry.name for entry in campaign.folder.manifest()}
+    for path in campaign.folder.archives.glob("*.mcap"):
+        try:
+            cycles = open_archive(path).columns.get("cycle", ())
+        except NotAnArchiveError:
+            assert path.name not in whole
+        except ArchiveError as error:
+            raise AssertionError(f"{path.name}: {error}") from error
+        else:
+            assert (np.diff(cycles) == 1).all(), path.name
+
+
+def refused_run(disk: Disk, campaign: Campaign, rule: Rule) -> list[str]:
+    """Run on a disk that refuses, then on a well one; what was refused."""
+    before = entered(campaign)
+    disk.do_wrong(rule)
+    told = None
+    try:
+        Campaign.open(campaign.folder.root).run(
+            None, None, Silent(), accept_dry_run=True, durable=True
+        )
+    except HilError as error:
+        told = error
+    struck = disk.do_wrong()
+    if told is not None:
+        assert struck, str(told)
+        require_told(told, campaign.folder.root)
+    after = entered(campaign)
+    assert before.items() <= after.items(), "what was whole is whole"
+    require_readable(campaign)
+    result = Campaign.open(campaign.folder.root).run(None, None, Silent(), accept_dry_run=True)
+    assert result.complete
+    assert after.items() <= entered(campaign).items()
+    return struck
+
+
+def rounds(disk: Disk, designed: tuple[Cell, CampaignPlan], seeds: range) -> int:
+    """How many refusals struck."""
+    count = 0
+    for seed in seeds:
+        campaign = Campaign.create(disk.root / f"round_{seed}", *designed)
+        pass_rehearsal(campaign.folder)
+        rule = drawn(random.Random(f"refused/{seed}"))
+        try:
+            count += bool(refused_run(disk, campaign, rule))
+        except Exception as error:
+            error.add_note(f"seed {seed}: {rule}")
+            raise
+        finally:
+            disk.do_wrong()
+    return count
+
+
+def test_a_disk_that_refuses_costs_the_motion_and_no_more(
+    disk: Disk, designed: tuple[Cell, CampaignPlan]
+) -> None:
+    assert rounds(disk, designed, range(2)) >= 1
+
+
+def test_a_campaign_whose_manifest_is_refused_is_not_left_half_made(
+    disk: Disk, designed: tuple[Cell, CampaignPlan]
+) -> None:
+    # One that is left without a manifest would look like one whose cell file was edited.
+    root = disk.root / "half"
+    disk.do_wrong(Rule((RENAME,), "manifest.json", error="EDQUOT"))
+    with pytest.raises(OutputError, match=r"manifest\.json.*quota exceeded.*make room"):
+        Campaign.create(root, *designed)
+    assert disk.do_wrong()
+    assert list(root.iterdir()) == []
+    assert Campaign.create(root, *designed).folder.sealed
+
+
+@pytest.mark.slow
+def test_a_rehearsal_that_a_disk_refused_goes_on_and_passes(
+    disk: Disk, designed: tuple[Cell, CampaignPlan]
+) -> None:
+    # The last as a kill leaves it, in the middle of making the rehearsal's own campaign.
+    for number, (operation, after) in enumerate(((WRITE, 40), (RENAME, 12), (SYNC, 8))):
+        campaign = Campaign.create(disk.root / f"rehearsed_{number}", *designed)
+        disk.do_wrong(Rule((operation,), after=after, error="EIO"))
+        with pytest.raises(HilError) as told:
+            campaign.rehearse()
+        assert disk.do_wrong()
+        require_told(told.value, campaign.folder.root)
+        (campaign.folder.rehearsed / "plain" / "manifest.json").unlink(missing_ok=number == 2)
+        assert Campaign.open(campaign.folder.root).rehearse().passed
+
+
+@pytest.mark.slow
+def test_many_refusals_cost_the_motion_and_no_more(
+    disk: Disk, designed: tuple[Cell, CampaignPlan]
+) -> None:
+    assert rounds(disk, designed, range(100, 140)) > 20
