@@ -28,6 +28,7 @@ MOST_JOINTS: Final = 64
 """Time and memory of a model grow faster than their square: a minute and 1.5 GB for 100."""
 
 _LINK = "link "
+_UNIT: Final = 1e-6  # by which the length of an axis, made a unit vector by the reader, may be off
 
 
 class LinkFrame(NamedTuple):
@@ -195,6 +196,11 @@ def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:
     joint.calc(data, pin.neutral(model))
     subspace = np.asarray(data.S, dtype=np.float64).reshape(6)
     linear, angular = subspace[:3], subspace[3:]
+    if not abs(float(np.linalg.norm(subspace)) - 1.0) < _UNIT:
+        raise ModelError(
+            f'joint {name!r} has an <axis> without a direction; write one such as xyz="0 0 1"',
+            joint=name,
+        )
     revolute = bool(np.any(angular))
     return (angular if revolute else linear).copy(), revolute
 

@@ -88,6 +88,8 @@ class _Reading:
             self._parser.Parse(self._data, True)
         finally:
             del self._parser  # it knows this object: both would wait for the cycle collector
+        # Some readers take colons for namespaces, and refuse names that others take.
+        expat.ParserCreate(namespace_separator="}").Parse(self._data, True)
 
     def _entity(self, name: str, *_: object) -> None:
         raise _RefusedError(f"it declares the entity {name!r}; write its text where it is used")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
 from typing import Any
 
 from planner.decimals import radians_in, without_decimals
@@ -45,6 +45,8 @@ def from_text(text: str) -> dict[str, Any]:
         return dict(_items(tomllib.loads(text, parse_float=Decimal)))
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
+    except InvalidOperation as error:
+        raise ValueError("it has a number beyond all bounds") from error
 
 
 def _table(path: str, data: Mapping[str, Any], comments: Mapping[str, str]) -> list[str]:

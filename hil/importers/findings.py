@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -153,7 +154,7 @@ def _range(name: str, position: Array, limits: Limits) -> str:
     low, high = float(position.min()), float(position.max())
     text = f"{name}: {low:.3f} .. {high:.3f} {'rad' if limits.revolute else 'm'}"
     if limits.revolute:
-        text += f" ({np.degrees(low):.0f} .. {np.degrees(high):.0f} deg)"
+        text += f" ({math.degrees(low):.0f} .. {math.degrees(high):.0f} deg)"
     if np.isfinite(limits.lower):
         text += f", limits of the URDF {limits.lower:.3f} .. {limits.upper:.3f}"
     return text

@@ -335,11 +335,17 @@ class _Collected:
         edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist()]
         ends = [*(time[edge] for edge in edges[1:]), time[-1]]
         for edge, until in zip(edges, ends, strict=True):
-            name = State(int(state[edge])).name.lower().replace("_", " ")
+            name = _state_name(int(state[edge]))
             if self.states and self.states[-1][2] == name:
                 self.states[-1] = (self.states[-1][0], float(until), name)
             else:
                 self.states.append((float(time[edge]), float(until), name))
+
+
+def _state_name(number: int) -> str:
+    """A state of the session; the number itself of one that a stranger's archive made up."""
+    known = number in State.__members__.values()
+    return State(number).name.lower().replace("_", " ") if known else f"state {number}"
 
 
 def _shown(columns: Mapping[str, NDArray[Any]], scales: _Scales) -> Iterator[tuple[str, Array]]:

@@ -103,9 +103,10 @@ def put_together(records: list[Record], *, index: bool) -> bytes:
     """The file, with right lengths and checksums, and an index of it where that is wanted."""
     built = IndexBuilder()
     file = bytearray(MAGIC)
+    described = _described(records)
     for one in records:
         at = len(file)
-        body = _sealed(one)
+        body = _sealed(one, described)
         file += _HEAD.pack(one.opcode, len(body)) + body
         if not index:
             continue
@@ -130,8 +131,19 @@ def _joined(records: list[Record]) -> bytes:
     return b"".join(_HEAD.pack(one.opcode, len(one.body)) + one.body for one in records)
 
 
-def _sealed(one: Record) -> bytes:
-    """The body with the checksum that fits it."""
+def _described(records: list[Record]) -> str:
+    """The checksum of the description, which the outcome repeats."""
+    for one in records:
+        with contextlib.suppress(Exception):  # damaged beyond reading: nothing to repeat
+            name, entries = _entries(one.body) if one.opcode == METADATA else ("", {})
+            if name == schema.METADATA:
+                entries.pop("checksum", None)
+                return schema.checksum(entries)
+    return ""
+
+
+def _sealed(one: Record, described: str) -> bytes:
+    """The body with the checksums that fit it."""
     if one.inside is not None:
         plain = _joined(one.inside)
         pack = {b"zstd": zstandard.ZstdCompressor().compress, b"lz4": lz4.frame.compress}
@@ -143,9 +155,9 @@ def _sealed(one: Record) -> bytes:
     if one.opcode == METADATA:
         with contextlib.suppress(Exception):  # damaged beyond reading: as it is
             name, entries = _entries(one.body)
-            if "checksum" in entries:
-                entries.pop("checksum")
-                entries.pop(schema.DESCRIPTION, None)  # or no change of `hil` would get further
+            if entries.pop("checksum", None) is not None:
+                if schema.DESCRIPTION in entries:
+                    entries[schema.DESCRIPTION] = described
                 return _metadata(name, {**entries, "checksum": schema.checksum(entries)})
     return one.body
 

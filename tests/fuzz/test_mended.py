@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, InitPacket
+from drivers.states import State
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd
 from hil.archive import Samples, write_samples
@@ -18,10 +19,14 @@ from hil.campaign.folder import CampaignFolder
 from hil.campaign.rehearsal import Rehearsal
 from hil.cell import Cell
 from hil.design.result import DesignResult
+from hil.design.toml_text import from_text
 from hil.errors import ArchiveError, InputError, SourceError
 from hil.importers import ColumnMap, import_log, import_rosbag2
 from hil.new import from_archive
-from hil.plots.archive_view import view_of
+from hil.plots.archive_view import _state_name, view_of
+from identification.errors import ModelError
+from identification.kinematics import chain_from_urdf
+from tests.fault_matrix.small_cell import URDF
 from tests.fuzz.targets import cell_file, documents, importers
 
 JOINTS = ("shoulder", "elbow")
@@ -137,3 +142,27 @@ def test_a_rehearsal_that_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "rehearsal.json").write_bytes(json.dumps({"a": 1}).encode() + b"\xff")
     with pytest.raises(InputError, match=r"rehearsal\.json cannot be read"):
         Rehearsal.load(CampaignFolder(tmp_path))
+
+
+def test_numbers_beyond_all_bounds_in_a_design_are_refused() -> None:
+    with pytest.raises(ValueError, match="beyond all bounds"):
+        from_text("a=1e9999999999999999999")
+
+
+@pytest.mark.parametrize(
+    ("was", "put", "why"),
+    [
+        ('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>', "without a direction"),
+        ("<inertial>", '<inertial :="">', "is no XML"),
+    ],
+)
+def test_a_robot_that_only_some_readers_take_is_refused(was: str, put: str, why: str) -> None:
+    text = URDF.replace(was, put)
+    assert text != URDF
+    with pytest.raises(ModelError, match=why):
+        chain_from_urdf(text)
+
+
+def test_an_archive_in_a_state_that_nobody_knows_is_drawn() -> None:
+    assert _state_name(State.OPEN) == "open"
+    assert _state_name(105) == "state 105"

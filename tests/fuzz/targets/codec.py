@@ -126,7 +126,7 @@ def _carried(
         got = got if made is None else made
     if controller.segmented and got is not None and not touched:
         assert got == packet, "segments carry every byte"
-    if got is not None:
+    if got is not None and not touched:
         packet_number(got)
     return got
 
