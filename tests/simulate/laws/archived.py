@@ -111,7 +111,7 @@ def read(path: Path) -> Archived:
     return _read(path, stat.st_mtime_ns, stat.st_size)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=24)
 def _read(path: Path, _changed: int, _size: int) -> Archived:
     found = Archived(path)
     reading = _Reading(found)
