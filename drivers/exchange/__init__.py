@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.exchange.control import ArchiveState, ControlBlock, Ended
-from drivers.exchange.errors import ExchangeError
+from drivers.exchange.errors import ExchangeError, WithdrawnError
 from drivers.exchange.event_log import EventReader, EventWriter
 from drivers.exchange.loop import exchange
 from drivers.exchange.notices import (
@@ -56,5 +56,6 @@ __all__ = [
     "RingReader",
     "SharedCycleRing",
     "SharedPacketRing",
+    "WithdrawnError",
     "exchange",
 ]

@@ -88,12 +88,11 @@ class ControlBlock:
         override: fraction of the speed asked for.
         override_count: raised by one for each override asked for, after it was written.
         finish: 1 when the exchange is to leave open mode and end.
-        program_id: of the program to be taken, raised for each; any other is not taken any more.
+        program_offered: id of the program to be read, raised for each.
+        program_id: of the program that may begin once it was read; negative to withdraw it.
         held: 1 if the motion going on is to rest on its path, 0 if it is to go on; an order, not
             a state: it says nothing of a later motion.
         hold_count: raised by one each time, after `held` was written.
-        archive_heartbeat: s.
-        archive_state: an `ArchiveState`.
         exchange_heartbeat: s.
         state: `drivers.states.State` of the session.
         cycle: the controller's cycle.
@@ -122,6 +121,8 @@ class ControlBlock:
         finished: 1 when the exchange has ended properly.
         motion_time: s of the motion taken last that were gone through; NaN if it does not tell.
         rate: how fast its motion time runs, 1 as planned; NaN likewise.
+        archive_heartbeat: s.
+        archive_state: an `ArchiveState`.
     """
 
     supervisor_heartbeat = _Real(0)
@@ -132,9 +133,7 @@ class ControlBlock:
     override_count = _Whole(5)
     held = _Whole(6)
     hold_count = _Whole(7)
-
-    archive_heartbeat = _Real(8)
-    archive_state = _Whole(9)
+    program_offered = _Whole(8)
 
     exchange_heartbeat = _Real(16)
     state = _Whole(17)
@@ -161,6 +160,9 @@ class ControlBlock:
     ended_interval = _Whole(38)
     motion_time = _Real(39)
     rate = _Real(40)
+
+    archive_heartbeat = _Real(48)
+    archive_state = _Whole(49)
 
     def __init__(self, fd: int) -> None:
         whole = memoryview(memory.attach(fd)).cast("B")

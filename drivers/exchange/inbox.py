@@ -15,6 +15,10 @@ from drivers.exchange import program
 from drivers.motion_source import MotionSource
 
 LONGEST_MESSAGE: Final = 1 << 16
+WITHDRAWN: Final = "it was withdrawn"
+"""Why a program is refused that nobody wants any more."""
+READ: Final = "read"
+"""Said of a program that can be requested."""
 _IDENTITY: Final = struct.Struct("<Q")
 _DESCRIPTOR: Final = struct.Struct("@i")
 
@@ -69,9 +73,15 @@ class Inbox:
         self.taken = _IDENTITY.unpack(message)[0]
         return HandedOver(self.taken, fd)
 
+    def read(self) -> None:
+        """Say that the program taken last was read."""
+        self._say(READ)
+
     def answer(self, refusal: RequestError | None) -> None:
         """Say what became of the program taken last."""
-        told = None if refusal is None else (refusal.state, refusal.reason)
+        self._say(None if refusal is None else (refusal.state, refusal.reason))
+
+    def _say(self, told: str | tuple[str, str] | None) -> None:
         # Without a supervisor nobody wants to know.
         with contextlib.suppress(OSError):
             self._channel.send(pickle.dumps((self.taken, told)), socket.MSG_DONTWAIT)

@@ -9,16 +9,16 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from drivers.errors import RequestError
 from drivers.exchange import control, event_log, memory
-from drivers.exchange.errors import ExchangeError
+from drivers.exchange.errors import ExchangeError, WithdrawnError
 from drivers.exchange.event_log import EventReader
-from drivers.exchange.inbox import LONGEST_MESSAGE, hand_over
+from drivers.exchange.inbox import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
 from drivers.exchange.notices import ExchangeEvent
 from drivers.exchange.realtime import RealTimeReport
 from drivers.exchange.settings import ExchangeSettings
@@ -66,6 +66,10 @@ class ExchangeStatus:
     rate: float
     latencies: tuple[int, ...]
     finished: bool
+
+
+def _always() -> bool:
+    return True
 
 
 class ExchangeProcess:
@@ -138,37 +142,46 @@ class ExchangeProcess:
         """Sign of life; to be given at least every 0.2 s, from any thread."""
         self._control.supervisor_heartbeat = time.monotonic()
 
-    def submit(self, source: MotionSource) -> int:
+    def submit(self, source: MotionSource, wanted: Callable[[], bool] = _always) -> int:
         """Hand a motion over, to be run as soon as every wanted axis is open.
 
         Its arrays of 4 KiB and more arrive read-only. Reading it takes the exchange about 0.2 ms
         per MB, so that answers may come late meanwhile; axes should be closed. Gives signs of
         life while it waits; a motion that is not accepted in time is withdrawn.
 
+        Args:
+            source: the motion.
+            wanted: asked when the exchange has read the motion and could begin with it the next
+                moment, which may be long after this call.
+
         Returns:
             The program's id.
 
         Raises:
+            WithdrawnError: it is not wanted any more; nothing has begun.
             RequestError: the session refuses it.
             ExchangeError: the exchange does not answer.
         """
-        identity = self._control.program_id + 1
+        identity = self._control.program_offered + 1
         try:
             hand_over(self._channel, identity, source)
         except OSError as error:
             raise ExchangeError(f"the exchange process is gone: {error}") from error
         self.beat()  # the next cycle may take it, and wants a sign of life no older than that
-        self._control.program_id = identity
-        answered = 0
+        self._control.program_offered = identity
         try:
-            while answered != identity:  # the answer to one that was withdrawn may still come
-                answered, refusal = self._answer(ANSWER_TIMEOUT)
+            told = self._answer_to(identity)
+            if told == READ:
+                self.beat()
+                self._control.program_id = identity if wanted() else -identity
+                told = self._answer_to(identity)
         except BaseException:
             # Nobody waits for this motion any more: it must not begin after all.
-            self._control.program_id = identity + 1
+            self._control.program_id = -identity
             raise
-        if refusal is not None:
-            raise RequestError(*refusal)
+        if told is not None:
+            state, reason = told
+            raise (WithdrawnError if reason == WITHDRAWN else RequestError)(state, reason)
         return identity
 
     def stop(self) -> None:
@@ -260,6 +273,13 @@ class ExchangeProcess:
             if fd != closed:
                 os.close(fd)
                 setattr(self, name, closed)
+
+    def _answer_to(self, identity: int) -> Any:
+        """What is said of this program next; the answer to one given up may still come before."""
+        while True:
+            answered, told = self._answer(ANSWER_TIMEOUT)
+            if answered == identity:
+                return told
 
     def _answer(self, timeout: float) -> Any:
         """The next message of the exchange."""

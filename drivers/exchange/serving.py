@@ -15,7 +15,7 @@ from drivers.events import Event, MotionEnded
 from drivers.exchange.control import PATIENCE, STALE, ArchiveState, ControlBlock, Ended
 from drivers.exchange.digest import Digest
 from drivers.exchange.event_log import EventWriter
-from drivers.exchange.inbox import Inbox
+from drivers.exchange.inbox import WITHDRAWN, Inbox
 from drivers.exchange.latency import bin_of
 from drivers.exchange.notices import (
     NO_ARCHIVE,
@@ -27,7 +27,7 @@ from drivers.exchange.notices import (
     ResumeRefused,
 )
 from drivers.exchange.shared_ring import SharedCycleRing
-from drivers.motion_source import progress_of
+from drivers.motion_source import MotionSource, progress_of
 from drivers.record import MEASURED
 from drivers.session import Session
 from drivers.states import State
@@ -102,6 +102,7 @@ class Serving:
         self._arm = ring.measured[0, _POSITION].copy()
         self._arm_moved_at = -math.inf
         self._digest = Digest()
+        self._offered: MotionSource | None = None
         self._source: object = None
 
     def __call__(self) -> bool:
@@ -141,8 +142,10 @@ class Serving:
         if control.hold_count != self._holds:
             self._holds = control.hold_count
             self._change_hold(bool(control.held))
-        if control.program_id != self._inbox.taken:
-            self._take_program(now)
+        if control.program_offered != self._inbox.taken:
+            self._read_program(now)
+        if self._offered is not None:
+            self._take_program(self._offered, now)
         if session.requested and self._needs_archive:
             trouble = self._archive_trouble(now)
             if trouble:
@@ -191,17 +194,31 @@ class Serving:
         except DriverError as error:
             self.say((HoldRefused if held else ResumeRefused)(str(error)))
 
-    def _take_program(self, now: float) -> None:
-        """Read the program that was handed over, request it, and say what became of it."""
-        control, name = self._control, self._session.state.name.lower()
-        refusal = None
+    def _read_program(self, now: float) -> None:
+        """Read the program that was handed over. That takes time, in which it may be withdrawn."""
+        self._offered = None
         try:
             handed_over = self._inbox.take()
             if handed_over is None:
-                return  # withdrawn before, or its descriptor is still on the way
-            source = handed_over.unpacked()
-            if handed_over.identity != control.program_id:
-                raise RequestError(name, "it was withdrawn")
+                return  # its descriptor is still on the way
+            self._offered = handed_over.unpacked()
+        except Exception as error:  # whatever the classes of a foreign program raise
+            name = self._session.state.name.lower()
+            self._answer(RequestError(name, f"the program cannot be read: {error!r}"))
+        else:
+            self._inbox.read()
+        self._control.pickup_us = 1e6 * (time.monotonic() - now)
+
+    def _take_program(self, source: MotionSource, now: float) -> None:
+        """Request the program that was read, once it may begin, and say what became of it."""
+        control, identity = self._control, self._inbox.taken
+        name = self._session.state.name.lower()
+        refusal = None
+        try:
+            if control.program_id == -identity or control.program_offered != identity:
+                raise RequestError(name, WITHDRAWN)
+            if control.program_id != identity:
+                return  # the supervisor has not said yet
             if self.reason:
                 raise RequestError(name, self.reason)
             if self._needs_archive and (trouble := self._archive_trouble(now)):
@@ -213,11 +230,15 @@ class Serving:
             refusal = error
         except Exception as error:  # whatever the classes of a foreign program raise
             refusal = RequestError(name, f"the program cannot be read: {error!r}")
+        self._answer(refusal)
+
+    def _answer(self, refusal: RequestError | None) -> None:
+        """Say what became of the program taken last."""
+        self._offered = None
         if refusal is None:
-            control.program_accepted = self._inbox.taken
+            self._control.program_accepted = self._inbox.taken
         else:
-            control.program_refused = self._inbox.taken
-        control.pickup_us = 1e6 * (time.monotonic() - now)
+            self._control.program_refused = self._inbox.taken
         self._inbox.answer(refusal)
 
     def _report(self, now: float) -> None:

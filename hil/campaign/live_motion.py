@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, get_args
 
 from drivers.errors import DriverError, RequestError
 from drivers.events import MotionEnded, Outcome
-from drivers.exchange import NO_ARCHIVE
+from drivers.exchange import NO_ARCHIVE, WithdrawnError
 from drivers.motion_source import MotionSource
 from hil.archive import ArchiveSpec
 from hil.archive.commands import Closed, Failed
@@ -52,19 +52,20 @@ class LiveMotion:
         self._view.look()
         self._link.open_archive(spec, from_now=True, until_ended=True)
         # That may have taken seconds: nothing is asked for that is no longer wanted.
-        if not self._wanted(source):
-            self._link.complete("stopped", NOT_BEGUN)
-            return MotionEnded("stopped", NOT_BEGUN, -1, -1)
-        self._require_same_session()
-        self._view.forget_motion()
-        sight = self._sight(source)
-        self._link.heart.begin()
-        try:
-            self._submit(source, spec)
-            self._link.heart.turn()
-            return self._supervised(sight, spec)
-        finally:
-            self._link.heart.rest()
+        while self._wanted(source):
+            self._require_same_session()
+            self._view.forget_motion()
+            sight = self._sight(source)
+            self._link.heart.begin()
+            try:
+                self._submit(source, spec)
+                return self._supervised(sight, spec)
+            except WithdrawnError:
+                continue  # it was stopped, held or slowed while it was handed over
+            finally:
+                self._link.heart.rest()
+        self._link.complete("stopped", NOT_BEGUN)
+        return MotionEnded("stopped", NOT_BEGUN, -1, -1)
 
     def _supervised(self, sight: Sight, spec: ArchiveSpec) -> MotionEnded:
         """How the motion that was asked for ended."""
@@ -95,6 +96,11 @@ class LiveMotion:
             self._link.complete("void", str(error))
             raise
 
+    def _still_wanted(self) -> bool:
+        """Whether it may begin the next moment, as it was handed over."""
+        self._link.heart.turn()
+        return self._steering.unchanged(self._stop)
+
     def _require_same_session(self) -> None:
         """A controller that began anew may announce limits that no motion was checked against."""
         self._view.look()
@@ -107,7 +113,9 @@ class LiveMotion:
 
     def _submit(self, source: MotionSource, spec: ArchiveSpec) -> None:
         try:
-            self._exchange.submit(source)
+            self._exchange.submit(source, self._still_wanted)
+        except WithdrawnError:
+            raise
         except RequestError as error:
             self._link.complete("refused", str(error))
             why = self._link.heart.explained(str(error))

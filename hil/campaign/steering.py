@@ -83,6 +83,11 @@ class Steering:
             )
         return True
 
+    def unchanged(self, stop: Stop) -> bool:
+        """Whether a motion may begin as `begin` left it; not if it is to be slower or to rest."""
+        wish = self._watch.wish()
+        return not (stop.requested or wish.held or wish.override < self.fraction)
+
     def follow(self, motion: Steered) -> None:
         """Pass on what is wished now. A motion held before it began begins at rest."""
         wish = self._watch.wish()

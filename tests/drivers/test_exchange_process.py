@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from drivers.exchange import (
     RealTimeSettings,
     ResumeRefused,
     RingReader,
+    WithdrawnError,
     process,
 )
 from drivers.exchange.serving import LONGEST_LINGER
@@ -232,7 +233,34 @@ def test_a_program_that_was_given_up_does_not_begin_after_all(monkeypatch):
         assert controller.moved == 0.0
         controller.open = False
         controller.cycle(2)
-        assert exchange.submit(still(10)) == 3
+        assert exchange.submit(still(10)) == 2
+
+
+def test_a_program_is_asked_for_only_once_it_was_read_and_may_be_withdrawn_until_then():
+    with running() as (exchange, controller):
+        begin = time.monotonic()
+        said = iter((False, True))
+
+        def wanted():
+            assert time.monotonic() - begin > Lengthy.READING  # the exchange has it by now
+            return next(said)
+
+        controller.open = True
+        for refused in (True, False):
+            with pytest.raises(WithdrawnError) if refused else nullcontext():
+                exchange.submit(Lengthy(), wanted)
+            controller.cycle(20)
+            assert (controller.moved == 0.0) is refused
+
+
+class Lengthy(Cruise):
+    """Takes long to be read, as a program of many megabytes does."""
+
+    READING = 0.05
+
+    def __setstate__(self, state):
+        time.sleep(self.READING)
+        self.__dict__.update(state)
 
 
 class Trap:
