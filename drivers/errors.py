@@ -216,6 +216,12 @@ class NotFinite(GuardError):
 
     check = "finiteness"
 
+    def __init__(
+        self, joint: int, value: float, bound: float, cycle: int, unit: str | None = None
+    ) -> None:
+        super().__init__(joint, value, bound, cycle, unit)
+        self.args = (f"joint {joint + 1} has {value} where a number must be (cycle {cycle})",)
+
 
 class TargetNotFinite(NotFinite):
     """An axis that is open, but no joint of the cell, would be answered a target that is no number.

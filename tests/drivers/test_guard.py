@@ -82,6 +82,7 @@ def test_what_is_not_finite_never_passes(joint, value, in_velocity):
     with np.errstate(invalid="ignore"), pytest.raises(GuardError) as caught:
         begun().check_set_point(q, qd, "plan", 1)
     assert caught.value.check == "finiteness"
+    assert "where a number must be" in str(caught.value)
     assert caught.value.joint == joint
 
 

@@ -132,6 +132,11 @@ def _override(chance: random.Random, story: Story) -> str:
     return f"override@{at}:{slower}\noverride@{at + chance.randint(100, 500)}:100"
 
 
+def _lurch(chance: random.Random, story: Story) -> str:
+    size = chance.choice(("0.0001", "0.01", "-0.3", "6.5", "nan"))
+    return f"lurch@{_cycle(chance, story)}{chance.choice(('', 'x3'))}:{size}"
+
+
 DRAWS: Final[Mapping[str, tuple[float, Draw]]] = {
     "lose": (3.0, _link("lose", 9)),
     "delay": (2.0, _delay),
@@ -162,6 +167,7 @@ DRAWS: Final[Mapping[str, tuple[float, Draw]]] = {
     "short-write": (0.8, _write("short-write")),
     "save-full": (0.6, lambda chance, story: f"save-full@{chance.randint(1, story.saves)}"),
     "create-full": (0.6, lambda chance, story: f"create-full@{chance.randint(1, story.creates)}"),
+    "lurch": (1.0, _lurch),
     "stop": (1.2, _at("stop@{at}")),
     "override": (1.0, _override),
     "hold": (1.0, lambda chance, story: f"hold@{_cycle(chance, story)}x{chance.randint(1, 5)}"),

@@ -33,6 +33,7 @@ from sim_fixtures.settings import WHILE_SILENT
 from tests.hil.fast_cell import pass_rehearsal
 from tests.simulate.disk import Disk, Killed, planted
 from tests.simulate.drawing import Story, draw_script
+from tests.simulate.lurching import lurching
 from tests.simulate.observed import ArmHistory, Digests, Estimated, Life, Observed
 from tests.simulate.person import Person
 from tests.simulate.scenes import NEIGHBOURS, Scene, scene_of
@@ -257,7 +258,8 @@ class _World:
         )
 
     def _run(self, connection: Link) -> tuple[RunResult | None, BaseException | None]:
-        with planted(self.disk), _no_waiting():
+        lurches = lurching(self._script, lambda: self.controller.cycle, self._struck)
+        with planted(self.disk), _no_waiting(), lurches:
             try:
                 result = Campaign.open(self.folder).run(
                     connection,

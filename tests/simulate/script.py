@@ -30,6 +30,7 @@ disk-error@7                     likewise, as a broken disk does
 short-write@7:keep=0.3           the 7th write takes only a share of what it is given
 save-full@2                      the 2nd save of the manifest fails
 create-full@3                    the 3rd archive cannot be made
+lurch@1200x3:0.01                a defect of ours: 3 set-points are off by 0.01 rad; or :nan
 stop@1200                        Ctrl-C once: the arm is to stop on its path
 override@1200:60                 the person asks for 60 % of the speed
 hold@1200x3                      the person holds the arm, and releases it when asked 3 times
@@ -43,6 +44,7 @@ KINDS: Final[dict[str, str]] = {
     "kill": "cycle",
     "interrupt": "cycle",
     "power-cut": "cycle",
+    "lurch": "cycle",
     "stop": "cycle",
     "override": "cycle",
     "hold": "cycle",
@@ -62,7 +64,7 @@ _LINE: Final = re.compile(
     r"(?P<kind>[a-z-]+)@(?P<at>\d{1,9})(?:x(?P<count>\d{1,6}))?(?P<options>(?::[^:\s]+)*)"
 )
 _NUMBER: Final = re.compile(r"(?:keep=)?(?P<value>[+-]?\d+(?:\.\d+)?)(?P<unit>ms|s)?")
-_WORDS: Final = frozenset({"answering", "left", "before", "after"})
+_WORDS: Final = frozenset({"answering", "left", "before", "after", "nan"})
 
 
 @dataclass(frozen=True)

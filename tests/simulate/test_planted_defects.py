@@ -144,9 +144,24 @@ def smooths_what_it_archives(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Recorder, "_write", written)
 
 
+def lets_everything_pass(patch: pytest.MonkeyPatch) -> None:
+    """The guard does not look at set-points."""
+    patch.setattr(Guard, "check_set_point", lambda *arguments: None)
+
+
+def moves_an_arm_that_does_not_follow(patch: pytest.MonkeyPatch) -> None:
+    """The guard does not look at what the arm does."""
+    patch.setattr(Guard, "check_feedback", lambda *arguments: None)
+
+
 DEFECTS: dict[str, tuple[Plant, tuple[str, ...]]] = {
     "a duplicate is answered anew": (answers_duplicates_anew, ("duplicate@300x40",)),
     "a motion catches up, unguarded": (catches_up_unguarded, ("lose@{moving}x2", "kill@9999")),
+    "the guard lets set-points pass": (lets_everything_pass, ("lurch@{moving}x3:0.0001",)),
+    "an arm that does not follow is moved": (
+        moves_an_arm_that_does_not_follow,
+        ("following-error@{moving}x60:axis=1:slip",),
+    ),
     "a motion goes on after a gap": (goes_on_after_a_gap, ("lose@{moving}x4",)),
     "what piled up is answered": (answers_what_piled_up, ("stall@{moving}:7ms",)),
     "records are lost unsaid": (loses_a_record, ()),
