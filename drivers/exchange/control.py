@@ -99,7 +99,7 @@ class ControlBlock:
         interval: in open mode, -1 before the first.
         program_accepted: id of the program accepted last.
         program_refused: id of the program refused last.
-        pickup_us: microseconds the last program took to be read and requested.
+        pickup_us: microseconds the last program took to be read.
         ended_count: motions that have ended, raised after the two that follow were written; a
             second witness, should the event get lost.
         ended_outcome: of the last of them, an `Ended`.

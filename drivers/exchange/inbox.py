@@ -37,6 +37,10 @@ class HandedOver:
         finally:
             os.close(self.fd)
 
+    def drop(self) -> None:
+        """Nobody wants it any more."""
+        os.close(self.fd)
+
 
 class Inbox:
     """The exchange's end; never waits.

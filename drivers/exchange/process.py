@@ -29,7 +29,7 @@ from drivers.states import State
 START_TIMEOUT: Final = 60.0
 """s until a process that was started has opened its link; imports may be slow on a cold disk."""
 ANSWER_TIMEOUT: Final = 5.0
-"""s until a program has been accepted or refused."""
+"""s until a program has been read, and again until it has been accepted or refused."""
 _BEAT: Final = 0.1
 
 
@@ -72,6 +72,9 @@ def _always() -> bool:
     return True
 
 
+def _nothing() -> None: ...
+
+
 class ExchangeProcess:
     """An exchange that runs in a process, and a process session, of its own.
 
@@ -98,6 +101,7 @@ class ExchangeProcess:
         self._log_fd = memory.create("hil-exchange-log", 0)
         self._control = control.ControlBlock(self.control_fd)
         self._events = EventReader(self.event_fd)
+        self._offers = 0
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.beat()
         settings_fd = memory.create("hil-settings", 0)
@@ -151,8 +155,8 @@ class ExchangeProcess:
 
         Args:
             source: the motion.
-            wanted: asked when the exchange has read the motion and could begin with it the next
-                moment, which may be long after this call.
+            wanted: asked once the exchange has read the motion, which may be long after this call,
+                and again until it has begun with it; if not, the motion is withdrawn.
 
         Returns:
             The program's id.
@@ -162,27 +166,35 @@ class ExchangeProcess:
             RequestError: the session refuses it.
             ExchangeError: the exchange does not answer.
         """
-        identity = self._control.program_offered + 1
+        # Counted before anything is sent: no two programs may ever have the same id.
+        self._offers = identity = self._offers + 1
         try:
             hand_over(self._channel, identity, source)
         except OSError as error:
             raise ExchangeError(f"the exchange process is gone: {error}") from error
-        self.beat()  # the next cycle may take it, and wants a sign of life no older than that
         self._control.program_offered = identity
         try:
             told = self._answer_to(identity)
             if told == READ:
-                self.beat()
-                self._control.program_id = identity if wanted() else -identity
-                told = self._answer_to(identity)
+                self._permit(identity, wanted)
+                told = self._answer_to(identity, lambda: self._permit(identity, wanted))
         except BaseException:
-            # Nobody waits for this motion any more: it must not begin after all.
+            # Nobody waits for this motion any more: it must not begin after all, nor go on.
             self._control.program_id = -identity
+            self.stop()
             raise
         if told is not None:
             state, reason = told
             raise (WithdrawnError if reason == WITHDRAWN else RequestError)(state, reason)
         return identity
+
+    def _permit(self, identity: int, wanted: Callable[[], bool]) -> None:
+        """Let the program that was read begin, or withdraw it for good."""
+        if self._control.program_id != -identity and wanted():
+            self.beat()  # the next cycle may take it, and wants a sign of life no older than that
+            self._control.program_id = identity
+        else:
+            self._control.program_id = -identity
 
     def stop(self) -> None:
         """Ask for a stop on the path and for the end of open mode."""
@@ -274,15 +286,15 @@ class ExchangeProcess:
                 os.close(fd)
                 setattr(self, name, closed)
 
-    def _answer_to(self, identity: int) -> Any:
+    def _answer_to(self, identity: int, meanwhile: Callable[[], None] = _nothing) -> Any:
         """What is said of this program next; the answer to one given up may still come before."""
         while True:
-            answered, told = self._answer(ANSWER_TIMEOUT)
+            answered, told = self._answer(ANSWER_TIMEOUT, meanwhile)
             if answered == identity:
                 return told
 
-    def _answer(self, timeout: float) -> Any:
-        """The next message of the exchange."""
+    def _answer(self, timeout: float, meanwhile: Callable[[], None] = _nothing) -> Any:
+        """The next message of the exchange; `meanwhile` is called ten times a second."""
         end = time.monotonic() + timeout
         self._channel.settimeout(_BEAT)
         while True:
@@ -291,6 +303,7 @@ class ExchangeProcess:
                 message = self._channel.recv(LONGEST_MESSAGE)
             except TimeoutError:
                 if time.monotonic() < end:
+                    meanwhile()
                     continue
                 raise ExchangeError(f"the exchange process was silent for {timeout:g} s") from None
             except OSError:

@@ -28,11 +28,13 @@ from drivers.exchange.notices import (
 )
 from drivers.exchange.shared_ring import SharedCycleRing
 from drivers.motion_source import MotionSource, progress_of
+from drivers.packets import InitPacket
 from drivers.record import MEASURED
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
 
+STOPPED: Final = "the supervisor asked for a stop"
 ORPHAN_LINGER: Final = 2.0
 """s that packets are answered, after the axes were closed, for nobody."""
 FINISH_LINGER: Final = 1.0
@@ -103,6 +105,7 @@ class Serving:
         self._arm_moved_at = -math.inf
         self._digest = Digest()
         self._offered: MotionSource | None = None
+        self._offered_to: InitPacket | None = None
         self._source: object = None
 
     def __call__(self) -> bool:
@@ -135,17 +138,20 @@ class Serving:
             self._orphan("the supervisor closed its end")
         if control.stop_count != self._stops:
             self._stops = control.stop_count
-            session.stop("the supervisor asked for a stop")
+            session.stop(STOPPED)
+            if self._offered is not None:
+                self._answer(RequestError(self._state, STOPPED))
         if control.override_count != self._overrides:
             self._overrides = control.override_count
             self._change_override(control.override)
         if control.hold_count != self._holds:
             self._holds = control.hold_count
             self._change_hold(bool(control.held))
-        if control.program_offered != self._inbox.taken:
-            self._read_program(now)
+        # In a later call than it was read, so that a stop in between is seen first.
         if self._offered is not None:
             self._take_program(self._offered, now)
+        if control.program_offered != self._inbox.taken:
+            self._read_program(now)
         if session.requested and self._needs_archive:
             trouble = self._archive_trouble(now)
             if trouble:
@@ -196,15 +202,20 @@ class Serving:
 
     def _read_program(self, now: float) -> None:
         """Read the program that was handed over. That takes time, in which it may be withdrawn."""
+        handed_over = self._inbox.take()
+        if handed_over is None:
+            return  # its descriptor is still on the way
         self._offered = None
         try:
-            handed_over = self._inbox.take()
-            if handed_over is None:
-                return  # its descriptor is still on the way
+            if self._withdrawn(handed_over.identity):
+                handed_over.drop()
+                raise RequestError(self._state, WITHDRAWN)
             self._offered = handed_over.unpacked()
+            self._offered_to = self._session.init
+        except RequestError as error:
+            self._answer(error)
         except Exception as error:  # whatever the classes of a foreign program raise
-            name = self._session.state.name.lower()
-            self._answer(RequestError(name, f"the program cannot be read: {error!r}"))
+            self._answer(RequestError(self._state, f"the program cannot be read: {error!r}"))
         else:
             self._inbox.read()
         self._control.pickup_us = 1e6 * (time.monotonic() - now)
@@ -212,25 +223,37 @@ class Serving:
     def _take_program(self, source: MotionSource, now: float) -> None:
         """Request the program that was read, once it may begin, and say what became of it."""
         control, identity = self._control, self._inbox.taken
-        name = self._session.state.name.lower()
-        refusal = None
         try:
-            if control.program_id == -identity or control.program_offered != identity:
-                raise RequestError(name, WITHDRAWN)
+            if self._withdrawn(identity):
+                raise RequestError(self._state, WITHDRAWN)
             if control.program_id != identity:
                 return  # the supervisor has not said yet
-            if self.reason:
-                raise RequestError(name, self.reason)
-            if self._needs_archive and (trouble := self._archive_trouble(now)):
-                raise RequestError(name, trouble)
+            self._require_time_for_motions(now)
             self._session.request(source)
             self._source = source
             control.motion_time, control.rate = progress_of(source)
         except RequestError as error:
-            refusal = error
-        except Exception as error:  # whatever the classes of a foreign program raise
-            refusal = RequestError(name, f"the program cannot be read: {error!r}")
-        self._answer(refusal)
+            self._answer(error)
+        else:
+            self._answer(None)
+
+    def _withdrawn(self, identity: int) -> bool:
+        control = self._control
+        return control.program_id == -identity or control.program_offered != identity
+
+    def _require_time_for_motions(self, now: float) -> None:
+        """Raise RequestError if no motion may begin now, whatever the session says."""
+        trouble = self.reason
+        if not trouble and self._needs_archive:
+            trouble = self._archive_trouble(now)
+        if not trouble and self._session.init is not self._offered_to:
+            trouble = "the controller began a new session since this motion was handed over"
+        if trouble:
+            raise RequestError(self._state, trouble)
+
+    @property
+    def _state(self) -> str:
+        return self._session.state.name.lower()
 
     def _answer(self, refusal: RequestError | None) -> None:
         """Say what became of the program taken last."""

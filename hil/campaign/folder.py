@@ -36,7 +36,7 @@ LOCK = "campaign.lock"
 LOCK_PATIENCE = 0.5
 """s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
 _LOCKING: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-"""The folder may come from elsewhere: neither a link nor a pipe is taken for the lock."""
+"""The folder may come from elsewhere: no link is followed, and no pipe waited for."""
 _ANOTHER: Final = "{} is not the one this campaign began with"
 _RESTORE: Final = "restore it, or begin a new campaign"
 
@@ -162,7 +162,7 @@ class CampaignFolder:
             lock = os.open(self.root / LOCK, _LOCKING | os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise CampaignFolderError(
-                self.root, f"{LOCK} cannot be written ({error.strerror})", "make it writable"
+                self.root, f"{LOCK} cannot be written ({error.strerror})", "make it a writable file"
             ) from error
         if not _taken(lock, fcntl.LOCK_EX, LOCK_PATIENCE):
             os.close(lock)

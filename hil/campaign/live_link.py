@@ -275,6 +275,8 @@ class LiveLink:
         self.view.lost = None
         self.archive.send(Open(self.job, spec, drives, from_now, until_ended))
         answer = self.archive.answer(OPEN_TIMEOUT, self.job)
+        if answer is not None:
+            self._late_path = ""  # commands are obeyed in order
         if isinstance(answer, Opened):
             return
         self.open_path = ""

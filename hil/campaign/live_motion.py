@@ -48,8 +48,7 @@ class LiveMotion:
 
     def run(self, source: MotionSource, spec: ArchiveSpec) -> MotionEnded:
         """See `MotionLink.run`."""
-        self._steering.begin(source, self._stop)  # no archive is open while a hold stands
-        self._view.look()
+        self._wait_for_begin(source)  # no archive is opened while a hold stands
         self._link.open_archive(spec, from_now=True, until_ended=True)
         # That may have taken seconds: nothing is asked for that is no longer wanted.
         while self._wanted(source):
@@ -61,7 +60,7 @@ class LiveMotion:
                 self._submit(source, spec)
                 return self._supervised(sight, spec)
             except WithdrawnError:
-                continue  # it was stopped, held or slowed while it was handed over
+                continue  # it was stopped, held or slowed meanwhile, or a new session began
             finally:
                 self._link.heart.rest()
         self._link.complete("stopped", NOT_BEGUN)
@@ -91,15 +90,23 @@ class LiveMotion:
     def _wanted(self, source: MotionSource) -> bool:
         """Whether the motion is still to begin; waits while it is held."""
         try:
-            return self._steering.begin(source, self._stop)
+            return self._wait_for_begin(source)
         except ControllerFault as error:
             self._link.complete("void", str(error))
             raise
 
+    def _wait_for_begin(self, source: MotionSource) -> bool:
+        """See `Steering.begin`; what the exchange says meanwhile is not lost."""
+        begins = self._steering.begin(source, self._stop, self._view.look)
+        self._view.look()
+        return begins
+
     def _still_wanted(self) -> bool:
         """Whether it may begin the next moment, as it was handed over."""
         self._link.heart.turn()
-        return self._steering.unchanged(self._stop)
+        self._view.look()
+        same_session = self._view.inits == self._link.inits
+        return same_session and self._steering.unchanged(self._stop)
 
     def _require_same_session(self) -> None:
         """A controller that began anew may announce limits that no motion was checked against."""
@@ -123,8 +130,10 @@ class LiveMotion:
         except DriverError as error:
             self._raise_failure()
             self._exchange.stop()
-            closed = self._link.complete("void", str(error))
-            raise ControllerFault(f"{error}; {spec.path} is {closed.outcome}") from error
+            self._view.look()
+            why = self._view.failure() or str(error)
+            closed = self._link.complete("void", why)
+            raise ControllerFault(f"{why}; {spec.path} is {closed.outcome}") from error
 
     def _look(self, sight: Sight) -> None:
         """Take in what is new, pass wishes on, and show it if that is due."""

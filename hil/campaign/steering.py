@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -57,8 +58,15 @@ class Steering:
         self._watch, self._most = watch, most
         self.fraction, self.held = most, False
 
-    def begin(self, source: MotionSource, stop: Stop) -> bool:
+    def begin(
+        self, source: MotionSource, stop: Stop, meanwhile: Callable[[], object] = lambda: None
+    ) -> bool:
         """Have a motion begin at the speed wished for; waits while a hold is wished for.
+
+        Args:
+            source: the motion.
+            stop: ends the waiting.
+            meanwhile: called again and again while it waits.
 
         Returns:
             Whether it may be asked for now; False once a stop is asked for.
@@ -68,6 +76,7 @@ class Steering:
         """
         wish = self._watch.wish()
         while wish.held and not stop.requested:
+            meanwhile()
             time.sleep(ASKED_EVERY)
             wish = self._watch.wish()
         if stop.requested:

@@ -137,10 +137,15 @@ def move(
             ended, stopped = _sent(way, cell, link, path, quiet=json)
             ended_as.append(ended)
         figures = _figures(ended, path, way, cell, link)
-        if ended.outcome == "completed" or not json:
-            said = f"{ended.outcome}: {ended.reason or 'the arm is there'}; archived in {path}"
+        said = f"{ended.outcome}: {ended.reason or 'the arm is there'}; archived in {path}"
+        if not json:
+            typer.echo(printable(said))
+        try:
+            link.close()
+        except ControllerFault as fault:
+            raise fault.beside(figures) from None
+        if json and ended.outcome == "completed":
             _tell(said, figures, json=json)
-        link.close()
     if ended.outcome == "stopped" and stopped:
         how = f"the arm was stopped on its way; {path} is whole."
         raise OperatorStopError(how).beside(figures)

@@ -239,18 +239,75 @@ def test_a_program_that_was_given_up_does_not_begin_after_all(monkeypatch):
 def test_a_program_is_asked_for_only_once_it_was_read_and_may_be_withdrawn_until_then():
     with running() as (exchange, controller):
         begin = time.monotonic()
-        said = iter((False, True))
-
-        def wanted():
-            assert time.monotonic() - begin > Lengthy.READING  # the exchange has it by now
-            return next(said)
-
         controller.open = True
-        for refused in (True, False):
-            with pytest.raises(WithdrawnError) if refused else nullcontext():
+        for said in (False, True):
+
+            def wanted(said=said):
+                assert time.monotonic() - begin > Lengthy.READING  # the exchange has it by now
+                return said
+
+            with nullcontext() if said else pytest.raises(WithdrawnError):
                 exchange.submit(Lengthy(), wanted)
             controller.cycle(20)
-            assert (controller.moved == 0.0) is refused
+            assert (controller.moved > 0.0) is said
+
+
+class TestBetweenReadingAndBeginning:
+    """Whatever comes in between, a motion begins only as it was meant to."""
+
+    def test_a_stop(self):
+        with running() as (exchange, controller):
+            controller.open = True
+            with pytest.raises(RequestError, match="asked for a stop"):
+                exchange.submit(Cruise(), lambda: exchange.stop() is None)
+            controller.open = True
+            controller.cycle(50)
+            assert controller.moved == 0.0
+
+    def test_a_new_session_of_the_controller(self):
+        with running() as (exchange, controller):
+            with pytest.raises(RequestError, match="new session since"):
+                exchange.submit(Cruise(), lambda: controller.start() is None)
+            controller.open = True
+            controller.cycle(50)
+            assert controller.moved == 0.0
+
+    def test_another_wish_while_the_exchange_stands_still(self):
+        with running() as (exchange, controller):
+            asked = []
+
+            def wanted():
+                asked.append(time.monotonic())
+                if len(asked) == 1:
+                    os.kill(exchange.pid, signal.SIGSTOP)
+                    return True
+                os.kill(exchange.pid, signal.SIGCONT)
+                return False
+
+            with pytest.raises(WithdrawnError):
+                exchange.submit(Cruise(), wanted)
+            assert len(asked) == 2
+            controller.open = True
+            controller.cycle(50)
+            assert controller.moved == 0.0
+
+    def test_an_exception_leaves_no_motion_behind_that_another_could_be_taken_for(
+        self, monkeypatch
+    ):
+        hand_over = process.hand_over
+
+        def interrupted(*arguments):
+            hand_over(*arguments)
+            raise KeyboardInterrupt
+
+        with running() as (exchange, controller):
+            with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+                patch.setattr(process, "hand_over", interrupted)
+                exchange.submit(Cruise())
+            exchange.submit(still(10))
+            controller.open = True
+            controller.cycle(50)
+            assert controller.moved == 0.0
 
 
 class Lengthy(Cruise):
