@@ -13,7 +13,9 @@ damaged, or was written for another key, counts as absent.
 from __future__ import annotations
 
 import json
+import math
 import os
+import re
 import struct
 import tempfile
 from collections.abc import Mapping
@@ -36,6 +38,8 @@ BESIDE: Final = ".hil-cache"
 """Name of the folder beside the archives."""
 
 _MAGIC: Final = b"HILCACH1"
+_NUMBERS: Final = re.compile(r"[<|][biuf][1-8]")
+"""Codes of the arrays that are kept. numpy would evaluate what else a stranger may have sealed."""
 _HEAD: Final = struct.Struct("<8sQI")  # magic, length of the rest, its checksum
 _TEXT: Final = struct.Struct("<I")  # length of the JSON text in front of the arrays
 
@@ -174,9 +178,10 @@ def decoded(data: bytes, key: str) -> Entry | None:
             return None
         arrays, at = {}, _TEXT.size + size
         for name, code, shape in content["arrays"]:
-            dtype = np.dtype(code)
-            count = int(np.prod(shape, dtype=np.int64))
-            if count < 0:
+            if not _NUMBERS.fullmatch(code) or not all(type(size) is int for size in shape):
+                return None
+            dtype, count = np.dtype(code), math.prod(shape)
+            if not 0 <= count <= len(body):
                 return None
             arrays[name] = np.frombuffer(body, dtype, count, at).reshape(shape)
             at += count * dtype.itemsize

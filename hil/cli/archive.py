@@ -93,9 +93,10 @@ def repair(
     for loss in done.losses:
         typer.echo(_shown([f"lost: {loss}"]), err=True)
     if done.output is None:
-        typer.echo(f"{file}: whole, nothing to repair")
+        typer.echo(_shown([f"{file}: whole, nothing to repair"]))
     else:
-        typer.echo(f"wrote {done.output}: {_saved(done.samples, done.samples_lost)}")
+        saved = _saved(done.samples, done.samples_lost)
+        typer.echo(_shown([f"wrote {done.output}: {saved}"]))
     raise typer.Exit(LOST if done.losses else 0)
 
 

@@ -57,7 +57,7 @@ def compare(
         write_together(output.parent, {output.name: comparison_bytes(found)})
         reporter.say(f"report: {output}")
     if json:
-        typer.echo(json_module.dumps(to_dict(found), ensure_ascii=False))
+        typer.echo(json_module.dumps(to_dict(found)))
     else:
         if not quiet:
             for one in told(found):

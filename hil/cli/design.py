@@ -23,6 +23,7 @@ from hil.design.folder import DesignFolder, require_same
 from hil.design.run import Designed, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
+from hil.printable import printable
 from hil.progress import reporter as make_reporter
 
 from . import design_words as words
@@ -168,9 +169,8 @@ def design(
         made = _campaign(folder, loaded, done)
         words.say_campaign(reporter, folder, made)
         summary = words.summary(done, folder) | words.campaign_summary(folder, made)
-        typer.echo(
-            json_format.dumps(summary, allow_nan=False) if json else words.line(done, folder)
-        )
+        told = words.line(done, folder)
+        typer.echo(json_format.dumps(summary, allow_nan=False) if json else printable(told))
         words.draw(folder, done, loaded, beside, together=known is not None)
 
     with _stoppable(folder) as stop:

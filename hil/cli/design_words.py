@@ -6,8 +6,7 @@ import math
 import shlex
 from typing import Any
 
-import typer
-
+from hil import lines
 from hil.cell import Cell
 from hil.design.compare import References
 from hil.design.findings import WEAK, margins, weakest
@@ -42,7 +41,7 @@ def warn_of_unchecked(done: Designed, cell: Cell) -> None:
     """Say on stderr, however quiet it is to be, what was not looked at."""
     unchecked = done.result.settings.unchecked
     if unchecked:
-        typer.echo(
+        lines.say(
             f"warning: not looked at: {', '.join(unchecked)}; {cell.name} may refuse this motion",
             err=True,
         )
@@ -125,7 +124,7 @@ def draw(
     try:
         save(figure, folder.picture)
     except InputError as error:
-        typer.echo(f"warning: {error}; repeat with --resume to draw it again", err=True)
+        lines.say(f"warning: {error}; repeat with --resume to draw it again", err=True)
 
 
 def _say_condition(reporter: Reporter, done: Designed) -> None:

@@ -82,4 +82,4 @@ def told_as_json(asked: bool) -> Iterator[None]:
 def _print(error: Exception, asked: bool) -> None:
     if asked:
         with suppress(OSError):  # nobody reads any more; the status still counts
-            typer.echo(json.dumps(as_json(error), ensure_ascii=False))
+            typer.echo(json.dumps(as_json(error)))

@@ -12,6 +12,8 @@ import typer
 from hil.archive import open_archive
 from hil.errors import InputError
 from hil.importers import ColumnMap, Findings, Robot, Use, import_log, import_rosbag2
+from hil.lines import say
+from hil.printable import printable
 from identification import FrictionLaw
 
 app = typer.Typer(
@@ -168,13 +170,13 @@ def _tell(path: Path, *, json: bool) -> None:
     found = Findings.of(open_archive(path).metadata)
     if json:
         told = {"archive": str(path), "found": found.lines, "doubts": found.doubts}
-        typer.echo(json_format.dumps(told, ensure_ascii=False))
+        typer.echo(json_format.dumps(told))
         return
     for line in found.lines:
-        typer.echo(line)
+        say(line)
     for doubt in found.doubts:
-        typer.secho(f"doubtful: {doubt}", fg=typer.colors.YELLOW)
-    typer.echo(f"wrote {path}")
+        typer.secho(printable(f"doubtful: {doubt}"), fg=typer.colors.YELLOW)
+    say(f"wrote {path}")
 
 
 def _use(kind: str) -> Use:

@@ -11,6 +11,7 @@ import typer
 from hil.campaign import stop_on_interrupt
 from hil.errors import InputError
 from hil.files import write_atomically
+from hil.lines import say
 from hil.new import Known, cell_of_urdf, from_archive, from_init, read_init
 
 PORT = 1000
@@ -102,11 +103,11 @@ def new(
         typer.echo(json_format.dumps(summary))
         return
     for note in known.notes:
-        typer.echo(f"note: {note}")
-    typer.echo(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})")
+        say(f"note: {note}")
+    say(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})")
     if unknown:
-        typer.echo(f'still unknown, marked "?": {", ".join(unknown)}')
-        typer.echo(f"fill them in, then `hil doctor {output}`; whatever is missing is named again")
+        say(f'still unknown, marked "?": {", ".join(unknown)}')
+        say(f"fill them in, then `hil doctor {output}`; whatever is missing is named again")
 
 
 def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool) -> Known:

@@ -21,6 +21,7 @@ from hil.cli.plan_input import (
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import check_format, draw_plan, save
+from hil.printable import printable
 from hil.random_motion import random_via_points
 from planner.motion_csv import to_csv
 from planner.moves import Fly, FlyDistance, FlyPercent, MotionPlan, plan_moves
@@ -122,7 +123,7 @@ def plan(
     typer.echo(
         json_format.dumps(_summary(planned, loaded, frame))
         if json
-        else _table(planned, loaded, frame)
+        else printable(_table(planned, loaded, frame))
     )
     if output is not None:
         _write_plan(output, PlanFile.of(planned, names))

@@ -19,6 +19,7 @@ from hil.campaign.live_link import LiveLink
 from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
 from hil.errors import ControllerFault, HilError, OperatorStopError
+from hil.lines import say
 from hil.printable import printable
 from hil.recording import archive_path
 from hil.recording import record as record_motion
@@ -148,7 +149,7 @@ def _report(path: Path, done: Recorded, cell: Cell) -> None:
     seconds = done.records * cell.period
     lost = f", {done.records_lost} records LOST" if done.records_lost else ""
     lost += f", {done.events_lost} events LOST" if done.events_lost else ""
-    typer.echo(
+    say(
         f"{path}: {seconds:.1f} s in {done.records} cycles, {done.missed} packets missed, "
         f"{done.late} answers late, {done.untaken} not taken{lost}; "
         f"{done.outcome}: {done.reason}"
@@ -186,7 +187,7 @@ class View:
         if progress.over != self._over:
             self._over = progress.over
             # Said in any case: who ends the program now may take the answers from a moving arm.
-            typer.echo(
+            say(
                 f"{progress.over}; still answering until the arm rests (Ctrl-C to leave at once)",
                 err=self._quiet,
             )

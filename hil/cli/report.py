@@ -34,4 +34,4 @@ def report(
         return
     verdict = Results.load(opened.folder.results).verdict
     told = {"report": str(page), "good": verdict.good, "verdict": verdict.line}
-    typer.echo(json_format.dumps(told, ensure_ascii=False))
+    typer.echo(json_format.dumps(told))

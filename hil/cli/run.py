@@ -147,7 +147,7 @@ def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool)
         finish(found.results, json=False, quiet=quiet)
         return
     verdict = json_format.loads(as_json(found.results))
-    typer.echo(json_format.dumps({**result.to_dict(), "verdict": verdict}, ensure_ascii=False))
+    typer.echo(json_format.dumps({**result.to_dict(), "verdict": verdict}))
     if not found.verdict.good:
         raise typer.Exit(NOT_GOOD)
 
@@ -155,11 +155,11 @@ def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool)
 def _tell(result: RunResult, *, json: bool) -> None:
     """What was done, where nothing is identified."""
     if json:
-        typer.echo(json_format.dumps({**result.to_dict(), "verdict": None}, ensure_ascii=False))
+        typer.echo(json_format.dumps({**result.to_dict(), "verdict": None}))
         return
     done, wanted = result.repetitions
     tested, tests = result.validations
-    typer.echo(
+    say(
         f"{result.campaign}: dry run {result.dry_run}, repetitions {done} of {wanted}, validation "
         f"{tested} of {tests}, {len(result.rejected)} rejected"
     )

@@ -13,6 +13,7 @@ from drivers.transports.faults import FaultyLink
 from hil.cell import Cell
 from hil.cli.simulation_status import Status
 from hil.errors import InputError
+from hil.printable import printable
 from hil.serving import Served, buttons, open_far_end, serve_session, undisturbed
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from sim_fixtures import ControllerSettings, SimulatedController
@@ -212,7 +213,7 @@ def _report(served: Served, status: Status, *, json: bool, interrupted: bool) ->
         typer.echo(json_format.dumps(_figures(served)))
     else:
         status.clear()
-        typer.echo("\n".join(_sentences(served)))
+        typer.echo(printable("\n".join(_sentences(served))))
     if not served.summary.ended and interrupted:
         raise typer.Exit(130)
     if served.gave_up or not served.summary.ended:

@@ -31,7 +31,7 @@ def status(
     """
     found = Campaign.open(campaign).status()
     if json:
-        typer.echo(json_module.dumps(found.to_dict(), ensure_ascii=False))
+        typer.echo(json_module.dumps(found.to_dict()))
         return
     console = Console()
     console.print(_table(found))

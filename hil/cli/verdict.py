@@ -51,7 +51,7 @@ def as_json(results: Results) -> str:
     found["delays"] = None if results.delays is None else results.delays.model_dump(mode="json")
     found["fitted"] = None if results.fitted is None else results.fitted.model_dump(mode="json")
     found["exports"] = None if results.exports is None else results.exports.model_dump(mode="json")
-    return json_module.dumps(found, ensure_ascii=False)
+    return json_module.dumps(found)
 
 
 def table(results: Results) -> list[str]:

@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from hil.printable import printable
+
 from .check import Check, Status
 from .fitness import CRITERIA, Fitness
 from .latency import Latency
@@ -32,12 +34,14 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
         console.print(verdict_line(verdict), markup=False, highlight=False, soft_wrap=True)
     console.print(f"({CRITERIA})", markup=False, highlight=False, soft_wrap=True)
     for line in remedies(diagnosis.checks):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     if not diagnosis.wanted.fit:
         console.print(f"\n{_OTHERWISE}", markup=False, highlight=False, soft_wrap=True)
     console.print()
     colour = "green" if diagnosis.fit else "red"
-    console.print(f"[bold {colour}]{escape(diagnosis.line)}[/]", highlight=False, soft_wrap=True)
+    console.print(
+        f"[bold {colour}]{escape(printable(diagnosis.line))}[/]", highlight=False, soft_wrap=True
+    )
 
 
 def _table(checks: tuple[Check, ...]) -> Table:
@@ -46,7 +50,7 @@ def _table(checks: tuple[Check, ...]) -> Table:
         table.add_column(title, overflow="fold")
     for check in checks:
         status = f"[{_COLOUR[check.status]}]{check.status}[/]"
-        table.add_row(escape(check.name), status, escape(check.found))
+        table.add_row(escape(check.name), status, escape(printable(check.found)))
     return table
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
@@ -125,7 +125,8 @@ def planted_in(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
+    most = sys.float_info.max
+    return isinstance(value, int | float) and type(value) is not bool and -most <= value <= most
 
 
 def _period(samples: Samples) -> float:

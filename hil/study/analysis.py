@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import open_archive
+from hil.archive import Archive, foreign_json, open_archive
 from hil.campaign import CampaignFolder
 from hil.campaign.plan import moves_from_dict
 from hil.errors import InputError
@@ -170,9 +169,15 @@ def classes_of(run: Run) -> dict[MotionClass, list[str]]:
     found: dict[MotionClass, list[str]] = {}
     folder = CampaignFolder(run.root)
     for name, _ in run.archives("validation"):
-        attachment = open_archive(folder.archives / name).attachments.get("plan.json", b"{}")
-        found.setdefault(class_of(json.loads(attachment)), []).append(name)
+        plan = plan_in(open_archive(folder.archives / name))
+        found.setdefault(class_of(plan), []).append(name)
     return found
+
+
+def plan_in(archive: Archive) -> dict[str, Any]:
+    """What an archive says of its planned motion; {} where it says nothing that can be read."""
+    plan = foreign_json.loads(archive.attachments.get("plan.json", b""))
+    return plan if isinstance(plan, dict) else {}
 
 
 def class_of(plan: Mapping[str, Any]) -> MotionClass:
@@ -180,7 +185,8 @@ def class_of(plan: Mapping[str, Any]) -> MotionClass:
 
     A motion in pieces whose moves were not kept is taken for fly-by, the interpolator's own way.
     """
-    if plan.get("trajectory", {}).get("type") == "fourier_series":
+    trajectory = plan.get("trajectory")
+    if isinstance(trajectory, dict) and trajectory.get("type") == "fourier_series":
         return "sinusoid"
     moves = moves_from_dict(plan)
     if moves is None or any(_rounds(move.fly) for move in moves.moves):

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, open_archive
+from hil.archive import Archive, foreign_json, open_archive
 from hil.batch.keys import arm_digest
 from hil.batch.trend_words import short_names
 from hil.campaign import CampaignFolder, CampaignFolderError
@@ -21,10 +20,9 @@ from hil.compare.gather import apart
 from hil.errors import InputError
 from hil.identify.sources import cell_of
 from hil.identify.summary import planted_in
-from hil.reading import json_of
 from identification.excitation import Excitation
 
-from .analysis import Run, class_of
+from .analysis import Run, class_of, plan_in
 from .designs import AP, B0, A, B
 from .records import PLANTED
 
@@ -120,21 +118,16 @@ def _recorded(run: Run, archive: Archive) -> Recorded:
         cell=cell,
         excitation=_excitation(archive),
         simulated=simulated,
-        effects=tuple(json.loads(archive.metadata.get("effects", "[]"))),
+        effects=foreign_json.names(archive.metadata.get("effects", "[]")) or (),
         planted=planted_in(cell, archive.metadata) if simulated else None,
     )
 
 
 def _excitation(archive: Archive) -> Excitation | None:
     try:
-        return Excitation.from_dict(_plan(archive)["excitation"])
+        return Excitation.from_dict(plan_in(archive)["excitation"])
     except (KeyError, TypeError, ValueError):
         return None
-
-
-def _plan(archive: Archive) -> dict[str, Any]:
-    plan: dict[str, Any] = json_of(archive.attachments.get("plan.json", b"{}"))
-    return plan
 
 
 def _method(archive: Archive) -> str:
@@ -142,7 +135,7 @@ def _method(archive: Archive) -> str:
     excitation = _excitation(archive)
     if excitation is None or excitation.method not in (A, B):
         return ""
-    stops = excitation.method == B and class_of(_plan(archive)) == "stop-to-stop"
+    stops = excitation.method == B and class_of(plan_in(archive)) == "stop-to-stop"
     return B0 if stops else excitation.method
 
 
