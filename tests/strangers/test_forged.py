@@ -64,4 +64,4 @@ def test_a_name_that_is_no_text_is_told_as_json(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 2
-    assert "x\udcff" in json.loads(done.stdout)["error"]
+    assert "x\\udcff" in json.loads(done.stdout)["error"]
