@@ -21,6 +21,8 @@ from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from planner import FourierSeries, PiecewiseCubic
 
+from .standstill import ARM_MOVED
+
 Array = NDArray[np.float64]
 
 FIELDS: Final = ("cycle", "gap", "position", "target_current", "commanded_position")
@@ -160,6 +162,23 @@ def torn_or_slowed(
         f"it was held or slowed about {at:.1f} s after its begin, so it is no repetition; leave "
         "the override at 100 %",
         by_hand=True,
+    )
+
+
+def unrest(played: Played, cell: Cell) -> Problem | None:
+    """What is wrong with a recording of the arm at rest: the noise of its sensors is taken from it.
+
+    Args:
+        played: it, as archived.
+        cell: its joints' names.
+    """
+    off = np.abs(played.position - np.median(played.position, axis=0)).max(axis=0)
+    joint = int(np.argmax(off))
+    if off[joint] <= ARM_MOVED:
+        return None
+    return Problem(
+        f"{cell.joint_names[joint]} moved by {off[joint]:.2g} rad while the arm was to stand "
+        f"still; {ARM_MOVED:g} rad is noise"
     )
 
 

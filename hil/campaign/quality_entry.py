@@ -24,8 +24,10 @@ from .quality import (
     RepetitionCheck,
     problem_of,
     torn_or_slowed,
+    unrest,
 )
 
+_JUDGED: Final = frozenset({"standstill", "excitation", "validation", "warmup"})
 _FEWEST_ALIKE: Final = 2
 """Attempts that must agree before they speak against what counts."""
 
@@ -64,10 +66,12 @@ class Entering:
             known: what is wrong with it, where that is known already.
         """
         played, problem = None, known
-        if problem is None and interval.kind in ("excitation", "validation", "warmup"):
+        if problem is None and interval.kind in _JUDGED:
             played = self._played(name)
             if interval.kind == "excitation":
                 problem = self._judged(played)
+            elif interval.kind == "standstill":
+                problem = unrest(played, self._cell)
             else:
                 # A cold arm may want more current than it has: that is what warming up is for.
                 judge = problem_of if interval.kind == "validation" else torn_or_slowed

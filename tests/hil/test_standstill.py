@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
+from hil.archive import open_archive
 from hil.campaign.standstill import Standstill
+from hil.testing import faulty_link
+from tests.hil.fast_cell import fast_campaign, fast_cell
 
 PERIOD = 0.002
 SECOND = round(1.0 / PERIOD)
@@ -53,3 +59,19 @@ def test_a_controller_that_starts_anew_begins_the_second_anew() -> None:
     still = Standstill(PERIOD)
     still.take(records(10_000, 10))
     assert not still.take(records(0, 10))
+
+
+def test_a_recording_of_the_noise_in_which_the_arm_moved_is_made_again(tmp_path: Path) -> None:
+    cell = fast_cell(tmp_path)
+    quiet = fast_campaign(tmp_path / "quiet", cell)
+    assert not quiet.run(unrehearsed=True).rejected
+    (archive,) = quiet.folder.completed("standstill")
+    cycle = int(open_archive(archive).columns["cycle"].mean())
+
+    pushed = fast_campaign(tmp_path / "pushed", cell)
+    result = pushed.run(faulty_link(cell, f"push@{cycle}x5:axis=1"), unrehearsed=True)
+    assert [one.archive for one in result.rejected] == ["standstill_000_a1.mcap"]
+    assert re.search(r"moved by .* rad while the arm was to stand still", result.rejected[0].reason)
+    assert [path.name for path in pushed.folder.completed("standstill")] == [
+        "standstill_000_a2.mcap"
+    ]
