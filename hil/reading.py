@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, Final
 
 LONGEST_TEXT: Final = 1 << 28
 """Bytes of the longest text that is read as a whole; the largest of ours has a hundredth of it."""
+_NO_FILE: Final = "it is a pipe or a device, no file"
 
 
 def opened(path: Path) -> BinaryIO:
@@ -33,7 +34,7 @@ def opened(path: Path) -> BinaryIO:
         if stat.S_ISDIR(mode):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if not stat.S_ISREG(mode):
-            raise OSError(errno.EINVAL, "it is a pipe or a device, no file", str(path))
+            raise OSError(errno.EINVAL, _NO_FILE, str(path))
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -52,6 +53,13 @@ def text_of(path: Path) -> str:
             raise OSError(errno.EFBIG, f"it has more than {LONGEST_TEXT} bytes", str(path))
         text = stream.read().decode("utf-8")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def remedy_of(trouble: OSError | UnicodeDecodeError, otherwise: str) -> str:
+    """What a person can do who named what `text_of` refuses."""
+    if isinstance(trouble, UnicodeDecodeError):
+        return "save it as UTF-8"
+    return "write it to a file first, and name that" if trouble.strerror == _NO_FILE else otherwise
 
 
 def json_of(text: str | bytes) -> Any:

@@ -129,7 +129,8 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
 
     Raises:
         ModelError: the text is no URDF of an open chain or none that may be read
-            (:func:`identification.urdf_text.refusal`), or has no joint of a name in `locked`.
+            (:func:`identification.urdf_text.refusal`), has a joint without a direction, or no
+            joint of a name in `locked`.
     """
     if (refused := refusal(urdf)) is not None:
         raise ModelError(f"the robot description is not a readable URDF: {refused}")
@@ -141,6 +142,8 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
         ) from error
     if (closed := closed_chain(urdf)) is not None:
         raise ModelError(f"the robot description is no open chain: {closed}")
+    for index in range(1, model.njoints):
+        _require_direction(model, index)
     if not locked:
         return model
     posture = locked_posture(model, locked)
@@ -192,17 +195,30 @@ def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:
             "only revolute, continuous, prismatic and fixed joints can be identified",
             joint=name,
         )
-    data = joint.createData()
-    joint.calc(data, pin.neutral(model))
-    subspace = np.asarray(data.S, dtype=np.float64).reshape(6)
+    subspace = _subspace(model, index)
     linear, angular = subspace[:3], subspace[3:]
-    if not abs(float(np.linalg.norm(subspace)) - 1.0) < _UNIT:
+    revolute = bool(np.any(angular))
+    return (angular if revolute else linear).copy(), revolute
+
+
+def _require_direction(model: pin.Model, index: int) -> None:
+    """Refuse an axis of length zero: a joint locked at an angle about it has no placement."""
+    if model.joints[index].nv == 1 and not (
+        abs(float(np.linalg.norm(_subspace(model, index))) - 1.0) < _UNIT
+    ):
+        name = model.names[index]
         raise ModelError(
             f'joint {name!r} has an <axis> without a direction; write one such as xyz="0 0 1"',
             joint=name,
         )
-    revolute = bool(np.any(angular))
-    return (angular if revolute else linear).copy(), revolute
+
+
+def _subspace(model: pin.Model, index: int) -> Array:
+    """Return the velocity of a joint with one degree of freedom at unit speed (6,)."""
+    joint = model.joints[index]
+    data = joint.createData()
+    joint.calc(data, pin.neutral(model))
+    return np.asarray(data.S, dtype=np.float64).reshape(6)
 
 
 def skew(vector: Array) -> Array:

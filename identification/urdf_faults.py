@@ -7,21 +7,24 @@ from __future__ import annotations
 
 from collections import Counter
 from typing import Final
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
+
+from identification.urdf_text import XACRO, left_by_xacro
+from identification.urdf_tree import urdf_tree
 
 _JOINT_TYPES: Final = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _WITH_LIMIT: Final = ("revolute", "prismatic")
 
 
 def urdf_fault(text: str) -> str | None:
-    """Return the first fault of URDF text in words, None if it has none of the known ones."""
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as problem:
-        return f"it is no XML ({problem})"
-    if any("xacro" in element.tag for element in root.iter() if isinstance(element.tag, str)):
-        return "it is a xacro file; expand it with: xacro FILE > robot.urdf"
+    """Return the first fault of URDF text in words, None if it has none of the known ones.
+
+    Raises:
+        ModelError: it is no XML.
+    """
+    root = urdf_tree(text)
+    if any(left_by_xacro(element.tag, element.attrib) for element in root.iter()):
+        return XACRO
     if root.tag != "robot":
         return f"its outermost element is <{root.tag}>, not <robot>"
     if "name" not in root.attrib:
@@ -57,8 +60,12 @@ def _joint_fault(joint: Element, links: list[str]) -> str | None:
 
 
 def closed_chain(text: str) -> str | None:
-    """Return which link two joints move, which readers take for a tree without a word."""
-    joints = ElementTree.fromstring(text).findall("joint")
+    """Return which link two joints move, which readers take for a tree without a word.
+
+    Raises:
+        ModelError: it is no XML.
+    """
+    joints = urdf_tree(text).findall("joint")
     children = Counter(end.get("link", "") for joint in joints for end in joint.findall("child"))
     name, count = children.most_common(1)[0] if children else ("", 0)
     return f"link {name!r} is the child of {count} joints: a closed chain" if count > 1 else None

@@ -45,6 +45,10 @@ def build_model(urdf: str, gravity: ArrayLike, armature: ArrayLike) -> pin.Model
 def _with_one_angle_each(urdf: str) -> str:
     """Continuous joints as revolute ones: pinocchio describes the former by sine and cosine."""
     root = ET.fromstring(urdf)
+    # To pinocchio a namespace is nothing; ET would write it back before every name.
+    namespace = root.tag[: root.tag.rfind("}") + 1]
+    for element in root.iter():
+        element.tag = element.tag.removeprefix(namespace)
     continuous = root.findall("joint[@type='continuous']")
     if not continuous:
         return urdf

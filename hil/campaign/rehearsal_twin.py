@@ -26,6 +26,7 @@ from hil.simulation import (
     simulated_controller,
     simulated_provenance,
 )
+from identification.urdf_tree import urdf_tree
 from planner.toml_value import toml_value
 from sim_fixtures import ServoSettings, SimulatedDrive, UnmodelledEffects
 
@@ -160,7 +161,7 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
 
 def _drawn_inertias(urdf: str, rng: np.random.Generator) -> str:
     """The URDF with each link's mass and tensor scaled alike, so that it stays a possible body."""
-    root = ElementTree.fromstring(urdf)
+    root = urdf_tree(urdf)
     for link in root.iter("link"):
         inertial = link.find("inertial")
         factor = 1.0 + SPREAD * rng.uniform(-1.0, 1.0)

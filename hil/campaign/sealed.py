@@ -9,7 +9,9 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
-from xml.etree import ElementTree
+
+from identification.errors import ModelError
+from identification.urdf_tree import urdf_tree
 
 MESH: Final = "mesh "
 """Begins the entry of a mesh, by its name in the URDF."""
@@ -52,8 +54,8 @@ def as_text(content: bytes) -> str:
 
 def _collision_meshes(urdf: bytes) -> list[str]:
     try:
-        root = ElementTree.fromstring(urdf)
-    except ElementTree.ParseError:  # whoever loads it says so
+        root = urdf_tree(as_text(urdf))
+    except (ModelError, UnicodeDecodeError):  # whoever loads it says so
         return []
     found = root.iterfind("./link/collision/geometry/mesh")
     return sorted({name for mesh in found if (name := mesh.get("filename"))})

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
+
+from identification.urdf_tree import urdf_tree
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
 
     Only the robot's own joints: a transmission names joints of the same name again.
     """
-    joints = {joint.get("name"): joint for joint in ElementTree.fromstring(urdf).findall("joint")}
+    joints = {joint.get("name"): joint for joint in urdf_tree(urdf).findall("joint")}
     rows = []
     for name in joint_names:
         limit = joints[name].find("limit")

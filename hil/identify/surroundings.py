@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from identification.masks import SATURATED
 from identification.nominal_prior import NOMINAL_SHARE
 from identification.nominal_scale import NominalScale, nominal_scale
 from identification.position_jumps import position_jumps
+from identification.urdf_tree import urdf_tree
 
 from .controller_model import controller_error, controller_inertia
 from .prepared import Prepared
@@ -108,7 +108,7 @@ def torque_limits(cell: Cell) -> Array | None:
         gear = np.abs(np.diag(drives.motor_from_joint))
         return np.asarray(gear * drives.torque_constant * drives.current_limit)
     efforts = {}
-    for joint in ElementTree.fromstring(cell.urdf).iter("joint"):
+    for joint in urdf_tree(cell.urdf).iter("joint"):
         limit = joint.find("limit")
         if limit is not None:
             efforts[joint.get("name")] = _positive(limit.get("effort", ""))

@@ -7,13 +7,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples, foreign_json
 from identification.resampling import time_base
+from identification.urdf_tree import urdf_tree
 
 Array = NDArray[np.float64]
 
@@ -118,7 +119,7 @@ def examine(samples: Samples, joint_names: Sequence[str], urdf: str) -> Findings
 def urdf_limits(urdf: str) -> dict[str, Limits]:
     """Limits by joint name."""
     found = {}
-    for joint in ElementTree.fromstring(urdf.encode()).iter("joint"):
+    for joint in urdf_tree(urdf).iter("joint"):
         kind, limit = joint.get("type"), joint.find("limit")
         if kind not in ("revolute", "continuous", "prismatic"):
             continue
@@ -134,7 +135,7 @@ def urdf_limits(urdf: str) -> dict[str, Limits]:
     return found
 
 
-def _numbers(limit: ElementTree.Element) -> dict[str, float]:
+def _numbers(limit: Element) -> dict[str, float]:
     """What of a limit is a number; what a macro left behind is none."""
     found = {}
     for key in ("lower", "upper", "velocity", "effort"):

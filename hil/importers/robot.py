@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.errors import SourceError
-from hil.reading import text_of
+from hil.reading import remedy_of, text_of
 from identification import FrictionLaw
 from planner.toml_value import toml_value
 
@@ -61,9 +61,9 @@ class Robot:
         try:
             urdf = text_of(path)
         except (OSError, UnicodeDecodeError) as error:
-            raise SourceError(
-                path, f"cannot be read ({error})", remedy="name a URDF file"
-            ) from error
+            why = error.strerror if isinstance(error, OSError) else error
+            remedy = remedy_of(error, "name a URDF file")
+            raise SourceError(path, f"cannot be read ({why})", remedy=remedy) from error
         law = friction or FrictionLaw()
         text = _cell_text(path.stem, law, gravity, rotor_inertia, locked or {})
         return cls._checked(text, urdf, path)

@@ -16,7 +16,7 @@ from drivers.drive_train import WRIST_AXES
 from hil.cell.unknown import UNKNOWN, WHERE
 from hil.cell.urdf import urdf_limits
 from hil.errors import InputError
-from hil.reading import text_of
+from hil.reading import remedy_of, text_of
 from identification.errors import ModelError
 from identification.kinematics import Chain, chain_from_urdf
 from planner.toml_value import toml_key, toml_value
@@ -94,7 +94,8 @@ def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
         text = text_of(path)
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else error
-        raise InputError(path, f"cannot be read ({why})", remedy="name a URDF") from error
+        remedy = remedy_of(error, "name a URDF")
+        raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error
     chain = _chain(path, text)
     unknown = sorted(set(fixed) - set(chain.joint_names))
     if unknown:

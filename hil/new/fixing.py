@@ -10,6 +10,8 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from identification.urdf_tree import urdf_tree
+
 _OF_MOVING_JOINTS: Final = (
     "axis", "limit", "mimic", "dynamics", "safety_controller", "calibration"
 )  # fmt: skip
@@ -31,7 +33,7 @@ class Mimic:
 def mimics(urdf: str) -> dict[str, Mimic]:
     """Joints that follow another one, by name; an offset that is no number counts as 0."""
     found = {}
-    for joint in ET.fromstring(urdf).findall("joint"):
+    for joint in urdf_tree(urdf).findall("joint"):
         mimic = joint.find("mimic")
         if mimic is not None:
             try:
@@ -48,8 +50,7 @@ def with_fixed(urdf: str, positions: Mapping[str, float]) -> str:
     Raises:
         KeyError: no joint has such a name.
     """
-    parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
-    root = ET.fromstring(urdf, parser=parser)
+    root = urdf_tree(urdf, comments=True)
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     for name, position in positions.items():
         _fix(joints[name], position)

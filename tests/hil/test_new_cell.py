@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,8 @@ from hil.cell.urdf import urdf_limits
 from hil.cli import app
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError
+from hil.importers import Robot
+from hil.new import cell_of_urdf
 from hil.new.controller import _nothing_moves
 from hil.new.fixing import with_fixed
 from hil.progress import Silent
@@ -268,6 +272,44 @@ def test_what_cannot_be_meant_is_refused_in_a_sentence(
     result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, InputError)
     assert sentence in str(result.exception)
+
+
+def test_namespace_and_encoding_of_the_urdf_change_nothing(
+    two_joints: Path, tmp_path: Path
+) -> None:
+    follows = '<mimic joint="hip" offset="0.3"/><limit effort="60" velocity="0"/>'
+    plain = TWO_JOINTS.replace('<limit effort="60" velocity="0"/>', follows)
+    drakes = plain.replace("<robot ", '<robot xmlns="http://drake.mit.edu" ')
+    drakes = drakes.replace('version="1.0"', 'version="1.0" encoding="GB2312"')
+    written = []
+    for text in (plain, drakes):
+        two_joints.write_text(text)
+        new(two_joints, tmp_path / "cell.toml", "--force")
+        copy = (tmp_path / "cell.urdf").read_text()
+        assert [*pin.buildModelFromXML(copy).names][1:] == ["hip"]
+        written.append((tmp_path / "cell.toml").read_text())
+    assert written[0] == written[1]
+
+
+def test_whoever_names_a_pipe_is_told_to_write_it_to_a_file(tmp_path: Path) -> None:
+    """As `hil new --urdf <(xacro robot.xacro)` does."""
+    reading, writing = os.pipe()
+    os.write(writing, TWO_JOINTS.encode())
+    os.close(writing)
+    try:
+        for read in (partial(cell_of_urdf, fixed={}), Robot.from_urdf):
+            with pytest.raises(InputError, match="write it to a file first"):
+                read(Path(f"/dev/fd/{reading}"))
+    finally:
+        os.close(reading)
+    with pytest.raises(InputError, match="name a URDF"):
+        cell_of_urdf(tmp_path, {})
+
+
+def test_a_urdf_that_is_no_utf8_is_to_be_saved_as_such(two_joints: Path) -> None:
+    two_joints.write_bytes(TWO_JOINTS.replace("hip", "h\xfc").encode("latin-1"))
+    with pytest.raises(InputError, match="save it as UTF-8"):
+        cell_of_urdf(two_joints, {})
 
 
 def test_the_command_prints_one_sentence_for_a_file_that_is_no_urdf(tmp_path: Path) -> None:

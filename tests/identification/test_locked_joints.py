@@ -70,6 +70,17 @@ def test_what_cannot_be_locked_is_refused_by_name() -> None:
         chain_from_urdf(TWO_LINK, {"shoulder": 0.0, "elbow": 0.0})
 
 
+@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
+def test_no_joint_is_locked_about_an_axis_without_a_direction(kind: str) -> None:
+    """Its placement would be no rotation: the cosine of the angle times the identity."""
+    still = one_joint(kind, "0 0 0").replace("</robot>", "") + (
+        '<link name="c"/><joint name="turns" type="continuous"><parent link="b"/>'
+        '<child link="c"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    with pytest.raises(ModelError, match="'strange' has an <axis> without a direction"):
+        chain_from_urdf(still, {"strange": 0.5})
+
+
 def text(element: ElementTree.Element | None) -> str:
     assert element is not None
     return ElementTree.tostring(element, encoding="unicode")

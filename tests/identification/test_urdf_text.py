@@ -9,13 +9,16 @@ import struct
 import time
 from pathlib import Path
 
+import numpy as np
+import pinocchio as pin
 import pytest
 
 from identification import ModelError, RobotModel
 from identification.excitation import CollisionChecker, Workspace
 from identification.excitation.errors import CollisionModelError
-from identification.kinematics import MOST_JOINTS
+from identification.kinematics import MOST_JOINTS, chain_from_urdf
 from identification.urdf_text import LONGEST, MOST_LINKS, refusal
+from identification.urdf_write import write_urdf
 
 INERTIAL = (
     '<inertial><mass value="6"/><origin xyz="0.2 0 0"/>'
@@ -58,6 +61,10 @@ def expanding() -> str:
     return declaring('<!ENTITY e0 "ha">' + "".join(lines), "&e9;")
 
 
+def without(old: str) -> str:
+    return arm(old, "")
+
+
 REFUSED = {
     "an entity of its own": (declaring('<!ENTITY x "y">', "&x;"), "declares the entity 'x'"),
     "entities without end": (expanding(), "declares the entity 'e0'"),
@@ -81,6 +88,18 @@ REFUSED = {
     ),
     "a chain that overflows the reader's stack": (chain(20_000, "fixed"), f"{MOST_LINKS} links"),
     "more joints than a model bears": (chain(300, "revolute"), f"at most {MOST_JOINTS}"),
+    "a name with a tab, which is two names to two readers": (
+        arm('name="shoulder"', 'name="a\tb"'),
+        "'a b' has a tab or line end",
+    ),
+    "what is described elsewhere": (
+        '<!DOCTYPE robot SYSTEM "x.dtd">' + arm("shoulder", "a&b;c"),
+        "described in 'x.dtd'",
+    ),
+    "a prefix of nowhere": (
+        arm("</robot>", "\n<gazebo:plugin/></robot>"),
+        'line 2 has a prefix that is declared nowhere; declare it, as in <robot xmlns:PREFIX="',
+    ),
     "more text than anybody writes": (" " * (LONGEST + 1), "characters"),
 }
 
@@ -98,11 +117,69 @@ def test_it_is_refused_in_a_sentence_and_at_once(case: str) -> None:
 
 @pytest.mark.parametrize(
     "number",
-    ["6 ", "nan", "inf", "1e999", "0x6", "6,0", "1_0", "${m}", "", "\u0663", "6&#10;", "9" * 400],
+    ["6 ", "nan", "inf", "1e999", "0x6", "6,0", "1_0", "", "\u0663", "6&#10;", "9" * 400],
 )
 def test_an_inertia_that_the_reader_would_leave_out_is_refused(number: str) -> None:
     with pytest.raises(ModelError, match=r"link 'upper' has value=.* in the <mass>"):
         RobotModel.from_urdf(arm('value="6"', f'value="{number}"'))
+
+
+LOST = {
+    '<mass value="6"/>': "no <mass> in its <inertial>; write one, or leave the <inertial> out",
+    ' value="6"': 'no value in the <mass> of its <inertial>; write value="..."',
+    ' ixy="0" ixz="0" iyz="0"': (
+        'no ixy, ixz, iyz in the <inertia> of its <inertial>; write ixy="0" ixz="0" iyz="0"'
+    ),
+    ' iyz="0"': 'no iyz in the <inertia> of its <inertial>; write iyz="0"',
+    ' izz="0.1"': 'no izz in the <inertia> of its <inertial>; write izz="..."',
+    INERTIAL[INERTIAL.index("<inertia ") : -len("</inertial>")]: "no <inertia> in its <inertial>",
+}
+
+
+@pytest.mark.parametrize("left_out", LOST)
+def test_so_is_one_of_which_a_part_is_missing(left_out: str) -> None:
+    """The reader drops the tensor, the mass too or not, and the shapes of the link."""
+    text = without(left_out)
+    whole, read = (pin.buildModelFromXML(urdf) for urdf in (ARM, text))
+    assert not np.allclose(read.inertias[1].inertia, whole.inertias[1].inertia)
+    with pytest.raises(ModelError) as caught:
+        RobotModel.from_urdf(text)
+    assert f"link 'upper' has {LOST[left_out]}" in str(caught.value)
+
+
+def test_a_negative_mass_is_refused() -> None:
+    with pytest.raises(ModelError, match="link 'upper' has a mass of -6 kg; write 0 or more"):
+        RobotModel.from_urdf(arm('value="6"', 'value="-6"'))
+
+
+@pytest.mark.parametrize("left_out", [INERTIAL, '<origin xyz="0.2 0 0"/>', ' xyz="0.2 0 0"'])
+def test_what_may_be_missing_is_not_asked_for(left_out: str) -> None:
+    assert RobotModel.from_urdf(without(left_out)).n_joints == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('value="6"', 'value="${m}"'),
+        ('value="6"', 'value="$(arg m)"'),
+        (INERTIAL, '<inertial><xacro:box mass="6"/></inertial>'),
+        ('type="revolute"', 'type="${kind}"'),
+    ],
+)
+def test_what_xacro_has_not_expanded_is_told_so(old: str, new: str) -> None:
+    text = arm(old, new).replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
+    with pytest.raises(ModelError, match="it is a xacro file; expand it with: xacro FILE"):
+        RobotModel.from_urdf(text)
+
+
+@pytest.mark.parametrize("encoding", ["GB2312", "Shift_JIS", "UTF-32", "ISO-8859-1", "nonsense"])
+def test_the_encoding_that_a_decoded_text_names_counts_no_longer(encoding: str) -> None:
+    joint = "\N{GREEK CAPITAL LETTER ALPHA}"  # its bytes cannot be printed in ISO-8859-1
+    text = f'<?xml version="1.0" encoding="{encoding}"?>{arm("shoulder", joint)}'
+    model = RobotModel.from_urdf(text)
+    assert model.joint_names == (joint,)
+    assert CollisionChecker(text, Workspace(floor=-1.0))
+    assert chain_from_urdf(write_urdf(text, model, model.nominal)).joint_names == (joint,)
 
 
 @pytest.mark.parametrize("blank", ["\t", "\n"])
@@ -145,6 +222,31 @@ def test_no_collision_shape_is_left_out_without_a_word(size: str, why: str) -> N
         with pytest.raises(CollisionModelError, match=why):
             checker(text)
     assert RobotModel.from_urdf(urdf).n_joints == 1  # to an estimate shapes are nothing
+
+
+PIPE = '<collision><geometry><{0} radius="0.1" length="1"/></geometry></collision>'
+
+
+@pytest.mark.parametrize(
+    ("shapes", "why"),
+    [
+        (SHAPE + PIPE.format("capsule"), "2 .* 0 .*: <capsule> is no known shape .known: box, cyl"),
+        (PIPE.format("Box"), "1 .* 0 .*: <Box> is no known shape"),
+        (SHAPE + "<collision/>", "2 .* 0 .*: it has a <collision> without a shape"),
+        ("<collision><geometry/></collision>", "1 .* 0 .*: it has a <collision> without a shape"),
+        (SHAPE + PIPE.format("cylinder").replace("0.1", "0,1"), "correct its <collision> elements"),
+        (SHAPE + PIPE.format("capsule").replace("collision", "visual"), "<capsule> is no known"),
+        (SHAPE + "<visual/>", "it has a <visual> without a shape"),
+        (
+            SHAPE.replace("</geo", '<sphere radius="2"/></geo'),
+            "of the 2 .* 1 could be read: give each shape a <collision> of its own",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_shape_is_told(shapes: str, why: str) -> None:
+    with pytest.raises(CollisionModelError, match=why) as caught:
+        checker(arm(SHAPE, shapes))
+    assert ("all of its link are left out" in str(caught.value)) == ("of its own" not in why)
 
 
 @pytest.mark.parametrize("corner", [math.nan, math.inf, 0.0])

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, NamedTuple
-from xml.etree import ElementTree
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.excitation.collision.lost_shapes import lost_shapes
 from identification.excitation.collision.workspace import Workspace
 from identification.excitation.errors import CollisionModelError, MissingMeshError
 
@@ -87,7 +86,9 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
             raise MissingMeshError(missing[1]) from error
         why = " ".join(str(error).split())
         raise CollisionModelError(f"collision shapes cannot be loaded: {why}") from error
-    _require_all(model, urdf, shapes)
+    names = [model.frames[item.parentFrame].name for item in shapes.geometryObjects]
+    if (lost := lost_shapes(urdf, names)) is not None:
+        raise CollisionModelError(lost)
     bodies = []
     for item in shapes.geometryObjects:
         shape = _body(item.geometry, model.frames[item.parentFrame].name)
@@ -105,18 +106,6 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     if not any(body.joint >= 0 for body in bodies):
         raise CollisionModelError("no moving link of the robot description has a collision shape")
     return sorted(bodies, key=lambda body: body.joint)
-
-
-def _require_all(model: pin.Model, urdf: str, shapes: pin.GeometryModel) -> None:
-    """Refuse a description of which the reader left a shape out, as it does without an error."""
-    read = Counter(model.frames[item.parentFrame].name for item in shapes.geometryObjects)
-    for link in ElementTree.fromstring(urdf).findall("link"):
-        written, name = len(link.findall("collision")), link.get("name", "")
-        if read[name] != written:
-            raise CollisionModelError(
-                f"of the {written} collision shapes of link {name!r} {read[name]} could be read: "
-                "correct its <collision> elements (sizes are numbers with single spaces between)"
-            )
 
 
 def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:

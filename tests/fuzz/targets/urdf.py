@@ -44,6 +44,9 @@ TREE = URDF.replace(
 <transmission name="t"><joint name="elbow"/></transmission></robot>""",
 )
 TURNING = URDF.replace('type="revolute"', 'type="continuous"')
+DRAKES = '<?xml version="1.0" encoding="GB2312"?>' + TURNING.replace(
+    "<robot ", '<robot xmlns="http://drake.mit.edu" '
+)
 
 
 @lru_cache
@@ -123,8 +126,8 @@ def refuses(read: Callable[[str], object], text: str) -> bool:
 
 
 def seeds() -> list[bytes]:
-    """Two joints, a tree with a gripper, joints without limits."""
-    return [text.encode() for text in (URDF, TREE, TURNING)]
+    """Two joints, a tree with a gripper, joints without limits, and one in a namespace."""
+    return [text.encode() for text in (URDF, TREE, TURNING, DRAKES)]
 
 
 TARGET = Target(run, seeds, mutate_text, most=8000, replayed=60)
