@@ -20,17 +20,12 @@ from drivers.exchange import (
 from drivers.states import State
 from hil.archive.pulse import Pulse
 
+from .beginning import Beginning
 from .motion_link import Connection
 
-BEGIN_TIMEOUT = 60.0
-"""s within which a motion that was accepted must have begun."""
-OFF_TIMEOUT = 2.0
-"""s with the drive off after which a motion that was accepted does not begin any more."""
 HUNG = 5.0
 """s without a sign of life after which an exchange process is ended: the controller, unanswered
 for so long, has acted by its own watch."""
-
-_WITHOUT_DRIVE = frozenset((State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED))
 
 
 @dataclass(eq=False)
@@ -56,8 +51,7 @@ class ExchangeView:
     inits: int = 0
     began: bool = False
     refused: Refused | None = None
-    _driven: float = 0.0
-    _asked: float = 0.0
+    _beginning: Beginning = field(default_factory=lambda: Beginning(time.monotonic()))
     _said: str = ""
     _ended_for: str = ""
     _ended_before: int = 0
@@ -92,21 +86,13 @@ class ExchangeView:
         """Another motion is about to be asked for."""
         self.look()
         self.ended, self.refused, self.began = None, None, False
-        self._asked = self._driven = time.monotonic()
+        self._beginning = Beginning(time.monotonic())
         self._ended_before = self.status.ended_count
 
     def not_begun(self) -> str | None:
         """Why the motion asked for will not begin any more, in words; None while it may."""
-        now = time.monotonic()
-        if self.state not in _WITHOUT_DRIVE:
-            self._driven = now
-        if self.began or self.motion_ended:
-            return None
-        if now - self._driven > OFF_TIMEOUT:
-            return "the drive went off before the motion began"
-        if now - self._asked > BEGIN_TIMEOUT:
-            return f"the motion did not begin within {BEGIN_TIMEOUT:g} s ({self.state.name})"
-        return None
+        found = self._beginning.hopeless(self.state, time.monotonic())
+        return None if self.began or self.motion_ended else found
 
     @property
     def motion_ended(self) -> bool:

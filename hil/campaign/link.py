@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import RequestError
-from drivers.events import Event, MotionEnded
+from drivers.events import Event, MotionEnded, MotionStarted
 from drivers.exchange import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource, progress_of
@@ -30,6 +30,7 @@ from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
 from hil.cell import Cell
 from hil.errors import ControllerFault, OperatorStopError
 
+from .beginning import Beginning
 from .motion_link import (
     Connection,
     Progress,
@@ -167,9 +168,10 @@ class Link:
             except RequestError as error:
                 raise ControllerFault(str(error)) from error
             until_drain, patience = 1, AFTERMATH_CYCLES  # a wish counts from the first cycle
+            beginning, hopeless = Beginning(self.transport.now), None
 
             def over() -> bool:
-                nonlocal until_drain, patience
+                nonlocal until_drain, patience, hopeless
                 if stop.requested:
                     self.session.stop("stopped by the operator")
                 until_drain -= 1
@@ -177,16 +179,21 @@ class Link:
                     until_drain = DRAIN_CYCLES
                     taking.take()
                     watching.look(stop)
+                    if not taking.began:
+                        hopeless = beginning.hopeless(self.session.state, self.transport.now)
                 patience -= taking.recorder.ended is not None
-                return taking.recorder.over or patience < 0
+                return taking.recorder.over or patience < 0 or hopeless is not None
 
             exchange(self.transport, self.session, until=over)
+            if hopeless is not None:
+                self.session.stop(hopeless)
             taking.take()
             if taking.failure is not None:
                 raise taking.failure
-            ended = taking.recorder.ended or MotionEnded("lost", "the link ended", -1, -1)
-            taking.recorder.close(ended.outcome, ended.reason)
-        return ended
+            if hopeless is not None:
+                taking.recorder.close("void", hopeless)
+                raise ControllerFault(f"{hopeless}; nothing was sent ({spec.path})")
+            return taking.closed()
 
     def record(
         self,
@@ -307,6 +314,7 @@ class _Taking:
     def __init__(self, link: Link, recorder: Recorder) -> None:
         self.recorder = recorder
         self.failure: Exception | None = None
+        self.began = False
         self.sight: Sight | None = None
         self._link = link
         self._overflow = link.ring.overflow
@@ -317,6 +325,7 @@ class _Taking:
         link, recorder = self._link, self.recorder
         packets = link.drain_packets()
         events, records, before = link._events(), link.ring.drain(), recorder.records
+        self.began |= any(isinstance(one, MotionStarted | MotionEnded) for one in events)
         lost, self._overflow = link.ring.overflow - self._overflow, link.ring.overflow
         lost_packets = link.packets_overflow - self._packets_overflow
         self._packets_overflow = link.packets_overflow
@@ -334,6 +343,12 @@ class _Taking:
             self.failure = error
             link.session.stop("the archive cannot be written")
         link.cycles += recorder.records - before
+
+    def closed(self) -> MotionEnded:
+        """How the motion ended; the recording is completed."""
+        ended = self.recorder.ended or MotionEnded("lost", "the link ended", -1, -1)
+        self.recorder.close(ended.outcome, ended.reason)
+        return ended
 
 
 class _Watching:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from drivers.events import MotionStarted
 from hil.archive import Archive, open_archive
 from hil.cell import Cell
+from identification.noise import STANDSTILL_WINDOW
 from planner import FourierSeries, PiecewiseCubic
 
 from .standstill import ARM_MOVED
@@ -172,13 +173,17 @@ def unrest(played: Played, cell: Cell) -> Problem | None:
         played: it, as archived.
         cell: its joints' names.
     """
-    off = np.abs(played.position - np.median(played.position, axis=0)).max(axis=0)
-    joint = int(np.argmax(off))
-    if off[joint] <= ARM_MOVED:
+    rows = min(round(STANDSTILL_WINDOW / cell.period), len(played.position) - 1)
+    speed = np.abs(played.position[rows:] - played.position[:-rows]).max(axis=0) / (
+        rows * cell.period
+    )
+    allowed = np.maximum(cell.model.friction.standstill, ARM_MOVED / STANDSTILL_WINDOW)
+    joint = int(np.argmax(speed / allowed))
+    if speed[joint] <= allowed[joint]:
         return None
     return Problem(
-        f"{cell.joint_names[joint]} moved by {off[joint]:.2g} rad while the arm was to stand "
-        f"still; {ARM_MOVED:g} rad is noise"
+        f"{cell.joint_names[joint]} moved at {speed[joint]:.2g} rad/s while the arm was to stand "
+        f"still; below {allowed[joint]:.2g} rad/s it counts as standing"
     )
 
 

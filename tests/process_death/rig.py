@@ -33,7 +33,7 @@ from hil.demo_link import LOOPBACK, free_port
 from hil.errors import HilError
 from hil.progress import Silent
 from tests.process_death import product
-from tests.process_death.controller import REST, Page, Rows, at_rest, forked
+from tests.process_death.controller import Page, Rows, at_rest, forked
 from tests.process_death.rounds import Round, Trigger, Victim
 
 PATIENCE: Final = 90.0
@@ -319,10 +319,9 @@ def run(
         deaths: list[Death] = []
         entered = _killed(watched, campaign, played, page, victims, deaths)
         watched.wait("supervisor", "exchange", "archive")
-        _let_the_arm_rest(watched, page)
+        rows = _until_the_arm_rests(watched, page)
         memory = watched.memory
         records = np.zeros(0, cycle_dtype(product.JOINTS)) if memory is None else memory.records()
-        rows = page.rows()
         page.give_up()
         watched.wait("controller")
         supervisor = watched.pids["supervisor"]
@@ -373,13 +372,18 @@ def _killed(
     return entered
 
 
-def _let_the_arm_rest(watched: _Watched, page: Page) -> None:
-    """Nobody answers any more: until the controller alone has brought its arm to rest."""
-    deadline = time.monotonic() + PATIENCE
-    # A controller that nobody ever answered has not begun; one that ended its session is done.
-    while not watched.over("controller") and page.count and not at_rest(page.rows()[-REST:]):
-        if time.monotonic() > deadline:
-            return  # the laws will say so
+def _until_the_arm_rests(watched: _Watched, page: Page) -> Rows:
+    """Nobody answers any more: the account until the controller alone has its arm at rest.
+
+    And no longer: some open their axes again and again, whoever listens.
+    """
+    deadline = time.monotonic() + PATIENCE  # after which the laws will say so
+    while True:
+        # A controller that nobody ever answered has not begun; one that ended its session is done.
+        done = watched.over("controller") or time.monotonic() > deadline
+        rows = page.rows()
+        if done or not len(rows) or at_rest(rows):
+            return rows
         time.sleep(5 * LOOK)
 
 
