@@ -193,6 +193,7 @@ def test_a_worker_killed_in_mid_run_changes_no_bit(pair: Cluster) -> None:
     assert found.total.tobytes() == alone(range(80))
 
 
+@pytest.mark.slow
 def test_an_archive_that_ends_every_worker_is_named(tmp_path: Path) -> None:
     eager = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
     with running(tmp_path, **eager) as cluster:
@@ -258,6 +259,7 @@ def test_a_scheduler_without_workers_is_an_error(tmp_path: Path) -> None:
 # Real archives
 
 
+@pytest.mark.slow
 def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
     tmp_path: Path, campaign: Campaign, pair: Cluster
 ) -> None:

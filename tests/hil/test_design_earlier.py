@@ -32,6 +32,7 @@ def known(campaign, cell) -> Knowledge:
     return known_from([campaign.folder.root], cell, Silent())
 
 
+@pytest.mark.slow
 def test_joints_count_by_the_noise_of_their_torque(known, campaign):
     pooled = identify_campaign(campaign.folder.root, Silent()).estimate.pooled
     np.testing.assert_allclose(known.joint_weights, 1.0 / pooled.noise_std**2)
@@ -84,6 +85,7 @@ class Listening(Silent):
         self.said.append(text)
 
 
+@pytest.mark.slow
 def test_a_joint_that_stood_is_weighted_like_the_others_and_named(tmp_path, cell, run):
     short = cell.with_campaign(repetitions=1, validation_runs=1)
     limits, random = cell.joint_limits, np.random.default_rng(12)

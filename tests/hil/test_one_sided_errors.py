@@ -85,7 +85,11 @@ def test_effects_that_the_model_leaves_out_stay_green_at_their_usual_size(
 
 @pytest.mark.parametrize(
     "error",
-    [gear_4_turned, coupling_of_5_into_6_turned, torque_constants_of_2_and_3_swapped],
+    [
+        pytest.param(gear_4_turned, marks=pytest.mark.slow),
+        pytest.param(coupling_of_5_into_6_turned, marks=pytest.mark.slow),
+        torque_constants_of_2_and_3_swapped,
+    ],
     ids=lambda error: error.__name__,
 )
 def test_a_robot_that_is_not_what_the_cell_says_is_red(
@@ -100,7 +104,9 @@ def test_a_robot_that_is_not_what_the_cell_says_is_red(
     assert not found.good, found.line
 
 
-@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize(
+    "joint", [0, *(pytest.param(joint, marks=pytest.mark.slow) for joint in range(1, 6))]
+)
 def test_one_torque_constant_of_the_wrong_sign_is_red(
     honest: Campaign, monkeypatch: pytest.MonkeyPatch, joint: int
 ) -> None:

@@ -201,6 +201,7 @@ def outcome_of(archive: Archive) -> tuple[str, str]:
     return archive.outcome["outcome"], archive.outcome["reason"]
 
 
+@pytest.mark.slow
 def test_a_killed_supervisor_leaves_a_stopped_arm_and_a_whole_archive(rig: Rig) -> None:
     rig.wait_for_motion()
     rig.supervisor.kill()
@@ -239,6 +240,7 @@ def test_ctrl_c_in_the_terminal_stops_the_arm_on_its_path(rig: Rig) -> None:
     require_stopped_on_path(rig.campaign, archive.columns)
 
 
+@pytest.mark.slow
 def test_a_killed_archive_process_stops_the_arm_and_costs_its_last_chunk(rig: Rig) -> None:
     rig.wait_for_motion()
     os.kill(rig.archive, signal.SIGKILL)
@@ -286,6 +288,7 @@ def test_a_full_disk_stops_the_arm_and_what_was_flushed_is_whole(rig: Rig) -> No
     require_stopped_on_path(rig.campaign, excitation_in(rig.ring()))
 
 
+@pytest.mark.slow
 def test_a_killed_exchange_is_named_and_what_it_left_behind_is_archived(rig: Rig) -> None:
     rig.wait_for_motion()
     os.kill(rig.exchange, signal.SIGKILL)

@@ -117,7 +117,8 @@ def require_whole(campaign: Campaign, undisturbed: Campaign) -> None:
     assert np.max(apart) < 4.0
 
 
-@pytest.mark.parametrize("times", [2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow  # tests.process_death kills a supervisor in as many ways in each run of the tests
+@pytest.mark.parametrize("times", [2, 5])
 def test_a_campaign_that_is_killed_is_finished_and_finds_the_same(
     tmp_path: Path, designed: Campaign, times: int
 ) -> None:
