@@ -16,7 +16,9 @@ from hil.archive.amend import REJECTED
 from hil.archive.check_messages import message_faults
 from hil.archive.description import DescriptionError
 from hil.archive.names import KINDS, ArchiveName
-from hil.archive.survey import Survey, survey
+from hil.archive.order import checksums
+from hil.archive.standing import Survey
+from hil.archive.survey import survey
 from hil.errors import NotAnArchiveError
 
 ASPECTS = {
@@ -143,4 +145,6 @@ def _outcome_faults(outcome: Mapping[str, str]) -> list[str]:
     word = outcome.get("outcome")
     if word not in OUTCOMES:
         return [f"outcome is {word!r}, not one of {', '.join(OUTCOMES)}"]
+    if checksums(outcome.get(schema.CHUNKS, "")) is None:
+        return [f"{schema.CHUNKS} is no list of checksums"]
     return []

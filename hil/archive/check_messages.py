@@ -16,7 +16,7 @@ from hil.archive.chunk import ChunkParser, Messages
 from hil.archive.container import ChannelRecord, Damage, Record
 from hil.archive.description import Description
 from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
-from hil.archive.survey import Survey
+from hil.archive.standing import Survey
 from hil.reading import opened
 
 Fault = tuple[str, str]

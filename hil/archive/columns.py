@@ -68,11 +68,6 @@ class Columns:
         stamps += stamp["nanosec"]
         return np.asarray(stamps)
 
-    def cut(self, since: int) -> None:
-        """Drop the messages from the first one on that is stamped `since` [ns] or later."""
-        late = self._stamps[: self._count] >= since
-        self._count = int(late.argmax()) if late.any() else self._count
-
     def finished(self) -> dict[str, NDArray[Any]]:
         """The columns, contiguous and read-only."""
         columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}

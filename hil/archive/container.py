@@ -44,7 +44,7 @@ FOOTER_SIZE = RECORD.size + 20
 _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
 _NO_CRC = 0
-_FARTHEST = 1 << 62  # bytes, less than the end of any file
+FARTHEST = 1 << 62  # bytes, less than the end of any file
 
 
 class Damage(Exception):  # noqa: N818 - handed on as a finding, too
@@ -158,7 +158,7 @@ def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
     Raises:
         Damage: it is not there.
     """
-    if not RECORD.size <= length <= LARGEST_RECORD or offset > _FARTHEST:
+    if not RECORD.size <= length <= LARGEST_RECORD or offset > FARTHEST:
         raise Damage(offset, "is not of the length that the index says")
     stream.seek(offset)
     data = stream.read(length)
@@ -209,6 +209,18 @@ def records(
             if check_end:
                 _check_end(read(min(size - offset, LARGEST_RECORD)), offset)
             return
+
+
+def data_end(stream: BinaryIO, size: int) -> int | None:
+    """Where the summary must begin, found from head to head; None where the way is broken."""
+    stream.seek(0)
+    try:
+        for record in records(stream, size, skip=range(256), check_end=False):
+            if record.opcode == DATA_END:
+                return record.end
+    except Damage:
+        return None
+    return None
 
 
 def _check_end(tail: bytes, offset: int) -> None:

@@ -2,8 +2,8 @@
 
 A chunk counts whole or not at all. MCAP numbers the messages of each channel, so a chunk that
 vanished (a damaged opcode makes a reader skip it) is noticed by the next one; one that vanished at
-the end by the counts in the outcome. A whole chunk of another archive, numbered as ours was, is
-noticed by its cycles: they must grow, from the first to the last that the outcome names.
+the end by the counts in the outcome. Whether a whole chunk, numbered as ours was, is ours at all,
+`hil.archive.order` knows.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from hil.archive.container import Damage, Record
 from hil.archive.description import Description, DescriptionError
 from hil.archive.events import ArchivedEvent
 from hil.archive.messages import check_joints, decode_log, joint_state_of
+from hil.archive.order import Order
 from hil.archive.selection import Selection
 
 _NEEDED = ("kind", "joint_names", "attachments")
@@ -39,24 +40,17 @@ class _Waiting(NamedTuple):
     data: bytes
 
 
-class _Strange(Damage):
-    """Cycles that do not belong together: of those from `since` [ns] on none is believed."""
-
-    def __init__(self, offset: int, reason: str, since: int) -> None:
-        super().__init__(offset, reason)
-        self.since = since
-
-
 class Content:
     """What has been read from a file so far.
 
     Args:
         selection: what is wanted of it.
+        order: the chunks that must come.
         gapless: whether all chunks are read, so that the messages of a channel must count on from
             chunk to chunk; otherwise their numbers need only grow.
     """
 
-    def __init__(self, selection: Selection, *, gapless: bool = True) -> None:
+    def __init__(self, selection: Selection, order: Order, *, gapless: bool = True) -> None:
         self.metadata: dict[str, str] | None = None
         self.description: Description | None = None
         self.outcome: dict[str, str] | None = None
@@ -64,6 +58,7 @@ class Content:
         self.events: list[ArchivedEvent] = []
         self.parser = ChunkParser()
         self._selection = selection
+        self._order = order
         self._gapless = gapless
         self._size = 0
         self._decompressor = zstandard.ZstdDecompressor()
@@ -92,15 +87,7 @@ class Content:
                 self._check_counts(size)
         except Damage as found:  # in an earlier record
             damage = found
-        if isinstance(damage, _Strange):
-            self._forget(damage.since)
         return damage
-
-    def _forget(self, since: int) -> None:
-        """Drop what was read of a time [ns] that two chunks claim."""
-        for channel in self._channels.values():
-            channel.forget(since)
-        self.events = [event for event in self.events if event.time < since * 1e-9]
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns read, all of the same length."""
@@ -130,9 +117,8 @@ class Content:
         if name == schema.OUTCOME:
             if not schema.belong_together(self.metadata, entries):
                 reason = f"(metadata {name!r}) is that of another recording"
-                raise _Strange(record.offset, reason, 0)
-            entries.pop(schema.DESCRIPTION, None)
-            self.outcome = entries
+                raise Damage(record.offset, reason)
+            self.outcome = {key: entries[key] for key in entries if key not in schema.SEALS}
             return
         if self.metadata is not None:
             raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
@@ -152,6 +138,7 @@ class Content:
         if self.description is None:
             return  # some other MCAP file, which will be refused as such
         data = container.chunk_data(record, decompressor=self._decompressor)
+        self._order.check_chunk(container.chunk(record).crc, record.offset)
         if not self.parser.repeats(data):
             self._take_waiting()
             self._decode(self.parser.messages(data, record.offset), record.offset, len(record.body))
@@ -208,9 +195,17 @@ class Content:
             except LayoutError as error:
                 raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
             self._channels[topic] = _Channel(
-                layout, self._selection, gapless=self._gapless, growing=topic == schema.CYCLE
+                layout,
+                self._selection,
+                gapless=self._gapless,
+                order=self._order if self._grows(topic) else None,
             )
         return self._channels[topic]
+
+    def _grows(self, topic: str) -> bool:
+        """Whether the messages of a topic are of cycles, one each."""
+        recorded = {channel.topic for channel in self.parser.channels.values()}
+        return topic in schema.PER_CYCLE and schema.CYCLE in recorded
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout:
         assert self.description is not None
@@ -263,18 +258,7 @@ class Content:
         for key, count in counts.items():
             if self.outcome.get(key) != str(count):
                 raise Damage(size, f"is missing: {self.outcome.get(key)} {key} were written")
-        self._check_ends(size)
-
-    def _check_ends(self, size: int) -> None:
-        """Compare the first and the last cycle with those that the writer names."""
-        assert self.description is not None and self.outcome is not None
-        cycles, period = self._channels.get(schema.CYCLE), self.description.period
-        if cycles is None or not cycles.read or period is None or "repaired" in self.outcome:
-            return
-        for word, stamp in (("first", cycles.oldest), ("last", cycles.newest)):
-            written = self.outcome.get(f"{word}_cycle")
-            if written not in (None, str(round(stamp / (1e9 * period)))):
-                raise _Strange(size, f"is missing: the {word} cycle written was {written}", 0)
+        self._order.check_end(size)
 
 
 class _Channel:
@@ -282,15 +266,13 @@ class _Channel:
 
     Attributes:
         read: messages read so far, whether their time is wanted or not.
-        oldest, newest: stamps of the first and the last of them [ns], where they must grow.
     """
 
     def __init__(
-        self, layout: MessageLayout, selection: Selection, *, gapless: bool, growing: bool
+        self, layout: MessageLayout, selection: Selection, *, gapless: bool, order: Order | None
     ) -> None:
         self.read = 0
-        self.oldest = self.newest = -1
-        self._growing = growing
+        self._order = order
         self._layout = layout
         self._times = selection.times if selection.bounded else None
         self._gapless = gapless
@@ -304,28 +286,20 @@ class _Channel:
         data = messages.matrix(self._layout.size)
         if data is None or not self._layout.is_kept_by(data):
             raise Damage(offset, "(chunk) has messages that differ from those before")
-        if self._growing:
-            stamps = self._columns.stamps(data)
-            if (np.diff(stamps, prepend=self.newest) <= 0).any():
-                reason = "(chunk) has cycles that do not follow those before"
-                raise _Strange(offset, reason, int(stamps.min()))
+        if self._order is not None and len(data):
+            begins = self._gapless and not self.read
+            self._order.check_cycles(self._columns.stamps(data), offset, begins=begins)
         return data
 
     def append(self, data: Bytes, expected: int) -> None:
         """Append verified messages; `expected` is a guess at the final count."""
-        if self._growing and len(data):
-            ends = self._columns.stamps(data[[0, -1]])
-            self.oldest = self.oldest if self.read else int(ends[0])
-            self.newest = int(ends[1])
+        if self._order is not None and len(data):
+            self._order.take(int(self._columns.stamps(data[-1:])[0]))
         self.read += len(data)
         if self._times is not None:
             stamp = self._columns.stamps(data)
             data = data[(stamp >= self._times[0]) & (stamp < self._times[1])]
         self._columns.append(data, expected)
-
-    def forget(self, since: int) -> None:
-        """Drop the messages stamped `since` [ns] or later."""
-        self._columns.cut(since)
 
     def finished(self) -> dict[str, NDArray[Any]]:
         """The columns by our names."""

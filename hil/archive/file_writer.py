@@ -13,10 +13,13 @@ import numpy as np
 
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.messages import LogMessage, encode_log
+from hil.archive.order import listed
 from hil.archive.schema import (
+    CHUNKS,
     DESCRIPTION,
     EVENT_CHANNEL,
     FORMAT_VERSION,
+    LIBRARY,
     METADATA,
     OUTCOME,
     PROFILE,
@@ -26,7 +29,6 @@ from hil.archive.schema import (
 )
 from hil.errors import ArchiveWriteError
 
-LIBRARY = "hil"  # without version: the same recording gives the same bytes
 _MOST_NUMBERS = 1 << 32  # message numbers are counted modulo this
 _MEDIA_TYPES = {
     ".toml": "application/toml",
@@ -169,7 +171,9 @@ class ArchiveFile:
             return
         with self._guarded():
             self._writer.flush()
-            self._add_metadata(OUTCOME, {**outcome, DESCRIPTION: self._description})
+            chunks = listed(self._writer.checksums)
+            seals = {DESCRIPTION: self._description, CHUNKS: chunks}
+            self._add_metadata(OUTCOME, {**outcome, **seals})
             self._writer.finish()
             self._sink.flush()
             self._close()  # some file systems tell only now that they did not take everything

@@ -21,6 +21,9 @@ from hil.archive.container import RECORD, Chunk, Damage, Fields, Record
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 _FOOTER_HEAD = struct.Struct("<BQQQ")
+_GROUP = struct.Struct("<BQQ")  # opcode, offset, length
+_PLACE = struct.Struct("<QQ")  # offset, length
+_MOST_LISTED = 1 << 16  # bytes
 _DATA_END = RECORD.pack(container.DATA_END, 4) + bytes(4)
 
 
@@ -116,6 +119,39 @@ def chunk(data: bytes, compressed: bytes, compression: str, times: tuple[int, in
     return record(container.CHUNK, head + struct.pack("<Q", len(compressed)) + compressed)
 
 
+def metadata_places(stream: BinaryIO, size: int) -> list[tuple[int, int]]:
+    """Offset and length of the metadata records as the end of a file lists them.
+
+    A few hundred bytes are read and nothing is verified: what stands there must verify itself.
+    """
+    tail = container.FOOTER_SIZE + len(container.MAGIC)
+    stream.seek(max(0, size - tail))
+    footer = stream.read(tail)
+    if len(footer) < tail:
+        return []
+    *_, start = _FOOTER_HEAD.unpack_from(footer)
+    groups = _listed(stream, start, size - tail - start)
+    found = []
+    for group in groups:
+        if group.opcode == container.SUMMARY_OFFSET and len(group.body) == _GROUP.size:
+            opcode, at, length = _GROUP.unpack(group.body)
+            if opcode == container.METADATA_INDEX:
+                found += [_PLACE.unpack_from(item.body) for item in _listed(stream, at, length)]
+    return found
+
+
+def _listed(stream: BinaryIO, at: int, length: int) -> list[Record]:
+    """Short records that follow one another; none where that is not what stands there."""
+    if not 0 < length <= _MOST_LISTED or at > container.FARTHEST:
+        return []
+    stream.seek(at)
+    try:
+        found = [item for item in messages(stream.read(length), at) if isinstance(item, Record)]
+    except Damage:
+        return []
+    return [item for item in found if len(item.body) >= _PLACE.size]
+
+
 @dataclass
 class IndexBuilder:
     """Collects what message indexes and summary list, record after record as the file has them."""
@@ -201,7 +237,7 @@ class IndexBuilder:
         summary, offsets = b"", b""
         for opcode, group in groups.items():
             joined = b"".join(group)
-            body = struct.pack("<BQQ", opcode, start + len(summary), len(joined))
+            body = _GROUP.pack(opcode, start + len(summary), len(joined))
             offsets += record(container.SUMMARY_OFFSET, body)
             summary += joined
         offsets_start = start + len(summary)
@@ -247,14 +283,22 @@ class Summary:
     statistics: bytes = b""
 
     @classmethod
-    def read(cls, stream: BinaryIO, size: int) -> Summary | None:
-        """Read it; None where there is none, or where it is not whole or lists nonsense."""
+    def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Summary | None:
+        """Read it; None where there is none, or where it is not whole or lists nonsense.
+
+        Args:
+            stream: the file.
+            size: its length.
+            start: where the data section ends, of a file in which records have moved: then what
+                the summary lists may be elsewhere.
+        """
         tail = container.FOOTER_SIZE + len(container.MAGIC)
         if size < tail:
             return None
         stream.seek(size - tail)
         footer = stream.read(tail)
-        opcode, length, start, _ = _FOOTER_HEAD.unpack_from(footer)
+        opcode, length, stated, _ = _FOOTER_HEAD.unpack_from(footer)
+        moved, start = start is not None, stated if start is None else start
         (crc,) = struct.unpack_from("<I", footer, _FOOTER_HEAD.size)
         if (opcode, length) != (container.FOOTER, 20) or not footer.endswith(container.MAGIC):
             return None
@@ -270,7 +314,7 @@ class Summary:
             found = cls._parsed(body, start)
         except Damage:
             return None
-        return found if found._is_within(start) else None
+        return found if moved or found._is_within(start) else None
 
     def _is_within(self, end: int) -> bool:
         """Whether what it lists lies before `end`, and nothing twice."""

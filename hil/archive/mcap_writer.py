@@ -109,10 +109,16 @@ class McapWriter:
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._chunks: list[ChunkIndex] = []
+        self._checksums: list[int] = []
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._first = self._last = 0
+
+    @property
+    def checksums(self) -> tuple[int, ...]:
+        """Those of the chunks written so far, CRC-32 of their records."""
+        return tuple(self._checksums)
 
     def start(self, profile: str, library: str) -> None:
         """Begin the file."""
@@ -189,7 +195,9 @@ class McapWriter:
         self._chunk = _OpenChunk()
         data = chunk.data()
         packed = zstandard.compress(data, _LEVEL)
-        record = Chunk(_COMPRESSION, packed, chunk.last, chunk.first, zlib.crc32(data), len(data))
+        crc = zlib.crc32(data)
+        self._checksums.append(crc)
+        record = Chunk(_COMPRESSION, packed, chunk.last, chunk.first, crc, len(data))
         start = self._position
         length = self._put(_bytes_of(record))
         index_start = self._position

@@ -21,6 +21,7 @@ from hil.archive.content import Content
 from hil.archive.description import Description, DescriptionError
 from hil.archive.events import ArchivedEvent
 from hil.archive.index import Summary
+from hil.archive.order import Contested, Order, Written
 from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, LATER_FIELDS, METADATA
 from hil.archive.selection import Selection
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
@@ -188,12 +189,11 @@ def open_archive(
     try:
         with opened(path) as stream:
             size = os.fstat(stream.fileno()).st_size
-            content = _by_index(stream, size, selection) if selection.partial else None
+            written = Written.read(stream, size)
+            content = _by_index(stream, size, selection, written) if selection.partial else None
             damage = None
             if content is None:
-                stream.seek(0)
-                content = Content(selection)
-                damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
+                content, damage = _from_the_beginning(stream, size, selection, written)
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "")
         raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
@@ -218,12 +218,30 @@ def open_archive(
     )
 
 
-def _by_index(stream: BinaryIO, size: int, selection: Selection) -> Content | None:
+def _from_the_beginning(
+    stream: BinaryIO,
+    size: int,
+    selection: Selection,
+    written: Written,
+    until: Contested | None = None,
+) -> tuple[Content, Damage | None]:
+    """What is selected of the whole chunks before the first damage, and that."""
+    stream.seek(0)
+    content = Content(selection, Order(written, until=until))
+    damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
+    if until is None and isinstance(damage, Contested):  # some of what was read may be strange
+        return _from_the_beginning(stream, size, selection, written, damage)
+    return content, damage
+
+
+def _by_index(
+    stream: BinaryIO, size: int, selection: Selection, written: Written
+) -> Content | None:
     """What is selected, found through the summary; None where that or what it names is damaged."""
     summary = Summary.read(stream, size)
     if summary is None:
         return None
-    content = Content(selection, gapless=False)
+    content = Content(selection, Order(written, gapless=False), gapless=False)
     try:
         for record in summary.announced:
             content.parser.announce(record.opcode, record.body, record.offset)

@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -22,8 +22,10 @@ from hil.archive import container, foreign_json, index, schema
 from hil.archive.container import Record
 from hil.archive.description import Description, DescriptionError
 from hil.archive.index import IndexBuilder, MessageHead
+from hil.archive.order import listed
 from hil.archive.reader import open_archive
-from hil.archive.survey import HEADER, Piece, Survey, announced_attachments, survey
+from hil.archive.standing import Piece, Survey, announced_attachments
+from hil.archive.survey import HEADER, survey
 from hil.archive.written_anew import write_anew
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 
@@ -143,6 +145,7 @@ class ArchiveCopy:
         self._output = output
         self._offset = 0
         self._index = IndexBuilder()
+        self._checksums: list[int] = []
         self._decompressor = zstandard.ZstdDecompressor()
         self._compressor = zstandard.ZstdCompressor()
 
@@ -158,7 +161,7 @@ class ArchiveCopy:
                 for record in found.announced:
                     self._announce(record)
             self._piece(piece)
-        self._metadata(schema.OUTCOME, _outcome(found))
+        self._metadata(schema.OUTCOME, _outcome(found, self._checksums))
         self._put(self._index.tail(self._offset))
 
     def _put(self, data: bytes) -> None:
@@ -200,6 +203,7 @@ class ArchiveCopy:
             copy = index.chunk(data, bytes(head.data), head.compression, piece.times)
         taken = Record(self._offset, record.opcode, copy[container.RECORD.size :], 0)
         indexes = self._index.add_chunk(self._offset, len(copy), container.chunk(taken), data)
+        self._checksums.append(container.chunk(taken).crc)
         self._put(copy)
         self._put(indexes)
 
@@ -225,10 +229,11 @@ def _description(found: Survey) -> dict[str, str]:
     return {**found.metadata, "attachments": json.dumps(kept)}
 
 
-def _outcome(found: Survey) -> dict[str, str]:
-    """The ``hil.outcome`` record: as it was where nothing is lost."""
+def _outcome(found: Survey, chunks: Sequence[int]) -> dict[str, str]:
+    """The ``hil.outcome`` record of a file of these chunks: as it was where nothing is lost."""
     if not found.losses and found.outcome is not None:
-        return found.outcome
+        lists = {schema.CHUNKS: listed(chunks)} if schema.CHUNKS in found.outcome else {}
+        return {**found.outcome, **lists}  # other than before if another program cut the chunks
     before = found.outcome or {"outcome": "unknown", "reason": "the outcome is lost"}
     lost, lost_before = _samples_lost(found), _count(before.get("repaired.samples_lost", "0"))
     known = lost is not None and lost_before is not None
@@ -236,6 +241,7 @@ def _outcome(found: Survey) -> dict[str, str]:
     return {
         **before,
         schema.DESCRIPTION: schema.checksum(_description(found)),
+        schema.CHUNKS: listed(chunks),
         "samples": str(found.samples),
         "events": str(found.events),
         **({"packets": str(found.counts.get(schema.PACKETS, 0))} if "packets" in before else {}),

@@ -23,10 +23,15 @@ Array = NDArray[np.float64]
 
 FORMAT_VERSION = 1
 PROFILE = "ros2"
+LIBRARY = "hil"  # without version: the same recording gives the same bytes
 METADATA = "hil"
 OUTCOME = "hil.outcome"
 DESCRIPTION = "description"
 """Entry of the outcome: checksum of the ``hil`` record it belongs to. Older files have none."""
+CHUNKS = "chunks"
+"""Entry of the outcome: the checksums of all chunks in order. Older files have none."""
+SEALS = (DESCRIPTION, CHUNKS)
+"""Entries of the outcome that serve to verify the file, and say nothing of the recording."""
 CONTROLLERS_OWN = "controller"
 """Metadata entry ``motion`` of an archive whose motion was made by the controller's own program."""
 
@@ -36,6 +41,9 @@ COMMANDED = "/joint_states_commanded"
 MOTOR_CURRENT = "/motor_currents"
 PACKETS = "/hil/packets"
 EVENTS = "/hil/events"
+
+PER_CYCLE = frozenset((CYCLE, MEASURED, COMMANDED))
+"""Channels of which each cycle has one message, where there are cycles."""
 
 LATER_FIELDS = frozenset(("age",))
 """Fields of a cycle that older archives do not have; zero is what they would have held."""

@@ -1,117 +1,36 @@
 """Goes through a whole archive, past its damages, and says what of it stands.
 
 The reader stops at the first damage; a survey goes on, so that what follows can be saved. What it
-keeps has passed the same checks: checksums, and numbers of messages that count on.
+keeps has passed the same checks: checksums, numbers of messages that count on, and that chunks and
+cycles are those that were written (`hil.archive.order`).
 """
 
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
+import numpy as np
 import zstandard
+from numpy.typing import NDArray
 
-from hil.archive import container, foreign_json, index, schema
+from hil.archive import container, index, schema
 from hil.archive.container import Damage, Record
 from hil.archive.index import IndexBuilder, MessageHead, Summary
+from hil.archive.order import Contested, Order, Written
+from hil.archive.standing import NUMBERS, Fault, Piece, Survey, announced_attachments
 from hil.errors import ArchiveError
 from hil.reading import opened
 
-HEADER = index.record(container.HEADER, index.text(schema.PROFILE) + index.text("hil"))
-_NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
+HEADER = index.record(container.HEADER, index.text(schema.PROFILE) + index.text(schema.LIBRARY))
+_STAMP = struct.Struct("<iI")  # s, ns
+_STAMP_AT = 4  # in the data of a message, behind its encapsulation
 _BETWEEN = (container.MESSAGE_INDEX, container.HEADER, container.DATA_END)
-
-
-class Fault(NamedTuple):
-    """Something that is not as it must be.
-
-    Attributes:
-        aspect: part of the profile: container, metadata, attachments, chunks, sequence, outcome
-            or index.
-        text: what is wrong, as a sentence without its end.
-        loss: whether content is lost by it; otherwise it follows from what is there.
-    """
-
-    aspect: str
-    text: str
-    loss: bool
-
-
-class Piece(NamedTuple):
-    """A record that stands.
-
-    Attributes:
-        offset: where it begins in the file.
-        length: with its head.
-        opcode: kind of record.
-        shift: of a chunk behind a loss, how much too high its messages count, by channel.
-        times: of a chunk, first and last log time of its messages [ns].
-    """
-
-    offset: int
-    length: int
-    opcode: int
-    shift: dict[int, int] | None = None
-    times: tuple[int, int] | None = None
-
-
-@dataclass
-class Survey:
-    """What stands of a file, and what does not.
-
-    Attributes:
-        path: the file.
-        size: its length.
-        header: profile and library, None where the record is damaged.
-        metadata: entries of the ``hil`` record, None where it is missing or damaged.
-        outcome: entries of ``hil.outcome``, likewise.
-        attachments: names of those that stand.
-        pieces: records that stand, but for ``hil`` and ``hil.outcome``, in the order of the file.
-        announced: schemas and channels that only the summary still has.
-        faults: what is wrong.
-        counts: messages that stand, by topic.
-        types: of their messages, by topic.
-        missing: messages missing between those that stand, by topic.
-    """
-
-    path: Path
-    size: int
-    header: tuple[str, str] | None = None
-    metadata: dict[str, str] | None = None
-    outcome: dict[str, str] | None = None
-    attachments: list[str] = field(default_factory=list)
-    pieces: list[Piece] = field(default_factory=list)
-    announced: tuple[Record, ...] = ()
-    faults: list[Fault] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
-    types: dict[str, str] = field(default_factory=dict)
-    missing: dict[str, int] = field(default_factory=dict)
-
-    @property
-    def losses(self) -> list[str]:
-        """What is lost, and where; empty if everything that was written is there."""
-        if not any(fault.loss for fault in self.faults):
-            return []
-        return [fault.text for fault in self.faults if fault.loss or fault.aspect == "container"]
-
-    @property
-    def mixed(self) -> bool:
-        """Whether begin and end are of two recordings, and the samples of nobody knows which."""
-        return not schema.belong_together(self.metadata, self.outcome)
-
-    @property
-    def samples(self) -> int:
-        """Samples that stand."""
-        return max((self.counts.get(topic, 0) for topic in _NUMBERS), default=0)
-
-    @property
-    def events(self) -> int:
-        """Events that stand."""
-        return self.counts.get(schema.EVENTS, 0)
 
 
 def survey(path: str | PathLike[str]) -> Survey:
@@ -124,18 +43,58 @@ def survey(path: str | PathLike[str]) -> Survey:
     try:
         with opened(path) as stream:
             size = os.fstat(stream.fileno()).st_size
-            surveyor = _Surveyor(stream, Survey(path, size))
-            surveyor.run()
+            written = Written.read(stream, size)
+            if written.strange:
+                written = Written()  # told as a fault of the outcome
+            try:
+                return _Surveyor(stream, Survey(path, size), Order(written, gapless=False)).run()
+            except Contested as contested:
+                order = Order(written, gapless=False, until=contested)
+                return _Surveyor(stream, Survey(path, size), order).run()
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
-    return surveyor.survey
+
+
+@dataclass
+class _Inside:
+    """What a chunk holds.
+
+    Attributes:
+        numbered: sequence numbers of its messages, by channel.
+        places: where their data begin, by channel.
+        announced: its other records.
+        stamps: log times of all messages [ns].
+    """
+
+    numbered: dict[int, list[int]] = field(default_factory=dict)
+    places: dict[int, list[int]] = field(default_factory=dict)
+    announced: list[Record] = field(default_factory=list)
+    stamps: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, data: bytes, offset: int) -> _Inside:
+        found = cls()
+        for item in index.messages(data, offset):
+            if isinstance(item, MessageHead):
+                found.numbered.setdefault(item.channel, []).append(item.sequence)
+                found.places.setdefault(item.channel, []).append(item.data)
+                found.stamps.append(item.log_time)
+            else:
+                found.announced.append(item)
+        return found
+
+    @property
+    def times(self) -> tuple[int, int]:
+        """First and last log time."""
+        return min(self.stamps, default=0), max(self.stamps, default=0)
 
 
 class _Surveyor:
     """Fills a survey from a file."""
 
-    def __init__(self, stream: BinaryIO, survey: Survey) -> None:
+    def __init__(self, stream: BinaryIO, survey: Survey, order: Order) -> None:
         self.survey = survey
+        self._order = order
         self._stream = stream
         self._summary = Summary.read(stream, survey.size)
         self._decompressor = zstandard.ZstdDecompressor()
@@ -150,18 +109,25 @@ class _Surveyor:
         self._indexes: list[bytes] = []  # message indexes that must come now
         self._tail: bytes | None = None
 
-    def run(self) -> None:
-        """Survey the file."""
+    def run(self) -> Survey:
+        """Survey the file.
+
+        Raises:
+            Contested: two chunks claim the same cycles, and nobody knows which is right.
+        """
         self._stream.seek(0)
         try:
             for record in container.records(self._stream, self.survey.size, check_end=False):
                 self._visit(record)
+        except Contested:
+            raise
         except Damage as damage:
             self._lost_since = True  # and what is lost, counts and outcome will tell
             self._fault("container", damage, loss=False)
         for record in self._listed():
             self._visit(record)
         self._finish()
+        return self.survey
 
     def _listed(self) -> Iterator[Record]:
         """Records that the summary knows and the walk did not reach."""
@@ -204,6 +170,8 @@ class _Surveyor:
                 self._data_end(record)
             elif record.opcode not in _BETWEEN:
                 self._fault("container", Damage(record.offset, "is of an unknown kind"), loss=False)
+        except Contested:
+            raise
         except Damage as damage:
             aspect = _ASPECTS.get(record.opcode, "container")
             self._fault(aspect, damage, loss=record.opcode != container.HEADER)
@@ -263,38 +231,33 @@ class _Surveyor:
             return  # some other MCAP file
         if self._ended:
             raise Damage(record.offset, "(chunk) comes after a gap that nothing would show")
+        if self._order.closed:
+            return  # that nothing behind is believed was said
         data = container.chunk_data(record, decompressor=self._decompressor)
-        numbered: dict[int, list[int]] = {}
-        announced = []
-        stamps: list[int] = []
-        for item in index.messages(data, record.offset):
-            if isinstance(item, MessageHead):
-                numbered.setdefault(item.channel, []).append(item.sequence)
-                stamps.append(item.log_time)
-            else:
-                announced.append(item)
+        head = container.chunk(record)
+        self._order.check_chunk(head.crc, record.offset)
+        inside = _Inside.of(data, record.offset)
         known = dict(self._channels), dict(self._types)
         try:
-            for item in announced:
+            for item in inside.announced:
                 if item.opcode in (container.SCHEMA, container.CHANNEL):
                     self._announce(item.opcode, item.body, record.offset)
-            shift = self._continued(numbered, record.offset)
+            shift = self._continued(inside, data, record.offset)
         except Damage:
             self._channels, self._types = known  # what it announces goes with it
             raise
-        times = min(stamps, default=0), max(stamps, default=0)
-        head = container.chunk(record)
-        if (head.start_time, head.end_time) != times:
+        if (head.start_time, head.end_time) != inside.times:
             self._fault("index", Damage(record.offset, "(chunk) states other times"), loss=False)
         indexes = self._index.add_chunk(record.offset, record.end - record.offset, head, data)
         self._indexes = index.split(indexes)
         moved = shift if any(shift.values()) else None
         self._keep(record, moved)
-        self.survey.pieces[-1] = self.survey.pieces[-1]._replace(times=times)
+        self.survey.pieces[-1] = self.survey.pieces[-1]._replace(times=inside.times)
         self._lost_since = False
 
-    def _continued(self, numbered: dict[int, list[int]], offset: int) -> dict[int, int]:
+    def _continued(self, inside: _Inside, data: bytes, offset: int) -> dict[int, int]:
         """Check that the messages of a chunk count on; by how much they are ahead, by channel."""
+        numbered = inside.numbered
         self._recover_channels(numbered, offset)
         shift = {}
         for channel, sequence in numbered.items():
@@ -304,12 +267,15 @@ class _Surveyor:
             if first < self._next.get(channel, 0):
                 raise Damage(offset, "(chunk) repeats messages that were before")
             shift[channel] = first - self._standing(channel)
-        numbers = [channel for channel in numbered if self._channels[channel] in _NUMBERS]
+        numbers = [channel for channel in numbered if self._channels[channel] in NUMBERS]
         if len({(len(numbered[channel]), shift[channel]) for channel in numbers}) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
         gaps = {channel: numbered[channel][0] - self._next.get(channel, 0) for channel in numbered}
+        stamps = self._cycle_stamps(inside, data, offset)
         if any(gaps.values()):
             self._gap(gaps, offset)
+        if len(stamps):
+            self._order.take(int(stamps[-1]))
         for channel, sequence in numbered.items():
             topic = self._channels[channel]
             self._next[channel] = sequence[-1] + 1
@@ -318,6 +284,19 @@ class _Surveyor:
             self.survey.missing[topic] = missing
         return shift
 
+    def _cycle_stamps(self, inside: _Inside, data: bytes, offset: int) -> NDArray[np.int64]:
+        """The stamps of the cycles in a chunk, (k,) [ns], which follow those before."""
+        for channel, places in inside.places.items():
+            if self._channels[channel] == schema.CYCLE:
+                if places[-1] + _STAMP_AT + _STAMP.size > len(data):
+                    raise Damage(offset, "(chunk) has messages without a stamp")
+                stamps = [_STAMP.unpack_from(data, at + _STAMP_AT) for at in places]
+                found = np.array([s * 10**9 + ns for s, ns in stamps], np.int64)
+                begins = inside.numbered[channel][0] == 0
+                self._order.check_cycles(found, offset, begins=begins)
+                return found
+        return np.zeros(0, np.int64)
+
     def _standing(self, channel: int) -> int:
         return self.survey.counts.get(self._channels[channel], 0)
 
@@ -325,7 +304,8 @@ class _Surveyor:
         """Take channels that no record before announces from the summary."""
         if numbered.keys() <= self._channels.keys():
             return
-        announced = self._summary.announced if self._summary else ()
+        summary = self._summary or self._moved_summary()
+        announced = summary.announced if summary else ()
         for item in announced:
             self._announce(item.opcode, item.body, offset)
         unknown = numbered.keys() - self._channels.keys()
@@ -333,9 +313,17 @@ class _Surveyor:
             raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
         self.survey.announced = announced
 
+    def _moved_summary(self) -> Summary | None:
+        """The summary where a chunk of another length has come before it."""
+        here = self._stream.tell()
+        start = container.data_end(self._stream, self.survey.size)
+        found = start and Summary.read(self._stream, self.survey.size, start=start)
+        self._stream.seek(here)
+        return found or None
+
     def _gap(self, gaps: dict[int, int], offset: int) -> None:
         """Note that messages are missing; a gap in samples must show in the samples behind it."""
-        samples = any(gap for channel, gap in gaps.items() if self._channels[channel] in _NUMBERS)
+        samples = any(gap for channel, gap in gaps.items() if self._channels[channel] in NUMBERS)
         if samples and schema.CYCLE not in self._channels.values():
             self._ended = True
             raise Damage(offset, "(chunk) comes after a gap that nothing would show")
@@ -353,7 +341,7 @@ class _Surveyor:
         survey = self.survey
         if survey.metadata is None:
             return
-        if survey.header != (schema.PROFILE, "hil"):
+        if survey.header != (schema.PROFILE, schema.LIBRARY):
             self._fault("container", "the header is not that of the profile", loss=False)
         for name in announced_attachments(survey.metadata):
             if name not in survey.attachments:
@@ -368,12 +356,21 @@ class _Surveyor:
             return
         if self.survey.mixed:
             self._fault("outcome", "the outcome is that of another recording", loss=True)
+        cycles = [
+            at for channel, at in self._next.items() if self._channels[channel] == schema.CYCLE
+        ]
+        if str(max(cycles, default=0)) == outcome.get("samples"):
+            self._order.check_end(self.survey.size)
         counts = {"samples": self.survey.samples, "events": self.survey.events}
         if "packets" in outcome:
             counts["packets"] = self.survey.counts.get(schema.PACKETS, 0)
+        stated = {key: outcome.get(key) for key in counts}
+        if self._order.listed is not None:
+            counts["chunks"] = sum(p.opcode == container.CHUNK for p in self.survey.pieces)
+            stated["chunks"] = str(self._order.listed)
         for key, count in counts.items():
-            if outcome.get(key) != str(count):
-                text = f"{outcome.get(key)} {key} were written, {count} are there"
+            if stated[key] != str(count):
+                text = f"{stated[key]} {key} were written, {count} are there"
                 self._fault("outcome", text, loss=True)
 
     def _check_summary(self) -> None:
@@ -392,8 +389,3 @@ _ASPECTS = {
     container.ATTACHMENT: "attachments",
     container.CHUNK: "chunks",
 }
-
-
-def announced_attachments(metadata: dict[str, str]) -> list[str]:
-    """Names of the attachments that must be there."""
-    return list(foreign_json.names(metadata.get("attachments", "[]")) or ())

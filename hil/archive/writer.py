@@ -128,7 +128,8 @@ class ArchiveWriter:
             torque: joint torque of each record, shape (k, n) [N·m]; None when it is not known.
 
         Raises:
-            ArchiveWriteError: the disk refuses, or the archive is closed.
+            ArchiveWriteError: the disk refuses, the archive is closed, or the cycles do not grow,
+                in which case nothing of these records is written.
         """
         if self._file.closed:
             raise ArchiveWriteError(self._path, "the archive is closed")
@@ -141,6 +142,7 @@ class ArchiveWriter:
                 f"records are {records['position'].shape}, torques {torques.shape}, "
                 f"expected {shape}"
             )
+        self._check_growth(records["cycle"])
         if self._first is None:
             self._first = int(records["cycle"][0])
         self._newest = int(records["cycle"][-1])
@@ -236,6 +238,21 @@ class ArchiveWriter:
             self.close("unknown", reason="the recording ended without an outcome")
         else:
             self.close("interrupted", reason=f"{type(error).__name__}: {error}")
+
+    def _check_growth(self, cycles: NDArray[np.int64]) -> None:
+        """Check that cycles follow one another, and those written before."""
+        before = int(cycles[0]) - 1 if self._first is None else self._newest
+        falling = np.flatnonzero(np.diff(cycles, prepend=before) <= 0)
+        if falling.size:
+            at = int(falling[0])
+            last = int(cycles[at - 1]) if at else before
+            raise ArchiveWriteError(
+                self._path,
+                f"cycle {int(cycles[at])} cannot follow cycle {last}: the cycles of an archive "
+                "grow",
+                field="cycle",
+                remedy="begin another archive for another session with the controller",
+            )
 
     def _slot(self, cycle: int) -> int:
         return (cycle - (self._first or 0)) // self._cycles_per_chunk

@@ -39,7 +39,12 @@ def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, IO[bytes]],
             os.fsync(output.fileno())
             back = open_archive(output.name, fields=())
             if not back.complete:
-                raise ArchiveError(source, f"cannot be written anew: {back.damage}")
+                raise ArchiveError(
+                    source,
+                    f"cannot be written anew: {back.damage}",
+                    remedy="it is as it was, and what opens of it can be read: restore it from a "
+                    "copy, or record again",
+                )
             Path(output.name).replace(target)
         sync_folder(target.parent)
     except OSError as error:

@@ -56,14 +56,15 @@ def restored(truth: Undamaged) -> Iterator[Undamaged]:
 
 @pytest.mark.parametrize("where", [0, 5, -1])
 def test_a_whole_chunk_of_another_repetition_is_noticed(restored: Undamaged, where: int) -> None:
-    # Its checksum is right and so is the number of its messages; its cycles are others.
+    # Its checksum is right and so is the number of its messages, but it is not the one written.
     path, other = excitations(restored)[:2]
     data, strange = restored.files[path], restored.files[other]
     (begin, end), (first, last) = chunks(data)[where], chunks(strange)[where]
     path.write_bytes(data[:begin] + strange[first:last] + data[end:])
     archive = open_archive(path)
     assert not archive.complete
-    assert "do not follow" in str(archive.missing) or "cycle written was" in str(archive.missing)
+    assert "(chunk) is of another recording" in str(archive.missing)
+    assert archive.n_samples == 50 * (where % len(chunks(data))), "whole chunks before it"
 
 
 def test_the_content_of_another_recording_behind_a_whole_begin_is_noticed(

@@ -18,6 +18,7 @@ import zstandard
 
 from hil.archive import container, schema
 from hil.archive.index import IndexBuilder
+from hil.archive.order import listed
 from tests.fuzz.mutate_bytes import mutate_bytes
 from tests.fuzz.mutate_text import mutate_text
 
@@ -103,10 +104,12 @@ def put_together(records: list[Record], *, index: bool) -> bytes:
     """The file, with right lengths and checksums, and an index of it where that is wanted."""
     built = IndexBuilder()
     file = bytearray(MAGIC)
-    described = _described(records)
+    described, checksums = _described(records), list[int]()
     for one in records:
         at = len(file)
-        body = _sealed(one, described)
+        body = _sealed(one, {schema.DESCRIPTION: described, schema.CHUNKS: listed(checksums)})
+        if one.opcode == CHUNK and len(body) >= _CHUNK.size:
+            checksums.append(_CHUNK.unpack_from(body)[3])
         file += _HEAD.pack(one.opcode, len(body)) + body
         if not index:
             continue
@@ -142,8 +145,8 @@ def _described(records: list[Record]) -> str:
     return ""
 
 
-def _sealed(one: Record, described: str) -> bytes:
-    """The body with the checksums that fit it."""
+def _sealed(one: Record, seals: dict[str, str]) -> bytes:
+    """The body with the checksums that fit it, and entries of the outcome that fit the rest."""
     if one.inside is not None:
         plain = _joined(one.inside)
         pack = {b"zstd": zstandard.ZstdCompressor().compress, b"lz4": lz4.frame.compress}
@@ -156,8 +159,7 @@ def _sealed(one: Record, described: str) -> bytes:
         with contextlib.suppress(Exception):  # damaged beyond reading: as it is
             name, entries = _entries(one.body)
             if entries.pop("checksum", None) is not None:
-                if schema.DESCRIPTION in entries:
-                    entries[schema.DESCRIPTION] = described
+                entries |= {key: seals[key] for key in seals if key in entries}
                 return _metadata(name, {**entries, "checksum": schema.checksum(entries)})
     return one.body
 

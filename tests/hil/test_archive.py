@@ -314,6 +314,29 @@ class TestBadInput:
         with writer(tmp_path / NAME) as archive, pytest.raises(ValueError, match="expected"):
             archive.write(np.zeros(3, cycle_dtype(6)))
 
+    @pytest.mark.parametrize("first", [12000, 12099, 0])
+    def test_another_session_needs_another_archive(self, tmp_path, first):
+        rows = records(100)
+        with writer(tmp_path / NAME) as archive:
+            archive.write(rows[:0])
+            archive.write(rows, torques(rows))
+            sentence = rf"cycle {first} cannot follow cycle 12099.*begin another archive"
+            with pytest.raises(ArchiveWriteError, match=sentence):
+                archive.write(records(100, first=first))
+            archive.close("completed")
+        back = open_archive(tmp_path / NAME)
+        assert back.complete
+        assert same(back.cycles(), rows)
+
+    def test_cycles_that_fall_within_a_batch_are_refused(self, tmp_path):
+        rows = records(100)
+        rows["cycle"][60:] -= 30
+        with writer(tmp_path / NAME) as archive:
+            with pytest.raises(ArchiveWriteError, match="cycle 12030 cannot follow cycle 12059"):
+                archive.write(rows)
+            archive.close("void")
+        assert open_archive(tmp_path / NAME).n_samples == 0
+
     def test_a_closed_archive_takes_nothing_more(self, tmp_path):
         archive = writer(tmp_path / NAME)
         archive.close("completed")

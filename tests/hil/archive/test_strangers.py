@@ -23,6 +23,7 @@ from hil.archive.check import check_archive
 from hil.archive.container import Record
 from hil.archive.description import Description, DescriptionError
 from hil.archive.index import IndexBuilder
+from hil.archive.order import listed
 from hil.archive.overview import overview
 from hil.archive.repair import repair
 from hil.cli import app
@@ -53,6 +54,7 @@ def stranger(
     """The small archive with other content, all checksums and the index fitting it."""
     data, builder = bytearray(container.MAGIC), IndexBuilder()
     given = {"hil": metadata or {}, "hil.outcome": outcome or {}}
+    checksums: list[int] = []
 
     def put(opcode: int, body: bytes) -> int:
         data.extend(index.record(opcode, body))
@@ -62,6 +64,8 @@ def stranger(
         if record.opcode == container.METADATA:
             name, entries = container.metadata(record)
             del entries["checksum"]
+            if schema.CHUNKS in entries:
+                entries[schema.CHUNKS] = listed(checksums)
             entries |= given[name]
             if name == "hil":
                 described = schema.checksum(entries)
@@ -78,6 +82,7 @@ def stranger(
             body = whole[container.RECORD.size :]
             at = put(container.CHUNK, body)
             taken = Record(at, container.CHUNK, body, len(body))
+            checksums.append(container.chunk(taken).crc)
             data.extend(builder.add_chunk(at, len(whole), container.chunk(taken), plain))
         elif record.opcode == container.ATTACHMENT:
             name, content = container.attachment(record)

@@ -1,0 +1,236 @@
+"""Whether a chunk is one that was written, and stands where it was written.
+
+Its own checksum says that a chunk is whole, not that it is of this recording: a file system may put
+a chunk of another archive in its place. The outcome lists the checksums of all chunks in order, so
+that each is known by its own. Archives of earlier versions have no such list, torn ones no outcome:
+there the cycles must do, which grow from the first to the last that the outcome names. Where two
+chunks claim the same cycles, nobody knows which is strange, and neither is believed.
+
+Reader and survey ask the same questions here, in the order of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import BinaryIO, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import container, index, schema
+from hil.archive.container import Damage, Record
+from hil.archive.description import DescriptionError, period
+
+_DIGITS = 8  # of a checksum
+_MOST_DIGITS = 18  # of a cycle
+_BUT_METADATA = frozenset(range(256)) - {container.METADATA}
+
+
+class Contested(Damage):
+    """Cycles that cannot be where they are, though each chunk may be sound by itself.
+
+    Attributes:
+        since: stamp [ns]; no chunk that reaches it is believed, nor any behind.
+    """
+
+    def __init__(self, offset: int, reason: str, since: int) -> None:
+        super().__init__(offset, reason)
+        self.since = since
+
+
+def listed(checksums: Iterable[int]) -> str:
+    """The checksums of chunks as the outcome lists them."""
+    return "".join(f"{crc:08x}" for crc in checksums)
+
+
+def checksums(text: str) -> tuple[int, ...] | None:
+    """The checksums that such a list holds; None where it is none."""
+    try:
+        data = bytes.fromhex(text)
+    except ValueError:
+        return None
+    if len(text) != 2 * len(data) or len(text) % _DIGITS:
+        return None
+    return tuple(np.frombuffer(data, ">u4").tolist())
+
+
+@dataclass(frozen=True)
+class Written:
+    """What the end of a file says of its chunks, as far as it is there.
+
+    Attributes:
+        chunks: their checksums in order.
+        ends: stamps of the first and the last cycle [ns].
+        strange: whether that end is of another recording than the beginning.
+    """
+
+    chunks: tuple[int, ...] | None = None
+    ends: tuple[int, int] | None = None
+    strange: bool = False
+
+    @classmethod
+    def read(cls, stream: BinaryIO, size: int) -> Self:
+        """Find it; the stream is left anywhere."""
+        found = _records_of_ours(_indexed(stream, size))
+        if found.keys() != {schema.METADATA, schema.OUTCOME}:
+            found = _records_of_ours(_walked(stream, size))
+        written = cls.of(found.get(schema.METADATA), found.get(schema.OUTCOME))
+        # Another program that copies a file may cut its chunks anew, and then names itself.
+        return written if _is_ours(stream, size) else replace(written, chunks=None)
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, str] | None, outcome: Mapping[str, str] | None) -> Self:
+        """What the outcome says, given both records as they stand."""
+        if metadata is None or outcome is None:
+            return cls()
+        if not schema.belong_together(metadata, outcome):
+            return cls(strange=True)
+        return cls(checksums(outcome.get(schema.CHUNKS, "-")), _ends(metadata, outcome))
+
+
+class Order:
+    """Goes with the chunks of a file from its beginning to its end.
+
+    Args:
+        written: what the end of the file says.
+        gapless: whether every chunk comes; otherwise some are left out.
+        until: what an earlier go ended with.
+    """
+
+    def __init__(
+        self, written: Written, *, gapless: bool = True, until: Contested | None = None
+    ) -> None:
+        self._written = written
+        self._gapless = gapless
+        self._until = until
+        self._at = 0
+        self._newest = -1
+        self.closed = False
+        """Whether no further chunk can be believed."""
+
+    @property
+    def listed(self) -> int | None:
+        """How many chunks were written, None where nothing says so."""
+        chunks = self._written.chunks
+        return None if chunks is None else len(chunks)
+
+    def check_chunk(self, crc: int, offset: int) -> None:
+        """Check that the chunk with this checksum, its own, is the next.
+
+        Raises:
+            Damage: it is not.
+        """
+        if self._written.strange:
+            reason = "(chunk) is of nobody knows what: the outcome is that of another recording"
+            raise Damage(offset, reason)
+        chunks = self._written.chunks
+        if chunks is None:
+            return
+        try:
+            at = chunks.index(crc, self._at)
+        except ValueError:
+            known = crc in chunks
+            why = "stands behind one that followed it" if known else "is of another recording"
+            raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums") from None
+        if self._gapless and at != self._at:
+            raise Damage(offset, "(chunk) does not continue the one before")
+        self._at = at + 1
+
+    def check_cycles(self, stamps: NDArray[np.int64], offset: int, *, begins: bool) -> None:
+        """Check that cycles follow those before, and that they are of this recording.
+
+        Args:
+            stamps: theirs, shape (k,) [ns], k > 0.
+            offset: where their chunk stands.
+            begins: whether they are the first that were written.
+
+        Raises:
+            Contested: a chunk before claims the same time.
+            Damage: this chunk is wrong by itself.
+        """
+        if self._until is not None and stamps.max() >= self._until.since:
+            self.closed = True
+            raise Damage(offset, self._until.reason)
+        if (np.diff(stamps) <= 0).any():
+            raise Damage(offset, "(chunk) has cycles that do not grow")
+        first, last = self._written.ends or (int(stamps[0]), int(stamps[-1]))
+        if stamps[0] < first or stamps[-1] > last or (begins and stamps[0] != first):
+            reason = "(chunk) has cycles of another recording: the outcome names others"
+            raise Damage(offset, reason)
+        if stamps[0] <= self._newest:
+            reason = "(chunk) has cycles that do not follow those before, or others claim them too"
+            raise Contested(offset, reason, int(stamps[0]))
+
+    def take(self, newest: int) -> None:
+        """Note that cycles up to the stamp `newest` [ns] were taken."""
+        self._newest = newest
+
+    def check_end(self, size: int) -> None:
+        """Check that the last cycle taken is the last that was written, where none is missing.
+
+        Raises:
+            Contested: it is another.
+        """
+        ends = self._written.ends
+        if ends is None or self._newest in (-1, ends[1]) or self._until is not None:
+            return
+        reason = "(chunk) does not end with the last cycle that the outcome names"
+        raise Contested(size, reason, self._newest)
+
+
+def _ends(metadata: Mapping[str, str], outcome: Mapping[str, str]) -> tuple[int, int] | None:
+    """Stamps of the first and the last cycle; None of what was repaired or has no cycles."""
+    try:
+        step = period(metadata)
+    except DescriptionError:
+        return None
+    texts = [outcome.get(key, "") for key in ("first_cycle", "last_cycle")]
+    if step is None or "repaired" in outcome:
+        return None
+    if not all(t.isascii() and t.isdecimal() and len(t) <= _MOST_DIGITS for t in texts):
+        return None
+    first, last = (round(int(text) * (step * 1e9)) for text in texts)
+    return (first, last) if first <= last else None  # earlier versions took two sessions
+
+
+def _is_ours(stream: BinaryIO, size: int) -> bool:
+    """Whether the header says that the file was written by us."""
+    stream.seek(0)
+    try:
+        header = next(container.records(stream, size, check_end=False))
+        fields = container.Fields(header.body, header.offset)
+        fields.text()  # the profile
+        return header.opcode == container.HEADER and fields.text() == schema.LIBRARY
+    except Damage:
+        return False
+
+
+def _records_of_ours(records: Iterable[Record]) -> dict[str, dict[str, str]]:
+    """The first of each of our two metadata records that passes its checksum."""
+    found: dict[str, dict[str, str]] = {}
+    try:
+        for record in records:
+            name, entries = container.metadata(record)
+            claimed = entries.pop("checksum", None)
+            if name in (schema.METADATA, schema.OUTCOME) and claimed == schema.checksum(entries):
+                found.setdefault(name, entries)
+    except Damage:
+        pass  # what comes behind it cannot be found this way
+    return found
+
+
+def _indexed(stream: BinaryIO, size: int) -> Iterator[Record]:
+    """Metadata records where the end of the file says that they are."""
+    for place in index.metadata_places(stream, size):
+        record = container.record_at(stream, *place)
+        if record.opcode == container.METADATA:
+            yield record
+
+
+def _walked(stream: BinaryIO, size: int) -> Iterator[Record]:
+    """Metadata records, found from head to head."""
+    stream.seek(0)
+    for record in container.records(stream, size, skip=_BUT_METADATA, check_end=False):
+        if record.opcode == container.METADATA:
+            yield record
