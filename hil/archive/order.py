@@ -44,28 +44,28 @@ def listed(checksums: Iterable[int]) -> str:
     return "".join(f"{crc:08x}" for crc in checksums)
 
 
-def checksums(text: str) -> tuple[int, ...] | None:
-    """The checksums that such a list holds; None where it is none."""
+def checksums(text: str) -> NDArray[np.uint32] | None:
+    """The checksums that such a list holds, shape (k,); None where it is none."""
     try:
         data = bytes.fromhex(text)
     except ValueError:
         return None
     if len(text) != 2 * len(data) or len(text) % _DIGITS:
         return None
-    return tuple(np.frombuffer(data, ">u4").tolist())
+    return np.frombuffer(data, ">u4").astype(np.uint32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Written:
     """What the end of a file says of its chunks, as far as it is there.
 
     Attributes:
-        chunks: their checksums in order.
+        chunks: their checksums in order, shape (k,).
         ends: stamps of the first and the last cycle [ns].
         strange: whether that end is of another recording than the beginning.
     """
 
-    chunks: tuple[int, ...] | None = None
+    chunks: NDArray[np.uint32] | None = None
     ends: tuple[int, int] | None = None
     strange: bool = False
 
@@ -122,20 +122,21 @@ class Order:
             Damage: it is not.
         """
         if self._written.strange:
-            reason = "(chunk) is of nobody knows what: the outcome is that of another recording"
+            reason = "(chunk) may be of either of two: the outcome is that of another recording"
             raise Damage(offset, reason)
         chunks = self._written.chunks
         if chunks is None:
             return
-        try:
-            at = chunks.index(crc, self._at)
-        except ValueError:
-            known = crc in chunks
-            why = "stands behind one that followed it" if known else "is of another recording"
-            raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums") from None
-        if self._gapless and at != self._at:
+        if self._at < len(chunks) and chunks[self._at] == crc:
+            self._at += 1
+            return
+        places = np.flatnonzero(chunks == crc)
+        if not len(places) or places[-1] < self._at:
+            why = "stands behind one that followed it" if len(places) else "is of another recording"
+            raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
+        if self._gapless:
             raise Damage(offset, "(chunk) does not continue the one before")
-        self._at = at + 1
+        self._at = int(places[-1]) + 1
 
     def check_cycles(self, stamps: NDArray[np.int64], offset: int, *, begins: bool) -> None:
         """Check that cycles follow those before, and that they are of this recording.

@@ -258,6 +258,16 @@ class TestRefused:
         repair(broken)
         assert victim.read_bytes() == b"precious"
 
+    def test_what_does_not_read_back_is_thrown_away_with_a_remedy(
+        self, broken, written, monkeypatch
+    ):
+        broken.write_bytes(written.data[:-100])
+        torn = open_archive(broken)
+        monkeypatch.setattr(written_anew, "open_archive", lambda *_, **__: torn)
+        with pytest.raises(ArchiveError, match=r"cannot be written anew.*restore it from a copy"):
+            repair(broken)
+        assert [path.name for path in broken.parent.iterdir()] == [broken.name]
+
     def test_a_full_disk_is_our_error_and_leaves_nothing(self, broken, written, monkeypatch):
         broken.write_bytes(written.data[:-100])
 
