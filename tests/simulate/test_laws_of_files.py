@@ -15,6 +15,7 @@ from scipy.stats import norm
 from hil import Campaign
 from hil.campaign.errors import MotionFailedError
 from hil.campaign.status import CampaignStatus
+from tests.disk.harm import chunks
 from tests.simulate.altered import found, played, with_life
 from tests.simulate.laws.archived import read
 from tests.simulate.laws.estimated import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
@@ -49,7 +50,8 @@ def spoilt(path: Path, at: int, length: int = 1) -> None:
 
 def test_a_byte_flipped_in_a_chunk_is_found(copied: Observed) -> None:
     path = whole(copied)
-    spoilt(path, path.stat().st_size // 2)
+    begin, end = chunks(path.read_bytes())[1]
+    spoilt(path, (begin + end) // 2)
     assert f"{path.name}: is not whole" in found(copied, "archives")
     assert f"{path.name} is not what was entered" in found(copied, "folder")
     assert f"{path.name} was pooled" in found(copied, "estimate")
