@@ -115,7 +115,12 @@ def _time(archive: Archive) -> Array:
     columns, period = archive.columns, archive.period
     if "cycle" in columns:
         if period is None:
-            raise ArchiveError(archive.path, "has cycles but no period", field="period")
+            raise ArchiveError(
+                archive.path,
+                "has cycles but no period, so that their times are not known",
+                field="period",
+                remedy="copy it again from where it was recorded; something changed it",
+            )
         cycles = columns["cycle"]
         return np.asarray((cycles - cycles[0]) * period)
     elapsed = np.asarray((columns["stamp"] - columns["stamp"][0]) * 1e-9)

@@ -31,24 +31,38 @@ OTHER_ARM = init_bytes(gear_ratio=np.full(N, 99.0))
 
 
 class Controller:
-    """Status, modes and axis data of the packets to come."""
+    """Status, modes and axis data of the packets to come.
 
-    def __init__(self) -> None:
+    Args:
+        train: of the arm.
+        start: where it stands at first.
+        arm: its number, from 1.
+        n_axes: slots of a packet.
+        slots: slot of each joint.
+    """
+
+    def __init__(
+        self, train=None, start=START, *, arm: int = 1, n_axes: int = len(AXES), slots=SLOTS
+    ) -> None:
+        self._train = drive_train() if train is None else train
+        self._arm, self._n_axes, self._slots = arm, n_axes, slots
         self.number = 0
-        self.status = [oracle.DRIVE_ON, 0, 0, 0]
-        self.modes = [0] * len(AXES)
-        self.d = np.zeros((len(AXES), 8), np.float32)
-        self.put_arm_at(START)
+        self.status = [0, 0, 0, 0]
+        self.status[arm - 1] = oracle.DRIVE_ON
+        self.modes = [0] * n_axes
+        self.d = np.zeros((n_axes, 8), np.float32)
+        self.put_arm_at(start)
         self.exit_asked = False
 
     def put_arm_at(self, q) -> None:
-        motor = drive_train().motor_revolutions(q)
-        for slot, value in zip(SLOTS, motor, strict=True):
+        motor = self._train.motor_revolutions(q)
+        for slot, value in zip(self._slots, motor, strict=True):
             self.d[slot, [0, 2]] = value
             self.d[slot, [1, 3, 4]] = 0.0, 0.0, 0.5
 
     def wanted(self, mode: int) -> None:
-        for slot in SLOTS:
+        """All axes of the arm in a mode."""
+        for slot in self._slots:
             self.modes[slot] = mode
 
     def packet(self) -> bytes:
@@ -61,13 +75,13 @@ class Controller:
 
     def obey(self, reply: bytes, mode: int) -> None:
         """Go where the answer says; close the axes if it asks for that."""
-        answer = oracle.parse(reply, len(AXES))
+        answer = oracle.parse(reply, self._n_axes)
         refused = any(axis.mode in (505, 508) for axis in answer.axes)
-        if refused or answer.status[0] == 1:
+        if refused or answer.status[self._arm - 1] == 1:
             self.wanted(0)
             self.d[:, [1, 3]] = 0.0
         elif mode in POSITION_MODES:
-            for slot in SLOTS:
+            for slot in self._slots:
                 if self.modes[slot] == mode:
                     position, step = answer.axes[slot].floats[:2]
                     self.d[slot, :4] = position, step, position, step

@@ -32,7 +32,7 @@ from drivers import (
     Session,
 )
 from tests.fuzz.draw import Draw
-from tests.fuzz.drawn_arm import Controller, arm_of
+from tests.fuzz.drawn_arm import arm_of, controller_of
 
 WINDOW = 500
 STRANGE = (0, 10, 501, 3, 6, 11, 12, 14, 17, 500, 502, 504, 505, 506, 508, -1, 1 << 30, 99)
@@ -66,7 +66,7 @@ class Conversation:
             other_axes={(owner, axis + 1) for owner, axis in arm.axes},
         )
         self.obedient = not draw.chance(64)
-        self.controller = Controller(arm)
+        self.controller = controller_of(arm)
         self.reception = Reception(WINDOW)
         self.conduct = Conduct(
             arm.limits, arm.train, self.mode, arm.number, arm.slots, arm.arms,
@@ -182,7 +182,7 @@ class Conversation:
     def open_properly(self) -> None:
         draw = self._draw
         self.controller.status[self.arm.number - 1] = oracle.DRIVE_ON
-        self.controller.home()
+        self.controller.put_arm_at(self.arm.middle)
         self.controller.wanted(0)
         self.run(draw.between(1, 3))
         stagger = draw.chance(64)

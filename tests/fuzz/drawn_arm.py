@@ -12,9 +12,8 @@ import numpy as np
 # Shared with the tests of the drivers, whose modules stand beside one another.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
 
-import oracle
 from arms_bench import train_of
-from judge import POSITION_MODES
+from model_controller import Controller
 
 from drivers import DriveTrain, GuardLimits, InitPacket
 
@@ -42,6 +41,11 @@ class Arm:
     limits: GuardLimits
     init: bytes
     other: bytes
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Joints (n,) [rad] within their range, each elsewhere."""
+        return np.linspace(-0.5, 0.5, self.n)
 
     @property
     def slots(self) -> tuple[int, ...]:
@@ -100,47 +104,12 @@ def init_of(
     return init.encode()
 
 
-class Controller:
-    """Status, modes and axis data of the packets to come."""
-
-    def __init__(self, arm: Arm) -> None:
-        self._arm = arm
-        self.number = 0
-        self.status = [0, 0, 0, 0]
-        self.status[arm.number - 1] = oracle.DRIVE_ON
-        self.modes = [0] * len(arm.axes)
-        self.d = np.zeros((len(arm.axes), 8), np.float32)
-        self.home()
-
-    def home(self) -> None:
-        """The arm where it began, at rest."""
-        motor = self._arm.train.motor_revolutions(np.linspace(-0.5, 0.5, self._arm.n))
-        for slot, value in zip(self._arm.slots, motor, strict=True):
-            self.d[slot] = (value, 0.0, value, 0.0, 0.5, 0.0, 0.0, 0.0)
-
-    def wanted(self, mode: int) -> None:
-        """All axes of the arm in a mode."""
-        for slot in self._arm.slots:
-            self.modes[slot] = mode
-
-    def packet(self) -> bytes:
-        """The next one."""
-        self.number = oracle.answer_number(self.number)
-        axes = tuple(
-            oracle.Axis(mode, tuple(bytes(word) for word in row.view("V4")))
-            for mode, row in zip(self.modes, self.d, strict=True)
-        )
-        return oracle.build(oracle.Packet(self.number, bytes(self.status), bytes(4), axes))
-
-    def obey(self, reply: bytes, mode: int) -> None:
-        """Go where the answer says; close the axes if it asks for that."""
-        answer = oracle.parse(reply, len(self._arm.axes))
-        refused = any(axis.mode in (505, 508) for axis in answer.axes)
-        if refused or answer.status[self._arm.number - 1] == 1:
-            self.wanted(0)
-            self.d[:, [1, 3]] = 0.0
-        elif mode in POSITION_MODES:
-            for slot in self._arm.slots:
-                if self.modes[slot] == mode:
-                    position, step = answer.axes[slot].floats[:2]
-                    self.d[slot, :4] = position, step, position, step
+def controller_of(arm: Arm) -> Controller:
+    """One that begins with its arm in the middle of its range."""
+    return Controller(
+        arm.train,
+        arm.middle,
+        arm=arm.number,
+        n_axes=len(arm.axes),
+        slots=arm.slots,
+    )
