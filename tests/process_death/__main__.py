@@ -57,12 +57,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     missing = [n for n in wanted if n not in known]
     began = time.monotonic()
     folder = Path(tempfile.mkdtemp(prefix="process_death_"))
+    interrupted = False
     try:
         for result in _played(missing, given.jobs, folder, given.defect):
             results.append(result)
             if given.journal is not None:
                 journal.append(given.journal, result)
             _tell(result, len(results), len(wanted), folder, quiet=given.json)
+    except KeyboardInterrupt:
+        interrupted = True
+        sys.stderr.write("interrupted; with --journal the same command goes on from here\n")
     finally:
         kept = sorted(str(path) for path in folder.glob("round_*"))
         if not kept:
@@ -72,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(json.dumps(report) + "\n")
     else:
         sys.stdout.writelines(f"{name:>16} {value}\n" for name, value in report.items())
-    return 1 if report["failed"] else 0
+    return 130 if interrupted else 1 if report["failed"] else 0
 
 
 def _parser() -> argparse.ArgumentParser:
