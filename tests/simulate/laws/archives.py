@@ -296,6 +296,10 @@ def _motions(talk: Talk) -> list[int]:
 def _interval(
     life: Life, talk: Talk, interval: int, rows: NDArray[np.intp], mine: list[Placed], period: float
 ) -> Iterator[str]:
+    cycles = talk.records["cycle"]
+    ends = [e for e in talk.events if isinstance(e, MotionEnded) and e.interval == interval]
+    if ends:  # axes whose drive went off may be open for some cycles more
+        rows = rows[cycles[rows] <= ends[-1].cycle]
     holding = [p for p in mine if p.talk is talk and np.isin(rows, p.rows).any()]
     survived = not (life.died or life.disk)
     if len(holding) != 1:
@@ -303,14 +307,11 @@ def _interval(
             yield f"its {len(rows)} cycles are in {len(holding)} archives"
         return
     archived = holding[0].archived
-    ends = [e for e in talk.events if isinstance(e, MotionEnded) and e.interval == interval]
-    cycles = talk.records["cycle"]
     if ends and archived.whole:
         ended = ends[-1]
         told = {ended.outcome, *(("rejected",) if ended.outcome == "completed" else ())}
         if archived.ended not in told and archived.ended != "interrupted":
             yield f"it ended {ended.outcome}, and {archived.path.name} says {archived.ended!r}"
-        rows = rows[cycles[rows] <= ended.cycle]
     missing = rows[~np.isin(rows, holding[0].rows)]
     stated = int((archived.outcome or {}).get("records_lost", 0))
     if archived.whole and archived.ended != "interrupted" and len(missing) > stated:
