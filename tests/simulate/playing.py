@@ -98,6 +98,17 @@ def twin_of(group: int, root: Path) -> Twin:
     raise RuntimeError(f"no campaign of group {group} completes without faults, the last: {why}")
 
 
+def _unrest(scene: Scene, history: ArmHistory) -> float:
+    """The largest speed with closed or opening axes, in units of what the guard calls standstill.
+
+    Beyond one it is a matter of chance whether a motion may begin, with faults or without.
+    """
+    still = np.isin(history.phase, ("CLOSED", "OPENING"))
+    revolutions = np.abs(scene.cell.drive_train.gear_ratio) * scene.cell.period / (2.0 * np.pi)
+    speed = np.abs(history.velocity[still]) * revolutions
+    return float(speed.max(initial=0.0) / scene.cell.guard_limits.standstill)
+
+
 def _twin(scene: Scene, folder: Path) -> Twin:
     world = _World(scene, scene.controller, _EMPTY, random.Random(0), folder)
     life = world.live()
@@ -107,6 +118,8 @@ def _twin(scene: Scene, folder: Path) -> Twin:
     if found is None or found.result.pooled.undetermined:
         raise SceneError(f"{scene.words}: {why or 'undetermined'}")
     history = world.controller.history()
+    if (share := _unrest(scene, history)) > 1.0:
+        raise SceneError(f"{scene.words}: standing, it moves at {share:.2g} of what is at rest")
     moving = np.abs(history.velocity).max(axis=1) > _MOVING
     story = Story(
         cycles=world.controller.cycle,

@@ -12,6 +12,8 @@ import pytest
 from tests.simulate.__main__ import main
 from tests.simulate.drawing import DRAWS, Story, draw_script
 from tests.simulate.many import Journal, JournalError, stage_folder
+from tests.simulate.playing import SceneError, _twin, twin_of
+from tests.simulate.scenes import NEIGHBOURS, scene_of
 from tests.simulate.script import kind_of, parse_script, simpler
 from tests.simulate.shrinking import shrunk
 from tests.simulate.verdicts import Stage, Tally, Verdict
@@ -163,3 +165,11 @@ class TestCommand:
     def test_a_script_that_is_not_there_is_named(self, capsys) -> None:
         assert main(["--seed", "1", "--script", "/nowhere/script"]) == 2
         assert "/nowhere/script" in capsys.readouterr().err
+
+
+def test_a_scene_whose_arm_trembles_where_it_stands_is_drawn_anew(tmp_path: Path) -> None:
+    """Seed 744: whether a motion could begin was a matter of chance, five runs in a row."""
+    group = 744 // NEIGHBOURS
+    with pytest.raises(SceneError, match="standing, it moves at"):
+        _twin(scene_of(group), tmp_path / "trembling")
+    assert twin_of(group, tmp_path).scene.words != scene_of(group).words
