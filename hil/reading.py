@@ -16,6 +16,8 @@ from typing import Any, BinaryIO, Final
 
 LONGEST_TEXT: Final = 1 << 28
 """Bytes of the longest text that is read as a whole; the largest of ours has a hundredth of it."""
+_DEEPEST: Final = 32
+"""Tables and lists in one another; ours have four."""
 _NO_FILE: Final = "it is a pipe or a device, no file"
 
 
@@ -81,6 +83,17 @@ def toml_of(text: str) -> dict[str, Any]:
         ValueError: it is no TOML, or nested deeper than anybody reads.
     """
     try:
-        return tomllib.loads(text)
+        found = tomllib.loads(text)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
+    level: list[Any] = [found]
+    for _ in range(_DEEPEST):  # dotted keys nest without end, and the parser does not mind
+        level = [
+            inner
+            for table in level
+            for inner in (table.values() if isinstance(table, dict) else table)
+            if isinstance(inner, dict | list)
+        ]
+        if not level:
+            return found
+    raise ValueError("it is nested too deep")

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9
 """Share of the largest principal moment."""
+_MOST = 1e9
+"""kg, m, kg m²: no arm carries more, and products of more would overflow."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Payload:
             frame of the last joint.
 
     Raises:
-        ModelError: no body has this mass, or a figure is not finite.
+        ModelError: no body has this mass, or a figure is not finite, or beyond 1e9.
     """
 
     mass: float
@@ -42,10 +44,12 @@ class Payload:
     frame: str | None = None
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.mass) and self.mass >= 0.0):
+        if not 0.0 <= self.mass <= _MOST:
             raise ModelError(f"the payload weighs {self.mass!r} kg; give its mass, zero or more")
         if not all(math.isfinite(value) for value in (*self.centre, *self.inertia)):
             raise ModelError("the payload's centre or inertia holds a number that is not finite")
+        if not all(abs(value) <= _MOST for value in (*self.centre, *self.inertia)):
+            raise ModelError(f"the payload's centre or inertia holds a number beyond {_MOST:g}")
 
     @property
     def possible(self) -> bool:

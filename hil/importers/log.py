@@ -56,7 +56,8 @@ def import_log(
         ArchiveWriteError: the archive cannot be written.
     """
     log = _Log(Path(source), columns, robot)
-    values, stamp, origin = _read(log, columns)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is no number is refused by its place
+        values, stamp, origin = _read(log, columns)
     metadata = {"importer": "log", "clock_origin_ns": str(origin)}
     if columns.format.missing == "drop":
         whole = np.all([np.isfinite(array).all(axis=1) for array in values.values()], axis=0)
@@ -69,9 +70,11 @@ def import_log(
         metadata["motor_from_joint"] = json.dumps(matrix.tolist())
         if coupled and np.any(matrix != np.diag(np.diag(matrix))):
             robot = robot.with_coupling(matrix)
+    with np.errstate(over="ignore", invalid="ignore"):
+        joint_side = _joint_side(values, columns, log)
     return write_imported(
         output,
-        Samples(stamp, **_joint_side(values, columns, log)),
+        Samples(stamp, **joint_side),
         source=log.files,
         robot=robot,
         metadata=metadata,

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from hil.importers.findings import METADATA, examine
 from hil.importers.robot import Robot
 
 Use = Literal["excitation", "validation", "standstill"]
+
+_MOST: Final = 1e12
+"""Of any quantity: no arm has more, in whatever unit, and sums of squares of it do not overflow."""
 
 
 def write_imported(
@@ -45,7 +48,7 @@ def write_imported(
         use: what identification may do with them: fit, only predict, or take the noise from.
 
     Raises:
-        SourceError: no sample, or a value that is not finite.
+        SourceError: no sample, or a value that is not finite, or beyond 1e12.
         ArchiveWriteError: the archive cannot be written.
     """
     _check(samples, source[0], robot.joint_names)
@@ -88,13 +91,14 @@ def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
     for name, values in quantities.items():
         if values is None:
             continue
-        rows, columns = np.nonzero(~np.isfinite(values))
+        rows, columns = np.nonzero(~(np.abs(values) <= _MOST))
         if rows.size:
             raise SourceError(
                 source,
                 f"{name} of joint {joints[columns[0]]} is {values[rows[0], columns[0]]} in sample "
                 f"{rows[0]} ({elapsed[rows[0]]:.6g} s; {rows.size} such values)",
-                remedy="cut the recording there, or leave the quantity out",
+                remedy="cut the recording there, or leave the quantity out (numbers up to "
+                f"{_MOST:g} can be used)",
             )
 
 

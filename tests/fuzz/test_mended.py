@@ -26,6 +26,7 @@ from hil.new import from_archive
 from hil.plots.archive_view import _state_name, view_of
 from identification.errors import ModelError
 from identification.kinematics import chain_from_urdf
+from identification.payload import Payload
 from tests.fault_matrix.small_cell import URDF
 from tests.fuzz.targets import cell_file, documents, importers
 
@@ -166,3 +167,46 @@ def test_a_robot_that_only_some_readers_take_is_refused(was: str, put: str, why:
 def test_an_archive_in_a_state_that_nobody_knows_is_drawn() -> None:
     assert _state_name(State.OPEN) == "open"
     assert _state_name(105) == "state 105"
+
+
+@pytest.mark.parametrize("value", [2.2e203, -1e13, np.inf, np.nan])
+def test_a_log_with_a_number_that_no_arm_has_is_refused_by_its_place(
+    tmp_path: Path, value: float
+) -> None:
+    position = np.zeros((4, 2))
+    position[2, 1] = value
+    np.savez(tmp_path / "log.npz", q=position, t=0.002 * np.arange(4.0))
+    with pytest.raises(SourceError, match=r"position of joint ankle is \S+ in sample 2"):
+        import_log(
+            tmp_path / "log.npz", tmp_path / "o.mcap", robot=importers.robot(),
+            columns=importers.ARRAYS,
+        )  # fmt: skip
+    assert not (tmp_path / "o.mcap").exists()
+
+
+def test_a_signalling_nan_in_a_log_is_refused_as_any_other(tmp_path: Path) -> None:
+    position = np.zeros((4, 2), np.float32)
+    position.view(np.uint32)[1] = 0x7F800001
+    np.savez(tmp_path / "log.npz", q=position, t=0.002 * np.arange(4.0))
+    with pytest.raises(SourceError, match="is nan in sample 1"):
+        import_log(
+            tmp_path / "log.npz", tmp_path / "o.mcap", robot=importers.robot(),
+            columns=importers.ARRAYS,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "deep", [".".join("a" * 400) + " = 1", "a = " + "{b = [" * 60 + "1" + "]}" * 60]
+)
+def test_a_cell_file_whose_tables_nest_without_end_is_refused(tmp_path: Path, deep: str) -> None:
+    (tmp_path / "cell.toml").write_text(deep)
+    with pytest.raises(InputError, match=r"cell\.toml.*nested too deep"):
+        Cell.load(tmp_path / "cell.toml")
+
+
+@pytest.mark.parametrize(
+    "figures", [(1e200, (0.0, 0.0, 0.0)), (1.0, (0.0, 1e200, 0.0)), (1.0, (0.0, 0.0, np.nan))]
+)
+def test_a_payload_that_no_arm_carries_is_refused(figures: tuple) -> None:
+    with pytest.raises(ModelError, match="the payload"):
+        Payload(*figures)
