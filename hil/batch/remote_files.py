@@ -138,6 +138,7 @@ def _is_final(error: Exception) -> bool:
         return 400 <= status < 500 and status not in _TRY_LATER
     if isinstance(error, FileNotFoundError):
         return error.__cause__ is None
+    # The last is what fsspec raises where a kind of store cannot do what was asked at all.
     return isinstance(error, ImportError | ValueError | PermissionError | NotImplementedError)
 
 

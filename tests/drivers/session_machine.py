@@ -19,6 +19,7 @@ from hypothesis.stateful import (
     rule,
 )
 from judge import POSITION_MODES, Conduct
+from judged import Judged
 from model_controller import (
     ARMS,
     AXES,
@@ -30,15 +31,13 @@ from model_controller import (
     Controller,
     N,
 )
-from reception import Reception
+from reception import number_of
 from rig import START, drive_train, limits
 from sources import WILD, corrections, motions
 
 from drivers import (
     CycleRing,
     Guard,
-    InitReceived,
-    MotionEnded,
     RequestError,
     Session,
     State,
@@ -54,7 +53,7 @@ any_mode = st.sampled_from(
 wild = st.sampled_from(WILD) | st.floats(allow_nan=True, width=32)
 
 
-class SessionMachine(RuleBasedStateMachine):
+class SessionMachine(Judged, RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.mode = 4
@@ -65,24 +64,22 @@ class SessionMachine(RuleBasedStateMachine):
     )
     def begin(self, mode, obedient, cold, settle):
         self.mode, self.obedient = mode, obedient
-        self.ring = CycleRing(N, 512)
+        ring = CycleRing(N, 512)
         self.limits, self.train = limits(), drive_train()
-        self.session = Session(
+        session = Session(
             self.train,
             Guard(self.limits, PERIOD),
-            self.ring,
+            ring,
             mode=mode,
             max_gap=MAX_GAP,
             other_axes=OTHER_AXES,
             settle_cycles=settle,
         )
         self.controller = Controller()
-        self.now = 0.0
-        self.replies: list[tuple[bytes, bytes]] = []
-        self.reception = Reception(WINDOW)
-        self.conduct = self.new_conduct()
-        self.ages = None
-        self.unanswered = 0
+        self.hear(
+            session, ring, self.new_conduct(), n_axes=len(AXES), max_gap=MAX_GAP, window=WINDOW,
+            period=PERIOD, inits={GOOD_INIT: True, OTHER_ARM: False},
+        )  # fmt: skip
         if cold:
             for number in range(1, 10):
                 self.send(number.to_bytes(4, "little") + bytes(728))
@@ -108,55 +105,9 @@ class SessionMachine(RuleBasedStateMachine):
 
     def send(self, packet: bytes, elapsed: float = PERIOD) -> bytes | None:
         """Deliver it, and have the outcome judged."""
-        self.now += elapsed
-        if elapsed > 301.0:
-            self.silence_heard()
-        before, last = self.ring.slot, self.reception.last
-        kind = self.reception.expect(packet)
-        reply = self.session.reply(packet, self.now, self.ages)
-        self.drain()
-        rows = self.ring.slot - before
-        assert rows == (kind == "cyclic") or (kind == "cyclic" and rows < 0), "records"
-        if kind == "nothing":
-            assert reply is None
-            self.unanswered += 1
-        elif kind == "again":
-            assert reply == self.replies[-1][1], "a duplicate was answered otherwise"
-        else:
-            assert reply is not None
-            self.replies = [(packet, reply)]
-        if kind in ("echo", "init"):
-            assert reply == oracle.echo(packet)
-            if kind == "init":
-                self.conduct.usable = packet == GOOD_INIT
-            self.conduct.interrupted()
-        if kind == "cyclic":
-            assert len(reply) == oracle.length(len(AXES)), "length"
-            missed = (oracle_number(packet) - last) % 0x7FFF - 1
-            record = self.ring.last(1)[0]
-            # Packets that got no answer are gaps to the controller.
-            long_gap = record["gap"] + self.unanswered > MAX_GAP
-            self.conduct.judge(packet, reply, record, long_gap)
-            self.unanswered = 0
-            assert record["gap"] in (missed, 0)
-            if all(axis.mode == 504 for axis in oracle.parse(packet, len(AXES)).axes):
-                self.reception.ended = True
+        reply = self.deliver(packet, elapsed)
         self.seen_states.add(self.session.state)
         return reply
-
-    def silence_heard(self) -> None:
-        """More time has passed than any silence is allowed to take."""
-        if not self.reception.ended:
-            self.reception.silent = self.reception.n_axes is not None
-            self.conduct.interrupted()
-
-    def drain(self) -> None:
-        for event in self.session.events():
-            if isinstance(event, MotionEnded):
-                self.conduct.entitled = False
-                self.conduct.stopping = self.conduct.overridden = False
-            if isinstance(event, InitReceived):
-                assert (event.unusable is None) == (event.init.encode() == GOOD_INIT)
 
     def run(self, cycles: int) -> None:
         for _ in range(cycles):
@@ -259,15 +210,15 @@ class SessionMachine(RuleBasedStateMachine):
 
     @rule(copies=st.integers(1, 3))
     def duplicate(self, copies):
-        if self.replies:
+        if self.last is not None:
             for _ in range(copies):
-                self.send(self.replies[-1][0])
+                self.send(self.last[0])
 
     @rule(behind=st.integers(1, 40000))
     def out_of_turn(self, behind):
         packet = bytearray(self.controller.packet())
         self.controller.number = (self.controller.number - 2) % 0x7FFF + 1
-        number = (oracle_number(packet) - behind - 1) % 0x7FFF + 1
+        number = (number_of(packet) - behind - 1) % 0x7FFF + 1
         packet[:4] = number.to_bytes(4, "little")
         reply = self.send(bytes(packet))
         if reply is not None:
@@ -298,7 +249,7 @@ class SessionMachine(RuleBasedStateMachine):
             self.now += 400.0
             self.session.tick(self.now)
             self.silence_heard()
-            self.drain()
+            self.take_events()
         self.send(self.controller.packet(), elapsed=400.0)
 
     @rule(other=st.sampled_from([False, False, True]))
@@ -350,7 +301,7 @@ class SessionMachine(RuleBasedStateMachine):
     @rule()
     def stop(self):
         self.session.stop()
-        self.drain()
+        self.take_events()
         self.conduct.stopping = self.conduct.entitled
         self.run(1)
 
@@ -367,7 +318,3 @@ class SessionMachine(RuleBasedStateMachine):
     @rule(mode=open_modes, obedient=st.booleans(), settle=st.integers(0, 3))
     def new_session(self, mode, obedient, settle):
         self.begin(mode, obedient, False, settle)
-
-
-def oracle_number(packet: bytes) -> int:
-    return int.from_bytes(packet[:4], "little", signed=True)

@@ -20,14 +20,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
 
 import oracle
 from judge import POSITION_MODES, Conduct
-from reception import Reception
+from judged import Judged
+from reception import number_of
 from sources import FAULTS, WILD, Breaks, FedMotion, ScriptedCorrection, ScriptedMotion, smooth
 
 from drivers import (
     CycleRing,
     Guard,
-    InitReceived,
-    MotionEnded,
     RequestError,
     Session,
 )
@@ -43,7 +42,7 @@ CYCLES = 200
 """Of one conversation at most."""
 
 
-class Conversation:
+class Conversation(Judged):
     """One session, one controller, one user; `play` lets them act."""
 
     def __init__(self, draw: Draw) -> None:
@@ -53,31 +52,35 @@ class Conversation:
             draw.choice((2, 6, 1, 3, 4, 5)), draw.choice((1, 2, 4)), draw.below(4), draw.below(4), 2
         )
         self.mode = draw.choice((4, 4, 5, 1, 2, 7, 8, 9))
-        self.max_gap = draw.choice((2, 0, 5))
-        self.ring = CycleRing(arm.n, 2 * CYCLES)
-        self.session = Session(
+        max_gap = draw.choice((2, 0, 5))
+        ring = CycleRing(arm.n, 2 * CYCLES)
+        session = Session(
             arm.train,
             Guard(arm.limits, arm.period),
-            self.ring,
+            ring,
             mode=self.mode,
-            max_gap=self.max_gap,
+            max_gap=max_gap,
             arm=arm.number,
             settle_cycles=draw.choice((0, 3)),
             other_axes={(owner, axis + 1) for owner, axis in arm.axes},
         )
         self.obedient = not draw.chance(64)
         self.controller = controller_of(arm)
-        self.reception = Reception(WINDOW)
-        self.conduct = Conduct(
+        conduct = Conduct(
             arm.limits, arm.train, self.mode, arm.number, arm.slots, arm.arms,
             threshold=np.full(arm.n, 2.0), current=np.full(arm.n, 20.0), period=arm.period,
-            max_gap=self.max_gap,
+            max_gap=max_gap,
         )  # fmt: skip
-        self.now = 0.0
-        self.last: tuple[bytes, bytes] | None = None
-        self.ages: np.ndarray | None = None
-        self.unanswered = 0
+        self.hear(
+            session, ring, conduct, n_axes=len(arm.axes), max_gap=max_gap, window=WINDOW,
+            period=arm.period, inits={arm.init: True, arm.other: False},
+        )  # fmt: skip
         self.sent = 0
+
+    def deliver(self, packet: bytes, elapsed: float | None = None) -> bytes | None:
+        """One packet more, and its answer judged."""
+        self.sent += 1
+        return super().deliver(packet, elapsed)
 
     def play(self) -> None:
         """Start, then step by step until the bytes run out.
@@ -95,64 +98,6 @@ class Conversation:
             if not draw.left or self.sent > CYCLES:
                 return
             draw.choice(ACTS)(self)
-
-    # One packet ---------------------------------------------------------------------------
-
-    def deliver(self, packet: bytes, elapsed: float | None = None) -> bytes | None:
-        """One packet, and its answer judged."""
-        elapsed = self.arm.period if elapsed is None else elapsed
-        self.now += elapsed
-        self.sent += 1
-        if elapsed > 301.0:
-            self._silence_heard()
-        before, last = self.ring.slot, self.reception.last
-        kind = self.reception.expect(packet)
-        reply = self.session.reply(packet, self.now, self.ages)
-        self._events()
-        assert self.ring.slot - before == (kind == "cyclic"), "records"
-        if kind == "nothing":
-            assert reply is None, "an answer to what gets none"
-            self.unanswered += 1
-            return None
-        assert reply is not None, f"no answer to {kind}"
-        if kind == "again":
-            assert self.last is not None and reply == self.last[1], "a duplicate answered otherwise"
-            return reply
-        self.last = packet, reply
-        if kind in ("echo", "init"):
-            assert reply == oracle.echo(packet), "not an echo"
-            self.conduct.interrupted()
-        else:
-            self._cyclic(packet, reply, last)
-        return reply
-
-    def _cyclic(self, packet: bytes, reply: bytes, last: int) -> None:
-        record = self.ring.last(1)[0]
-        long_gap = record["gap"] + self.unanswered > self.max_gap
-        self.conduct.judge(packet, reply, record, bool(long_gap))
-        self.unanswered = 0
-        missed = (number_of(packet) - last) % 0x7FFF - 1
-        assert record["gap"] in (missed, 0), "the gap recorded"
-        slots = len(self.arm.axes)
-        if all(axis.mode == 504 for axis in oracle.parse(packet, slots).axes):
-            self.reception.ended = True
-
-    def _silence_heard(self) -> None:
-        if not self.reception.ended:
-            self.reception.silent = self.reception.n_axes is not None
-            self.conduct.interrupted()
-
-    def _events(self) -> None:
-        for event in self.session.events():
-            if isinstance(event, MotionEnded):
-                self.conduct.entitled = False
-                self.conduct.stopping = self.conduct.overridden = False
-            if isinstance(event, InitReceived):
-                self.conduct.usable = event.unusable is None
-                packet = event.init.encode()
-                if packet in (self.arm.init, self.arm.other):
-                    fits = packet == self.arm.init
-                    assert self.conduct.usable == fits, "which arms are moved"
 
     def run(self, cycles: int) -> None:
         """Cycles of a controller that goes on."""
@@ -264,8 +209,8 @@ class Conversation:
         for _ in range(self._draw.below(3)):
             self.now += 400.0
             self.session.tick(self.now)
-            self._silence_heard()
-            self._events()
+            self.silence_heard()
+            self.take_events()
         self.deliver(self.controller.packet(), elapsed=400.0)
 
     def start_over(self) -> None:
@@ -320,7 +265,7 @@ class Conversation:
 
     def stop(self) -> None:
         self.session.stop()
-        self._events()
+        self.take_events()
         self.conduct.stopping = self.conduct.entitled
         self.run(1)
 
@@ -340,11 +285,6 @@ def _edge(hold: int, share: float) -> np.ndarray:
     jerk = 100.0 * share * np.repeat([1.0, -1.0, -1.0, 1.0], hold)[:, None]
     rows = np.cumsum(np.cumsum(np.cumsum(jerk, axis=0), axis=0), axis=0) * 0.002**3
     return np.vstack([np.zeros((1, 1)), rows, rows[-1:]])
-
-
-def number_of(packet: bytes) -> int:
-    """As on the wire, signed."""
-    return int.from_bytes(packet[:4], "little", signed=True)
 
 
 _C = Conversation
