@@ -15,6 +15,8 @@ from hil.cell.text import replaced_value
 from hil.errors import SourceError
 from hil.reading import remedy_of, text_of
 from identification import FrictionLaw
+from identification.errors import ModelError
+from identification.kinematics import pinocchio_model
 from planner.toml_value import toml_value
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.81)
@@ -64,6 +66,10 @@ class Robot:
             why = error.strerror if isinstance(error, OSError) else error
             remedy = remedy_of(error, "name a URDF file")
             raise SourceError(path, f"cannot be read ({why})", remedy=remedy) from error
+        try:
+            pinocchio_model(urdf)
+        except ModelError as error:  # told of this file, and not of a cell that nobody wrote
+            raise SourceError(path, str(error), remedy="name a URDF file") from error
         law = friction or FrictionLaw()
         text = _cell_text(path.stem, law, gravity, rotor_inertia, locked or {})
         return cls._checked(text, urdf, path)

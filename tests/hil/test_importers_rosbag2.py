@@ -116,7 +116,7 @@ class TestRobot:
 
     def test_a_file_that_is_no_urdf_is_refused(self, tmp_path):
         (tmp_path / "bad.urdf").write_text("<robot")
-        with pytest.raises(InputError, match=r"bad\.urdf"):
+        with pytest.raises(InputError, match=r"bad\.urdf: the robot description .* is no XML"):
             Robot.from_urdf(tmp_path / "bad.urdf")
         with pytest.raises(InputError, match=r"none\.urdf.*cannot be read"):
             Robot.from_urdf(tmp_path / "none.urdf")
