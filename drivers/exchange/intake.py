@@ -39,10 +39,13 @@ TOO_OLD: Final = 3.0
 _TOO_OLD_AT_LEAST: Final = 0.005
 """s; the same, where cycles are short against what the system may be busy for."""
 _A_LITTLE: Final = 1000
+"""Packet numbers within which one is a little later than another, or a little earlier."""
 _SLEPT: Final = 0.1
 """Cycles that receiving a packet takes at most if it was there already."""
 
 Ages = NDArray[np.uint16]
+_Kind = tuple[int, int, bytes]
+"""Session within the pile, length, status and modes."""
 
 
 class Arrival(NamedTuple):
@@ -171,6 +174,9 @@ class Intake:
 class _Pile:
     """The newest packet of each kind, in the order of their arrival.
 
+    Numbers that are far apart are no matter of age: one of two such packets is of another session,
+    or its number was garbled, and which one the session knows.
+
     Args:
         n_axes: slots of a packet that mean something. Some controllers send more bytes, and what
             stands in those makes no kind.
@@ -182,13 +188,13 @@ class _Pile:
     def __init__(self, n_axes: int) -> None:
         self.left_out = 0
         self._modes = slice(HEADER_LENGTH, cyclic_length(n_axes), AXIS_LENGTH)
-        self._kinds: dict[tuple[int, int, bytes], Arrival] = {}
+        self._newest: list[tuple[_Kind, Arrival]] = []
         self._sessions = 0
 
     @property
     def kept(self) -> tuple[Arrival, ...]:
         """In order."""
-        return tuple(self._kinds.values())
+        return tuple(arrival for _, arrival in self._newest)
 
     def add(self, arrival: Arrival) -> None:
         """Take one that came after the others."""
@@ -197,21 +203,25 @@ class _Pile:
             self._sessions += 1
         status = packet[4 : 4 + N_ARMS]
         # The lowest byte tells the modes there are from each other.
-        modes = packet[self._modes]
-        kind = (self._sessions, len(packet), status + modes)
-        earlier = self._kinds.get(kind)
-        if earlier is None:
-            if len(self._kinds) >= MOST_KINDS:
-                del self._kinds[next(iter(self._kinds))]
-                self.left_out += 1
-        elif packet == earlier.packet:
-            return
-        else:
-            self.left_out += 1
+        kind = (self._sessions, len(packet), status + packet[self._modes])
+        for place, (other, earlier) in enumerate(self._newest):
+            if other != kind:
+                continue
+            if packet == earlier.packet:
+                return
             if _ahead(_number(earlier.packet), _number(packet)) <= _A_LITTLE:
-                return  # overtaken on the way
-            del self._kinds[kind]
-        self._kinds[kind] = arrival
+                self.left_out += 1  # overtaken on the way
+                return
+            if _ahead(_number(packet), _number(earlier.packet)) <= _A_LITTLE:
+                self._leave_out(place)
+                break
+        if len(self._newest) >= MOST_KINDS:
+            self._leave_out(0)
+        self._newest.append((kind, arrival))
+
+    def _leave_out(self, place: int) -> None:
+        del self._newest[place]
+        self.left_out += 1
 
 
 def _number(packet: bytes) -> int:

@@ -326,6 +326,23 @@ class TestHeldUp:
         assert len(sent) == 2
         assert source.advances <= advances + 2
 
+    @pytest.mark.parametrize("place", range(4))
+    @pytest.mark.parametrize("garbled", [0x10, 0x20, 0x40])
+    def test_a_garbled_number_does_not_take_the_place_of_the_newest(self, place, garbled):
+        """Seed 1667: it passed for the newest, and the session would have none of it."""
+        rig, source = self.moving()
+        on_time = rig.packet()
+        late = [rig.packet() for _ in range(3)]
+        wrong = bytearray(late[min(place, 2)])
+        wrong[1] ^= garbled
+        advances = source.advances
+        sent = self.serve(rig, on_time, [*late[:place], bytes(wrong), *late[place:]])
+        assert len(sent) == 2
+        assert sent[1][:4] == (rig.number + 1).to_bytes(4, "little")
+        assert source.advances == advances + 2
+        assert rig.session.counters.discarded == {"late": 2}
+        assert rig.session.counters.stale == 1
+
     @given(st.lists(st.integers(0, 255), max_size=400))
     def test_whatever_waits_few_are_answered(self, statuses):
         packets = [
