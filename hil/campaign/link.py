@@ -23,7 +23,7 @@ from drivers.motion_source import MotionSource, progress_of
 from drivers.packet_records import PacketRing
 from drivers.record import CycleRing
 from drivers.session import Session
-from drivers.states import State
+from drivers.states import HAS_SET_POINTS, State
 from drivers.transports import SimulatedTransport, Transport
 from drivers.transports.tapped import TappedTransport, tapped
 from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
@@ -182,7 +182,9 @@ class Link:
                     if not taking.began:
                         hopeless = beginning.hopeless(self.session.state, self.transport.now)
                 patience -= taking.recorder.ended is not None
-                return taking.recorder.over or patience < 0 or hopeless is not None
+                # One that was stopped while its axes opened has not begun; they have to close.
+                over = taking.recorder.over and self.session.state not in HAS_SET_POINTS
+                return over or patience < 0 or hopeless is not None
 
             exchange(self.transport, self.session, until=over)
             if hopeless is not None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from drivers import State
 from drivers.exchange import exchange
@@ -14,9 +17,11 @@ from hil.campaign import Link
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.motion_link import not_ready
 from hil.campaign.stop import Stop
+from hil.cell import Cell
 from hil.errors import ControllerFault
 from hil.simulation import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
+from sim_fixtures import Phase
 from tests.hil.fast_cell import fast_cell
 
 
@@ -65,10 +70,45 @@ def test_a_motion_whose_drive_goes_off_before_it_begins_is_not_waited_for_withou
     controller.emergency_stop()
     packets = iter(range(10))
     exchange(link.transport, link.session, until=lambda: next(packets, None) is None)
+    motion, spec = short_way(cell, where, tmp_path)
+    with pytest.raises(ControllerFault, match="went off before the motion began; nothing was sent"):
+        link.run(motion, spec, Stop())
+    assert (open_archive(spec.path).outcome or {})["outcome"] == "void"
+
+
+def test_a_motion_that_is_stopped_while_its_axes_open_leaves_them_closed(tmp_path: Path) -> None:
+    """Seed 2088 with `stop@30`: the link was left with some of the axes in open mode."""
+    cell = fast_cell(tmp_path)
+    controller = simulated_controller(cell)
+    link = Link.over(SimulatedTransport(controller), cell)
+    motion, spec = short_way(cell, link.connect(Stop()), tmp_path)
+    stop, phases = Stop(), []
+
+    class Looking:
+        """Presses stop when the first axis has opened."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(controller, name)
+
+        def next_packet(self) -> bytes | None:
+            phases.append(controller.phase)
+            stop.requested |= controller.phase is Phase.OPENING
+            return controller.next_packet()
+
+    link.transport = SimulatedTransport(Looking())
+    assert link.run(motion, spec, stop).outcome == "stopped"
+    assert Phase.OPENING in phases
+    assert Phase.OPEN not in phases
+    assert link.session.state is State.CLOSED
+
+
+def short_way(
+    cell: Cell, where: NDArray[np.float64], folder: Path
+) -> tuple[TrajectoryPlayer, ArchiveSpec]:
+    """A move of every joint by 0.1 rad, and the archive that it goes to."""
     way = plan_moves(where, (Move(where + 0.1),), cell.joint_limits).trajectory
     player = TrajectoryPlayer(way, cell.period, cell.joint_limits, start_tolerance=START_TOLERANCE)
     drives = {"drive_train.json": cell.drive_table.model_dump_json().encode()}
-    spec = ArchiveSpec(tmp_path / "a.mcap", cell.joint_names, cell.period, {"kind": "move"}, drives)
-    with pytest.raises(ControllerFault, match="went off before the motion began; nothing was sent"):
-        link.run(player, spec, Stop())
-    assert (open_archive(spec.path).outcome or {})["outcome"] == "void"
+    return player, ArchiveSpec(
+        folder / "a.mcap", cell.joint_names, cell.period, {"kind": "move"}, drives
+    )
