@@ -14,6 +14,7 @@ from hil.progress import reporter
 from tests.simulate.judging import judged
 from tests.simulate.many import Journal, JournalError, played, stage_folder
 from tests.simulate.observed import Observed
+from tests.simulate.playing import UndisturbedError
 from tests.simulate.script import GRAMMAR
 from tests.simulate.verdicts import Stage, Tally, Verdict, runs_of
 
@@ -32,7 +33,10 @@ The exit code is 1 if a law was broken. A script has lines of `hil simulate`'s f
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.seed is None and options.script is not None:
+        parser.error("--script is played with one --seed, not with --seeds")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the children
     try:
         return _one(options) if options.seed is not None else _many(options)
@@ -84,7 +88,11 @@ def _one(options: argparse.Namespace) -> int:
             raise ValueError(f"{options.script}: {error.strerror}; name a script") from error
     with stage_folder() as root:
         stage = Stage(root)
-        seen = stage.observed(options.seed, lines)
+        try:
+            seen = stage.observed(options.seed, lines)
+        except UndisturbedError as error:
+            sys.stdout.write(f"BROKEN undisturbed: {error}\n")
+            return 1
         broken = judged(seen)
         told = [f"seed {options.seed}: {stage.twin(options.seed).scene.words}", *_story(seen)]
     told += [f"BROKEN {law}: {text}" for law, text in broken]

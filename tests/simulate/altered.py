@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tests.simulate.laws import LAWS
+from tests.simulate.judging import LAWS
 from tests.simulate.laws.judged import judged_whole
 from tests.simulate.observed import Broken, Observed
 from tests.simulate.playing import NEIGHBOURS, play, twin_of

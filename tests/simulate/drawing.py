@@ -90,7 +90,7 @@ def _stall(chance: random.Random, story: Story) -> str:
 
 
 def _stalls(chance: random.Random, story: Story) -> str:
-    """A virtual machine that is taken its processor away again and again."""
+    """A virtual machine whose processor is taken away again and again."""
     at = _cycle(chance, story)
     lines = []
     for _ in range(chance.randint(2, 6)):

@@ -1,4 +1,4 @@
-"""A motion that is not the one that was planned, as by a defect of ours: the guard is left then."""
+"""A motion that is not the one that was planned, as by a defect of ours: only the guard is left."""
 
 from __future__ import annotations
 

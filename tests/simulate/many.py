@@ -115,7 +115,7 @@ def played(
         desks = [_Desk(groups, str(root), shrink) for _ in range(min(jobs, len(groups)))]
         for desk in desks:
             children.callback(desk.close)
-        busy = {desk: desk for desk in desks if desk.begin()}
+        busy = [desk for desk in desks if desk.begin()]
         while busy:
             left = min(desk.deadline for desk in busy) - monotonic()
             ready = wait([desk.connection for desk in busy], max(0.0, left))
@@ -125,7 +125,7 @@ def played(
                         journal.add(verdict)
                         yield verdict
                     if not desk.begin():
-                        del busy[desk]
+                        busy.remove(desk)
 
 
 class _Desk:

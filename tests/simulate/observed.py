@@ -109,21 +109,17 @@ class ArmHistory:
 
     Attributes:
         sent: (k,) packets as the controller sent them, b"" for none.
-        delivered: (k,) answers as they were handed to it, None for none.
         position: (k, n) joint angles [rad] at the beginning of the cycle.
         velocity: (k, n) [rad/s].
         phase: (k,) names of `sim_fixtures.Phase`.
         open_axes: (k,) whether any axis was in open mode.
-        drive_on: cycles in which somebody pressed the drive-on button or restarted the controller.
     """
 
     sent: tuple[bytes, ...]
-    delivered: tuple[bytes | None, ...]
     position: Array
     velocity: Array
     phase: tuple[str, ...]
     open_axes: NDArray[np.bool_]
-    drive_on: tuple[int, ...]
 
 
 class Estimated(NamedTuple):
@@ -152,10 +148,9 @@ class Observed:
         runs: the process lives, in order.
         arm: the controller's side.
         folder: the campaign's, after the last life.
-        twin: folder of the same plan on the same cell without any fault.
         found: the estimate from `folder` by the product's own way; None where the campaign was
             not completed, or where `unidentified` says why.
-        twin_found: that from `twin`.
+        twin_found: that of the same plan on the same cell without any fault; None of that itself.
         unidentified: why there is none although the campaign was completed; "" otherwise.
     """
 
@@ -168,7 +163,6 @@ class Observed:
     runs: tuple[Life, ...]
     arm: ArmHistory
     folder: Path
-    twin: Path
     found: Estimated | None
     twin_found: Estimated | None
     unidentified: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import random
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,9 @@ from unittest.mock import patch
 import numpy as np
 
 from drivers import State
+from drivers.errors import NotAtStandstill
 from hil.campaign import Campaign, Link, link, steering
+from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
 from hil.campaign.execution_result import RunResult
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.stop import Stop
@@ -57,6 +59,8 @@ _GIVES_UP: Final = 3000
 """Cycles without an init packet after which the person ends a run."""
 _MOVING: Final = 0.05
 """rad/s."""
+_JOG: Final = "jog the arm"
+"""What a run says that cannot find a free way from where the arm stands."""
 _EMPTY: Final = parse_script(())
 
 
@@ -69,33 +73,56 @@ class Twin:
         folder: of its campaign.
         found: its estimate.
         story: what a script may refer to.
+        seen: all that was seen of it.
+        redrawn: scenes before this one that were of no use.
     """
 
     scene: Scene
     folder: Path
     found: Estimated
     story: Story
+    seen: Observed
+    redrawn: int = 0
 
 
 class SceneError(Exception):
-    """An undisturbed campaign that does not complete: the scene is drawn anew."""
+    """A scene of no use, for a reason that scenes may have: another one is drawn."""
+
+
+class UndisturbedError(Exception):
+    """What no scene is a reason for: an undisturbed campaign that fails is a finding."""
 
 
 def twin_of(group: int, root: Path) -> Twin:
     """The undisturbed campaign of a group, in a folder below `root`.
 
     Raises:
-        RuntimeError: no scene of the group completes by itself.
+        UndisturbedError: it ends otherwise than any may.
+        RuntimeError: no scene of the group is of use.
     """
     why = ""
     for attempt in range(8):
         scene = scene_of(group, attempt)
         folder = root / f"twin_{group}_{attempt}"
         try:
-            return _twin(scene, folder)
+            return replace(_twin(scene, folder), redrawn=attempt)
         except SceneError as error:
             why = str(error)
-    raise RuntimeError(f"no campaign of group {group} completes without faults, the last: {why}")
+    raise RuntimeError(f"no scene of group {group} is of use, the last: {why}")
+
+
+def _require_use(scene: Scene, life: Life) -> None:
+    """What may be wrong with arms and motions that are drawn."""
+    error, result = life.error, life.result
+    if isinstance(error, RepetitionsRejectedError):
+        raise SceneError(f"{scene.words}: {error}")
+    if isinstance(error, MotionFailedError) and NotAtStandstill.check in error.reason:
+        raise SceneError(f"{scene.words}: {error}")
+    if result is None or not result.complete:
+        how = f"{type(error).__name__}: {error}" if error is not None else "incomplete"
+        raise UndisturbedError(f"{scene.words}: undisturbed, it ended {how}")
+    if result.rejected:
+        raise SceneError(f"{scene.words}: {result.rejected[0]} was rejected")
 
 
 def _unrest(scene: Scene, history: ArmHistory) -> float:
@@ -112,12 +139,13 @@ def _unrest(scene: Scene, history: ArmHistory) -> float:
 def _twin(scene: Scene, folder: Path) -> Twin:
     world = _World(scene, scene.controller, _EMPTY, random.Random(0), folder)
     life = world.live()
-    if life.result is None or not life.result.complete or life.result.rejected:
-        raise SceneError(f"{scene.words}: {life.error or life.result}")
+    _require_use(scene, life)
     found, why = estimated(folder)
-    if found is None or found.result.pooled.undetermined:
-        raise SceneError(f"{scene.words}: {why or 'undetermined'}")
-    history = world.controller.history()
+    if found is None:
+        raise UndisturbedError(f"{scene.words}: complete, and not identified: {why}")
+    if found.result.pooled.undetermined:
+        raise SceneError(f"{scene.words}: its motion does not determine all parameters")
+    history = world.history()
     if (share := _unrest(scene, history)) > 1.0:
         raise SceneError(f"{scene.words}: standing, it moves at {share:.2g} of what is at rest")
     moving = np.abs(history.velocity).max(axis=1) > _MOVING
@@ -128,7 +156,8 @@ def _twin(scene: Scene, folder: Path) -> Twin:
         bytes=12 + 36 * (scene.arm.n_joints + scene.arm.foreign_axes),
         **world.disk.done,
     )
-    return Twin(scene, folder, found, story)
+    seen = _observed(scene, world, [life], found, why)
+    return Twin(scene, folder, found, story, replace(seen, seed=scene.group * NEIGHBOURS))
 
 
 def play(seed: int, twin: Twin, root: Path, script: Script | None = None) -> Observed:
@@ -153,19 +182,25 @@ def play(seed: int, twin: Twin, root: Path, script: Script | None = None) -> Obs
     found, why = None, ""
     if lives[-1].result is not None and lives[-1].result.complete:
         found, why = estimated(world.folder)
+    seen = _observed(twin.scene, world, lives, found, why)
+    return replace(seen, seed=seed, twin_found=twin.found)
+
+
+def _observed(
+    scene: Scene, world: _World, lives: Sequence[Life], found: Estimated | None, why: str
+) -> Observed:
     return Observed(
-        seed=seed,
-        cell=twin.scene.cell,
-        plan=twin.scene.plan,
-        controller=settings,
-        schedule=script.lines,
+        seed=-1,
+        cell=scene.cell,
+        plan=scene.plan,
+        controller=world.settings,
+        schedule=world.script.lines,
         struck=world.struck(),
         runs=tuple(lives),
         arm=world.history(),
         folder=world.folder,
-        twin=twin.folder,
         found=found,
-        twin_found=twin.found,
+        twin_found=None,
         unidentified=why,
     )
 
@@ -199,14 +234,14 @@ class _World:
         folder: Path,
     ) -> None:
         self.folder = folder
-        self._scene, self._script, self._chance = scene, script, chance
+        self.settings, self.script = settings, script
+        self._scene, self._chance = scene, chance
         self._kind = chance.choice((WatchedTransport, StampedWatchedTransport))
         self.controller = WatchedController(
             simulated_controller(scene.cell, settings=settings), script
         )
         self.disk = Disk(script)
         self._clock = Clock(script)
-        self._transport: WatchedTransport | None = None
         self._person = Person(script, lambda: self.controller.cycle)
         self._due = sorted(
             (one for one in script.of("cycle") if one.kind in _BY_CYCLE), key=lambda one: one.at
@@ -232,7 +267,7 @@ class _World:
             patience -= self.controller.cycle > self._last
             if len(lives) == MOST_LIVES or patience <= 0:
                 break
-            self._between()
+            self._between(jog=_JOG in str(lives[-1].error))
         return lives
 
     def live(self) -> Life:
@@ -240,9 +275,7 @@ class _World:
         self._stop = Stop()
         self.disk.begin()
         first, before, names = self.controller.cycle, self._digests, _names(self.folder)
-        self._transport = transport = self._kind(
-            self.controller, self._script, self._clock, self._look
-        )
+        transport = self._kind(self.controller, self.script, self._clock, self._look)
         connection = Link.over(
             transport, self._scene.cell, finish=self.controller.controller.finish
         )
@@ -271,7 +304,7 @@ class _World:
         )
 
     def _run(self, connection: Link) -> tuple[RunResult | None, BaseException | None]:
-        lurches = lurching(self._script, lambda: self.controller.cycle, self._struck)
+        lurches = lurching(self.script, lambda: self.controller.cycle, self._struck)
         with planted(self.disk), _no_waiting(), lurches:
             try:
                 result = Campaign.open(self.folder).run(
@@ -302,14 +335,21 @@ class _World:
                 self.disk.dead = True
                 raise Killed(mishap.line)
 
-    def _between(self) -> None:
-        """The controller goes on alone, and somebody sees to it before the next run."""
-        hurry = self._script.has("hurry") and self.controller.cycle <= self._last + _HURRIES
-        hurried = hurry and not self.controller.ended
+    def _between(self, *, jog: bool) -> None:
+        """The controller goes on alone, and somebody sees to it before the next run.
+
+        Args:
+            jog: bring the arm home, as was asked for.
+        """
+        hurry = self.script.has("hurry") and self.controller.cycle <= self._last + _HURRIES
+        hurried = hurry and not jog and not self.controller.ended
         if not hurried:
             self.controller.alone(_AFTERWARDS)
         else:
-            self._struck += [one.line for one in self._script.of("always") if one.kind == "hurry"]
+            self._struck += [one.line for one in self.script.of("always") if one.kind == "hurry"]
+        if jog:
+            home = self._scene.cell.home
+            self.controller.controller.plant.set_state(home, np.zeros(len(home)))
         self.controller.press(restart=not hurried, warm=self._chance.random() < 0.5)
 
     def history(self) -> ArmHistory:
@@ -322,9 +362,9 @@ class _World:
         """Lines that came to pass, those on the link by the cycles that passed."""
         found = [*self._struck, *self.controller.struck, *self.disk.struck]
         found += [*self._clock.struck, *self._person.struck]
-        found += [one.line for one in self._script.of("always") if one.kind == "with-dry-run"]
-        on_link = [line for line, fault in self._script.faults if line not in found]
-        for line, fault in self._script.faults:
+        found += [one.line for one in self.script.of("always") if one.kind == "with-dry-run"]
+        on_link = [line for line, fault in self.script.faults if line not in found]
+        for line, fault in self.script.faults:
             if line in on_link and fault.cycle < self.controller.cycle and _of_link(fault):
                 found.append(line)
         return tuple(dict.fromkeys(found))

@@ -23,6 +23,7 @@ from hil.campaign.folder import CampaignFolder, Entry
 from planner import TrajectoryPlayer
 from tests.simulate.judging import judged
 from tests.simulate.many import stage_folder
+from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage
 
 SEED = 6
@@ -154,22 +155,32 @@ def moves_an_arm_that_does_not_follow(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Guard, "check_feedback", lambda *arguments: None)
 
 
-DEFECTS: dict[str, tuple[Plant, tuple[str, ...]]] = {
-    "a duplicate is answered anew": (answers_duplicates_anew, ("duplicate@300x40",)),
-    "a motion catches up, unguarded": (catches_up_unguarded, ("lose@{moving}x2", "kill@9999")),
-    "the guard lets set-points pass": (lets_everything_pass, ("lurch@{moving}x3:0.0001",)),
+DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
+    "a duplicate is answered anew": (answers_duplicates_anew, ("duplicate@300x40",), "replies"),
+    "a motion catches up, unguarded": (
+        catches_up_unguarded,
+        ("lose@{moving}x2", "kill@9999"),
+        "guard",
+    ),
+    "the guard lets set-points pass": (
+        lets_everything_pass,
+        ("lurch@{moving}x3:0.0001",),
+        "guard",
+    ),
     "an arm that does not follow is moved": (
         moves_an_arm_that_does_not_follow,
         ("following-error@{moving}x60:axis=1:slip",),
+        "guard",
     ),
-    "a motion goes on after a gap": (goes_on_after_a_gap, ("lose@{moving}x4",)),
-    "what piled up is answered": (answers_what_piled_up, ("stall@{moving}:7ms",)),
-    "records are lost unsaid": (loses_a_record, ()),
-    "a stopped motion counts": (takes_stopped_motions_for_whole, ("stop@{moving}",)),
-    "whole motions are done again": (does_whole_motions_again, ("stop@{late}",)),
-    "a torn archive counts": (believes_the_manifest, ("power-cut@{late}x2:keep=0.6",)),
-    "archives are smoothed": (smooths_what_it_archives, ()),
+    "a motion goes on after a gap": (goes_on_after_a_gap, ("lose@{moving}x4",), "gaps"),
+    "what piled up is answered": (answers_what_piled_up, ("stall@{moving}:7ms",), "piles"),
+    "records are lost unsaid": (loses_a_record, (), "archives"),
+    "a stopped motion counts": (takes_stopped_motions_for_whole, ("stop@{moving}",), "folder"),
+    "whole motions are done again": (does_whole_motions_again, ("stop@{late}",), "folder"),
+    "a torn archive counts": (believes_the_manifest, ("power-cut@{late}x2:keep=0.6",), "folder"),
+    "archives are smoothed": (smooths_what_it_archives, (), "archives"),
 }
+"""What is planted, the script that brings it out, and the law that finds it."""
 
 
 def script(stage: Stage, lines: tuple[str, ...]) -> list[str]:
@@ -186,8 +197,20 @@ FAST = "a motion catches up, unguarded"
     [pytest.param(name, marks=[pytest.mark.slow] if name != FAST else []) for name in DEFECTS],
 )
 def test_it_is_found(name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    plant, lines = DEFECTS[name]
+    plant, lines, law = DEFECTS[name]
     wanted = script(stage, lines)
     assert judged(stage.observed(SEED, wanted)) == []
     plant(monkeypatch)
-    assert judged(stage.observed(SEED, wanted)) != []
+    assert law in {one.law for one in judged(stage.observed(SEED, wanted))}
+
+
+def test_a_defect_that_needs_no_fault_is_no_reason_to_draw_another_arm(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(self: Runner, *arguments: Any) -> str:
+        raise TypeError("planted")
+
+    monkeypatch.setattr(Runner, "play", fails)
+    verdict = stage.verdict(SEED + NEIGHBOURS)
+    assert verdict.broken[0][0] == "undisturbed"
+    assert "it ended TypeError: planted" in verdict.broken[0][1]

@@ -14,7 +14,7 @@ from typing import Any, Self
 from tests.simulate.drawing import DRAWS
 from tests.simulate.judging import LAWS, judged
 from tests.simulate.observed import Broken, Observed
-from tests.simulate.playing import Twin, play, twin_of
+from tests.simulate.playing import Twin, UndisturbedError, play, twin_of
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.script import kind_of, parse_script
 from tests.simulate.shrinking import shrunk
@@ -35,6 +35,7 @@ class Verdict:
         cycles: that the controller took, in all.
         broken: laws and what is wrong, as (law, text).
         shrunk: the smallest script that breaks the first of these laws; () if none was broken.
+        redrawn: scenes that were of no use before that of this seed's group.
         seconds: processor time.
     """
 
@@ -47,6 +48,7 @@ class Verdict:
     cycles: int
     broken: tuple[tuple[str, str], ...] = ()
     shrunk: tuple[str, ...] = ()
+    redrawn: int = 0
     seconds: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
@@ -79,10 +81,17 @@ class Stage:
     def _made(self, group: int) -> Twin:
         for old in self._root.glob("twin_*"):
             shutil.rmtree(old)
-        return twin_of(group, self._root)
+        twin = twin_of(group, self._root)
+        if broken := judged(twin.seen):
+            raise UndisturbedError("; ".join(f"{one.law}: {one.text}" for one in broken))
+        return twin
 
     def twin(self, seed: int) -> Twin:
-        """The run without faults of a seed's group."""
+        """The run without faults of a seed's group, which keeps every law.
+
+        Raises:
+            UndisturbedError: it does not, or ends otherwise than any may.
+        """
         return self._twin(seed // NEIGHBOURS)
 
     def observed(self, seed: int, lines: Iterable[str] | None = None) -> Observed:
@@ -100,7 +109,10 @@ class Stage:
     def verdict(self, seed: int, *, shrink: bool = True) -> Verdict:
         """Play a seed, judge it, and make its script small where it fails."""
         begun = time.process_time()
-        seen = self.observed(seed)
+        try:
+            seen = self.observed(seed)
+        except UndisturbedError as error:
+            return Verdict(seed, "", (), (), (), (), 0, (("undisturbed", str(error)),))
         broken = judged(seen)
         plain = shrunk(seen.schedule, self._fails(seed, broken[0])) if broken and shrink else ()
         self.clear()
@@ -114,6 +126,7 @@ class Stage:
             cycles=len(seen.arm.sent),
             broken=tuple((one.law, one.text) for one in broken),
             shrunk=plain,
+            redrawn=self.twin(seed).redrawn,
             seconds=time.process_time() - begun,
         )
 
@@ -148,6 +161,7 @@ class Tally:
         ends: how often a run ended in each way.
         campaigns: how often the last one did.
         broken: how often each law was broken.
+        redrawn: scenes of no use, by group of seeds.
         cycles: of all controllers.
         seconds: of processor time.
     """
@@ -159,6 +173,7 @@ class Tally:
     ends: Counter[str] = field(default_factory=Counter)
     campaigns: Counter[str] = field(default_factory=Counter)
     broken: Counter[str] = field(default_factory=Counter)
+    redrawn: dict[int, int] = field(default_factory=dict)
     cycles: int = 0
     seconds: float = 0.0
 
@@ -170,6 +185,7 @@ class Tally:
         self.ends.update(verdict.runs)
         self.campaigns[verdict.runs[-1] if verdict.runs else "nothing"] += 1
         self.broken.update({law for law, _ in verdict.broken})
+        self.redrawn[verdict.seed // NEIGHBOURS] = verdict.redrawn
         self.cycles += verdict.cycles
         self.seconds += verdict.seconds
         if verdict.broken:
@@ -185,10 +201,12 @@ class Tally:
             "never_struck": sorted(set(DRAWS) - {"stalls"} - set(self.struck)),
             "met": dict(sorted(self.met.items())),
             "never_met": sorted(set(EXPECTED) - set(self.met)),
-            "laws_asked": dict.fromkeys(LAWS, self.ran),
+            "laws": sorted(LAWS),
             "laws_broken": dict(sorted(self.broken.items())),
             "runs_ended": dict(sorted(self.ends.items())),
             "campaigns_ended": dict(sorted(self.campaigns.items())),
+            "scenes": len(self.redrawn),
+            "scenes_redrawn": sum(self.redrawn.values()),
             "cycles": self.cycles,
             "processor_seconds": round(self.seconds, 1),
         }

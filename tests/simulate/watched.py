@@ -43,12 +43,10 @@ class WatchedController:
             if not isinstance(fault, LinkFault):
                 self._faults.setdefault(fault.cycle, []).append((line, fault))
         self._sent: list[bytes] = []
-        self._delivered: list[bytes | None] = []
         self._position: list[Array] = []
         self._velocity: list[Array] = []
         self._phase: list[str] = []
         self._open: list[bool] = []
-        self._pressed: list[int] = []
 
     @property
     def ended(self) -> bool:
@@ -66,7 +64,6 @@ class WatchedController:
         self.cycle += 1
         plant = self.controller.plant
         self._sent.append(packet)
-        self._delivered.append(None)
         self._position.append(plant.position.copy())
         self._velocity.append(plant.velocity.copy())
         self._phase.append(self.controller.phase.name)
@@ -75,8 +72,6 @@ class WatchedController:
 
     def accept(self, reply: bytes | None) -> None:
         """See `drivers.transports.simulated.Peer`."""
-        if reply is not None:
-            self._delivered[-1] = reply
         self.controller.accept(reply)
 
     def alone(self, cycles: int) -> None:
@@ -91,19 +86,16 @@ class WatchedController:
         if restart:
             self.controller.restart(warm=warm)
         self.controller.drive_on()
-        self._pressed.append(self.cycle)
 
     def history(self) -> ArmHistory:
         """All of it."""
         n = self.controller.plant.position.size
         return ArmHistory(
             sent=tuple(self._sent),
-            delivered=tuple(self._delivered),
             position=np.array(self._position).reshape(-1, n),
             velocity=np.array(self._velocity).reshape(-1, n),
             phase=tuple(self._phase),
             open_axes=np.array(self._open, dtype=bool),
-            drive_on=tuple(self._pressed),
         )
 
 
@@ -134,7 +126,7 @@ def _jump(mishap: Mishap) -> bool:
 class WatchedTransport(SimulatedTransport):
     """The PC's end of the link, with its stalls, its clock, and all packets written down.
 
-    It is one in virtual time by what it carries packets through, another one inside it.
+    Packets go through another transport in virtual time, which it holds.
 
     Args:
         peer: the controller.

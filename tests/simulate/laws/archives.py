@@ -98,7 +98,11 @@ def archives(observed: Observed) -> Iterator[Broken]:
     for number, one in enumerate(all_placed):
         name = one.archived.path.name
         texts = [
-            *_readable(one, by_library=number == one_asked % len(all_placed)),
+            *_readable(
+                one,
+                by_library=number == one_asked % len(all_placed),
+                newest=any(one is p for p in _newest(all_placed, one.life)),
+            ),
             *_columns(one.archived, observed.cell.period),
             *_stated(one),
             *_made_of(one, gears, constants),
@@ -109,11 +113,23 @@ def archives(observed: Observed) -> Iterator[Broken]:
         yield Broken(LAW, text)
 
 
-def _readable(one: Placed, *, by_library: bool) -> Iterator[str]:
+def _newest(all_placed: tuple[Placed, ...], life: Life) -> list[Placed]:
+    """The archive of a life with its last cycles, and those that had none yet."""
+    mine = [p for p in all_placed if p.life is life]
+    last = max((_last_of(p) for p in mine), default=-1)
+    return [p for p in mine if _last_of(p) in (-1, last)]
+
+
+def _last_of(one: Placed) -> int:
+    """Index among the exchanged packets of the last cycle in an archive, -1 for none."""
+    return int(one.talk.index[one.rows[-1]]) if one.talk is not None and len(one.rows) else -1
+
+
+def _readable(one: Placed, *, by_library: bool, newest: bool) -> Iterator[str]:
     archived, life = one.archived, one.life
     name = archived.path.name
-    may_be_torn = life.died or bool(life.disk) or any(name in later for later in [life.torn])
-    if not archived.whole and not may_be_torn:
+    at_work = newest and (life.died or bool(life.disk))  # on it, when that befell it
+    if not archived.whole and not at_work and name not in life.torn:
         yield f"is not whole ({archived.problem}), though nobody tore it"
     if not archived.whole or by_library:
         yield from _as_the_product_reads(archived)
@@ -230,7 +246,7 @@ def _decoded(
     period = talk.init.period
     finite = np.isfinite(d).all(axis=(1, 2))  # a garbled packet may hold any number
     size = np.abs(np.linalg.inv(gears.matrix)).sum(axis=1).max() * (
-        1.0 + np.abs(d[finite, :, 0:4:2]).max(initial=0.0)
+        1.0 + np.abs(d[finite, :, 0:4:2]).max(axis=(1, 2), initial=0.0, keepdims=True)[:, :, 0]
     )
     bound = 16.0 * len(slots) * _EPS * size
     for column, name in enumerate(_SI):
@@ -278,7 +294,9 @@ def _each_interval(observed: Observed, all_placed: tuple[Placed, ...]) -> Iterat
             for first in _motions(talk):
                 rows = np.flatnonzero(intervals == first)
                 if len(rows):
-                    for text in _interval(life, talk, first, rows, mine, observed.cell.period):
+                    last = talk is one.talks[-1] and first == _motions(talk)[-1]
+                    period = observed.cell.period
+                    for text in _interval(life, talk, first, rows, mine, period, last=last):
                         yield f"life {number}, interval {first}: {text}"
         taken: set[tuple[int, int]] = set()
         for p in mine:
@@ -294,14 +312,22 @@ def _motions(talk: Talk) -> list[int]:
 
 
 def _interval(
-    life: Life, talk: Talk, interval: int, rows: NDArray[np.intp], mine: list[Placed], period: float
+    life: Life,
+    talk: Talk,
+    interval: int,
+    rows: NDArray[np.intp],
+    mine: list[Placed],
+    period: float,
+    *,
+    last: bool,
 ) -> Iterator[str]:
     cycles = talk.records["cycle"]
     ends = [e for e in talk.events if isinstance(e, MotionEnded) and e.interval == interval]
     if ends:  # axes whose drive went off may be open for some cycles more
         rows = rows[cycles[rows] <= ends[-1].cycle]
     holding = [p for p in mine if p.talk is talk and np.isin(rows, p.rows).any()]
-    survived = not (life.died or life.disk)
+    # Who dies, or has no room, does so at the last motion that was begun.
+    survived = not (last and (life.died or life.disk))
     if len(holding) != 1:
         if len(holding) > 1 or (survived and not _cut_short(life)):
             yield f"its {len(rows)} cycles are in {len(holding)} archives"

@@ -162,6 +162,8 @@ class _Sorting:
             self._kinds.append("nothing")
             self._left_out.append(index)
             return
+        if one.now >= self._deadline and not reception.ended:
+            self._wrong.append((index, "came after a silence that nobody noticed"))
         last, silent = reception.last, reception.silent
         kind = reception.expect(one.packet)
         self._kinds.append(kind if one.replies else "nothing")

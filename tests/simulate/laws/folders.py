@@ -85,7 +85,7 @@ def _texts(observed: Observed) -> Iterator[str]:
         yield "an archive is entered twice"
     for entry in entries:
         yield from _entry(observed, entry, torn)
-    yield from _kept(observed, torn)
+    yield from _kept(observed)
     yield from _once(observed, entries)
     yield from _left_over(observed, names)
     yield from _told(observed, entries)
@@ -111,7 +111,7 @@ def _entry(observed: Observed, entry: Entry, torn: set[str]) -> Iterator[str]:
         yield f"{entry.name} was rejected for another reason than the manifest says"
 
 
-def _kept(observed: Observed, torn: set[str]) -> Iterator[str]:
+def _kept(observed: Observed) -> Iterator[str]:
     """No file ever vanishes or changes, but for a rejection, which is written into it."""
     for number, life in enumerate(observed.runs, 1):
         for name, digest in life.before.items():
@@ -120,7 +120,7 @@ def _kept(observed: Observed, torn: set[str]) -> Iterator[str]:
             now = life.after.get(name)
             if now is None:
                 yield f"life {number}: {name} is gone"
-            elif now != digest and name not in torn:
+            elif now != digest and name not in life.torn:
                 path = observed.folder / "archives" / name
                 if not path.exists() or read(path).ended != "rejected":
                     yield f"life {number}: {name} was changed"

@@ -1,6 +1,6 @@
 """Every packet got the answer that the documents give it, and none that they do not.
 
-`docs/safety.md` and section 6 of the facts on the wire: one answer to each fresh well-formed
+`docs/safety.md` and what the protocol demands: one answer to each fresh well-formed
 packet, with the next number; the same bytes to a duplicate; none to what is stale, foreign or
 malformed; the safest known answer wherever an axis is not open; set-points only between the first
 one, where the controller has the arm, and whatever ends open mode.

@@ -1,9 +1,9 @@
 """Whatever happened, the arm ends at rest with its axes closed.
 
 Seen at the arm itself, after the last process of the PC is gone and the controller alone has acted;
-and at the end of each run that says it brought the arm to rest. There the set-points rest and the
-arm stands as the cell means it (`[robot.friction] standstill`): against dry friction its servo may
-still creep to where it was sent.
+and at the end of each run that ends by itself, but for what it lost or was refused. There the
+set-points rest and the arm stands as the cell means it (`[robot.friction] standstill`): against
+dry friction its servo may still creep to where it was sent.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from hil.campaign.errors import MotionFailedError
+from hil.errors import ControllerFault, HilError
 from tests.simulate.observed import Broken, Life, Observed
 
 from .wire import Array, Gears
@@ -33,7 +34,7 @@ def rest(observed: Observed) -> Iterator[Broken]:
     if fastest > _STANDSTILL:
         yield Broken(LAW, f"the arm moves at the end, by {fastest:.2g} motor revolutions a cycle")
     for number, life in enumerate(observed.runs, 1):
-        if _says_at_rest(life) and life.exchanged:
+        if _ends_at_rest(life) and life.exchanged:
             at = min(life.last_cycle, len(arm.open_axes) - 1)
             speed = np.abs(arm.velocity[at])
             if (speed > observed.cell.model.friction.standstill).any():
@@ -47,8 +48,13 @@ def _speed(velocity: Array, gears: Gears, period: float) -> float:
     return float(np.abs(velocity @ gears.matrix.T).max(initial=0.0) * period)
 
 
-def _says_at_rest(life: Life) -> bool:
-    """Whether the run itself says that the arm stands and open mode was left."""
-    if life.result is not None:
-        return True
-    return isinstance(life.error, MotionFailedError) and life.error.outcome == "stopped"
+def _ends_at_rest(life: Life) -> bool:
+    """Whether the arm has to stand, outside open mode, when the run has ended.
+
+    Who dies leaves that to the controller, which also acts alone where a motion was refused or
+    lost, or where there was never a session to speak of.
+    """
+    error = life.error
+    if isinstance(error, MotionFailedError):
+        return error.outcome == "stopped"
+    return error is None or (isinstance(error, HilError) and not isinstance(error, ControllerFault))

@@ -20,21 +20,23 @@ from .folders import WANTED, manifest_of
 from .wire import Array
 
 LAW: Final = "resume"
-PERSON_NEEDED: Final = {
-    "ControllerFault": "the drive is off, or what the controller announces is not the cell's",
-    "MotionFailedError": "the guard, the link or a stop ended a motion",
-    "MotionRefusedError": "the way from where the arm stands is not free: jog it",
-    "RepetitionsRejectedError": "something touches the arm, slips, or was changed",
-    "ArmChangedError": "the same, for certain",
-    "DryRunError": "somebody has to look at the dry run and accept it",
-    "AgainstGravityError": "somebody has to accept a torque by the joint's name",
-    "OperatorStopError": "a person stopped it",
-    "ArchiveWriteError": "the disk is full or broken: make room",
-    "CampaignFolderError": "the folder cannot be written: make room",
-    "OutputError": "what was found cannot be written: make room",
-}
-"""Errors that may end a run, and what for."""
-_DEATHS: Final = ("Killed", "PowerCut", "KeyboardInterrupt")
+PERSON_NEEDED: Final = frozenset(
+    (
+        "ControllerFault",  # the drive is off, or what the controller announces is not the cell's
+        "MotionFailedError",  # the guard, the link or a stop ended a motion
+        "MotionRefusedError",  # the way from where the arm stands is not free: jog it
+        "RepetitionsRejectedError",  # something touches the arm, slips, or was changed
+        "ArmChangedError",  # the same, for certain
+        "DryRunError",  # somebody has to look at the dry run and accept it
+        "AgainstGravityError",  # somebody has to accept a torque by the joint's name
+        "OperatorStopError",  # a person stopped it
+        "ArchiveWriteError",  # the disk is full or broken: make room
+        "CampaignFolderError",  # the folder cannot be written: make room
+        "OutputError",  # what was found cannot be written: make room
+    )
+)
+"""Errors that may end a run."""
+_DEATHS: Final = ("Killed", "KeyboardInterrupt")
 _OFF_PATH: Final = 1e-4
 """rad between set-point and plan that is rounding of the wire (`hil.campaign.quality`)."""
 

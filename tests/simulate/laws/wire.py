@@ -1,4 +1,4 @@
-"""The wire read a second time, many packets at once, from the facts alone.
+"""The wire read a second time, many packets at once, from the protocol alone.
 
 Layout, codes and the safe answer are those of `tests/drivers/oracle.py`, which knows nothing of the
 package under test; here they are arrays, so that a law may look at every packet of a campaign.
@@ -121,7 +121,7 @@ def safe_answers(received: Packets, arms: Sequence[int]) -> SafeAnswers:
 
 @dataclass(frozen=True, eq=False)
 class Init:
-    """What an init packet announces of one arm's joints; own decoding, offsets of the facts.
+    """What an init packet announces of one arm's joints; own decoding, offsets of the protocol.
 
     Attributes:
         n_axes: slots of a cyclic packet.
@@ -167,7 +167,7 @@ class Init:
 
 @dataclass(frozen=True, eq=False)
 class Gears:
-    """Motor revolutions from joint angles, by the formulas of the facts (section 8).
+    """Motor revolutions from joint angles, by the formulas of docs/cell-file.md.
 
     Attributes:
         matrix: (n, n) motor revolutions per rad.
