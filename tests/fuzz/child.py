@@ -93,7 +93,7 @@ def _fuzz(name: str, folder: Path, options: list[str]) -> int:
     return 0
 
 
-def _shorten(run: Callable[[bytes], None], folder: Path) -> None:
+def _shorten(run: Callable[[bytes], object], folder: Path) -> None:
     """Take pieces out of an input, ever smaller ones, as long as the cause stays the same."""
     from tests.fuzz.findings import INPUT, SHORTEST, signature
 

@@ -1,9 +1,9 @@
 """A conversation of a session with a controller, drawn from bytes and judged at every step.
 
-The arm, its place among other arms' axes, the open mode, cycle and bounds are drawn; the controller
-obeys or not, packets are lost, repeated, garbled, old, cut; the user asks, stops, overrides. What
-must hold is what the judge of the drivers' tests says (`judge`, `reception`, `oracle`), which
-shares nothing with the session but the records' layout and the drive train.
+The arm, its place among other arms' axes and the open mode are drawn; cycle and bounds are always
+the same. The controller obeys or not, packets are lost, repeated, garbled, old, cut; the user asks,
+stops, overrides. What must hold is what the judge of the drivers' tests says (`judge`, `reception`,
+`oracle`), which shares nothing with the session but the records' layout and the drive train.
 """
 
 from __future__ import annotations
@@ -47,9 +47,8 @@ class Conversation(Judged):
 
     def __init__(self, draw: Draw) -> None:
         self._draw = draw
-        # A motion's table is made for cycles of 2 ms; in shorter ones it would be too fast.
         self.arm = arm = arm_of(
-            draw.choice((2, 6, 1, 3, 4, 5)), draw.choice((1, 2, 4)), draw.below(4), draw.below(4), 2
+            draw.choice((2, 6, 1, 3, 4, 5)), draw.choice((1, 2, 4)), draw.below(4), draw.below(4)
         )
         self.mode = draw.choice((4, 4, 5, 1, 2, 7, 8, 9))
         max_gap = draw.choice((2, 0, 5))
@@ -224,9 +223,7 @@ class Conversation(Judged):
     # What the user does -------------------------------------------------------------------
 
     def request(self) -> None:
-        draw = self._draw
-        fits = (self.mode in POSITION_MODES) != draw.chance(8)
-        source = self._motion() if fits == (self.mode in POSITION_MODES) else self._motion(True)
+        source = self._motion(other_kind=self._draw.chance(8))
         try:
             self.session.request(source)
         except RequestError:
@@ -237,7 +234,7 @@ class Conversation(Judged):
         self.conduct.entitled = True
         self.conduct.stopping = self.conduct.overridden = False
 
-    def _motion(self, other_kind: bool = False) -> ScriptedMotion | ScriptedCorrection:
+    def _motion(self, *, other_kind: bool) -> ScriptedMotion | ScriptedCorrection:
         draw, n = self._draw, self.arm.n
         direction = np.array([draw.choice((1.0, 0.0, -1.0)) for _ in range(n)])
         if draw.chance(128):

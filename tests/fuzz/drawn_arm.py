@@ -17,6 +17,9 @@ from model_controller import Controller
 
 from drivers import DriveTrain, GuardLimits, InitPacket
 
+CYCLE_MS = 2
+"""Of every arm: the tables of motions are made for it, and would be too fast in a shorter one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Arm:
@@ -59,7 +62,7 @@ class Arm:
 
 
 @lru_cache(maxsize=64)
-def arm_of(n: int, number: int, order: int, foreign: int, cycle_ms: int) -> Arm:
+def arm_of(n: int, number: int, order: int, foreign: int) -> Arm:
     """An arm of `n` joints among `foreign` axes that are not its own, in a drawn order."""
     own = [(number, joint) for joint in range(n)]
     strangers = [(number, 9), (number % 4 + 1, 0), (number % 4 + 1, 3)][:foreign]
@@ -75,8 +78,8 @@ def arm_of(n: int, number: int, order: int, foreign: int, cycle_ms: int) -> Arm:
         following_error=np.full(n, 2.0),
         current=np.full(n, 20.0),
     )
-    made = [init_of(axes, number, train, n, cycle_ms, ratio) for ratio in (1.0, 1.5)]
-    return Arm(n, number, axes, cycle_ms / 1000, train, limits, *made)
+    made = [init_of(axes, number, train, n, ratio) for ratio in (1.0, 1.5)]
+    return Arm(n, number, axes, CYCLE_MS / 1000, train, limits, *made)
 
 
 def init_of(
@@ -84,7 +87,6 @@ def init_of(
     number: int,
     train: DriveTrain,
     n: int,
-    cycle_ms: int,
     ratio: float,
 ) -> bytes:
     """An init packet with these slots; `ratio` is that of its gears to the arm's."""
@@ -97,7 +99,7 @@ def init_of(
     influence = np.zeros((4, 10))
     influence[number - 1, 3:6] = train.k54, train.k64, train.k65
     init = InitPacket.build(
-        1, cycle_ms, {}, open_axes_map=table, kinematic_influence=influence,
+        1, CYCLE_MS, {}, open_axes_map=table, kinematic_influence=influence,
         following_error=np.full((4, 10), 2.0), current_limit=np.full((4, 10), 20.0), **rows,
     )  # fmt: skip
     init.record["n_axes"] = len(axes)

@@ -28,6 +28,15 @@ def test_the_corpus_is_small_and_breaks_no_law(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", targets.NAMES)
+def test_what_is_well_formed_is_taken(name: str) -> None:
+    target = targets.load(name)
+    seeds = target.seeds()
+    assert [at for at, data in enumerate(seeds) if not target.run(data)] == []
+    planted = [path.name for path in sorted((CORPORA / name).glob("seed-*"))]
+    assert [one for one in planted if not target.run((CORPORA / name / one).read_bytes())] == []
+
+
+@pytest.mark.parametrize("name", targets.NAMES)
 def test_changes_of_it_break_none_either(name: str) -> None:
     target, kept = targets.load(name), inputs(name)
     for seed in range(target.replayed):

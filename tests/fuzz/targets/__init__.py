@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Protocol
 
 NAMES = ("codec", "session", "cell_file", "archive", "importers", "urdf", "documents")
@@ -23,18 +27,26 @@ class Target:
     """One of them.
 
     Attributes:
-        run: raises where a law is broken, and nothing where the input is refused as documented.
-        seeds: inputs to begin with, made by the product's own writers.
+        run: raises where a law is broken; else whether the input is taken, False where it is
+            refused as documented.
+        seeds: inputs to begin with, made by the product's own writers; all of them are taken.
         mutate: changes that get past checksums and grammars.
         most: bytes of the longest input.
         replayed: changed inputs that the test of the corpora tries.
     """
 
-    run: Callable[[bytes], None]
+    run: Callable[[bytes], bool]
     seeds: Callable[[], list[bytes]]
     mutate: Mutation
     most: int = 1 << 14
     replayed: int = 200
+
+
+def place_of(name: str) -> Path:
+    """A temporary folder for a target's files, which goes when the process ends."""
+    made = Path(tempfile.mkdtemp(name))
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return made
 
 
 def load(name: str) -> Target:

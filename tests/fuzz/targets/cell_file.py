@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "hil"))
-
-from fast_cell import CELL, URDF
-
 from hil.cell import Cell, CellError
 from hil.cell.text import NoTableError
 from hil.errors import HilError
 from tests.fuzz.mutate_text import mutate_text
-from tests.fuzz.targets import Target
+from tests.fuzz.targets import Target, place_of
+from tests.hil.fast_cell import CELL, URDF
 
 LINKS = """[controller]
 transport = "udp"
@@ -33,6 +28,7 @@ CAN = """[controller]
 transport = "can"
 cycle_ms = 2
 [controller.can]
+interface = "socketcan"
 channel = "can0"
 profile = "fd"
 """
@@ -61,24 +57,25 @@ margin = 0.02
 @lru_cache
 def folder() -> Path:
     """Where the file under test lies, beside its URDF."""
-    made = Path(tempfile.mkdtemp("cell"))
+    made = place_of("cell")
     (made / "fast.urdf").write_text(URDF)
     return made
 
 
-def run(data: bytes) -> None:
-    """Load the file; use everything that a command would."""
+def run(data: bytes) -> bool:
+    """Load the file, if it can be; use everything that a command would."""
     path = folder() / "cell.toml"
     path.write_bytes(data)
     try:
         cell = Cell.load(path)
     except CellError as error:
         explained(error, path)
-        return
+        return False
     again = Cell.from_texts(cell.text, cell.urdf, path)
     assert again.text == cell.text
     used(cell)
     changed(cell)
+    return True
 
 
 def explained(error: HilError, path: Path) -> None:

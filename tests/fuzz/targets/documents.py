@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "hil"))
-
-from fast_cell import fast_campaign, fast_cell
-
 from hil.campaign.dry_run import DryRun
+from hil.campaign.errors import CampaignFolderError, NotRehearsedError
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.rehearsal import Rehearsal
@@ -23,10 +18,11 @@ from hil.campaign.warmup import WarmUp
 from hil.cli.plan_input import read_plan_file
 from hil.design.result import DesignResult, _seal
 from hil.design.settings import load_settings, preset_text
-from hil.errors import HilError, InputError
+from hil.errors import InputError
 from hil.results import Results
 from tests.fuzz.mutate_text import mutate_text
-from tests.fuzz.targets import Target
+from tests.fuzz.targets import Target, place_of
+from tests.hil.fast_cell import fast_campaign, fast_cell
 
 NAMES = (
     "plan.json", "settings.toml", "results.json", "manifest.json", "rehearsal.json", "dry_run.json",
@@ -39,21 +35,28 @@ _SEALED = re.compile(r'^sha256 = "[^"]*"', re.MULTILINE)
 @lru_cache
 def folder() -> Path:
     """A campaign's folder."""
-    return Path(tempfile.mkdtemp("documents"))
+    return place_of("documents")
 
 
-def run(data: bytes) -> None:
-    """Read one of them."""
+def run(data: bytes) -> bool:
+    """Read one of them; whether it could be."""
     name = NAMES[data[0] % len(NAMES)] if data else NAMES[0]
     path = folder() / name
     path.write_bytes(data[1:])
     try:
         READERS[name](path)
     except InputError as error:
-        assert error.path is not None, error
-        assert error.problem, error
+        explained(error)
+        return False
     finally:
         path.unlink()
+    return True
+
+
+def explained(error: InputError) -> None:
+    """An error says of which file it is and what is wrong there."""
+    assert error.path is not None, error
+    assert error.problem, error
 
 
 def plan(path: Path) -> None:
@@ -69,14 +72,17 @@ def manifest(path: Path) -> None:
     """Everything a run asks of the manifest."""
     found = CampaignFolder(path.parent)
     for ask in (
-        found.manifest, found.damaged, lambda: found.completed("excitation"),
+        found.damaged, lambda: found.completed("excitation"),
         lambda: found.whole("excitation", 0), lambda: found.next_name("excitation", 0),
         found.require_unchanged, lambda: found.plan_hash,
     ):  # fmt: skip
-        with suppress(HilError):
+        try:
             ask()
-    with suppress(HilError):
-        found.require_unchanged()
+        except CampaignFolderError as error:
+            explained(error)
+        except NotRehearsedError as error:
+            assert str(path.parent) in str(error), error
+    found.manifest()
 
 
 def results(path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import sqlite3
-import tempfile
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
@@ -19,16 +18,17 @@ from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
 from tests.fuzz.mutate_bytes import mutate_bytes
 from tests.fuzz.mutate_mcap import mutate_mcap
 from tests.fuzz.mutate_text import mutate_text
-from tests.fuzz.targets import Target
+from tests.fuzz.targets import Target, place_of
 from tests.hil.test_importers_mcap import STORE, mcap
 from tests.hil.test_importers_mcap import states as messages
 from tests.hil.test_importers_rosbag2 import STATE, URDF, bag, states
 
-TEXT, MAP, NPZ, NPY, MATLAB, SQLITE, BAG, MESSAGES, PACKED = range(9)
+TEXT, MAP, NPZ, NPY, MATLAB, SQLITE, BAG, MESSAGES, PACKED, FIELDS = range(10)
 """First byte of an input: what the others are a file of."""
 SUFFIXES = {
     TEXT: "log.csv", MAP: "map.toml", NPZ: "log.npz", NPY: "log.npy", MATLAB: "log.m",
     SQLITE: "bag.db3", BAG: "bag.mcap", MESSAGES: "log.mcap", PACKED: "bag.db3.zstd",
+    FIELDS: "fields.npy",
 }  # fmt: skip
 COLUMNS = """[position]
 columns = ["q1", "q2"]
@@ -63,6 +63,7 @@ decimal = "."
 """
 ARRAYS = ColumnMap.model_validate({"position": {"columns": "q"}, "time": {"column": "t"}})
 ALONE = ColumnMap.model_validate({"position": {"joints_along": "columns"}, "sample_rate": 500.0})
+NAMED = ColumnMap.model_validate({"position": {"columns": ["q1", "q2"]}, "time": {"column": "t"}})
 TOPICS = ColumnMap.model_validate(
     {"position": {"columns": "/joint_states/position"}, "time": {"column": "/joint_states/stamp"}}
 )
@@ -71,7 +72,7 @@ TOPICS = ColumnMap.model_validate(
 @lru_cache
 def folder() -> Path:
     """Where the recording lies."""
-    return Path(tempfile.mkdtemp("log"))
+    return place_of("log")
 
 
 @lru_cache
@@ -82,8 +83,8 @@ def robot() -> Robot:
     return Robot.from_urdf(path)
 
 
-def run(data: bytes) -> None:
-    """Import it; look at what was written."""
+def run(data: bytes) -> bool:
+    """Import it, if it can be; look at what was written."""
     kind = data[0] % len(SUFFIXES) if data else TEXT
     source, output = folder() / SUFFIXES[kind], folder() / "out.mcap"
     source.write_bytes(data[1:])
@@ -94,13 +95,14 @@ def run(data: bytes) -> None:
         assert not output.exists(), "refused, and left behind"
         assert isinstance(error, InputError)
         assert error.path is not None and error.problem, error
-        return
+        return False
     archive = open_archive(output)
     assert archive.complete
     kept = check_archive(output)
     assert kept.keeps, kept.faults
     assert archive.kind == "imported"
     assert np.isfinite(archive.columns["position"]).all()
+    return True
 
 
 def _imported(kind: int, source: Path, output: Path) -> None:
@@ -112,7 +114,9 @@ def _imported(kind: int, source: Path, output: Path) -> None:
         log.write_text(LINES)
         import_log(log, output, robot=robot(), columns=columns)
     else:
-        columns = {NPY: ALONE, MESSAGES: TOPICS, NPZ: ARRAYS, MATLAB: ARRAYS}.get(kind, _map())
+        columns = {
+            NPY: ALONE, MESSAGES: TOPICS, NPZ: ARRAYS, MATLAB: ARRAYS, FIELDS: NAMED,
+        }.get(kind, _map())  # fmt: skip
         import_log(source, output, robot=robot(), columns=columns)
 
 
@@ -130,7 +134,9 @@ def seeds() -> list[bytes]:
     np.savez(arrays, q=q, t=t)
     np.savez_compressed(packed, q=q, t=t)
     np.save(one, q)
-    np.save(typed, np.zeros(8, [("q", "<f8"), ("t", "<M8[ns]")]))
+    rows = np.zeros(8, [("q1", "<f8"), ("q2", "<f4"), ("at", "<M8[ns]"), ("t", "<f8")])
+    rows["t"] = t
+    np.save(typed, rows)
     matlab = "q = [" + "; ".join(f"{a} {b}" for a, b in q) + "];\nt = [0 1 2 3 4 5 6 7]';\n"
     database = bag(folder() / "seed.db3", {"/joint_states": (STATE, states())})
     with closing(sqlite3.connect(database)) as connection:
@@ -143,9 +149,10 @@ def seeds() -> list[bytes]:
     foreign = mcap(folder() / "seed.mcap", topics).read_bytes()
     (folder() / "seed.mcap").unlink()
     made = {
-        TEXT: (LINES.encode(), LINES.replace(",", "\t").replace("t\t", "").encode()),
+        TEXT: (LINES.encode(), LINES.replace(",", "\t").encode()),
         MAP: (COLUMNS.encode(), ODD_MAP.encode()), NPZ: (arrays.getvalue(), packed.getvalue()),
-        NPY: (one.getvalue(), typed.getvalue()), MATLAB: (matlab.encode(),), SQLITE: (sqlite,),
+        NPY: (one.getvalue(),), FIELDS: (typed.getvalue(),),
+        MATLAB: (matlab.encode(),), SQLITE: (sqlite,),
         BAG: (foreign,), MESSAGES: (foreign,), PACKED: (zstandard.compress(sqlite),),
     }  # fmt: skip
     return [bytes((kind,)) + data for kind, files in made.items() for data in files]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import random
 
+from drivers import State
 from tests.fuzz.conversation import Conversation
 from tests.fuzz.draw import Draw
 from tests.fuzz.mutate_bytes import mutate_bytes
 from tests.fuzz.targets import Target
 
 
-def run(data: bytes) -> None:
-    """One conversation."""
-    Conversation(Draw(data)).play()
+def run(data: bytes) -> bool:
+    """One conversation; whether the arm was open in it."""
+    talk = Conversation(Draw(data))
+    talk.play()
+    return bool((talk.ring.rows["state"] == State.OPEN).any())
 
 
 def seeds() -> list[bytes]:

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "hil"))
-
-from fast_cell import URDF
 
 from hil.arm import Arm
 from hil.errors import InputError
@@ -26,7 +20,8 @@ from identification.excitation.errors import CollisionModelError
 from identification.kinematics import chain_from_urdf
 from identification.model import RobotModel
 from tests.fuzz.mutate_text import mutate_text
-from tests.fuzz.targets import Target
+from tests.fuzz.targets import Target, place_of
+from tests.hil.fast_cell import URDF
 
 TREE = URDF.replace(
     "</robot>",
@@ -52,57 +47,60 @@ DRAKES = '<?xml version="1.0" encoding="GB2312"?>' + TURNING.replace(
 @lru_cache
 def folder() -> Path:
     """Where the description lies."""
-    return Path(tempfile.mkdtemp("urdf"))
+    return place_of("urdf")
 
 
-def run(data: bytes) -> None:
-    """Read it as every command does that takes one."""
+def run(data: bytes) -> bool:
+    """Read it as every command does that takes one; whether all of them do."""
     path = folder() / "robot.urdf"
     path.write_bytes(data)
-    as_a_cell_is_begun(path)
-    as_an_import_takes_it(path)
+    taken = [as_a_cell_is_begun(path), as_an_import_takes_it(path)]
     try:
         text = data.decode()
     except UnicodeDecodeError:
-        return
-    as_a_model(text)
+        return False
+    taken.append(as_a_model(text))
+    return all(taken)
 
 
-def as_a_cell_is_begun(path: Path) -> None:
+def as_a_cell_is_begun(path: Path) -> bool:
     """`hil new`."""
     try:
         made = cell_of_urdf(path, {})
         text, unknown = made.text(path.with_name("cell.toml"))
     except InputError as error:
         assert error.remedy, error
-        return
+        return False
     assert made.joint_names
     assert unknown, "nobody has said all of a new cell"
     assert text
+    return True
 
 
-def as_an_import_takes_it(path: Path) -> None:
+def as_an_import_takes_it(path: Path) -> bool:
     """`hil import`."""
     try:
         Robot.from_urdf(path)
     except InputError as error:
         assert error.path is not None
+        return False
+    return True
 
 
-def as_a_model(text: str) -> None:
+def as_a_model(text: str) -> bool:
     """Chain, model, shapes and collisions."""
     try:
         chain = chain_from_urdf(text)
     except ModelError:
         assert refuses(RobotModel.from_urdf, text)
         assert refuses(Arm.from_urdf, text)
-        return
+        return False
     n = chain.n_joints
     for values in (chain.rotation, chain.translation, chain.axis, chain.inertial):
         assert np.isfinite(values).all(), "a chain with numbers that are none"
     assert np.allclose(np.linalg.norm(chain.axis, axis=1), 1.0)
     if n > 12:  # only slower
-        return
+        return True
     try:
         model = RobotModel.from_urdf(text)
     except ModelError:
@@ -114,6 +112,7 @@ def as_a_model(text: str) -> None:
     assert all(np.isfinite(corners).all() for corners in arm.corners(np.zeros((1, n))))
     with suppress(CollisionModelError, ModelError):
         CollisionChecker(text, Workspace(floor=0.0))
+    return model is not None
 
 
 def refuses(read: Callable[[str], object], text: str) -> bool:
