@@ -7,6 +7,7 @@ a kill too, until each target has been fuzzed for --minutes.
 
 Beside the journal lie FILE.files/TARGET/corpus and findings; a finding is a folder with the input,
 its shortest form and the traceback. ``python -m tests.fuzz.child TARGET --once INPUT`` repeats it.
+Told as deaths are processes that ended early and whose last input alone does not repeat that.
 
 Examples:
   python -m tests.fuzz session --minutes 5 --journal runs/fuzz.jsonl
@@ -35,7 +36,7 @@ LEAST = 5.0  # s that are worth a start
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit status is 1 if anything was found, 0 otherwise."""
+    """Run the command; the exit status is 1 if anything was found, or died, and 0 otherwise."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.fuzz",
         description=__doc__,
@@ -62,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
         teller.say("stopped; the same command goes on from here")
     report = reported(names, given.journal)
     sys.stdout.write(json.dumps(report) + "\n" if given.json else told(report))
-    return int(any(target["findings"] for target in report["targets"].values()))
+    return int(bool(report["findings"] or report["not_reproduced"]))
 
 
 class Run:
@@ -87,17 +88,17 @@ class Run:
         """
         left = sum(max(0.0, self._wanted - done) for done in self._done.values())
         with self._teller.task("fuzzing", left) as task:
-            workers = [
-                threading.Thread(target=self._worker, args=(task,), daemon=True)
-                for _ in range(jobs)
-            ]
-            for worker in workers:
-                worker.start()
+            workers = [threading.Thread(target=self._worker, args=(task,)) for _ in range(jobs)]
             try:
+                for worker in workers:
+                    worker.start()
                 while any(worker.is_alive() for worker in workers):
                     time.sleep(0.2)
             finally:
                 self._ended.set()
+                for worker in workers:  # each ends its process and writes down what that did
+                    if worker.ident is not None:
+                        worker.join()
         if self._failed:
             raise self._failed[0]
 
@@ -134,8 +135,8 @@ class Run:
         try:
             if not any(places.corpus.iterdir()):
                 keeping.plant(places.corpus, target.seeds())
-            piece = live(name, seconds, target.most, places)
-            shorten(name, places)
+            piece = live(name, seconds, target.most, places, self._ended)
+            shorten(name, places, self._ended)
         finally:
             shutil.rmtree(places.scratch, ignore_errors=True)
         return piece
@@ -152,20 +153,29 @@ def reported(names: tuple[str, ...], path: Path) -> dict[str, Any]:
         "inputs": sum(target.get("inputs", 0) for target in found.values()),
         "seconds": round(sum(target.get("seconds", 0.0) for target in found.values()), 1),
         "findings": sum(len(target["findings"]) for target in found.values()),
+        "not_reproduced": sum(target.get("not_reproduced", 0) for target in found.values()),
         "targets": found,
     }
 
 
 def told(report: dict[str, Any]) -> str:
     """The same for a person."""
-    lines = [f"{'target':>10} {'inputs':>12} {'minutes':>8} {'edges':>7} {'features':>9} findings"]
+    lines = [
+        f"{'target':>10} {'inputs':>12} {'minutes':>8} {'edges':>7} {'features':>9} "
+        f"{'findings':>8} deaths"
+    ]
     for name, target in report["targets"].items():
         lines.append(
             f"{name:>10} {target.get('inputs', 0):>12,} {target.get('seconds', 0.0) / 60:>8.1f} "
             f"{target.get('edges', 0):>7,} {target.get('features', 0):>9,} "
-            f"{len(target['findings'])}"
+            f"{len(target['findings']):>8} {target.get('not_reproduced', 0):>6}"
         )
         lines += [f"{'':>10} {count:>12,} × {cause}" for cause, count in target["findings"].items()]
+    if report["not_reproduced"]:
+        lines.append(
+            f"deaths that one input does not repeat: {report['not_reproduced']}; "
+            "see FILE.files/TARGET/not_reproduced"
+        )
     return "\n".join(lines) + "\n"
 
 

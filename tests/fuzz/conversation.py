@@ -171,7 +171,7 @@ class Conversation(Judged):
 
     def grow_old(self) -> None:
         ages = [self._draw.below(4) for _ in range(8)]
-        self.ages = np.tile(np.uint16(ages), (len(self.arm.axes), 1))
+        self.ages = np.tile(np.array(ages, np.uint16), (len(self.arm.axes), 1))
         self.run(1)
         self.ages = None
 

@@ -22,7 +22,8 @@ class Piece:
         features: likewise; an edge run through more often is another feature.
         corpus: inputs kept, at its end.
         memory: resident at its end [MB].
-        ended: "whole", or how it ended early: "crash", "timeout", "memory", "killed".
+        ended: "whole", "stopped" where the user ended it, or how it ended early: "crash",
+            "timeout", "memory", "killed".
         reproduced: whether what ended it early ends the target again in a fresh process.
     """
 
@@ -79,8 +80,9 @@ def summary(found: Iterable[Piece]) -> dict[str, dict[str, Any]]:
         total["inputs"] += piece.inputs
         for name in ("edges", "features", "corpus", "memory"):
             total[name] = max(total[name], getattr(piece, name))
-        total["ended_early"] += piece.ended != "whole"
-        total["not_reproduced"] += piece.ended != "whole" and not piece.reproduced
+        early = piece.ended not in ("whole", "stopped")
+        total["ended_early"] += early
+        total["not_reproduced"] += early and not piece.reproduced
     return totals
 
 

@@ -9,7 +9,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,9 +22,11 @@ CORPORA = Path(__file__).parent / "corpora"
 _PULSE = re.compile(
     r"^#(\d+)\s+\w+\s+cov: (\d+) ft: (\d+) corp: (\d+)/\S+.*? rss: (\d+)Mb", re.MULTILINE
 )
+_TOTAL = re.compile(r"^stat::number_of_executed_units:\s+(\d+)", re.MULTILINE)
 _OPEN = re.compile(r"^#(\d+)\s", re.MULTILINE)
 _PLACE = re.compile(r'File "([^"]+)", line (\d+)')
 _ENDINGS = {"crash": "crash", "timeout": "timeout", "oom": "memory", "slow": "whole"}
+_PATIENCE = 10.0  # s for libFuzzer to say what it did, where it is asked to end
 _GRACE = 240.0  # s beyond the time that a process was given, for its start on a loaded machine
 
 
@@ -52,12 +56,12 @@ class Places:
         return places
 
 
-def live(target: str, seconds: float, most: int, places: Places) -> Piece:
-    """Fuzz a target in a process of its own for some time, or until that ends earlier."""
+def live(target: str, seconds: float, most: int, places: Places, ended: threading.Event) -> Piece:
+    """Fuzz a target in a process of its own for some time, or until that or `ended` ends it."""
     begun = time.monotonic()
     log = places.scratch / "log"
     options = [
-        f"-max_total_time={max(1, round(seconds))}", f"-max_len={most}", "-print_final_stats=0",
+        f"-max_total_time={max(1, round(seconds))}", f"-max_len={most}", "-print_final_stats=1",
         f"-artifact_prefix={places.scratch}/", "-reload=0", "-close_fd_mask=3", str(places.corpus),
         str(CORPORA / target),
     ]  # fmt: skip
@@ -67,27 +71,38 @@ def live(target: str, seconds: float, most: int, places: Places) -> Piece:
             stdout=stream, stderr=stream, cwd=ROOT, env=environment_of(places),
             start_new_session=True,
         )  # fmt: skip
-        try:
-            process.wait(seconds + _GRACE)
-        except subprocess.TimeoutExpired:
-            pass
-        finally:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+        stopped = _watched(process, seconds + _GRACE, ended)
     text = log.read_text("utf-8", errors="replace")
     pulses = _PULSE.findall(text)
     _, edges, features, corpus, memory = map(int, pulses[-1]) if pulses else (0,) * 5
-    inputs = int(counted[-1]) if (counted := _OPEN.findall(text)) else 0
-    ended, reproduced = "whole", False
-    if process.returncode:
-        ended, reproduced = _understood(target, process.returncode, text, places)
-    if process.returncode > 0 and not inputs and not reproduced:
+    counted = _TOTAL.findall(text) or _OPEN.findall(text)
+    inputs = int(counted[-1]) if counted else 0
+    how, reproduced = "stopped" if stopped else "whole", False
+    if process.returncode and not stopped:
+        how, reproduced = _understood(target, process.returncode, text, places)
+    if process.returncode > 0 and not inputs and not reproduced and not stopped:
         raise RuntimeError(f"{target} cannot be fuzzed:\n{text[-3000:]}")
     lasted = time.monotonic() - begun
-    return Piece(
-        target, round(lasted, 1), inputs, edges, features, corpus, memory, ended, reproduced
-    )
+    return Piece(target, round(lasted, 1), inputs, edges, features, corpus, memory, how, reproduced)
+
+
+def _watched(process: subprocess.Popen[bytes], seconds: float, ended: threading.Event) -> bool:
+    """Wait until a process ends, and end it after `seconds`; True if `ended` ended it."""
+    until = time.monotonic() + seconds
+    try:
+        while process.poll() is None and time.monotonic() < until and not ended.is_set():
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(0.2)
+        stopped = process.poll() is None and ended.is_set()
+        if stopped:
+            os.killpg(process.pid, signal.SIGTERM)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_PATIENCE)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    return stopped
 
 
 def _understood(target: str, status: int, text: str, places: Places) -> tuple[str, bool]:
@@ -135,9 +150,11 @@ def _innermost(story: str) -> str:
     return ours[-1] if "Traceback (most recent call last)" in story else ours[0]
 
 
-def shorten(target: str, places: Places) -> None:
-    """Make the shortest input of each finding that has none yet."""
+def shorten(target: str, places: Places, ended: threading.Event) -> None:
+    """Make the shortest input of each finding that has none yet, unless `ended` is set."""
     for folder in sorted(places.findings.iterdir()):
+        if ended.is_set():
+            return
         if (folder / INPUT).exists() and not (folder / SHORTEST).exists():
             # A fault or a hang cannot be shortened from within; its input stays as it is.
             if not folder.name.startswith("SIG"):

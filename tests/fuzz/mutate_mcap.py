@@ -150,7 +150,7 @@ def _sealed(one: Record, seals: dict[str, str]) -> bytes:
     if one.inside is not None:
         plain = _joined(one.inside)
         pack = {b"zstd": zstandard.ZstdCompressor().compress, b"lz4": lz4.frame.compress}
-        packed = pack.get(one.compression, bytes)(plain)
+        packed: bytes = pack.get(one.compression, bytes)(plain)
         head = _CHUNK.pack(*one.times, len(plain), zlib.crc32(plain), len(one.compression))
         return head + one.compression + struct.pack("<Q", len(packed)) + packed
     if one.opcode == ATTACHMENT and len(one.body) > 4:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drivers import CyclicPacket, Guard, Session
-from drivers.transports.can import ends
+from drivers.transports.can import answers, ends
 from drivers.transports.can.ends import ControllerEnd, PcEnd
 from hil.archive import foreign_json, open_archive
 from hil.errors import ArchiveError
@@ -70,7 +76,7 @@ class TestBrokenLawsAreFound:
         assert self.in_the_codec()
 
     def test_answers_by_can_to_another_packet(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        answer = ends.write_reply
+        answer = answers.write_reply
         monkeypatch.setattr(ends, "write_reply", lambda *a: b"\1\1" + answer(*a)[2:])
         assert self.in_the_codec()
 
@@ -92,7 +98,7 @@ class TestBrokenLawsAreFound:
         whole = getattr(end, one_way)
 
         def emptied(*given: object) -> bytes | None:
-            packet = whole(*given)
+            packet: bytes | None = whole(*given)
             return packet and packet[:12] + bytes(len(packet) - 12)
 
         monkeypatch.setattr(end, one_way, emptied)
@@ -154,9 +160,10 @@ class TestFindings:
     def test_the_shortest_input_has_the_same_cause(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def run(data: bytes) -> None:
+        def run(data: bytes) -> bool:
             if b"needle" in data:
                 raise ValueError(data)
+            return True
 
         target = targets.Target(run, list, lambda data, most, seed: data)
         monkeypatch.setattr(targets, "load", lambda name: target)
@@ -189,6 +196,27 @@ class TestJournal:
         findings.Findings(Path(f"{path}.files/codec/findings")).keep("a", b"", "")
         assert command.main(arguments) == 1
 
+    @pytest.mark.parametrize("ended", ["crash", "memory", "killed"])
+    def test_a_death_that_no_input_repeats_is_told(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], ended: str
+    ) -> None:
+        path = tmp_path / "j.jsonl"
+        journal.append(path, replace(PIECE, seconds=61.0))
+        journal.append(path, replace(PIECE, ended=ended))
+        arguments = ["codec", "--minutes", "1", "--journal", str(path)]
+        assert command.main(arguments) == 1
+        assert "does not repeat: 1" in capsys.readouterr().out
+        assert command.main([*arguments, "--json"]) == 1
+        assert json.loads(capsys.readouterr().out)["not_reproduced"] == 1
+
+    def test_a_piece_that_was_stopped_is_no_death(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        path = tmp_path / "j.jsonl"
+        journal.append(path, replace(PIECE, seconds=61.0, ended="stopped"))
+        assert command.main(["codec", "--journal", str(path)]) == 0
+        assert "deaths that" not in capsys.readouterr().out
+
 
 def test_inputs_worth_keeping_reach_most_with_few_bytes(tmp_path: Path) -> None:
     for name, size in (("a", 10), ("b", 5), ("c", 5), ("d", 30)):
@@ -212,3 +240,28 @@ def test_a_real_process_of_libfuzzer_is_understood(
     report = json.loads(capsys.readouterr().out)
     assert report["targets"]["codec"]["features"] > 100
     assert report["inputs"] > 50
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
+def test_a_run_that_is_interrupted_leaves_nothing_behind(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    run = subprocess.Popen(
+        [sys.executable, "-m", "tests.fuzz", "codec", "--minutes", "3", "--journal", str(path)],
+        cwd=Path(__file__).parents[2], env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    corpus = Path(f"{path}.files/codec/corpus")
+    planted = len(targets.load("codec").seeds())
+    until = time.monotonic() + 120.0
+    while len([*corpus.glob("*")]) <= planted and time.monotonic() < until:
+        time.sleep(0.2)
+    run.send_signal(signal.SIGINT)
+    told, _ = run.communicate(timeout=60.0)
+    assert run.returncode == 0, told
+    (piece,) = journal.pieces(path)
+    assert piece.ended == "stopped"
+    assert piece.inputs > planted
+    before = {one.name for one in corpus.iterdir()}
+    time.sleep(2.0)
+    assert before == {one.name for one in corpus.iterdir()}, "something goes on"

@@ -28,7 +28,9 @@ from identification.errors import ModelError
 from identification.kinematics import chain_from_urdf
 from identification.payload import Payload
 from tests.fault_matrix.small_cell import URDF
-from tests.fuzz.targets import cell_file, documents, importers
+from tests.fuzz.targets import documents, importers
+from tests.hil.fast_cell import CELL
+from tests.hil.fast_cell import URDF as CELLS_URDF
 
 JOINTS = ("shoulder", "elbow")
 
@@ -79,9 +81,9 @@ def test_a_cell_is_not_begun_from_what_an_archive_cannot_say(
 def test_a_cell_whose_link_cannot_be_changed_says_how_to_write_it(
     tmp_path: Path, written: str
 ) -> None:
-    begin, _, rest = cell_file.CELL.partition("[controller]")
+    begin, _, rest = CELL.partition("[controller]")
     path = tmp_path / "cell.toml"
-    (tmp_path / "fast.urdf").write_text(cell_file.URDF)
+    (tmp_path / "fast.urdf").write_text(CELLS_URDF)
     path.write_text(f"{written}\n{begin}{rest[rest.index('[campaign]') :]}")
     with pytest.raises(InputError, match=r"write \[controller\] in a line of its own"):
         Cell.load(path).with_link(transport="udp")
@@ -207,6 +209,8 @@ def test_a_cell_file_whose_tables_nest_without_end_is_refused(tmp_path: Path, de
 @pytest.mark.parametrize(
     "figures", [(1e200, (0.0, 0.0, 0.0)), (1.0, (0.0, 1e200, 0.0)), (1.0, (0.0, 0.0, np.nan))]
 )
-def test_a_payload_that_no_arm_carries_is_refused(figures: tuple) -> None:
+def test_a_payload_that_no_arm_carries_is_refused(
+    figures: tuple[float, tuple[float, float, float]],
+) -> None:
     with pytest.raises(ModelError, match="the payload"):
         Payload(*figures)

@@ -80,13 +80,10 @@ def as_read(archive: Archive) -> None:
 
 def as_told(path: Path) -> None:
     """`hil archive check` and `info`."""
-    for tell in (check_archive, overview):
-        try:
-            told = tell(path)
-        except ArchiveError:
-            continue
-        if tell is overview:
-            json.dumps(told.to_dict())
+    with suppress(ArchiveError):
+        check_archive(path)
+    with suppress(ArchiveError):
+        json.dumps(overview(path).to_dict())
 
 
 def as_drawn(path: Path) -> None:

@@ -114,12 +114,13 @@ def used(cell: Cell) -> None:
 
 def changed(cell: Cell) -> None:
     """A cell on another link, or with other repetitions, is the same in everything else."""
-    for change in (
+    changes: tuple[Callable[[], Cell], ...] = (
         lambda: cell.with_link(transport="udp", host="127.0.0.1", port=4000, cycle_ms=2),
         lambda: cell.with_link(transport="simulated"),
         lambda: cell.with_campaign(repetitions=3, validation_runs=1),
         lambda: cell.with_urdf(cell.path.with_name("b.toml"), "other.urdf"),
-    ):
+    )
+    for change in changes:
         try:
             other = change()
         except (CellError, NoTableError) as error:
