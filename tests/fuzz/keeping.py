@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
-import tempfile
 from pathlib import Path
 
 from tests.fuzz import targets
@@ -31,35 +31,63 @@ def keep(name: str, journal: Path) -> str:
     own count, as far as there is room.
     """
     places = Places.beside(journal, name)
-    target = targets.load(name)
-    kept = {path.name: path.read_bytes() for path in (CORPORA / name).glob("*-*")}
-    for folder in sorted(places.findings.iterdir()):
-        shortest = folder / SHORTEST
-        if shortest.exists() and shortest.stat().st_size <= LARGEST:
-            data = shortest.read_bytes()
-            kept[f"found-{digest(data)[:12]}"] = data
-    with tempfile.TemporaryDirectory() as scratch:
-        control = Path(scratch) / "control"
-        tried = sorted({*places.corpus.iterdir(), *(CORPORA / name).iterdir()})
-        control.write_text("\n".join([str(len(tried)), "0", *map(str, tried)]) + "\n")
-        for _ in range(_ENDINGS):  # one that ends the process is passed over by the next
-            ended = subprocess.run(
-                [*command_of(name), "--fuzz", str(places.findings), "-merge_inner=1",
-                 "-close_fd_mask=3", f"-max_len={target.most}",
-                 f"-merge_control_file={control}"],
-                cwd=ROOT, env=environment_of(places), capture_output=True, check=False,
-            )  # fmt: skip
-            if not ended.returncode:
-                break
-        reached = features_of(control.read_text("utf-8"))
-    for path in chosen(reached, MOST_FILES - len(kept), MOST_BYTES - sum(map(len, kept.values()))):
-        kept[digest(path.read_bytes())] = path.read_bytes()
+    try:
+        kept, too_long = _kept(name, places)
+        first = places.scratch / "kept"
+        first.mkdir()
+        for file_name, data in kept.items():
+            (first / file_name).write_bytes(data)
+        others = [*places.corpus.iterdir(), *(CORPORA / name).iterdir()]
+        added = {digest(path.read_bytes()): path for path in others if "-" not in path.name}
+        reached = _reached(name, [*sorted(first.iterdir()), *sorted(added.values())], places)
+        known = frozenset[int]().union(*(reached.pop(path, ()) for path in first.iterdir()))
+        room = MOST_BYTES - sum(map(len, kept.values()))
+        for path in chosen(reached, MOST_FILES - len(kept), room, known):
+            data = path.read_bytes()
+            kept[digest(data)] = data
+    finally:
+        shutil.rmtree(places.scratch, ignore_errors=True)
     (CORPORA / name).mkdir(parents=True, exist_ok=True)
     for path in (CORPORA / name).iterdir():
         path.unlink()
     for file_name, data in kept.items():
         (CORPORA / name / file_name).write_bytes(data)
-    return f"{len(kept)} inputs, {sum(map(len, kept.values()))} bytes"
+    told = f"{len(kept)} inputs, {sum(map(len, kept.values()))} bytes"
+    if too_long:
+        told += f"; left out, being longer than {LARGEST} bytes: {', '.join(too_long)}"
+    return told
+
+
+def _kept(name: str, places: Places) -> tuple[dict[str, bytes], list[str]]:
+    """What stays in any case, by file name, and the findings that are too long for it."""
+    kept = {path.name: path.read_bytes() for path in (CORPORA / name).glob("*-*")}
+    too_long = []
+    for folder in sorted(places.findings.iterdir()):
+        shortest = folder / SHORTEST
+        if not shortest.exists():
+            continue
+        data = shortest.read_bytes()
+        if len(data) > LARGEST:
+            too_long.append(f"{folder.name} ({len(data)} bytes)")
+        else:
+            kept[f"found-{digest(data)[:12]}"] = data
+    return kept, too_long
+
+
+def _reached(name: str, tried: list[Path], places: Places) -> dict[Path, frozenset[int]]:
+    """What each input reaches."""
+    control = places.scratch / "control"
+    control.write_text("\n".join([str(len(tried)), "0", *map(str, tried)]) + "\n")
+    for _ in range(_ENDINGS):  # one that ends the process is passed over by the next
+        ended = subprocess.run(
+            [*command_of(name), "--fuzz", str(places.findings), "-set_cover_merge=1",
+             "-merge_inner=1", "-close_fd_mask=3", f"-max_len={targets.load(name).most}",
+             f"-merge_control_file={control}"],
+            cwd=ROOT, env=environment_of(places), capture_output=True, check=False,
+        )  # fmt: skip
+        if not ended.returncode:
+            break
+    return features_of(control.read_text("utf-8"))
 
 
 def features_of(control: str) -> dict[Path, frozenset[int]]:
@@ -75,10 +103,15 @@ def features_of(control: str) -> dict[Path, frozenset[int]]:
     return reached
 
 
-def chosen(reached: dict[Path, frozenset[int]], files: int, size: int) -> list[Path]:
-    """Inputs that together reach most, greedily, within a number of files and bytes."""
+def chosen(
+    reached: dict[Path, frozenset[int]],
+    files: int,
+    size: int,
+    known: frozenset[int] = frozenset(),
+) -> list[Path]:
+    """Inputs that together reach most beyond `known`, greedily, within a number of files, bytes."""
     left = {
-        path: set(features)
+        path: set(features - known)
         for path, features in reached.items()
         if path.exists() and path.stat().st_size <= LARGEST
     }

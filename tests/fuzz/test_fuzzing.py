@@ -228,6 +228,38 @@ def test_inputs_worth_keeping_reach_most_with_few_bytes(tmp_path: Path) -> None:
     reached = keeping.features_of(control)
     assert [path.name for path in keeping.chosen(reached, 3, 100)] == ["d", "b"]
     assert [path.name for path in keeping.chosen(reached, 3, 20)] == ["a", "c"]
+    known = frozenset((1, 2, 3, 10))
+    assert [path.name for path in keeping.chosen(reached, 3, 100, known)] == ["d"]
+    assert [path.name for path in keeping.chosen(reached, 3, 20, known)] == ["c"]
+
+
+def test_what_is_kept_is_no_copy_and_what_is_too_long_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keeping, "CORPORA", tmp_path / "corpora")
+    monkeypatch.setattr(keeping, "_reached", lambda name, tried, places: {
+        path: frozenset(path.read_bytes()) for path in tried
+    })  # fmt: skip
+    scratch = []
+    beside = keeping.Places.beside
+
+    def watched(path: Path, name: str) -> keeping.Places:
+        scratch.append(beside(path, name))
+        return scratch[-1]
+
+    monkeypatch.setattr(keeping.Places, "beside", watched)
+    keeping.plant(tmp_path / "corpora" / "codec", [b"olm"])
+    (tmp_path / "corpora" / "codec" / "seed-1").write_bytes(b"abc")
+    own = tmp_path / "j.files" / "codec"
+    keeping.plant(own / "corpus", [b"abc", b"abcd", b"ab"])
+    for name, data in (("short", b"x"), ("long", bytes(30_000))):
+        (own / "findings" / name).mkdir(parents=True)
+        (own / "findings" / name / findings.SHORTEST).write_bytes(data)
+    told = keeping.keep("codec", tmp_path / "j")
+    assert told.endswith("longer than 20000 bytes: long (30000 bytes)")
+    kept = sorted(path.read_bytes() for path in (tmp_path / "corpora" / "codec").iterdir())
+    assert kept == [b"abc", b"abcd", b"olm", b"x"]
+    assert not any(places.scratch.exists() for places in scratch)
 
 
 @pytest.mark.slow
