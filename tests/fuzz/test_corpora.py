@@ -22,6 +22,7 @@ def inputs(name: str) -> list[bytes]:
 def test_the_corpus_is_small_and_breaks_no_law(name: str) -> None:
     target, kept = targets.load(name), inputs(name)
     assert 0 < len(kept) <= keeping.MOST_FILES
+    assert len(set(kept)) == len(kept)
     assert sum(map(len, kept)) <= keeping.MOST_BYTES
     for data in kept:
         target.run(data)

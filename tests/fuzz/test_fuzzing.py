@@ -21,7 +21,7 @@ from drivers.transports.can.ends import ControllerEnd, PcEnd
 from hil.archive import foreign_json, open_archive
 from hil.errors import ArchiveError
 from tests.fuzz import __main__ as command
-from tests.fuzz import findings, journal, keeping, targets
+from tests.fuzz import findings, journal, keeping, lives, targets
 from tests.fuzz.child import main as child
 from tests.fuzz.draw import Draw
 from tests.fuzz.mutate_mcap import put_together, taken_apart
@@ -241,13 +241,13 @@ def test_what_is_kept_is_no_copy_and_what_is_too_long_is_told(
         path: frozenset(path.read_bytes()) for path in tried
     })  # fmt: skip
     scratch = []
-    beside = keeping.Places.beside
+    beside = lives.Places.beside
 
-    def watched(path: Path, name: str) -> keeping.Places:
+    def watched(path: Path, name: str) -> lives.Places:
         scratch.append(beside(path, name))
         return scratch[-1]
 
-    monkeypatch.setattr(keeping.Places, "beside", watched)
+    monkeypatch.setattr(lives.Places, "beside", watched)
     keeping.plant(tmp_path / "corpora" / "codec", [b"olm"])
     (tmp_path / "corpora" / "codec" / "seed-1").write_bytes(b"abc")
     own = tmp_path / "j.files" / "codec"
