@@ -78,10 +78,11 @@ def _reached(name: str, tried: list[Path], places: Places) -> dict[Path, frozens
     """What each input reaches."""
     control = places.scratch / "control"
     control.write_text("\n".join([str(len(tried)), "0", *map(str, tried)]) + "\n")
+    # merge_inner=2 asks for all that an input reaches, 1 only for what no earlier one did.
     for _ in range(_ENDINGS):  # one that ends the process is passed over by the next
         ended = subprocess.run(
-            [*command_of(name), "--fuzz", str(places.findings), "-set_cover_merge=1",
-             "-merge_inner=1", "-close_fd_mask=3", f"-max_len={targets.load(name).most}",
+            [*command_of(name), "--fuzz", str(places.findings), "-merge_inner=2",
+             "-close_fd_mask=3", f"-max_len={targets.load(name).most}",
              f"-merge_control_file={control}"],
             cwd=ROOT, env=environment_of(places), capture_output=True, check=False,
         )  # fmt: skip
