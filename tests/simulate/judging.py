@@ -8,9 +8,8 @@ from typing import Final
 from tests.simulate.gaps import gaps, piles
 from tests.simulate.laws import LAWS as OTHERS
 from tests.simulate.observed import Broken, Law, Observed
-from tests.simulate.script import kind_of
+from tests.simulate.script import DISTURBS_THE_ARM, kind_of
 
-_DISTURBS_THE_ARM: Final = frozenset({"push", "saturate", "following-error", "corrupt"})
 _FOR_A_PERSON: Final = frozenset({"RepetitionsRejectedError", "ArmChangedError"})
 
 
@@ -24,7 +23,7 @@ def completion(seen: Observed) -> Iterator[Broken]:
         if seen.found is None:
             yield Broken("completion", f"complete, and not identified: {seen.unidentified}")
         return
-    disturbed = any(kind_of(line) in _DISTURBS_THE_ARM for line in seen.struck)
+    disturbed = any(kind_of(line) in {*DISTURBS_THE_ARM, "corrupt"} for line in seen.struck)
     looked_for = disturbed and type(seen.runs[-1].error).__name__ in _FOR_A_PERSON
     if not looked_for:
         yield Broken("completion", f"after {len(seen.runs)} runs it ended {seen.ended}")

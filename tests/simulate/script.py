@@ -111,6 +111,10 @@ class Script:
         return any(one.kind == kind for one in self.mishaps)
 
 
+DISTURBS_THE_ARM: Final = frozenset({"push", "saturate", "following-error"})
+"""Kinds of lines after which it may be elsewhere than where it was sent."""
+
+
 def kind_of(line: str) -> str:
     """The kind of a line, for tallies."""
     return line.partition("@")[0]
