@@ -57,6 +57,11 @@ def text_of(path: Path) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
+def lies_there(path: Path) -> bool:
+    """Whether anything lies there: a link that leads nowhere does, and is no absent file."""
+    return path.is_symlink() or path.exists()
+
+
 def remedy_of(trouble: OSError | UnicodeDecodeError, otherwise: str) -> str:
     """What a person can do who named what `text_of` refuses."""
     if isinstance(trouble, UnicodeDecodeError):

@@ -15,7 +15,7 @@ import numpy as np
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.files import write_or_tell
-from hil.reading import json_of, text_of
+from hil.reading import json_of, lies_there, text_of
 
 from .errors import CampaignFolderError
 from .folder import CampaignFolder
@@ -98,7 +98,7 @@ class DryRun:
             CampaignFolderError: the file is damaged, or of another version.
         """
         path = folder.dry_run
-        if not path.exists():
+        if not lies_there(path):
             return None
         try:
             content: dict[str, Any] = json_of(text_of(path))

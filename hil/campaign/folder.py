@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 from hil.archive import ArchiveName
 from hil.archive.amend import REJECTED
 from hil.files import write_atomically
-from hil.reading import json_of, opened, text_of
+from hil.reading import json_of, lies_there, opened, text_of
 
 from .errors import CampaignFolderError, NotRehearsedError
 from .sealed import MESH, MISSING, as_text, checksums, combined
@@ -149,7 +149,7 @@ class CampaignFolder:
     @property
     def sealed(self) -> bool:
         """Whether there is a manifest."""
-        return self._manifest.exists()
+        return lies_there(self._manifest)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -357,7 +357,7 @@ class CampaignFolder:
         return sums
 
     def _content(self) -> dict[str, Any]:
-        if not self._manifest.exists():
+        if not self.sealed:
             return {"inputs": {}, "archives": []}
         try:
             content = json_of(text_of(self._manifest))

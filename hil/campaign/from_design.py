@@ -43,7 +43,7 @@ def campaign_of_design(root: Path, cell: Cell, excitation: Excitation) -> Campai
     """
     _ = cell.controller  # named before anything is drawn
     folder = CampaignFolder(root)
-    if (root / "manifest.json").exists():
+    if folder.sealed:
         there = _there(root)
         if there is not None and _same(there, cell, excitation):
             return there

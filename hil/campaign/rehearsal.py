@@ -11,7 +11,7 @@ from typing import Final, Literal, Self
 from pydantic import StrictBool, ValidationError, model_validator
 
 from hil.files import write_or_tell
-from hil.reading import text_of
+from hil.reading import lies_there, text_of
 from hil.results.frozen import Frozen
 
 from .errors import CampaignFolderError
@@ -81,10 +81,10 @@ class Rehearsal(Frozen):
             CampaignFolderError: the file cannot be read.
         """
         path = folder.rehearsal
+        if not lies_there(path):
+            return None
         try:
             return cls.model_validate_json(text_of(path))
-        except FileNotFoundError:
-            return None
         except (OSError, ValueError) as error:
             raise CampaignFolderError(
                 folder.root,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from hil.archive import ArchiveName
 from hil.counted import counted
 from hil.errors import HilError
+from hil.reading import lies_there
 from hil.results import Results
 
 from .dry_run import DryRun
@@ -213,7 +214,7 @@ def _motions(campaign: Campaign, kind: str, words: str) -> _Found:
 
 def _identified(folder: CampaignFolder) -> _Found:
     command = f"hil identify {_quoted(folder)}"
-    if not folder.results.exists():
+    if not lies_there(folder.results):
         return _Found(False, "not identified yet", command)
     results = Results.load(folder.results)
     used = {*results.repetitions, *(one.archive for one in results.validation)}

@@ -27,7 +27,7 @@ from scipy.stats import theilslopes
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.files import write_or_tell
-from hil.reading import json_of, text_of
+from hil.reading import json_of, lies_there, text_of
 from planner import FourierSeries, PiecewiseCubic
 
 from .errors import CampaignFolderError
@@ -109,7 +109,7 @@ class WarmUp:
         Raises:
             CampaignFolderError: the file is damaged.
         """
-        if not path.exists():
+        if not lies_there(path):
             return None
         try:
             content: dict[str, Any] = json_of(text_of(path))

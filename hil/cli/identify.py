@@ -15,6 +15,7 @@ from hil.identify import Options, identify_archives, identify_campaign
 from hil.identify.options import ESTIMATORS, Estimator
 from hil.outcome import write_outcome
 from hil.progress import reporter as make_reporter
+from hil.reading import lies_there
 from identification.preprocessing import Smoother
 
 LONGEST_DELAY = 0.5
@@ -127,13 +128,13 @@ def identify(
         output = output or (archives[0] / "paper" if paper else archives[0])
         make_folder(output)
         loose = sorted(archives[0].glob("*.mcap"))
-        if not loose and not (archives[0] / "manifest.json").exists():
+        if not loose and not lies_there(archives[0] / "manifest.json"):
             raise InputError(
                 archives[0],
                 "holds neither a campaign nor archives",
                 remedy="name the folder of a campaign (`hil design -o`), or archives (*.mcap)",
             )
-        if loose and not (archives[0] / "manifest.json").exists():
+        if loose and not lies_there(archives[0] / "manifest.json"):
             # A folder of `hil record`.
             found = identify_archives(loose, reporter, options, predict=unseen)
         else:

@@ -24,7 +24,10 @@ from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.batch.cache import Store, decoded, encoded
 from hil.campaign import Campaign, CampaignFolderError
-from hil.campaign.folder import LOCK
+from hil.campaign.dry_run import DryRun
+from hil.campaign.folder import LOCK, CampaignFolder
+from hil.campaign.rehearsal import Rehearsal
+from hil.campaign.warmup import WarmUp
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import ArchiveError, HilError, InputError
@@ -78,6 +81,8 @@ def put(path: Path, what: str) -> None:
         path.mkdir()
     elif what == "a link to itself":
         path.symlink_to(path)
+    elif what == "a link to nothing":
+        path.symlink_to(path.with_name("not_there"))
     elif what == "a sparse terabyte":
         path.touch()
         os.truncate(path, 1 << 40)
@@ -86,20 +91,24 @@ def put(path: Path, what: str) -> None:
 
 
 THINGS = (
-    *("a pipe", "a device", "a folder", "a link to itself", "a sparse terabyte", DEEP),
+    *("a pipe", "a device", "a folder", "a link to itself", "a link to nothing"),
+    *("a sparse terabyte", DEEP),
     *("{}", "[]", "null", "1", "NaN", "1e999", "9" * 5000, '{"a":' * 50_000, "a=" + "[" * 50_000),
     "",
 )
 FILES: dict[str, Callable[[Path], object]] = {
-    "manifest.json": lambda root: Campaign.open(root).status(),
+    "manifest.json": lambda root: CampaignFolder(root).manifest(),
     "plan.json": lambda root: Campaign.open(root).status(),
     "cell.toml": lambda root: Campaign.open(root).status(),
     "robot.urdf": lambda root: Campaign.open(root).status(),
-    "rehearsal.json": lambda root: Campaign.open(root).status(),
-    "dry_run.json": lambda root: Campaign.open(root).status(),
-    "warmup.json": lambda root: Campaign.open(root).status(),
+    "rehearsal.json": lambda root: Rehearsal.load(CampaignFolder(root)),
+    "dry_run.json": lambda root: DryRun.load(CampaignFolder(root)),
+    "warmup.json": lambda root: WarmUp.load(CampaignFolder(root).warmup, ""),
     "results.json": lambda root: Results.load(root / "results.json"),
 }
+STEPS = {"rehearsal.json": "rehearse", "dry_run.json": "dry run", "warmup.json": "warm-up",
+         "results.json": "identify"}  # fmt: skip
+"""Whose file says nothing of the others: the status goes on to them."""
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -107,15 +116,39 @@ def test_whatever_lies_in_the_place_of_a_file_is_named(name: str, folder: Path) 
     kept = (folder / name).read_bytes() if (folder / name).exists() else None
     for thing in THINGS:
         put(folder / name, thing)
-        try:
-            with within(20.0):
-                FILES[name](folder)
-        except NAMED as error:
-            assert "\n" not in str(error)
+        with within(20.0), pytest.raises(NAMED) as refused:
+            FILES[name](folder)
+        told = str(refused.value)
+        assert name in told, thing
+        assert "\n" not in told, thing
         shutil.rmtree(folder / name) if thing == "a folder" else (folder / name).unlink()
     if kept is not None:
         (folder / name).write_bytes(kept)
         FILES[name](folder)
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_the_status_names_the_file_of_a_step_and_goes_on(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.campaign.status.drift_wanted", lambda cell: 0.1)
+    for thing in THINGS:
+        put(folder / name, thing)
+        with within(20.0):
+            steps = {step.name: step for step in Campaign.open(folder).status().steps}
+        assert steps[STEPS[name]].state != "done", thing
+        assert name in steps[STEPS[name]].sentence, thing
+        shutil.rmtree(folder / name) if thing == "a folder" else (folder / name).unlink()
+
+
+@pytest.mark.parametrize("thing", ["a folder", "a link to itself", "a link to nothing"])
+def test_a_manifest_that_cannot_be_read_is_no_missing_one(thing: str, folder: Path) -> None:
+    """As a missing one it would take an edited plan for the one the campaign began with."""
+    put(folder / "manifest.json", thing)
+    campaign = Campaign.open(folder)
+    for step in (campaign.status, campaign.folder.accept_changes):
+        with pytest.raises(CampaignFolderError, match=r"manifest\.json is damaged"):
+            step()
 
 
 @pytest.mark.parametrize("away", ["../elsewhere_000_a1.mcap", "../../excitation_000_a1.mcap",
@@ -144,7 +177,7 @@ def test_what_is_written_goes_through_no_link(suffix: str, folder: Path) -> None
     assert target.read_text() == "new"
 
 
-def test_nor_does_it_wait_for_a_pipe(folder: Path) -> None:
+def test_writing_waits_for_no_pipe(folder: Path) -> None:
     os.mkfifo(folder / "manifest.json.tmp")
     with within(20.0):
         write_atomically(folder / "manifest.json", "new")
