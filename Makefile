@@ -72,5 +72,5 @@ bench: $(STAMP)  ## every benchmark that needs no data beside the project
 	$(BIN)/python -m benchmarks.archive --sizes
 	$(BIN)/python -m benchmarks.turnaround --busy
 
-clean:  ## remove .venv, runs and caches
-	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+clean:  ## remove .venv, runs, mutants and caches
+	rm -rf $(VENV) runs build dist mutants *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
