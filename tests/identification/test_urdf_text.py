@@ -137,7 +137,7 @@ LOST = {
 
 
 @pytest.mark.parametrize("left_out", LOST)
-def test_so_is_one_of_which_a_part_is_missing(left_out: str) -> None:
+def test_an_inertia_of_which_a_part_is_missing_is_refused(left_out: str) -> None:
     """The reader drops the tensor, the mass too or not, and the shapes of the link."""
     text = without(left_out)
     whole, read = (pin.buildModelFromXML(urdf) for urdf in (ARM, text))
@@ -183,7 +183,7 @@ def test_the_encoding_that_a_decoded_text_names_counts_no_longer(encoding: str) 
 
 
 @pytest.mark.parametrize("blank", ["\t", "\n"])
-def test_so_is_one_with_blanks_that_only_xml_takes_for_spaces(blank: str) -> None:
+def test_blanks_that_only_xml_takes_for_spaces_are_refused(blank: str) -> None:
     with pytest.raises(ModelError, match="tab or line end within an attribute of the <origin>"):
         RobotModel.from_urdf(arm('xyz="0.2 0 0"', f'xyz="0.2{blank}0 0"'))
 

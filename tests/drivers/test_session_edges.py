@@ -121,7 +121,7 @@ class TestNumbers:
         assert rig.send(rig.packet()) is not None
         assert rig.state is after
 
-    def test_unless_number_1_is_just_the_next(self):
+    def test_after_a_silence_a_number_1_that_is_just_the_next_begins_nothing_anew(self):
         rig = Rig()
         rig.status = 0
         rig.start()
@@ -354,7 +354,7 @@ class TestFaulted:
             modes = answer.axes["mode"].tolist()
             assert modes == [rig.mode] * 3 + [Mode.FOLLOWING_ERROR] + [rig.mode] * 2
 
-    def test_unless_another_axis_could_then_be_held_nowhere(self):
+    def test_drive_off_is_asked_for_if_another_axis_could_then_be_held_nowhere(self):
         rig, _ = moving(20)
         rig.axes["d"][3, 2] += 3.0
         assert (rig.cycle().axes["mode"] == Mode.FOLLOWING_ERROR).sum() == 1

@@ -152,7 +152,7 @@ class TestStop:
         assert execution.hold() is None
         assert not execution.held
 
-    def test_nor_is_one_that_stops_held_or_resumed(self, kind):
+    def test_one_that_stops_is_neither_held_nor_resumed(self, kind):
         execution = begun(kind())
         assert execution.hold() is None
         assert execution.held

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import edges
 import numpy as np
 import pytest
+from edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
 from rig import PERIOD, N, limits
 
-from drivers import Guard, GuardError, GuardLimits
+from drivers import Guard, GuardLimits
 from drivers.correction_guard import CorrectionGuard
 from drivers.errors import (
     AccelerationLimit,
@@ -19,20 +21,6 @@ from drivers.errors import (
     VelocityLimit,
 )
 
-REST = np.zeros(N)
-WIDE = 1e9
-JUST_BELOW, JUST_ABOVE = 1.0 + 5e-7, 1.0 + 2e-6
-"""Of a bound, which has a relative tolerance of 1e-6."""
-FACTORS = {"plan": (1.0, 1.0), "override": (1.3, 1.7), "stop": (2.0, 3.0)}
-
-joints = pytest.mark.parametrize("joint", [0, N - 1])
-signs = pytest.mark.parametrize("sign", [-1.0, 1.0])
-
-
-def at(joint: int, value: float) -> np.ndarray:
-    """Zero but for one joint."""
-    return value * np.eye(N)[joint]
-
 
 def begun(kind: str, bounds: GuardLimits | None = None) -> CorrectionGuard:
     checks = CorrectionGuard(Guard(bounds or limits(), PERIOD), kind)
@@ -42,15 +30,7 @@ def begun(kind: str, bounds: GuardLimits | None = None) -> CorrectionGuard:
 
 def only(kind: str, **bounds: float) -> CorrectionGuard:
     """Every rate but those given is out of reach."""
-    wide = dict.fromkeys(("velocity", "acceleration", "jerk"), WIDE)
-    return begun(kind, limits(**{k: np.full(N, v) for k, v in (wide | bounds).items()}))
-
-
-def refused(kind: type, check, *args) -> GuardError:
-    with pytest.raises(GuardError) as caught:
-        check(*args)
-    assert type(caught.value) is kind
-    return caught.value
+    return begun(kind, edges.only(**bounds))
 
 
 V, A, J = 0.5, 8.0, 100.0

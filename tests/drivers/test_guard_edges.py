@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import edges
 import numpy as np
 import pytest
+from edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
 from rig import PERIOD, START, N, limits
 
 from drivers import Guard
@@ -12,7 +14,6 @@ from drivers.errors import (
     CurrentLimit,
     FirstSetPoint,
     FollowingError,
-    GuardError,
     JerkLimit,
     MotionHeld,
     MotionNotCarriedOn,
@@ -23,39 +24,19 @@ from drivers.errors import (
     VelocityMismatch,
 )
 
-REST = np.zeros(N)
 EVERY = np.ones(N, dtype=bool)
 TURNS = np.array([40.0, -30.0, 20.0, -10.0, 5.0, -2.0])
 """Motor revolutions at which an arm may stand."""
-WIDE = 1e9
-JUST_BELOW, JUST_ABOVE = 1.0 + 5e-7, 1.0 + 2e-6
-"""Of a bound, which has a relative tolerance of 1e-6."""
 RATES = {"velocity": VelocityLimit, "acceleration": AccelerationLimit, "jerk": JerkLimit}
-FACTORS = {"plan": (1.0, 1.0), "override": (1.3, 1.7), "stop": (2.0, 3.0)}
 
-joints = pytest.mark.parametrize("joint", [0, N - 1])
-signs = pytest.mark.parametrize("sign", [-1.0, 1.0])
 names = pytest.mark.parametrize("bounds", FACTORS)
 
 
-def at(joint: int, value: float) -> np.ndarray:
-    """Zero but for one joint."""
-    return value * np.eye(N)[joint]
-
-
 def only(**bounds: float) -> Guard:
-    """At START, at rest; every bound but those given is out of reach."""
-    wide = dict.fromkeys(("velocity", "acceleration", "jerk"), WIDE)
-    guard = Guard(limits(**{k: np.full(N, v) for k, v in (wide | bounds).items()}), PERIOD)
+    """At START, at rest; every rate but those given is out of reach."""
+    guard = Guard(edges.only(**bounds), PERIOD)
     guard.begin(START, REST, REST, np.zeros((2, N)), 0)
     return guard
-
-
-def refused(kind: type, check, *args, **named) -> GuardError:
-    with pytest.raises(GuardError) as caught:
-        check(*args, **named)
-    assert type(caught.value) is kind
-    return caught.value
 
 
 class TestPositions:
@@ -186,7 +167,7 @@ class TestRates:
         assert error.bound == pytest.approx(50.0 * FACTORS[after][1], rel=1e-5)
 
     def test_each_wide_set_point_begins_the_waiting_anew(self):
-        guard, jerk, row = only(jerk=50.0), 140.0, START.copy()
+        guard, jerk = only(jerk=50.0), 140.0
         wide = ["stop", "plan", "stop", "plan", "plan"]
         rows = [START + at(2, jerk * (PERIOD * k) ** 3 / 6.0) for k in range(1, 8)]
         for cycle, (row, bounds) in enumerate(zip(rows, wide, strict=False)):

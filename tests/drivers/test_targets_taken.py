@@ -62,7 +62,7 @@ class TestWhere:
         assert not Sent(way * 0.01).refuses(-19.99 - 2.0)
 
     @pytest.mark.parametrize("depth", [1, 2, 3])
-    def test_so_many_back_and_no_more(self, depth):
+    def test_one_of_so_many_back_counts_and_none_before(self, depth):
         step = 0.24
         assert not Sent(step, depth).refuses(1.0 - depth)
         assert Sent(step, depth).refuses(-depth)
@@ -79,7 +79,7 @@ class TestWhere:
         assert Sent(0.24).refuses(2.0, missed=1)
         assert not Sent(0.24).refuses(2.0, missed=2)
 
-    def test_but_by_fewer_than_may_be_missed(self):
+    def test_the_last_is_carried_on_by_fewer_steps_than_may_be_missed(self):
         assert not Sent(0.24, depth=2).refuses(1.0, missed=5)
         assert Sent(0.24, depth=2).refuses(2.0, missed=5)
 
@@ -114,7 +114,7 @@ class TestHowMany:
     def test_a_target_carried_on_is_no_answer_lost(self, ahead):
         assert Sent(SLOW).check(ahead, missed=2) == 0
 
-    def test_nor_is_one_carried_on_past_where_the_joint_was_before(self):
+    def test_a_target_carried_on_past_where_the_joint_was_is_no_answer_lost(self):
         sent = Sent(SLOW)
         sent.add(1.0)
         sent.add(2.1)

@@ -168,7 +168,7 @@ class TestRequests:
         assert caught.value.state == machine.state.name.lower()
         assert machine.execution is None
 
-    def test_nor_where_a_stop_was_asked_for_nor_for_an_arm_that_cannot_be_moved(self):
+    def test_none_is_promised_after_a_stop_nor_for_an_arm_that_cannot_be_moved(self):
         machine = walked(*TO_OPEN)
         with pytest.raises(RequestError, match="another arm"):
             machine.request(requested(Cruise()), "it is another arm")
@@ -176,7 +176,7 @@ class TestRequests:
         with pytest.raises(RequestError, match="being left"):
             machine.request(requested(Cruise()), None)
 
-    def test_nor_a_second_one(self):
+    def test_no_second_motion_is_promised(self):
         with pytest.raises(RequestError, match="another motion"):
             moving().request(requested(Cruise()), None)
 
