@@ -10,7 +10,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import select
 import signal
 import sys
 import time
@@ -25,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
-from drivers.states import State
 from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
 from hil.campaign.folder import Entry
 from hil.cell import Cell
@@ -35,35 +33,10 @@ from hil.progress import Silent
 from tests.process_death import product
 from tests.process_death.controller import Page, Rows, at_rest, forked
 from tests.process_death.rounds import Round, Trigger, Victim
+from tests.process_death.watched import LOOK, PATIENCE, Death, NeverHappenedError, Watched
 
-PATIENCE: Final = 90.0
-"""s for anything that has to happen, on a machine that does other things as well."""
-LOOK: Final = 0.001
-"""s between two looks."""
-NOTICED: Final = 100
-"""Cycles within which an exchange has noticed the death of its supervisor."""
-MAY_MOVE: Final = (State.OPENING, State.OPEN, State.EXITING)
 MARK: Final = "HIL_PROCESS_DEATH"
 """Variable in the environment of every process that a supervisor starts."""
-
-
-class NeverHappenedError(AssertionError):
-    """Something that has to happen did not."""
-
-
-@dataclass(eq=False)
-class Death:
-    """One kill.
-
-    Attributes:
-        victim: who died.
-        pid: its process.
-        written: records that the exchange had written just before.
-    """
-
-    victim: Victim
-    pid: int
-    written: int
 
 
 @dataclass(eq=False)
@@ -146,105 +119,6 @@ def _forked_supervisor(campaign: Path, said: Path, planted: Path | None) -> int:
         os._exit(status)
 
 
-class _Watched:
-    """The processes of one run while it goes on."""
-
-    def __init__(self, page: Page, supervisor: int, controller: int, *, loops: bool) -> None:
-        self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
-        self.status: dict[int, int] = {}
-        self.memory: product.Memory | None = None
-        self._page, self._loops = page, loops
-        self._ends: dict[int, int] = {}
-        self._leaving: int | None = None
-        self._watch(supervisor)
-        self._watch(controller)
-
-    def _watch(self, pid: int) -> None:
-        with suppress(ProcessLookupError):
-            self._ends[pid] = os.pidfd_open(pid)
-
-    def over(self, victim: Victim) -> bool:
-        """Whether a process has ended; one that never began counts as ended."""
-        pid = self.pids.get(victim, 0)
-        if pid not in self._ends:
-            return True
-        if not select.select([self._ends[pid]], [], [], 0.0)[0]:
-            return False
-        if victim in ("supervisor", "controller") and pid not in self.status:
-            self.status[pid] = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        return True
-
-    def look(self) -> None:
-        """Find what the supervisor has started meanwhile."""
-        modules: tuple[tuple[Victim, str], ...] = (
-            ("exchange", product.EXCHANGE),
-            ("archive", product.ARCHIVE),
-        )
-        for victim, module in modules:
-            if victim not in self.pids and (
-                pid := product.started_by(self.pids["supervisor"], module)
-            ):
-                self._watch(pid)
-                self.pids[victim] = pid
-                self._page.tell(self.pids.get("exchange", 0), self.pids.get("archive", 0))
-        if self.memory is None and "exchange" in self.pids:
-            with suppress(OSError):
-                self.memory = product.Memory(self.pids["exchange"])
-        if not self._loops and self._left_alone():
-            self._page.finish()  # as whoever stands at the cabinet would
-
-    def _left_alone(self) -> bool:
-        """Whether nobody wants anything to move any more, and nothing does.
-
-        An exchange may take some cycles to notice that its supervisor is dead, and begin a motion
-        meanwhile. A controller that is told to end closes its axes as soon as their targets stand,
-        which they also do at the begin of a motion.
-        """
-        control = None if self.memory is None else self.memory.control
-        if not (self.over("supervisor") or (control is not None and control.finish)):
-            return False
-        if self._leaving is None:
-            self._leaving = self._page.count
-        moves = control is not None and control.state in MAY_MOVE and not self.over("exchange")
-        return not moves and self._page.count - self._leaving > NOTICED
-
-    def wait(self, *victims: Victim) -> None:
-        """Until they have ended.
-
-        Raises:
-            NeverHappenedError: one did not.
-        """
-        deadline = time.monotonic() + PATIENCE
-        for victim in victims:
-            while not self.over(victim):
-                self.look()
-                if time.monotonic() > deadline:
-                    raise NeverHappenedError(f"the {victim} never ended")
-                time.sleep(5 * LOOK)
-
-    def kill(self, victim: Victim) -> Death:
-        """SIGKILL."""
-        written = 0 if self.memory is None else self.memory.written
-        with suppress(ProcessLookupError):
-            os.kill(self.pids[victim], signal.SIGKILL)
-        return Death(victim, self.pids[victim], written)
-
-    def close(self) -> None:
-        """End whatever is left, and let go."""
-        for victim, pid in self.pids.items():
-            if not self.over(victim):
-                with suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-        for victim in ("supervisor", "controller"):
-            pid = self.pids[victim]
-            if pid not in self.status:
-                self.status[pid] = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        for end in self._ends.values():
-            os.close(end)
-        if self.memory is not None:
-            self.memory.close()
-
-
 class _Due:
     """Whether the moment of a trigger has come."""
 
@@ -289,10 +163,10 @@ class _Due:
 @contextmanager
 def _started(
     campaign: Campaign, played: Round, page: Page, said: Path, planted: Path | None
-) -> Iterator[_Watched]:
+) -> Iterator[Watched]:
     controller = forked(campaign.cell, played, page)
     supervisor = _forked_supervisor(campaign.folder.root, said, planted)
-    watched = _Watched(page, supervisor, controller, loops=played.loops)
+    watched = Watched(page, supervisor, controller, loops=played.loops)
     try:
         yield watched
     finally:
@@ -339,7 +213,7 @@ def run(
 
 
 def _killed(
-    watched: _Watched,
+    watched: Watched,
     campaign: Campaign,
     played: Round,
     page: Page,
@@ -372,7 +246,7 @@ def _killed(
     return entered
 
 
-def _until_the_arm_rests(watched: _Watched, page: Page) -> Rows:
+def _until_the_arm_rests(watched: Watched, page: Page) -> Rows:
     """Nobody answers any more: the account until the controller alone has its arm at rest.
 
     And no longer: some open their axes again and again, whoever listens.

@@ -42,6 +42,52 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 
 
+class Stranger:
+    """Writes records anew, all checksums and the index fitting them."""
+
+    def __init__(self) -> None:
+        self._data, self._index = bytearray(container.MAGIC), IndexBuilder()
+        self._checksums: list[int] = []
+        self._described = ""
+
+    def put(self, opcode: int, body: bytes) -> Record:
+        at = len(self._data)
+        self._data.extend(index.record(opcode, body))
+        return Record(at, opcode, body, len(body))
+
+    def metadata(self, record: Record, given: Mapping[str, Mapping[str, str]]) -> None:
+        name, entries = container.metadata(record)
+        del entries["checksum"]
+        if schema.CHUNKS in entries:
+            entries[schema.CHUNKS] = listed(self._checksums)
+        entries |= given[name]
+        if name == "hil":
+            self._described = schema.checksum(entries)
+        elif schema.DESCRIPTION in entries:
+            entries[schema.DESCRIPTION] = self._described
+        whole = index.metadata(name, {**entries, "checksum": schema.checksum(entries)})
+        self._index.add_metadata(len(self._data), len(whole), name)
+        self._data.extend(whole)
+
+    def chunk(self, record: Record, change: Callable[[bytes], bytes]) -> None:
+        plain = change(container.chunk_data(record, decompressor=zstandard.ZstdDecompressor()))
+        head = container.chunk(record)
+        times = head.start_time, head.end_time
+        whole = index.chunk(plain, zstandard.compress(plain), "zstd", times)
+        put = self.put(container.CHUNK, whole[container.RECORD.size :])
+        taken = container.chunk(put)
+        self._checksums.append(taken.crc)
+        self._data.extend(self._index.add_chunk(put.offset, len(whole), taken, plain))
+
+    def attachment(self, record: Record, given: Mapping[str, bytes]) -> None:
+        name, content = container.attachment(record)
+        put = self.put(container.ATTACHMENT, attachment(name, given.get(name, content)))
+        self._index.add_attachment(put.offset, put)
+
+    def written(self) -> bytes:
+        return bytes(self._data + self._index.tail(len(self._data)))
+
+
 def stranger(
     written,
     path: Path,
@@ -52,46 +98,17 @@ def stranger(
     chunk: Callable[[bytes], bytes] = bytes,
 ) -> Path:
     """The small archive with other content, all checksums and the index fitting it."""
-    data, builder = bytearray(container.MAGIC), IndexBuilder()
-    given = {"hil": metadata or {}, "hil.outcome": outcome or {}}
-    checksums: list[int] = []
-
-    def put(opcode: int, body: bytes) -> int:
-        data.extend(index.record(opcode, body))
-        return len(data) - len(body) - container.RECORD.size
-
+    made = Stranger()
     for record in written.records:
         if record.opcode == container.METADATA:
-            name, entries = container.metadata(record)
-            del entries["checksum"]
-            if schema.CHUNKS in entries:
-                entries[schema.CHUNKS] = listed(checksums)
-            entries |= given[name]
-            if name == "hil":
-                described = schema.checksum(entries)
-            elif schema.DESCRIPTION in entries:
-                entries[schema.DESCRIPTION] = described
-            whole = index.metadata(name, {**entries, "checksum": schema.checksum(entries)})
-            builder.add_metadata(len(data), len(whole), name)
-            data.extend(whole)
+            made.metadata(record, {"hil": metadata or {}, "hil.outcome": outcome or {}})
         elif record.opcode == container.CHUNK:
-            plain = container.chunk_data(record, decompressor=zstandard.ZstdDecompressor())
-            plain, head = chunk(plain), container.chunk(record)
-            times = head.start_time, head.end_time
-            whole = index.chunk(plain, zstandard.compress(plain), "zstd", times)
-            body = whole[container.RECORD.size :]
-            at = put(container.CHUNK, body)
-            taken = Record(at, container.CHUNK, body, len(body))
-            checksums.append(container.chunk(taken).crc)
-            data.extend(builder.add_chunk(at, len(whole), container.chunk(taken), plain))
+            made.chunk(record, chunk)
         elif record.opcode == container.ATTACHMENT:
-            name, content = container.attachment(record)
-            body = attachment(name, (attachments or {}).get(name, content))
-            at = put(container.ATTACHMENT, body)
-            builder.add_attachment(at, Record(at, container.ATTACHMENT, body, len(body)))
+            made.attachment(record, attachments or {})
         elif record.opcode not in (container.MESSAGE_INDEX, container.DATA_END):
-            put(record.opcode, record.body)
-    path.write_bytes(data + builder.tail(len(data)))
+            made.put(record.opcode, record.body)
+    path.write_bytes(made.written())
     return path
 
 
