@@ -23,7 +23,6 @@ from pathlib import Path
 Address = tuple[str, int]
 LENGTH = struct.Struct("<I")
 _UDP = 17
-_MORE_FRAGMENTS = 0x2000
 _EVERYTHING = 0x0003  # what leaves is shown to no narrower protocol
 
 
@@ -37,11 +36,11 @@ def checksum(data: bytes) -> int:
     return 0xFFFF - total & 0xFFFF
 
 
-def datagram(source: Address, target: Address, body: bytes, *, fragment: int = 0) -> bytes:
-    """An IPv4 datagram with a UDP packet in it; `fragment` is its flags and offset."""
+def datagram(source: Address, target: Address, body: bytes) -> bytes:
+    """An IPv4 datagram with a UDP packet in it."""
     udp = struct.pack("!4H", source[1], target[1], 8 + len(body), 0) + body
     addresses = socket.inet_aton(source[0]) + socket.inet_aton(target[0])
-    head = struct.pack("!BBHHHBBH", 0x45, 0, 20 + len(udp), 7, fragment, 64, _UDP, 0) + addresses
+    head = struct.pack("!BBHHHBBH", 0x45, 0, 20 + len(udp), 7, 0, 64, _UDP, 0) + addresses
     return head[:10] + struct.pack("!H", checksum(head)) + head[12:] + udp
 
 
@@ -100,15 +99,22 @@ def bodies(what: str, session: list[bytes], rng: random.Random) -> Iterator[byte
         return itertools.cycle([session[0]])
     if what == "cyclic":
         return itertools.cycle([body for body in session[20:] if len(body) != 1200])
+    if what == "later":  # with numbers that a session that began just now has not come to
+        return itertools.cycle(session[-1000:])
     return itertools.cycle(session)  # "replay": the whole session, from its beginning
 
 
 class Sender:
-    """Sends from this host's own address, or under another's; counts what is answered."""
+    """Sends from this host's own address, or under another's.
+
+    Attributes:
+        sent: packets that the system took.
+        answered: packets that came back.
+    """
 
     def __init__(self, target: Address, source: Address | None) -> None:
         self._target, self._source = target, source
-        self.answered = 0
+        self.sent = self.answered = 0
         if source is None:
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -124,6 +130,7 @@ class Sender:
             else:
                 packet = datagram(self._source, self._target, body[:1472])
                 self._socket.sendto(packet, (self._target[0], 0))
+            self.sent += 1
 
     def listen(self) -> None:
         """Count what came back, if that can come to this host."""
@@ -140,15 +147,15 @@ def attack(
     over = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: over.set())
     begin = time.monotonic()
-    sent = 0
+    tried = 0
     while (elapsed := time.monotonic() - begin) < seconds and not over.is_set():
-        for _ in range(max(0, min(200, int(rate * elapsed) - sent))):
+        for _ in range(max(0, min(200, int(rate * elapsed) - tried))):
             sender.send(next(packets))
-            sent += 1
+            tried += 1
         sender.listen()
-        if sent >= rate * elapsed:
+        if tried >= int(rate * elapsed):
             time.sleep(min(0.001, 1.0 / rate))
-    return {"sent": sent, "answered": sender.answered, "rate": sent / (time.monotonic() - begin)}
+    return {"sent": sender.sent, "answered": sender.answered}
 
 
 def address(text: str) -> Address:
@@ -159,7 +166,9 @@ def address(text: str) -> Address:
 def main() -> int:
     """Record or attack."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("record", "init", "sync", "cyclic", "replay", "odd"))
+    parser.add_argument(
+        "what", choices=("record", "init", "sync", "cyclic", "later", "replay", "odd")
+    )
     parser.add_argument("--to", type=address, required=True, help="HOST:PORT of the PC")
     parser.add_argument("--as", dest="source", type=address, help="HOST:PORT to send under")
     parser.add_argument("--port", action="store_true", help="read the port to send under first")
@@ -168,6 +177,8 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
     if asked.what == "record":
         told: dict[str, float] = {"recorded": record(asked.to[1], asked.seconds, asked.session)}
     else:

@@ -17,22 +17,24 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 import pytest
 
 from hil.archive import Archive, open_archive
+from hil.cell import Cell
 from hil.cell.link import with_link
 from tests.hil.fast_cell import fast_cell
-from tests.strangers.wire import HOSTS, Wire, missing, wire
+from tests.strangers.wire import BROADCAST, HOSTS, Wire, missing, wire
 
 pytestmark = pytest.mark.slow
 
 PORT = 2001
 PERIOD = 0.002
 CONTROLLER = HOSTS["controller"]
-ATTACKER = (sys.executable, "-m", "tests.strangers.attacker")
+WHERE = f"{HOSTS['pc']}:{PORT}"
+Process: TypeAlias = "subprocess.Popen[bytes]"
 PATIENCE = 240.0
 """s for commands to end, on a machine that does other things as well."""
 
@@ -67,60 +69,104 @@ class Told:
         return found
 
 
+class Hosts:
+    """What runs on the three hosts; ended with the block."""
+
+    def __init__(self, net: Wire, folder: Path, attack: Sequence[str], session: Path | None):
+        cell = fast_cell(folder)
+        link = {"transport": "udp", "host": CONTROLLER, "port": PORT, "bind": HOSTS["pc"]}
+        cell.path.write_text(with_link(cell.text, **link))
+        self.archive = folder / "moved.mcap"
+        self._net, self._cell, self._attack, self._session = net, cell.path, attack, session
+        self._started: list[Process] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._started:
+            process.kill()
+            process.wait()
+
+    def _start(self, host: str, *command: str) -> Process:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        process = self._net.start(host, sys.executable, "-m", *command, **pipes)
+        self._started.append(process)
+        return process
+
+    def stranger(self) -> Process:
+        """Waits to be told; on the controller's host if it records."""
+        host = "controller" if self._attack[0] == "record" else "stranger"
+        known = () if self._session is None else ("--session", str(self._session))
+        target = ("--to", WHERE, "--seconds", "600")
+        return self._start(host, "tests.strangers.attacker", *target, *known, *self._attack)
+
+    def controller(self) -> Process:
+        """With a simulated arm; for one motion."""
+        return self._start(
+            "controller", "hil", "simulate", str(self._cell), "--udp", WHERE, "--intervals", "1",
+            "--patience", "0.5", "--duration", "200", "--json",
+        )  # fmt: skip
+
+    def pc(self) -> Process:
+        """Moves the arm by 60 degrees in 7.6 s."""
+        return self._start(
+            "pc", "hil", "move", str(self._cell), "--joint", "1", "--by", "60", "--speed", "2",
+            "--yes", "--json", "-o", str(self.archive),
+        )  # fmt: skip
+
+    def moves(self) -> bool:
+        """Whether the arm is about to move, or does."""
+        return bool(list(self.archive.parent.glob("moved.mcap*")))
+
+    def tell(self, stranger: Process) -> None:
+        """Let him begin, under the controller's port if he was asked for that."""
+        port = 0
+        if "--port" in self._attack:
+            port = next(filter(None, self._net.ports("controller")))
+        assert stranger.stdin is not None
+        assert stranger.stdout is not None
+        assert stranger.stdout.readline() == b"ready\n"
+        stranger.stdin.write(f"{port}\n".encode())
+        stranger.stdin.flush()
+
+
+def said(process: Process) -> dict[str, Any]:
+    """What a command says in the end."""
+    out, errors = process.communicate(timeout=PATIENCE)
+    assert out, errors.decode()
+    return json.loads(out)
+
+
 def moved(
     net: Wire,
     folder: Path,
     attack: Sequence[str],
     *,
     session: Path | None = None,
-    moving: bool = False,
+    begins: Literal["listening", "moving", "first"] = "listening",
 ) -> Told:
-    """Move the arm by 60 degrees in 7.6 s, under an attack.
+    """Move the arm under an attack.
 
-    It begins when the PC's port is open, or when the arm moves.
+    It begins when the PC's port is open, when the arm moves, or before there is a controller.
     """
-    cell = fast_cell(folder)
-    linked = with_link(cell.text, transport="udp", host=CONTROLLER, port=PORT, bind=HOSTS["pc"])
-    cell.path.write_text(linked)
-    hil = (sys.executable, "-m", "hil")
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    where = f"{HOSTS['pc']}:{PORT}"
-    target = ("--to", where, "--seconds", "600")
-    known = () if session is None else ("--session", str(session))
-    host = "controller" if attack[0] == "record" else "stranger"
-    stranger = net.start(host, *ATTACKER, *attack, *target, *known, **pipes)
-    simulated = net.start(
-        "controller", *hil, "simulate", str(cell.path), "--udp", where, "--intervals", "1",
-        "--patience", "0.5", "--duration", "200", "--json", **pipes,
-    )  # fmt: skip
-    out = folder / "moved.mcap"
-    move = net.start(
-        "pc", *hil, "move", str(cell.path), "--joint", "1", "--by", "60", "--speed", "2", "--yes",
-        "--json", "-o", str(out), **pipes,
-    )  # fmt: skip
-    try:
+    with Hosts(net, folder, attack, session) as hosts:
+        stranger = hosts.stranger()
+        simulated = None if begins == "first" else hosts.controller()
+        move = hosts.pc()
         assert net.await_port("pc", PORT, PATIENCE), move.communicate()
-        assert stranger.stdin is not None
-        while moving and not list(folder.glob("moved.mcap*")) and move.poll() is None:
+        while begins == "moving" and not hosts.moves() and move.poll() is None:
             time.sleep(0.02)
-        there = [port for port in net.ports("controller") if port]
-        stranger.stdin.write(f"{there[0]}\n".encode())
-        stranger.stdin.flush()
-        move_said, move_err = move.communicate(timeout=PATIENCE)
-        simulated_said, simulated_err = simulated.communicate(timeout=PATIENCE)
+        hosts.tell(stranger)
+        simulated = simulated or hosts.controller()
+        move_said = said(move)
+        if begins == "first":  # it would go on asking
+            simulated.send_signal(signal.SIGINT)
+        simulated_said = said(simulated)
         stranger.send_signal(signal.SIGTERM)
-        stranger_said, stranger_err = stranger.communicate(timeout=PATIENCE)
-    finally:
-        for process in (move, simulated, stranger):
-            process.kill()
-            process.wait()
-    assert simulated_said, simulated_err.decode()
-    assert stranger_said, stranger_err.decode()
-    assert move_said, move_err.decode()
-    return Told(
-        json.loads(move_said), move.returncode, json.loads(simulated_said),
-        json.loads(stranger_said), open_archive(out) if out.exists() else None,
-    )  # fmt: skip
+        stranger_said = said(stranger)
+    archive = open_archive(hosts.archive) if hosts.archive.exists() else None
+    return Told(move_said, move.returncode, simulated_said, stranger_said, archive)
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +196,7 @@ OWN = {
     "sync packets": ("sync", "--rate", "200"),
     "cyclic packets in a flood": ("cyclic", "--rate", "20000"),
     "a recorded session": ("replay", "--rate", "1000"),
+    "packets from the address of all": ("init", "--rate", "200", "--as", f"{BROADCAST}:5555"),
     "lengths that no packet has, and fragments": ("odd", "--rate", "500"),
 }
 
@@ -161,6 +208,16 @@ def test_another_host_is_counted_and_gets_no_answer(
     told = moved(net, tmp_path, OWN[what], session=session)
     went_on(told)
     assert told.rejected["foreign"] > 500
+    assert told.stranger["sent"] > 500
+    assert told.stranger["answered"] == 0
+
+
+def test_what_goes_to_everybody_does_not_arrive(net: Wire, session: Path, tmp_path: Path) -> None:
+    attack = ("init", "--rate", "200", "--to", f"{BROADCAST}:{PORT}")
+    told = moved(net, tmp_path, attack, session=session)
+    went_on(told)
+    assert told.stranger["sent"] > 500
+    assert not told.rejected
     assert told.stranger["answered"] == 0
 
 
@@ -170,37 +227,78 @@ def test_another_port_of_the_controllers_address_is_a_stranger_too(
 ) -> None:
     """A second controller that starts, or a stranger who writes the controller's address."""
     under = ("--as", f"{CONTROLLER}:5555")
-    told = moved(net, tmp_path, (what, "--rate", "200", *under), session=session, moving=True)
+    told = moved(net, tmp_path, (what, "--rate", "200", *under), session=session, begins="moving")
     went_on(told)
     assert told.rejected["foreign"] > 500
 
 
-@pytest.mark.parametrize("what", ["init", "replay", "cyclic", "odd"])
-def test_under_the_controllers_own_address_and_port_the_arm_is_still_guarded(
+def kept_its_limits(archive: Archive, cell: Cell) -> None:
+    """Nothing was sent that a stop may not do; an arm that is not stopped does less."""
+    limits = cell.guard_limits
+    sent = archive.cycles()["commanded_position"]
+    assert np.nanmin(sent - limits.lower) >= 0.0
+    assert np.nanmax(sent - limits.upper) <= 0.0
+    widest = (
+        limits.velocity,
+        limits.acceleration * limits.stop_acceleration,
+        limits.jerk * limits.stop_jerk,
+    )
+    for order, bound in enumerate(widest, 1):
+        assert np.nanmax(np.abs(np.diff(sent, order, axis=0)) / PERIOD**order / bound) <= 1.0
+
+
+def ended_by(told: Told, reason: str) -> None:
+    """The command ends with exit status 4 and one sentence that says why."""
+    assert told.code == 4, told.move
+    assert "\n" not in told.move["error"]
+    assert reason in told.move["error"], told.move
+
+
+def as_controller(net: Wire, session: Path, folder: Path, what: str) -> Told:
+    """Under the controller's own address and port, while the arm moves: the limits are kept."""
+    under = ("--as", f"{CONTROLLER}:1", "--port")
+    told = moved(net, folder, (what, "--rate", "100", *under), session=session, begins="moving")
+    assert told.archive is not None, told.move
+    assert told.archive.complete
+    assert told.stranger["sent"] > 20
+    kept_its_limits(told.archive, Cell.load(folder / "cell.toml"))
+    return told
+
+
+@pytest.mark.parametrize("what", ["init", "replay"])
+def test_a_start_under_the_controllers_own_address_and_port_ends_the_run(
     what: str, net: Wire, session: Path, tmp_path: Path
 ) -> None:
-    """Nothing in the protocol tells such a stranger from the controller: the run may end.
-
-    What is sent keeps the limits all the same, and what is said of it is one sentence.
-    """
-    under = ("--as", f"{CONTROLLER}:1", "--port")
-    told = moved(net, tmp_path, (what, "--rate", "100", *under), session=session, moving=True)
-    assert told.code in (0, 4), told.move
-    if told.archive is None:
-        assert told.code == 4
-        return
-    speed = np.abs(np.diff(told.archive.cycles()["commanded_position"], axis=0)) / PERIOD
-    limit = np.radians([400.0, 400.0])
-    assert np.nanmax(speed / limit) <= 1.0
+    """Nothing in the protocol tells such a stranger from the controller."""
+    ended_by(as_controller(net, session, tmp_path, what), "the controller started over")
 
 
-def test_whoever_begins_first_under_the_controllers_address_can_keep_it_out(
+def test_an_arm_elsewhere_under_the_controllers_own_address_and_port_ends_the_run(
     net: Wire, session: Path, tmp_path: Path
 ) -> None:
-    """Then nothing moves, and the command ends with a sentence."""
+    """Numbers that the controller has not come to yet, of when the arm had arrived."""
+    told = as_controller(net, session, tmp_path, "later")
+    ended_by(told, "of joint 1 is")
+    assert told.move["outcome"] == "refused"
+
+
+@pytest.mark.parametrize(("what", "kind"), [("cyclic", "stale"), ("odd", "malformed")])
+def test_what_the_controller_cannot_send_does_not_end_the_run(
+    what: str, kind: str, net: Wire, session: Path, tmp_path: Path
+) -> None:
+    """Packets of numbers that were answered long ago, and what is no packet."""
+    told = as_controller(net, session, tmp_path, what)
+    went_on(told)
+    assert told.rejected[kind] > 100
+
+
+def test_whoever_begins_first_under_the_controllers_address_keeps_it_out(
+    net: Wire, session: Path, tmp_path: Path
+) -> None:
     under = ("--as", f"{CONTROLLER}:5555")
-    told = moved(net, tmp_path, ("init", "--rate", "200", *under), session=session)
-    assert told.code in (0, 4), told.move
-    if told.archive is None:
-        assert told.controller["intervals"] == 0
-        assert told.move["error"]
+    attack = ("init", "--rate", "200", *under)
+    told = moved(net, tmp_path, attack, session=session, begins="first")
+    assert told.stranger["sent"] > 500
+    ended_by(told, "the controller did not reach drive-on within")
+    assert told.archive is None
+    assert told.controller["replies"] == told.controller["intervals"] == 0
