@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +21,7 @@ from hil.errors import ControllerFault
 from tests.disk.harm import chunks
 from tests.simulate.altered import found, played, with_life
 from tests.simulate.laws.archived import read
-from tests.simulate.laws.estimated import FALSE_ALARM, SEEDS, bound
+from tests.simulate.laws.estimated import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
 from tests.simulate.observed import Life, Observed
 
 
@@ -239,8 +240,11 @@ def test_what_does_not_count_must_not_be_pooled(copied: Observed) -> None:
 
 
 def test_the_bound_on_estimates_is_the_quantile_that_it_says() -> None:
+    assert degrees_of_freedom(1.9599639845400545) == math.inf
+    assert degrees_of_freedom(2.3646242510102993) == pytest.approx(7.0, rel=1e-6)
     # Normal deviates: 2 (1 - Phi(z)) for one of 10 parameters in all seeds together.
-    assert 2.0 * norm.sf(bound(10)) * 10 * SEEDS == pytest.approx(FALSE_ALARM, rel=1e-9)
+    z = bound(math.inf, 10)
+    assert 2.0 * norm.sf(z) * 10 * SEEDS == pytest.approx(FALSE_ALARM, rel=1e-9)
 
 
 # The campaign as a whole --------------------------------------------------------------------

@@ -3,20 +3,26 @@
 The difference of two estimates with standard deviations s and s' is held against q hypot(s, s'), q
 the normal quantile at the level that makes one false alarm among all parameters of all `SEEDS`
 seeds as improbable as `FALSE_ALARM` (Bonferroni). s comes from a few blocks of residuals, and with
-their degrees of freedom Student's t would allow hundreds of s, which no wrong estimate exceeds; but
-both runs are of one arm and mostly of the same motions, so that they err alike.
+their degrees of freedom Student's t would allow hundreds of s, which hardly any wrong estimate
+exceeds; but both runs are of one arm and of the same motions, so that they err alike. Where
+something disturbed the arm, they need not: there it is Student's t, whose degrees of freedom follow
+from the interval that `results.json` states (half a 95 % interval is `interval_factor` s).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from scipy.stats import norm
+from scipy.optimize import brentq
+from scipy.stats import t as student
 
 from identification import Estimate
 from tests.simulate.observed import Broken, Observed
+from tests.simulate.script import DISTURBS_THE_ARM, kind_of
 
 from .folders import WANTED, manifest_of, parsed
 
@@ -32,7 +38,8 @@ def estimate(observed: Observed) -> Iterator[Broken]:
         for text in _pooled(observed):
             yield Broken(LAW, text)
     if found is not None and twin is not None:
-        for text in _alike(found.result.pooled, twin.result.pooled):
+        disturbed = any(kind_of(line) in DISTURBS_THE_ARM for line in observed.struck)
+        for text in _alike(found.result.pooled, twin.result.pooled, disturbed=disturbed):
             yield Broken(LAW, text)
 
 
@@ -51,11 +58,12 @@ def _pooled(observed: Observed) -> Iterator[str]:
         yield f"{', '.join(sorted(left_out))} count and were not pooled"
 
 
-def _alike(ours: Estimate, theirs: Estimate) -> Iterator[str]:
+def _alike(ours: Estimate, theirs: Estimate, *, disturbed: bool) -> Iterator[str]:
     if ours.names != theirs.names:
         yield "other parameters than in the undisturbed run"
         return
-    quantile = bound(len(ours.names))
+    freedom = min(map(degrees_of_freedom, (ours.interval_factor, theirs.interval_factor)))
+    quantile = bound(freedom if disturbed else math.inf, len(ours.names))
     unknown = {*ours.undetermined, *theirs.undetermined}
     spread = np.hypot(ours.std, theirs.std)
     for j, name in enumerate(ours.names):
@@ -69,6 +77,16 @@ def _alike(ours: Estimate, theirs: Estimate) -> Iterator[str]:
             )
 
 
-def bound(n_parameters: int) -> float:
+@lru_cache(maxsize=64)
+def degrees_of_freedom(interval_factor: float) -> float:
+    """Of the t distribution with this 97.5 % quantile; infinite for the normal one."""
+    least, most = 0.5, 1e7
+    if interval_factor <= student.ppf(0.975, most):
+        return math.inf
+    return float(brentq(lambda k: student.ppf(0.975, k) - interval_factor, least, most))
+
+
+@lru_cache(maxsize=64)
+def bound(freedom: float, n_parameters: int) -> float:
     """Deviations that no parameter of any seed differs by, but with `FALSE_ALARM`."""
-    return float(norm.isf(FALSE_ALARM / (2.0 * n_parameters * SEEDS)))
+    return float(student.isf(FALSE_ALARM / (2.0 * n_parameters * SEEDS), freedom))
