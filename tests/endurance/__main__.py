@@ -16,7 +16,12 @@ Four hours in three pieces:
     done
     python -m tests.endurance --merge --journal long.jsonl
 
-The exit code is 1 if anything is wrong, 0 if not; what a run is too short for is said as a doubt.
+Merged are as many journals as are named, those compressed by `xz` (`long.jsonl.xz`) among them.
+
+The exit code is 1 if anything is wrong, 0 if not, and 2 if the journal is none. What a run is too
+short for is said as a doubt, and so is what the load of the machine explains: slower answers while
+more was to do, campaigns given up and answers missed while there was more to do than cores. Two
+bounds hold at any load: half of a piece's campaigns, and 1 % of its answers.
 """
 
 from __future__ import annotations
@@ -24,12 +29,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
-from tests.endurance.journal import read_journal
+from tests.endurance.journal import COMPRESSED, ForeignError, Piece, read_journal
 from tests.endurance.piece import run_piece
 from tests.endurance.verdict import SHARES, Verdict, judge
 
@@ -40,23 +46,17 @@ LONGEST = 90.0
 def main(arguments: list[str] | None = None) -> int:
     """Run a piece, or only merge; print the verdict over all pieces."""
     given = _parser().parse_args(arguments)
-    if not given.merge:
-        if given.folder is None or given.minutes is None:
-            _parser().error("--minutes and --folder are needed to run a piece")
-        if not 0.0 < given.minutes <= LONGEST:
-            _parser().error(f"--minutes must be above 0 and at most {LONGEST:g}")
-        with stop_on_interrupt() as stop:
-            run_piece(
-                given.folder,
-                given.journal,
-                60.0 * given.minutes,
-                given.rate,
-                stop,
-                reporter(quiet=given.json),
-            )
-    pieces = read_journal(given.journal)
+    try:
+        _read(given.journal)  # before anything is appended to what is none
+        if not given.merge:
+            _run(given)
+        pieces = _read(given.journal)
+    except ForeignError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
     if not pieces:
-        sys.stderr.write(f"error: {given.journal} holds no piece; run one first\n")
+        names = ", ".join(map(str, given.journal))
+        sys.stderr.write(f"error: no piece is in {names}; run one first\n")
         return 2
     verdict = judge(pieces)
     if given.json:
@@ -67,13 +67,33 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if verdict.faults else 0
 
 
+def _read(journals: Sequence[Path]) -> list[Piece]:
+    return [piece for path in journals for piece in read_journal(path)]
+
+
+def _run(given: argparse.Namespace) -> None:
+    """Run a piece, and append to the journal."""
+    if given.folder is None or given.minutes is None:
+        _parser().error("--minutes and --folder are needed to run a piece")
+    if not 0.0 < given.minutes <= LONGEST:
+        _parser().error(f"--minutes must be above 0 and at most {LONGEST:g}")
+    if len(given.journal) > 1 or given.journal[0].suffix == COMPRESSED:
+        _parser().error("a piece is appended to one --journal, and not to a compressed one")
+    seconds = 60.0 * given.minutes
+    with stop_on_interrupt() as stop:
+        told = reporter(quiet=given.json)
+        run_piece(given.folder, given.journal[0], seconds, given.rate, stop, told)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m tests.endurance",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--journal", type=Path, required=True, help="JSON lines; appended to")
+    parser.add_argument(
+        "--journal", type=Path, required=True, nargs="+", help="JSON lines; appended to"
+    )
     parser.add_argument("--minutes", type=float, help="how long this piece takes, 90 at most")
     parser.add_argument("--folder", type=Path, help="where campaigns are made")
     parser.add_argument(
@@ -92,8 +112,9 @@ def _lines(verdict: Verdict) -> list[str]:
         f", {', '.join(figures['scheduling'])}",
         f"processor: {figures['processor_share']} of a core",
         f"campaigns: {archives['campaigns']} ({archives['complete']} complete, "
-        f"{archives['restarts']} restarts), {archives['motions']} motions, "
-        f"{archives['archives']} archives {archives['outcomes']}, {archives['records']} records",
+        f"{archives['given_up']} given up, {archives['restarts']} restarts), "
+        f"{archives['motions']} motions, {archives['archives']} archives {archives['outcomes']}, "
+        f"{archives['records']} records",
         f"exchange: {latency['answered']} answered, {latency['missed']} missed, "
         f"{latency['late']} late, longest {latency['worst_us']:.0f} µs",
         "",

@@ -7,6 +7,7 @@ torn one, which is passed over. `begin` and `end` enclose a piece; one without a
 from __future__ import annotations
 
 import json
+import lzma
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+COMPRESSED: Final = ".xz"
+"""End of the name of a journal that is kept small; nothing is appended to it any more."""
 SYNC_EVERY: Final = 60.0
 """s between two waits for the disk."""
 
@@ -84,6 +87,11 @@ class Ran:
     records_lost: int
     descriptors: Mapping[str, int]
 
+    @property
+    def given_up(self) -> bool:
+        """Whether it was left incomplete, and nobody had asked for that."""
+        return not (self.complete or self.stopped)
+
 
 @dataclass(frozen=True)
 class Piece:
@@ -139,24 +147,51 @@ class Journal:
         os.close(self._fd)
 
 
+class ForeignError(ValueError):
+    """A file that is no journal of a long run, in a sentence."""
+
+
 def read_journal(path: Path) -> list[Piece]:
-    """All pieces of a journal; none if there is no such file."""
+    """All pieces of a journal; none if there is no such file.
+
+    Args:
+        path: of the file; where its name ends in `.xz` it is compressed.
+
+    Raises:
+        ForeignError: it cannot be read, or a line of it is none of ours.
+    """
     pieces: list[Piece] = []
-    for line in path.read_bytes().splitlines() if path.exists() else ():
+    try:
+        content = path.read_bytes() if path.exists() else b""
+        if content and path.suffix == COMPRESSED:
+            content = lzma.decompress(content)
+    except (OSError, lzma.LZMAError) as error:
+        raise ForeignError(f"{path} cannot be read: {error}") from error
+    for place, line in enumerate(content.splitlines(), 1):
         try:
             facts = json.loads(line)
         except ValueError:
             continue  # torn by a kill
-        kind = facts.pop("kind")
-        if kind == "begin":
-            pieces.append(Piece(facts))
-        elif kind == "link":
-            pieces[-1] = replace(pieces[-1], begun={**pieces[-1].begun, **facts})
-        elif kind == "sample":
-            used = {name: Use(**use) for name, use in facts.pop("processes").items()}
-            pieces[-1].samples.append(Sample(processes=used, **facts))
-        elif kind == "campaign":
-            pieces[-1].campaigns.append(Ran(**facts))
-        elif kind == "end":
-            pieces[-1] = replace(pieces[-1], ended=facts)
+        try:
+            _take(facts, pieces)
+        except (AttributeError, IndexError, KeyError, TypeError) as error:
+            raise ForeignError(f"{path}, line {place} is none of a long run's journal") from error
     return pieces
+
+
+def _take(facts: dict[str, Any], pieces: list[Piece]) -> None:
+    """Take a line into the pieces that were read so far."""
+    kind = facts.pop("kind")
+    if kind == "begin":
+        pieces.append(Piece(facts))
+    elif kind == "link":
+        pieces[-1] = replace(pieces[-1], begun={**pieces[-1].begun, **facts})
+    elif kind == "sample":
+        used = {name: Use(**use) for name, use in facts.pop("processes").items()}
+        pieces[-1].samples.append(Sample(processes=used, **facts))
+    elif kind == "campaign":
+        pieces[-1].campaigns.append(Ran(**facts))
+    elif kind == "end":
+        pieces[-1] = replace(pieces[-1], ended=facts)
+    else:
+        raise KeyError(kind)

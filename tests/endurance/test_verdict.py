@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +59,8 @@ def piece(
                 latencies=counts.tolist(),
             )
         )
-    return Piece({"scheduling": "SCHED_FIFO 50"}, samples, [ran(n) for n in range(3)], {})
+    begun = {"scheduling": "SCHED_FIFO 50", "machine": "2 cores, Linux"}
+    return Piece(begun, samples, [ran(n) for n in range(3)], {"reason": "", "supervisor": 0})
 
 
 def ran(number: int) -> Ran:
@@ -113,7 +114,7 @@ def test_a_run_that_is_too_short_says_so(sound: list[Piece]) -> None:
     short = replace(sound[0], samples=sound[0].samples[:40])
     verdict = judge([short])
     assert verdict.faults == []
-    assert sum("too short to tell" in text for text in verdict.doubts) == len(PROCESSES) + 1
+    assert sum("too short to tell" in text for text in verdict.doubts) == len(PROCESSES) + 2
 
 
 @pytest.mark.parametrize("since", [60.0, 900.0])
@@ -189,6 +190,7 @@ def test_a_killed_piece_leaves_its_journal(
     with Journal(path) as journal:
         journal.add("begin", rate=1000)
         journal.add("link", scheduling="ordinary", notes=[], t=1.0)
+        journal.add("campaign", **asdict(ran(0)))
         journal.add("end", reason="interrupted", supervisor=0, controller=None)
     first, second = read_journal(path)
     assert first.ended is None

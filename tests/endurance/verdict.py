@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.stats import mannwhitneyu
 
+from tests.endurance.course import judge_course
 from tests.endurance.journal import Piece, Sample
 from tests.endurance.trends import Slope, largest_rise, quantile, slope
 
@@ -30,6 +31,8 @@ RARE: Final = 0.01
 BLOCK: Final = 10
 """Minutes at each end of a piece that are compared as well: a change some time before the end shows
 there and not in two minutes."""
+BUSIER: Final = 0.5
+"""By which a load has to be larger to explain that answers are slower."""
 BIN: Final = 2.0**0.25
 """Ratio of two latencies that the exchange's own histogram just tells apart."""
 
@@ -133,10 +136,7 @@ def judge(pieces: Sequence[Piece]) -> Verdict:
         "scheduling": sorted({str(piece.begun.get("scheduling")) for piece in pieces}),
         "processor_share": _processor_share(pieces),
     }
-    for number, piece in enumerate(pieces, 1):
-        reason = (piece.ended or {}).get("reason", "")
-        if reason not in ("", "interrupted"):
-            faults.append(f"piece {number} ended early: {reason}")
+    judge_course(pieces, WARM_UP, faults, doubts)
     figures["memory"] = _judge_memory(pieces, faults, doubts)
     figures["descriptors"] = _judge_descriptors(pieces, faults, doubts)
     figures["archives"] = _judge_archives(pieces, faults)
@@ -223,6 +223,7 @@ def _judge_archives(pieces: Sequence[Piece], faults: list[str]) -> dict[str, Any
     return {
         "campaigns": len(ran),
         "complete": sum(one.complete for one in ran),
+        "given_up": sum(one.given_up for one in ran),
         "restarts": sum(len(one.restarts) for one in ran),
         "motions": sum(one.motions for one in ran),
         "archives": sum(one.archives for one in ran),
@@ -250,7 +251,7 @@ def _judge_latency(pieces: Sequence[Piece], faults: list[str], doubts: list[str]
             _judge_ends(f"piece {number}: {name} of the latency", one, chance, faults, doubts)
     return {
         "pieces": of_pieces,
-        "ratio_in_4_h": _trends(every, faults),
+        "ratio_in_4_h": _trends(every, faults, doubts),
         "minutes": [[asdict(one) for one in minutes] for minutes in every],
         "worst_us": max(
             (s.counters["worst_turnaround_us"] for p in pieces for s in p.samples[-1:]), default=0.0
@@ -295,7 +296,7 @@ def _judge_ends(
     block = one["block_chance"] < chance and one["last_block_us"] > BIN * one["first_block_us"]
     for found, key, words in ((minute, "", "minute"), (block, "_block", f"{BLOCK} minutes")):
         if found:
-            busier = one[f"last{key}_load"] > one[f"first{key}_load"] + 0.5
+            busier = one[f"last{key}_load"] > one[f"first{key}_load"] + BUSIER
             (doubts if busier else faults).append(
                 f"{what} is {one[f'last{key}_us']:.0f} µs in its last {words} and "
                 f"{one[f'first{key}_us']:.0f} µs in its first, at loads of "
@@ -303,9 +304,13 @@ def _judge_ends(
             )
 
 
-def _trends(every: Sequence[Sequence[Minute]], faults: list[str]) -> dict[str, dict[str, float]]:
-    """By how much each quantile grows in `LONG`, as a factor."""
+def _trends(
+    every: Sequence[Sequence[Minute]], faults: list[str], doubts: list[str]
+) -> dict[str, dict[str, float]]:
+    """By how much each quantile grows in `LONG`, as a factor; a load that grows explains it."""
     trends = {}
+    rises = [_rise_of_load(minutes) for minutes in every if len(minutes) >= 2 * BLOCK]
+    busier = bool(rises) and float(np.median(rises)) > BUSIER
     for name in SHARES:
         logs = [np.log2([one.quantiles[name] for one in minutes]) for minutes in every]
         found = slope([(np.arange(len(one)) / 60.0, one) for one in logs], CONFIDENCE)
@@ -313,8 +318,18 @@ def _trends(every: Sequence[Sequence[Minute]], faults: list[str]) -> dict[str, d
         trends[name] = factors
         long_enough = sum(len(one) for one in logs) >= 2 * BLOCK
         if long_enough and factors["low"] > BIN:
-            faults.append(f"{name} of the latency grows {factors['value']:.2f}-fold in {LONG:g} h")
+            grows = f"{name} of the latency grows {factors['value']:.2f}-fold in {LONG:g} h"
+            if busier:
+                doubts.append(f"{grows}, as the load grew by {np.median(rises):.1f}")
+            else:
+                faults.append(grows)
     return trends
+
+
+def _rise_of_load(minutes: Sequence[Minute]) -> float:
+    """From the first block of a piece to its last."""
+    early, late = ([one.load for one in part] for part in (minutes[:BLOCK], minutes[-BLOCK:]))
+    return float(np.median(late) - np.median(early))
 
 
 def _factor(doublings: float) -> float:
