@@ -7,7 +7,7 @@ Each must give a named error, or what it gave before, or say in words what was l
 (`tests/disk/laws.py`).
 
 Rounds in the journal are not run again. A failure is printed with the command that repeats it. The
-exit code is 1 if a law was broken in any round of the journal.
+exit code is 1 if a law was broken in any round of the journal, 2 if the journal is none of these.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import random
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -75,21 +75,36 @@ def appending(path: Path | None) -> Iterator[int]:
 
 
 def known(path: Path | None) -> dict[int, dict[str, object]]:
-    """Rounds of a journal by number."""
+    """Rounds of a journal by number.
+
+    Raises:
+        ValueError: it cannot be read, or a line is no result of a round.
+    """
     found: dict[int, dict[str, object]] = {}
-    for line in path.read_text().splitlines() if path is not None and path.exists() else ():
+    if path is None or not path.exists():
+        return found
+    try:
+        lines = path.read_text("utf-8", "replace").splitlines()
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    for place, line in enumerate(lines, 1):
         try:
             entry = json.loads(line)
         except ValueError:
             continue  # torn by a kill
-        found[entry["round"]] = entry
+        try:
+            found[int(entry["round"])] = {name: entry[name] for name in ("round", "harm", "broken")}
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}, line {place} is no result of a round") from error
     return found
 
 
-def run(given: argparse.Namespace) -> dict[int, dict[str, object]]:
-    """The rounds that are asked for, those in the journal among them."""
-    rounds = known(given.journal)
-    left = [n for n in range(given.start, given.start + given.rounds) if n not in rounds]
+def run(
+    given: argparse.Namespace, before: Mapping[int, dict[str, object]]
+) -> dict[int, dict[str, object]]:
+    """The rounds that are asked for, without those that were run before."""
+    rounds: dict[int, dict[str, object]] = {}
+    left = [n for n in range(given.start, given.start + given.rounds) if n not in before]
     if not left:
         return rounds
     tell = reporter(quiet=given.json)
@@ -129,7 +144,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, help="where a temporary folder is made")
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
     given = parser.parse_args(arguments)
-    rounds = run(given)
+    try:
+        rounds = known(given.journal)
+    except ValueError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    rounds |= run(given, rounds)
     failed = sorted(number for number, one in rounds.items() if one["broken"])
     kinds = Counter(str(one["harm"]).partition(" in ")[0] for one in rounds.values())
     facts = {"ran": len(rounds), "failed": len(failed), "seeds_failed": failed}

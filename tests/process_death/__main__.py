@@ -9,7 +9,11 @@ next run complete the campaign? The number of a round is its seed.
     python -m tests.process_death --rounds 1 --start 417      # this one again
 
 Rounds that the journal knows are not run again, so the first command may be interrupted and
-repeated. Exit status 1 if a law was broken; the folders of such rounds are kept.
+repeated. Exit status 1 if a law was broken; the folders of such rounds are kept. Exit status 2 if
+the journal is none of these.
+
+`loss_waived` counts rounds that lost more than the bound with the archive process, by no more
+cycles than the controller had waited for it in vain just before it died.
 """
 
 from __future__ import annotations
@@ -50,7 +54,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Also where a shell has started this in the background, and ignores SIGINT.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    known = {} if given.journal is None else journal.read(given.journal)
+    try:
+        known = {} if given.journal is None else journal.read(given.journal)
+    except ValueError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
     numbers = range(given.start, given.start + given.rounds)
     wanted = [n for n in numbers if given.only in (None, drawn(n).victims[0])]
     results = [known[n] for n in wanted if n in known]
@@ -163,6 +171,7 @@ def summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "archives_torn": len(lost),
         "lost_at_most": lost[-1] if lost else 0,
         "lost_within_promise": sum(count <= PROMISED for count in lost),
+        "loss_waived": sum("waived" in one for one in results),
         "estimates_apart_at_most": max((one.get("apart", 0.0) for one in results), default=0.0),
         "seconds": sum(one["seconds"] for one in results),
         "processor_seconds": sum(one["processor"] for one in results),

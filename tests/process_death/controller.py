@@ -39,13 +39,15 @@ ROW: Final = np.dtype(
         ("phase", "u1"),
         ("replied", "?"),
         ("deserted", "?"),
+        ("lagged", "?"),
         ("rejected", "<i4"),
         ("position", "<f8", (2,)),
         ("velocity", "<f8", (2,)),
     ]
 )
 """One cycle: wire number of its packet, phase after it, whether a valid answer came, whether the
-exchange process was found dead, answers rejected so far, and the plant's joints after it [rad,
+exchange process was found dead, whether the archive process was waited for in vain before it was
+sent, answers rejected so far, and the plant's joints after it [rad,
 rad/s]."""
 CAPACITY: Final = 40_000
 _HEADER: Final = 128
@@ -154,7 +156,7 @@ class WaitingEnd:
 
     def __init__(self, host: str, port: int, page: Page) -> None:
         self.number = 0
-        self.deserted = False
+        self.deserted = self.lagged = False
         self._link, self._port, self._page = UdpFarEnd(host, port), port, page
         self._exchange, self._archive = _Life(), _Life()
         self._began = False
@@ -166,7 +168,7 @@ class WaitingEnd:
         while not (self._began or self._page.given_up):
             self._began = listening(self._port)
             time.sleep(0.005)
-        self._wait_for_archive()
+        self.lagged = self._wait_for_archive()
         self._link.send(packet)
 
     def receive(self, timeout: float) -> bytes | None:
@@ -186,14 +188,15 @@ class WaitingEnd:
         """Close the link."""
         self._link.close()
 
-    def _wait_for_archive(self) -> None:
+    def _wait_for_archive(self) -> bool:
+        """Until the archive process is not far behind; whether that was in vain."""
         page = self._page
         if not page.archive or self.deserted:
-            return
+            return False
         if self._progress is None:
             with suppress(OSError):
                 self._progress = ArchivedSoFar(page.exchange)
-            return
+            return False
         until = time.monotonic() + LONGEST_LAG
         while (
             self._progress.begun
@@ -202,8 +205,9 @@ class WaitingEnd:
         ):
             if time.monotonic() > until or self._exchange.over(page.exchange):
                 page.lag()
-                return
+                return True
             time.sleep(0.0005)
+        return False
 
 
 class _Wishes(Buttons):
@@ -241,7 +245,7 @@ def serve(cell: Cell, played: Round, page: Page) -> None:
         plant = controller.plant
         rejected = controller.rejected_replies + tally.rejected
         page.add((
-            end.number, controller.phase, replied, end.deserted, rejected,
+            end.number, controller.phase, replied, end.deserted, end.lagged, rejected,
             plant.position, plant.velocity,
         ))  # fmt: skip
 

@@ -5,24 +5,32 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+NEEDED: Final = ("round", "broken", "seconds", "processor")
+"""What every result has, however its round ended; a line without is of another kind of journal."""
 
 
 def read(path: Path) -> dict[int, dict[str, Any]]:
     """Results by round; a last line that was not ended is torn, and left out.
 
     Raises:
-        ValueError: a line is no result.
+        ValueError: it cannot be read, or a line is no result.
     """
     if not path.exists():
         return {}
     results: dict[int, dict[str, Any]] = {}
-    lines = path.read_text("utf-8").splitlines(keepends=True)
+    try:
+        lines = path.read_text("utf-8", "replace").splitlines(keepends=True)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
     if lines and not lines[-1].endswith("\n"):
         lines.pop()
     for place, line in enumerate(lines):
         try:
             result = json.loads(line)
+            if missing := [name for name in NEEDED if name not in result]:
+                raise KeyError(*missing)
             results[int(result["round"])] = result
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}, line {place + 1} is no result of a round") from error

@@ -148,9 +148,8 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
             result["apart"] = apart
             if apart > stage.undisturbed.bound:
                 broken.append(f"the estimate is another one (squared distance {apart:.1f})")
-    except (
-        Exception
-    ) as error:  # whatever it is, this round is to be looked at, and the others go on
+    except Exception as error:
+        # Whatever it is, this round is to be looked at, and the others go on.
         broken = [f"{type(error).__name__}: {error}"]
         (folder / "error.txt").write_text(traceback.format_exc())
     now = os.times()

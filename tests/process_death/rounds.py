@@ -37,11 +37,12 @@ class Trigger:
     """When the first victim dies.
 
     Attributes:
-        moment: what is waited for: the `start` of the supervisor, a `cycle` of the controller, an
-            `archive` that is created, one that is `entered` in the manifest, a `state` of the
-            exchange.
-        count: which cycle, or which archive, entry or time that the state was entered.
+        moment: what is waited for: the `start` of the supervisor, a `cycle` of the controller, a
+            `motion` that has come some way, an `archive` that is created, one that is `entered` in
+            the manifest, a `state` of the exchange.
+        count: which cycle, or which motion, archive, entry or time that the state was entered.
         delay: s from then to the kill.
+        way: s of its own time that a motion has come, where one is waited for.
         state: of the session, where one is waited for.
     """
 
