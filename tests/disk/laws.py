@@ -18,7 +18,7 @@ from hil.archive.check import check_archive
 from hil.batch.run import Plan, reidentify
 from hil.batch.workers import Workers
 from hil.compare import gather
-from hil.errors import HilError
+from hil.errors import HilError, InputError
 from hil.identify import Identification, identify_archives, identify_campaign
 from hil.plots.archive_view import view_of
 from hil.progress import Silent
@@ -79,27 +79,40 @@ def broken(
             which knows their checksums.
         workers: for a batch of the folder and its comparison with itself; None: without them.
     """
+
+    def named(what: Callable[[], Iterator[str]]) -> Iterator[str]:
+        return _named(what, truth, harmed)
+
     for path in harmed:
-        yield from _named(lambda path=path: _reads(truth, path))  # type: ignore[misc]
-        yield from _named(lambda path=path: _checks(truth, path))  # type: ignore[misc]
-        yield from _named(lambda path=path: _looks(truth, path))  # type: ignore[misc]
+        yield from named(lambda path=path: _reads(truth, path))  # type: ignore[misc]
+        yield from named(lambda path=path: _checks(truth, path))  # type: ignore[misc]
+        yield from named(lambda path=path: _looks(truth, path))  # type: ignore[misc]
     identifies = _identifies_campaign if number % 2 else _identifies
     if any(path in truth.paths for path in harmed):  # moves are never read for it
-        yield from _named(lambda: identifies(truth, harmed))
+        yield from named(lambda: identifies(truth, harmed))
     if workers is not None:
-        yield from _named(lambda: _pools(truth, harmed, workers))
-        yield from _named(lambda: _compares(truth, harmed, workers))
+        yield from named(lambda: _pools(truth, harmed, workers))
+        yield from named(lambda: _compares(truth, workers))
 
 
-def _named(what: Callable[[], Iterator[str]]) -> Iterator[str]:
-    """What a reader breaks; an error of ours that names the file or folder breaks nothing."""
+def _named(
+    what: Callable[[], Iterator[str]], truth: Undamaged, harmed: Sequence[Path]
+) -> Iterator[str]:
+    """What a reader breaks; an error of ours that blames what was damaged breaks nothing."""
     try:
         yield from what()
     except HilError as error:
-        if ".mcap" not in str(error) and "/" not in str(error):
-            yield f"an error that names no file: {error}"
+        if not _blames(str(error), truth, harmed):
+            yield f"an error that names nothing that was damaged: {error}"
     except Exception as error:
         yield f"an undocumented {type(error).__name__}: {error}"
+
+
+def _blames(text: str, truth: Undamaged, harmed: Sequence[Path]) -> bool:
+    """Whether a sentence names a damaged archive, or their folder and no other archive."""
+    if any(path.name in text for path in harmed):
+        return True
+    return str(truth.root) in text and not any(path.name in text for path in truth.files)
 
 
 def _reads(truth: Undamaged, path: Path) -> Iterator[str]:
@@ -147,7 +160,7 @@ def _as_before(
     truth: Undamaged, harmed: Sequence[Path], found: Identification, what: str
 ) -> Iterator[str]:
     before, now = truth.loose.estimate.pooled, found.estimate.pooled
-    if np.allclose(before.values, now.values, rtol=SAME, atol=0.0):
+    if _alike(before.values, now.values):
         return
     said = [*found.results.notes, *found.results.verdict.doubts]
     if not any(path.name in text for path in harmed for text in said):
@@ -155,10 +168,18 @@ def _as_before(
     yield from _within(before.values, before.std, now.values, now.std, what)
 
 
+def _alike(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Whether two estimates are the same; of other parameters they are not."""
+    return one.shape == other.shape and np.allclose(one, other, rtol=SAME, atol=0.0)
+
+
 def _within(
     before: NDArray[Any], std: NDArray[Any], now: NDArray[Any], other: NDArray[Any], what: str
 ) -> Iterator[str]:
-    """Damage takes samples away: what is left estimates the same parameters."""
+    """Damage takes samples away: what is left estimates the same parameters.
+
+    Too little may be left for all of them; that it is another estimate has to be said then, too.
+    """
     if before.shape != now.shape:
         return
     apart = np.abs(now - before) / np.hypot(std, other)
@@ -166,6 +187,7 @@ def _within(
         yield f"{what}: an estimate {np.nanmax(apart):.1f} standard deviations from that before"
 
 
+ALONE = "is the only campaign"
 SAME = 1e-9
 """Relative difference of two sums of the same terms in another order."""
 APART = 5.0
@@ -189,17 +211,22 @@ def _by_archive(
 def _pools(truth: Undamaged, harmed: Sequence[Path], workers: Workers) -> Iterator[str]:
     found, said = _by_archive(truth.root, workers)
     same = found.keys() == truth.batch.keys() and all(
-        np.allclose(found[name][0], truth.batch[name][0], rtol=SAME, atol=0.0) for name in found
+        _alike(found[name][0], truth.batch[name][0]) for name in found
     )
     if not same and not any(path.name in text for path in harmed for text in said):
         yield f"batch: another estimate, and nothing is said of {harmed[0].name}"
     yield from _within(*truth.batch[""], *found[""], "batch")
 
 
-def _compares(truth: Undamaged, harmed: Sequence[Path], workers: Workers) -> Iterator[str]:
-    """Of one campaign alone `hil compare` makes nothing, and says what is broken in it."""
-    gather([str(truth.root)], workers, Silent())
-    yield "compare: one campaign was compared"
+def _compares(truth: Undamaged, workers: Workers) -> Iterator[str]:
+    """Of one campaign alone `hil compare` makes nothing, says so, and names it."""
+    try:
+        gather([str(truth.root)], workers, Silent())
+    except InputError as error:
+        if not str(error).startswith(f"{truth.root}: {ALONE}"):
+            yield f"compare: of one campaign it says: {error}"
+    else:
+        yield "compare: one campaign was compared"
 
 
 def _same(one: Archive, other: Archive) -> bool:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import builtins
 import importlib.util
+import io
 import json
 import os
+import stat
 import subprocess
 import sys
 import tempfile
@@ -172,7 +175,10 @@ def _path(where: object) -> Path | None:
 
 
 def plant(disk: PlantedDisk) -> ExitStack:
-    """Put a disk under the functions of `os` that write, create, flush and rename."""
+    """Put a disk under the functions that write, create, flush and rename.
+
+    These are some of `os`, and `open`.
+    """
 
     def met(
         name: str, operation: str, which: int = 0, when: Callable[..., bool] = lambda *_: True
@@ -188,8 +194,8 @@ def plant(disk: PlantedDisk) -> ExitStack:
 
     functions: Sequence[tuple[str, Callable[..., Any]]] = (
         ("write", met("write", WRITE)),
-        ("fsync", met("fsync", SYNC)),
-        ("fdatasync", met("fdatasync", SYNC)),
+        ("fsync", met("fsync", SYNC, when=_is_file)),
+        ("fdatasync", met("fdatasync", SYNC, when=_is_file)),
         ("rename", met("rename", RENAME, which=1)),
         ("replace", met("replace", RENAME, which=1)),
         ("open", met("open", CREATE, when=lambda _path, flags, *_: bool(flags & os.O_CREAT))),
@@ -197,7 +203,44 @@ def plant(disk: PlantedDisk) -> ExitStack:
     undo = ExitStack()
     for name, function in functions:
         undo.enter_context(patch.object(os, name, function))
+    for module in (io, builtins):  # the first is what `Path.open` calls
+        undo.enter_context(patch.object(module, "open", _opening(disk, io.open)))
     return undo
+
+
+def _is_file(descriptor: int) -> bool:
+    """Not a folder: whose names are flushed where its file system can do that, and else not."""
+    return stat.S_ISREG(os.fstat(descriptor).st_mode)
+
+
+class _Raw(io.FileIO):
+    """A file that asks the disk before it writes: `FileIO` does not call `os.write`."""
+
+    def __init__(self, disk: PlantedDisk, path: Path, mode: str) -> None:
+        self._disk, self._path = disk, path
+        super().__init__(path, mode)
+
+    def write(self, data: Any, /) -> int | None:
+        self._disk.meet(WRITE, self._path)
+        return super().write(data)
+
+
+def _opening(disk: PlantedDisk, true: Callable[..., Any]) -> Callable[..., Any]:
+    """As `open`: a file that is made on this disk, or written to, asks it before."""
+
+    def function(file: Any, mode: str = "r", *arguments: Any, **named: Any) -> Any:
+        path = None if isinstance(file, int) else _path(file)
+        if path is None or not set(mode) & set("wax") or not path.is_relative_to(disk.root):
+            return true(file, mode, *arguments, **named)
+        disk.meet(CREATE, path)
+        raw = _Raw(disk, path, mode.replace("b", "").replace("t", ""))
+        buffered = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
+        if "b" in mode:
+            return buffered
+        words = {key: named[key] for key in ("encoding", "errors", "newline") if key in named}
+        return io.TextIOWrapper(buffered, **words)
+
+    return function
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,7 +13,7 @@ from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import repair
 from hil.batch.local import LocalWorkers
-from hil.errors import ArchiveError
+from hil.errors import ArchiveError, InputError
 from hil.identify import identify_archives
 from hil.progress import Silent
 from tests.disk.damage import campaign, main, play
@@ -142,3 +143,68 @@ def test_a_foreign_journal_is_told_of_in_a_sentence(
     assert path.read_bytes() == content
     assert main(["--rounds", "1", "--journal", str(tmp_path)]) == 2
     assert f"error: {tmp_path} cannot be read" in capsys.readouterr().err
+
+
+HARMED = "archives/excitation_000_a1.mcap"
+
+
+@pytest.mark.parametrize(
+    ("text", "passes"),
+    [
+        (f"/elsewhere/{HARMED}: the chunk at 3 is torn", True),
+        ("{root}: an archive has another checksum", True),
+        ("something in A/s is odd", False),
+        ("an .mcap file is odd", False),
+        ("{root}/archives/excitation_001_a1.mcap: the chunk at 3 is torn", False),
+    ],
+)
+def test_an_error_has_to_blame_what_was_damaged(
+    truth: Undamaged, monkeypatch: pytest.MonkeyPatch, text: str, passes: bool
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise ArchiveError(None, text.format(root=truth.root))
+
+    monkeypatch.setattr("tests.disk.laws.open_archive", refused)
+    monkeypatch.setattr("tests.disk.laws.check_archive", refused)
+    monkeypatch.setattr("tests.disk.laws.view_of", refused)
+    monkeypatch.setattr("tests.disk.laws.identify_archives", refused)
+    laws = list(broken(truth, [truth.root / HARMED], 0))
+    assert all("names nothing that was damaged" in law for law in laws)
+    assert bool(laws) is not passes
+
+
+def test_an_estimate_of_other_parameters_has_to_be_told_of(
+    truth: Undamaged, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = identify_archives(truth.paths, Silent())
+    pooled = whole.estimate.pooled
+    fewer = replace(pooled, values=pooled.values[1:])
+    found = SimpleNamespace(estimate=SimpleNamespace(pooled=fewer), results=whole.results)
+    monkeypatch.setattr("tests.disk.laws.identify_archives", lambda *_: found)
+    path = excitations(truth)[0]
+    (law,) = broken(truth, [path], 0)
+    assert law == f"identify: another estimate, and nothing is said of {path.name}"
+
+
+@pytest.mark.parametrize(
+    ("said", "found"),
+    [
+        (None, "one campaign was compared"),
+        ("{root}: is the only campaign that was named", ""),
+        ("{root}: is of another arm", "it says: "),
+        ("nothing was given", "it says: "),
+    ],
+)
+def test_a_comparison_of_one_campaign_has_to_say_so(
+    truth: Undamaged, monkeypatch: pytest.MonkeyPatch, said: str | None, found: str
+) -> None:
+    def gathered(*_: object) -> None:
+        if said is not None:
+            raise InputError(None, said.format(root=truth.root))
+
+    monkeypatch.setattr("tests.disk.laws.gather", gathered)
+    monkeypatch.setattr("tests.disk.laws._pools", lambda *_: iter(()))
+    move = next(path for path in sorted(truth.files) if path.name.startswith("move"))
+    with LocalWorkers(1) as workers:
+        laws = list(broken(truth, [move], 0, workers))
+    assert [found in law for law in laws] == ([True] if found else [])

@@ -36,12 +36,14 @@ MOST: Final = PROMISED - 1 + 2 * LAG
 since the last one, the controller waits for it each time after `LAG` of them. `LAG` cannot be less:
 the process may look every 10 records as long as no chunk is due."""
 COMPARED: Final = ("number", "position", "target_current", "commanded_position", "state", "gap")
+GONE: Final = ("ended", "is gone", "cannot be started")
 NAMED: Final = {
-    "exchange": ("exchange process", "controller"),
-    "archive": ("archive process",),
+    "exchange": tuple(f"the exchange process {what}" for what in GONE),
+    "archive": tuple(f"the archive process {what}" for what in GONE),
     "controller": ("controller", "link", "silent", "nothing heard", "packet"),
 }
-"""Words of which one at least stands in the error of a supervisor that survived one of these."""
+"""Words of which one at least stands in the error of a supervisor that survived one of these. Of
+its own processes it knows that they are dead, and blames nobody else."""
 
 
 @dataclass(frozen=True, eq=False)
