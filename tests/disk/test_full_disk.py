@@ -11,8 +11,11 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -86,15 +89,25 @@ def hil(*words: object) -> Result:
 
 
 def require_told(result: Result, disk: Disk, *places: str) -> None:
-    """An error of ours: a path on that disk, what is wrong with it, and a documented status."""
+    """An error of ours: a path on that disk, what is wrong with it, and a documented status.
+
+    Args:
+        result: of the command.
+        disk: that is full.
+        places: folders and files on it of which one, or something in it, cannot be written.
+    """
     error = result.exception
     if isinstance(error, SystemExit):  # of several files, said by the command itself
-        assert "No space left on device" in result.output
-        return
-    assert isinstance(error, HilError), f"{error!r}\n{result.output}"
-    assert error.exit_code in (1, 2)
-    assert "No space left on device" in str(error)
-    assert any(place in str(error) for place in places), str(error)
+        said = [line for line in result.output.splitlines() if line.startswith("error: ")]
+        text = said[0].removeprefix("error: ") if said else result.output
+        assert error.code in (1, 2), text
+    else:
+        assert isinstance(error, HilError), f"{error!r}\n{result.output}"
+        assert error.exit_code in (1, 2)
+        text = str(error)
+    assert "No space left on device" in text, text
+    blamed = Path(text.partition(": ")[0]).resolve()
+    assert any(blamed.is_relative_to(disk.root.resolve() / place) for place in places), text
 
 
 def sums(campaign: Campaign) -> dict[str, str]:
@@ -167,6 +180,19 @@ STAGES: dict[str, tuple[str, ...]] = {
     "new": ("new", "--urdf", "campaign/robot.urdf", "--output", "new.toml", "--force"),
 }
 """What else leaves something on the disk: command and arguments, paths of which lie there."""
+WRITTEN: dict[str, tuple[str, ...]] = {
+    "design": ("designed",),
+    "compare": ("pages", "campaign", "second"),
+    "study": ("study", "campaign", "second"),
+    "rehearse": ("campaign",),
+    "identify": ("campaign",),
+    "report": ("campaign",),
+    "reidentify": ("batch", "campaign"),
+    "plot": ("plot.png",),
+    "repair": ("excitation_000_a1_repaired.mcap",),
+    "new": ("new.toml",),
+}
+"""Where each of them writes; sums of archives are kept beside these."""
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +234,7 @@ def test_every_command_says_that_the_disk_is_full_and_works_once_it_is_not(
     disk.empty()
     assert sums(campaign) == whole
     if full.exit_code or full.exception:
-        require_told(full, disk, "")
+        require_told(full, disk, *WRITTEN[stage])
     else:
         assert left, "nothing can be written where nothing is left"
     again = hil(*STAGES[stage], *_on_with_it(stage, disk, full))
@@ -258,3 +284,22 @@ def test_a_campaign_that_cannot_be_made_leaves_nothing(disk: Disk, campaign: Cam
         Campaign.create(disk.root / "other", campaign.cell, campaign.plan)
     disk.empty()
     Campaign.create(disk.root / "other", campaign.cell, campaign.plan)
+
+
+@pytest.mark.parametrize(
+    ("text", "passes"),
+    [
+        ("{root}/campaign/archives/a.mcap: cannot be written further: {full}", True),
+        ("/elsewhere/campaign/archives/a.mcap: cannot be written further: {full}", False),
+        ("{root}/second: cannot be written to ({full})", False),
+        ("the campaign cannot go on: {full}", False),
+        ("{root}/campaign: cannot be written to", False),
+    ],
+)
+def test_an_error_has_to_name_what_on_the_disk_cannot_be_written(
+    tmp_path: Path, text: str, passes: bool
+) -> None:
+    told = HilError(text.format(root=tmp_path, full="No space left on device"))
+    result = cast("Result", SimpleNamespace(exception=told, output=""))
+    with nullcontext() if passes else pytest.raises(AssertionError):
+        require_told(result, Disk(tmp_path), "campaign")

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -146,6 +147,32 @@ def test_a_disk_that_refuses_costs_the_motion_and_no_more(
     disk: Disk, designed: tuple[Cell, CampaignPlan]
 ) -> None:
     assert rounds(disk, designed, range(2)) >= 1
+
+
+@pytest.mark.parametrize("operation", [CREATE, WRITE])
+def test_a_manifest_that_is_refused_in_mid_campaign_is_told_of(
+    disk: Disk, designed: tuple[Cell, CampaignPlan], operation: str
+) -> None:
+    campaign = Campaign.create(disk.root / f"manifest_{operation}", *designed)
+    pass_rehearsal(campaign.folder)
+    rule = Rule((operation,), "manifest.json*", after=2, times=1, error="EIO")
+    assert refused_run(disk, campaign, rule) == [f"{operation} manifest.json.tmp"]
+
+
+def test_a_refusal_that_is_swallowed_is_found(
+    disk: Disk, designed: tuple[Cell, CampaignPlan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = Campaign.create(disk.root / "swallowed", *designed)
+    pass_rehearsal(campaign.folder)
+    true = Campaign.run
+
+    def swallowing(*arguments: Any, **named: Any) -> None:
+        with suppress(HilError):
+            true(*arguments, **named)
+
+    monkeypatch.setattr(Campaign, "run", swallowing)
+    with pytest.raises(AssertionError, match="struck, and it was told: None"):
+        refused_run(disk, campaign, Rule((WRITE,), "*.mcap", error="EIO"))
 
 
 def test_a_campaign_whose_manifest_is_refused_is_not_left_half_made(

@@ -1,0 +1,103 @@
+"""Laws about deaths, each broken by what would break it: a law that nothing can break is none."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from drivers.record import cycle_dtype
+from tests.process_death.__main__ import summary
+from tests.process_death.controller import ROW
+from tests.process_death.laws import MOST, Kept, _archived, _readable, _told
+from tests.process_death.rig import Death, Seen
+from tests.process_death.rounds import Victim
+
+CYCLES = 3000
+
+
+def seen(*victims: Victim, text: str = "", lagged: range = range(0)) -> Seen:
+    """A motion of 3000 cycles at whose end somebody died.
+
+    Args:
+        victims: who.
+        text: what the supervisor said.
+        lagged: cycles in which the archive process was waited for in vain.
+    """
+    records, rows = np.zeros(CYCLES, cycle_dtype(2)), np.zeros(CYCLES, ROW)
+    records["cycle"] = records["number"] = rows["number"] = np.arange(CYCLES)
+    records["commanded_velocity"] = 0.1
+    rows["lagged"][lagged] = True
+    deaths = [Death(victim, 1, CYCLES) for victim in victims]
+    return Seen(deaths, 4, {"text": text} if text else {}, rows, records, [], len(lagged))
+
+
+def kept(count: int, path: Path = Path("move_000_a1.mcap"), *, complete: bool = False) -> Kept:
+    """An archive of the first so many cycles."""
+    archive: Any = SimpleNamespace(complete=complete, missing="torn", outcome=None)
+    return Kept(path, cast("Any", None), archive, np.arange(count, dtype=np.int64))
+
+
+@pytest.mark.parametrize(
+    ("lost", "lagged", "allowed"),
+    [
+        (MOST, range(0), True),
+        (MOST + 1, range(0), False),
+        (MOST + 1, range(40, 90), False),  # one slow moment long before is no excuse
+        (2500, range(2999, 3000), False),  # and one just before it excuses one cycle
+        (MOST + 20, range(2960, 2980), True),
+        (MOST + 21, range(2960, 2980), False),
+    ],
+)
+def test_a_loss_is_waived_for_as_much_as_lagged_just_before_the_death(
+    lost: int, lagged: range, allowed: bool
+) -> None:
+    figures: dict[str, int] = {}
+    broken = list(_archived([kept(CYCLES - lost)], seen("archive", lagged=lagged), figures))
+    assert bool(broken) is not allowed
+    assert figures["lost"] == lost
+    assert ("waived" in figures) is (allowed and lost > MOST)
+
+
+def test_waivers_are_counted_in_the_summary() -> None:
+    one = {"round": 1, "broken": [], "seconds": 1.0, "processor": 1.0}
+    found = summary([one, one | {"lost": 90, "waived": 20}, one | {"lost": 30}])
+    assert found["loss_waived"] == 1
+    assert found["lost_within_promise"] == 1
+
+
+def test_only_the_newest_archive_may_be_torn_by_a_death(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    older, newest = tmp_path / "move_000_a1.mcap", tmp_path / "excitation_000_a1.mcap"
+    for place, path in enumerate((older, newest), 1):
+        path.touch()
+        os.utime(path, ns=(place * 10**9, place * 10**9))
+    monkeypatch.setattr("tests.process_death.laws._counted_plainly", lambda *_, **__: 7)
+    assert list(_readable(kept(7, newest), seen("archive"))) == []
+    (broken,) = _readable(kept(7, older), seen("archive"))
+    assert "move_000_a1.mcap is not complete" in broken
+    assert list(_readable(kept(7, newest), seen("exchange")))
+
+
+@pytest.mark.parametrize(
+    ("victim", "text", "true"),
+    [
+        ("exchange", "the exchange process ended; the controller gets no answers", True),
+        ("exchange", "the exchange process is gone: no such process", True),
+        ("exchange", "repetition 1 was lost: nothing was heard from the controller", False),
+        ("exchange", "the controller did not answer the exchange process", False),
+        ("archive", "the archive process ended (exit status -9); nothing was sent", True),
+        ("archive", "the disk of the archive process is full", False),
+        ("controller", "move 1 was lost: nothing was heard from the controller", True),
+        ("controller", "the exchange process ended", False),
+    ],
+)
+def test_a_supervisor_blames_who_died_and_nobody_else(
+    victim: Victim, text: str, true: bool
+) -> None:
+    assert (not list(_told(seen(victim, text=text)))) is true
