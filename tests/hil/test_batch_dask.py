@@ -174,6 +174,7 @@ def test_a_folder_that_workers_do_not_see_is_refused(workers: DaskWorkers, tmp_p
 # Workers that die, join and differ
 
 
+@pytest.mark.slow
 def test_a_worker_killed_in_mid_run_changes_no_bit(pair: Cluster) -> None:
     killed: list[int] = []
 
@@ -233,6 +234,7 @@ def test_a_worker_with_other_code_that_joins_later_computes_nothing() -> None:
     release_children()
 
 
+@pytest.mark.slow
 def test_a_cluster_that_goes_away_is_an_error_and_no_wait(tmp_path: Path) -> None:
     with running(tmp_path, workers=1) as cluster:
         workers = connected(cluster, patience=5.0)

@@ -167,6 +167,7 @@ def test_force_removes_nothing_but_a_campaign(campaign: Campaign, tmp_path: Path
     assert hil("demo", "--output", link, "--force").returncode == 2
 
 
+@pytest.mark.slow
 def test_an_archive_that_went_missing_is_named(campaign: Campaign, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(campaign.folder.root, folder)

@@ -243,6 +243,7 @@ def test_a_picture_that_cannot_be_written_is_a_warning(invoke, copied):
     assert not list(copied.glob("*.tmp"))
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_costs_journal_and_picture_but_no_motion(tmp_path):
     """As full for every file as it can be made without a disk of its own."""
     settings = tmp_path / "my.toml"

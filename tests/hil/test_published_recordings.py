@@ -52,6 +52,7 @@ def test_the_page_has_the_commands_of_three_identifications() -> None:
     assert [command.split()[0] for command in COMMANDS] == ["import", "identify"] * 3
 
 
+@pytest.mark.slow
 def test_the_ur10_in_sample(workplace: Path) -> None:
     """At most 5.15 % over all joints and every row."""
     assert fitted_by(COMMANDS[:2], workplace / "ur10").all_rows_relative_error <= 0.0515

@@ -348,6 +348,7 @@ def test_a_killed_exchange_ends_a_recording_as_lost(
     assert (outcome["outcome"], outcome["reason"]) == ("lost", "the exchange process ended")
 
 
+@pytest.mark.slow
 def test_a_hanging_archive_process_is_ended_and_answers_go_on(
     tmp_path: Path, on_udp: tuple[Path, int]
 ) -> None:

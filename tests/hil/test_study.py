@@ -196,6 +196,7 @@ def test_the_study_leaves_results_and_one_self_contained_page(
         assert paragraph.sentences
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_one_seed_is_one_study_with_any_number_of_processes_and_however_often_interrupted(
     whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell, tmp_path: Path
