@@ -59,8 +59,17 @@ def _ends_at_rest(life: Life) -> bool:
     lost, or where there was never a session to speak of.
     """
     error = life.error
+    if any(isinstance(one, KeyboardInterrupt) for one in _behind(error)):
+        return False  # the disk failed while it unwound
     if isinstance(error, MotionFailedError):
         return error.outcome == "stopped"
     ends = [event.outcome for _, event in life.events if isinstance(event, MotionEnded)]
     alone = isinstance(error, ControllerFault) or ends[-1:] in (["refused"], ["lost"])
     return error is None or (isinstance(error, HilError) and not alone)
+
+
+def _behind(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, and what was being handled when it was raised."""
+    while error is not None:
+        yield error
+        error = error.__context__
