@@ -7,8 +7,10 @@ up, so that many lines can hide few branches.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,16 +42,21 @@ def _share(found: list[dict[str, int]], reached: str, all_of_them: str) -> float
     return 100.0 * sum(one[reached] for one in found) / total if total else 100.0
 
 
-def main(path: str, *packages: str) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Print them; returns the exit status."""
-    report = json.loads(Path(path).read_text("utf-8"))
-    least = 100.0
-    for package in packages:
-        lines, branches = figures(report, package)
-        least = min(least, lines, branches)
+    parser = argparse.ArgumentParser(prog="python -m tests.coverage_figures", description=__doc__)
+    parser.add_argument("file", type=Path, help="what `coverage json` has written")
+    parser.add_argument("packages", nargs="+")
+    given = parser.parse_args(arguments)
+    try:
+        report = json.loads(given.file.read_text("utf-8"))
+        found = {package: figures(report, package) for package in given.packages}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        parser.error(f"{given.file} cannot be used: {error}")
+    for package, (lines, branches) in found.items():
         sys.stdout.write(f"{package}: {lines:.1f} % of lines, {branches:.1f} % of branches\n")
-    return int(least < LEAST)
+    return int(min(min(shares) for shares in found.values()) < LEAST)
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    sys.exit(main())

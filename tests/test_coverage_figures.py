@@ -24,10 +24,21 @@ def test_many_lines_do_not_hide_few_branches(
 ) -> None:
     path = tmp_path / "coverage.json"
     path.write_text(json.dumps(report(branches)))
-    assert main(str(path), "drivers") == status
+    assert main([str(path), "drivers"]) == status
     assert "96.0 % of lines" in capsys.readouterr().out
 
 
 def test_a_package_that_was_not_measured_is_named() -> None:
     with pytest.raises(ValueError, match="no file of planner"):
         figures(report(200), "planner")
+
+
+def test_what_is_no_report_is_told_in_a_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.txt").write_text("[1]")
+    for name in ("notes.txt", "nowhere.json"):
+        with pytest.raises(SystemExit) as ended:
+            main([str(tmp_path / name), "drivers"])
+        assert ended.value.code == 2
+        assert f"{name} cannot be used" in capsys.readouterr().err
