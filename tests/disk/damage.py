@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import random
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from hil.batch.local import LocalWorkers
 from hil.batch.workers import Workers
@@ -30,6 +29,8 @@ from hil.progress import reporter
 from tests.disk.harm import draw
 from tests.disk.laws import Undamaged, broken, undamaged
 from tests.hil.fast_cell import fast_campaign, fast_cell
+from tests.journal import Journal, JournalError
+from tests.journal import rounds as known
 
 EVERY = 10
 """Rounds of which one is pooled and compared as well."""
@@ -57,53 +58,11 @@ def play(
             path.write_bytes(truth.files[path])
 
 
-@contextmanager
-def appending(path: Path | None) -> Iterator[int]:
-    """A descriptor to append whole lines to; -1 without a journal."""
-    if path is None:
-        yield -1
-        return
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        size = os.fstat(descriptor).st_size
-        if size and os.pread(descriptor, 1, size - 1) != b"\n":
-            os.write(descriptor, b"\n")
-        yield descriptor
-    finally:
-        os.fsync(descriptor)
-        os.close(descriptor)
-
-
-def known(path: Path | None) -> dict[int, dict[str, object]]:
-    """Rounds of a journal by number.
-
-    Raises:
-        ValueError: it cannot be read, or a line is no result of a round.
-    """
-    found: dict[int, dict[str, object]] = {}
-    if path is None or not path.exists():
-        return found
-    try:
-        lines = path.read_text("utf-8", "replace").splitlines()
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    for place, line in enumerate(lines, 1):
-        try:
-            entry = json.loads(line)
-        except ValueError:
-            continue  # torn by a kill
-        try:
-            found[int(entry["round"])] = {name: entry[name] for name in ("round", "harm", "broken")}
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}, line {place} is no result of a round") from error
-    return found
-
-
 def run(
-    given: argparse.Namespace, before: Mapping[int, dict[str, object]]
-) -> dict[int, dict[str, object]]:
+    given: argparse.Namespace, before: Mapping[int, dict[str, Any]]
+) -> dict[int, dict[str, Any]]:
     """The rounds that are asked for, without those that were run before."""
-    rounds: dict[int, dict[str, object]] = {}
+    rounds: dict[int, dict[str, Any]] = {}
     left = [n for n in range(given.start, given.start + given.rounds) if n not in before]
     if not left:
         return rounds
@@ -112,7 +71,7 @@ def run(
         stop_on_interrupt() as stop,
         tempfile.TemporaryDirectory(dir=given.folder) as folder,
         LocalWorkers(1) as workers,
-        appending(given.journal) as journal,
+        Journal(given.journal) as journal,
         tell.task("damaging archives (rounds)", len(left)) as task,
     ):
         truth = campaign(Path(folder), workers)
@@ -122,8 +81,7 @@ def run(
             pooled = workers if number % EVERY == 0 else None
             words, laws = play(truth, number, pooled)
             rounds[number] = {"round": number, "harm": words, "broken": laws}
-            if journal >= 0:
-                os.write(journal, (json.dumps(rounds[number]) + "\n").encode())
+            journal.add(**rounds[number])
             for law in laws:
                 again = f"python -m tests.disk.damage --rounds 1 --start {number}"
                 sys.stderr.write(f"round {number} ({words}): {law}\n  again: {again}\n")
@@ -145,11 +103,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
     given = parser.parse_args(arguments)
     try:
-        rounds = known(given.journal)
-    except ValueError as error:
+        rounds = known(given.journal, "harm", "broken")
+        rounds |= run(given, rounds)
+    except JournalError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
-    rounds |= run(given, rounds)
     failed = sorted(number for number, one in rounds.items() if one["broken"])
     kinds = Counter(str(one["harm"]).partition(" in ")[0] for one in rounds.values())
     facts = {"ran": len(rounds), "failed": len(failed), "seeds_failed": failed}

@@ -125,26 +125,6 @@ def test_rounds_in_the_journal_are_not_run_again(
     assert '"seeds_failed": [3]' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b'{"kind": "begin", "rate": 1000}\n',
-        b'{"round": 3, "broken": [], "seconds": 9.0}\n',
-        b"[1, 2]\n",
-    ],
-)
-def test_a_foreign_journal_is_told_of_in_a_sentence(
-    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "rounds.jsonl"
-    path.write_bytes(content)
-    assert main(["--rounds", "1", "--journal", str(path)]) == 2
-    assert capsys.readouterr().err == f"error: {path}, line 1 is no result of a round\n"
-    assert path.read_bytes() == content
-    assert main(["--rounds", "1", "--journal", str(tmp_path)]) == 2
-    assert f"error: {tmp_path} cannot be read" in capsys.readouterr().err
-
-
 HARMED = "archives/excitation_000_a1.mcap"
 
 

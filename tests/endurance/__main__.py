@@ -35,9 +35,10 @@ from typing import Any
 
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
-from tests.endurance.journal import COMPRESSED, ForeignError, Piece, read_journal
+from tests.endurance.journal import Piece, read_journal
 from tests.endurance.piece import run_piece
 from tests.endurance.verdict import SHARES, Verdict, judge
+from tests.journal import COMPRESSED, JournalError
 
 LONGEST = 90.0
 """min of a piece."""
@@ -51,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
         if not given.merge:
             _run(given)
         pieces = _read(given.journal)
-    except ForeignError as error:
+    except JournalError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
     if not pieces:

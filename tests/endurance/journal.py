@@ -1,23 +1,17 @@
-"""What a long run leaves behind: one line of JSON each, appended as soon as it is known.
+"""What a long run leaves behind: one line of JSON each, added as soon as it is known.
 
-A line is written by one call, so that a process that is killed leaves whole lines and perhaps one
-torn one, which is passed over. `begin` and `end` enclose a piece; one without an end was killed.
+`begin` and `end` enclose a piece; one without an end was killed.
 """
 
 from __future__ import annotations
 
-import json
-import lzma
-import os
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
-COMPRESSED: Final = ".xz"
-"""End of the name of a journal that is kept small; nothing is appended to it any more."""
+from tests.journal import entries
+
 SYNC_EVERY: Final = 60.0
 """s between two waits for the disk."""
 
@@ -115,42 +109,6 @@ class Piece:
         return self.samples[-1].t if self.samples else 0.0
 
 
-class Journal:
-    """Appends to a file; what was written stays, whatever becomes of the process."""
-
-    def __init__(self, path: Path) -> None:
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
-        self._fd = os.open(path, flags, 0o644)
-        self._synced = time.monotonic()
-        size = os.fstat(self._fd).st_size
-        if size and os.pread(self._fd, 1, size - 1) != b"\n":
-            os.write(self._fd, b"\n")  # after the torn line of a killed piece
-
-    def add(self, kind: str, **facts: Any) -> None:
-        """Append one line."""
-        line = json.dumps({"kind": kind, **facts}, separators=(",", ":")) + "\n"
-        os.write(self._fd, line.encode())
-        if time.monotonic() - self._synced > SYNC_EVERY:
-            os.fsync(self._fd)
-            self._synced = time.monotonic()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        os.fsync(self._fd)
-        os.close(self._fd)
-
-
-class ForeignError(ValueError):
-    """A file that is no journal of a long run, in a sentence."""
-
-
 def read_journal(path: Path) -> list[Piece]:
     """All pieces of a journal; none if there is no such file.
 
@@ -158,24 +116,10 @@ def read_journal(path: Path) -> list[Piece]:
         path: of the file; where its name ends in `.xz` it is compressed.
 
     Raises:
-        ForeignError: it cannot be read, or a line of it is none of ours.
+        JournalError: it cannot be read, or a line of it is none of ours.
     """
     pieces: list[Piece] = []
-    try:
-        content = path.read_bytes() if path.exists() else b""
-        if content and path.suffix == COMPRESSED:
-            content = lzma.decompress(content)
-    except (OSError, lzma.LZMAError) as error:
-        raise ForeignError(f"{path} cannot be read: {error}") from error
-    for place, line in enumerate(content.splitlines(), 1):
-        try:
-            facts = json.loads(line)
-        except ValueError:
-            continue  # torn by a kill
-        try:
-            _take(facts, pieces)
-        except (AttributeError, IndexError, KeyError, TypeError) as error:
-            raise ForeignError(f"{path}, line {place} is none of a long run's journal") from error
+    entries(path, lambda facts: _take(facts, pieces), "line of a long run's journal")
     return pieces
 
 

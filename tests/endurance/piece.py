@@ -28,8 +28,9 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK, SIMULATE, free_port
 from hil.errors import HilError
 from hil.progress import Reporter, Silent, Task
-from tests.endurance.journal import Journal, Ran, Use
+from tests.endurance.journal import SYNC_EVERY, Ran, Use
 from tests.hil.fast_cell import fast_cell
+from tests.journal import Journal
 
 REPETITIONS: Final = 20
 """Of the excitation in a campaign, which so takes about half a minute."""
@@ -112,7 +113,7 @@ class Watched:
 
     def _link(self, pids: Mapping[str, int], scheduling: str, notes: list[str]) -> None:
         self._processes = {name: psutil.Process(pid) for name, pid in pids.items()}
-        self.journal.add("link", scheduling=scheduling, notes=notes, t=self._at)
+        self.journal.add(kind="link", scheduling=scheduling, notes=notes, t=self._at)
 
     def _status(self, counters: Mapping[str, float], latencies: list[int]) -> None:
         used = {}
@@ -120,7 +121,7 @@ class Watched:
             with suppress(psutil.Error):
                 used[name] = asdict(_use(process))
         self.journal.add(
-            "sample",
+            kind="sample",
             t=self._at,
             load=os.getloadavg()[0],
             processes=used,
@@ -160,7 +161,7 @@ class Watched:
             records_lost=lost,
             **told,
         )
-        self.journal.add("campaign", **asdict(ran))
+        self.journal.add(kind="campaign", **asdict(ran))
         if not faulty:  # what is faulty is to be looked at
             self._kept.append(Path(folder))
         while len(self._kept) > NEWEST:
@@ -197,9 +198,12 @@ def run_piece(
     """
     work = folder / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{os.getpid()}"
     prepare(work, rate)
-    with Journal(journal_path) as journal, reporter.task("enduring (s)", seconds) as task:
+    with (
+        Journal(journal_path, SYNC_EVERY) as journal,
+        reporter.task("enduring (s)", seconds) as task,
+    ):
         journal.add(
-            "begin",
+            kind="begin",
             at=datetime.now(UTC).isoformat(timespec="seconds"),
             rate=rate,
             seconds=seconds,
@@ -215,7 +219,7 @@ def run_piece(
             summary.seek(0)
             said = summary.read().decode().strip().splitlines()
             journal.add(
-                "end",
+                kind="end",
                 reason=reason,
                 supervisor=supervisor.poll(),
                 controller=json.loads(said[-1]) if said else None,

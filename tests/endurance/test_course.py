@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from tests.endurance.__main__ import main
-from tests.endurance.journal import Journal, Piece, Ran, read_journal
+from tests.endurance.journal import Piece, Ran, read_journal
 from tests.endurance.test_verdict import piece, ran
 from tests.endurance.verdict import judge
+from tests.journal import Journal
 
 
 @pytest.fixture(scope="module")
@@ -128,12 +129,12 @@ def test_shared_memory_of_others_that_comes_and_goes_is_none_of_ours(sound: Piec
 
 def written(path: Path, one: Piece) -> Path:
     with Journal(path) as journal:
-        journal.add("begin", **one.begun)
+        journal.add(kind="begin", **one.begun)
         for sample in one.samples:
-            journal.add("sample", **asdict(sample))
+            journal.add(kind="sample", **asdict(sample))
         for campaign in one.campaigns:
-            journal.add("campaign", **asdict(campaign))
-        journal.add("end", **(one.ended or {}))
+            journal.add(kind="campaign", **asdict(campaign))
+        journal.add(kind="end", **(one.ended or {}))
     return path
 
 
@@ -146,25 +147,6 @@ def test_pieces_of_several_journals_are_merged_compressed_or_not(
     assert read_journal(small) == read_journal(plain)
     assert main(["--merge", "--journal", str(plain), str(small), "--json"]) == 0
     assert '"pieces": 2' in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b'{"round": 1}\n', b"[1, 2]\n", b'{"kind": "sample"}\n', b'{"kind": "other"}\n', b"notes\n"],
-)
-@pytest.mark.parametrize("name", ["j.jsonl", "j.jsonl.xz"])
-def test_a_foreign_journal_is_told_of_in_a_sentence(
-    content: bytes, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / name
-    for data in {content, lzma.compress(content)} if name.endswith("xz") else {content}:
-        path.write_bytes(data)
-        assert main(["--merge", "--journal", str(path)]) == 2
-        said = capsys.readouterr().err
-        assert said.startswith("error: ")
-        assert str(path) in said
-        assert said.count("\n") == 1
-        assert path.read_bytes() == data
 
 
 def test_a_piece_is_not_appended_to_what_is_no_journal(tmp_path: Path) -> None:

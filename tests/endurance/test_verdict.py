@@ -10,9 +10,10 @@ import pytest
 
 from drivers.exchange.latency import BINS, bin_of, upper_edge
 from tests.endurance.__main__ import main
-from tests.endurance.journal import Journal, Piece, Ran, Sample, Use, read_journal
+from tests.endurance.journal import Piece, Ran, Sample, Use, read_journal
 from tests.endurance.trends import largest_rise, quantile, slope
 from tests.endurance.verdict import PROCESSES, judge, minutes_of
+from tests.journal import Journal
 
 MIB = 2**20
 SECONDS = 80 * 60
@@ -184,14 +185,14 @@ def test_a_killed_piece_leaves_its_journal(
 ) -> None:
     path = tmp_path / "long.jsonl"
     with Journal(path) as journal:
-        journal.add("begin", rate=1000)
+        journal.add(kind="begin", rate=1000)
     with path.open("ab") as file:
         file.write(b'{"kind":"samp')  # torn by SIGKILL
     with Journal(path) as journal:
-        journal.add("begin", rate=1000)
-        journal.add("link", scheduling="ordinary", notes=[], t=1.0)
-        journal.add("campaign", **asdict(ran(0)))
-        journal.add("end", reason="interrupted", supervisor=0, controller=None)
+        journal.add(kind="begin", rate=1000)
+        journal.add(kind="link", scheduling="ordinary", notes=[], t=1.0)
+        journal.add(kind="campaign", **asdict(ran(0)))
+        journal.add(kind="end", reason="interrupted", supervisor=0, controller=None)
     first, second = read_journal(path)
     assert first.ended is None
     assert second.ended is not None

@@ -30,13 +30,14 @@ from hil.progress import Reporter, reporter
 from tests.fuzz import journal, keeping, targets
 from tests.fuzz.findings import known
 from tests.fuzz.lives import Places, live, shorten
+from tests.journal import JournalError
 
 PIECE = 120.0  # s: what a kill loses of the figures, never of the inputs
 LEAST = 5.0  # s that are worth a start
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit status is 1 if anything was found, or died, and 0 otherwise."""
+    """Run the command; the exit status is 1 if anything was found, or died, 2 without a journal."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.fuzz",
         description=__doc__,
@@ -61,6 +62,9 @@ def main(arguments: list[str] | None = None) -> int:
         Run(names, 60.0 * given.minutes, until, given.journal, teller).work(given.jobs)
     except KeyboardInterrupt:
         teller.say("stopped; the same command goes on from here")
+    except JournalError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
     report = reported(names, given.journal)
     sys.stdout.write(json.dumps(report) + "\n" if given.json else told(report))
     return int(bool(report["findings"] or report["not_reproduced"]))

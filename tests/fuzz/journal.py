@@ -1,13 +1,13 @@
-"""What was fuzzed so far: a line of JSON for each piece, added durably, summed up for a reader."""
+"""What was fuzzed so far: a line for each piece, summed up for a reader."""
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from tests.journal import Journal, entries
 
 
 @dataclass(frozen=True)
@@ -39,31 +39,18 @@ class Piece:
 
 
 def append(path: Path, piece: Piece) -> None:
-    """Add a piece; it survives the death of this process and of the computer.
-
-    A line that a killed process left half written is closed first.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+b") as stream:
-        stream.seek(0, os.SEEK_END)
-        if stream.tell():
-            stream.seek(-1, os.SEEK_END)
-            if stream.read(1) != b"\n":
-                stream.write(b"\n")
-        stream.write(json.dumps(asdict(piece)).encode() + b"\n")
-        stream.flush()
-        os.fsync(stream.fileno())
+    """Add a piece; it survives the death of this process and of the computer."""
+    with Journal(path) as journal:
+        journal.add(**asdict(piece))
 
 
 def pieces(path: Path) -> list[Piece]:
-    """All pieces; a line torn by a kill is left out."""
-    found = []
-    for line in path.read_text("utf-8").splitlines() if path.exists() else ():
-        try:
-            found.append(Piece(**json.loads(line)))
-        except (ValueError, TypeError):
-            continue
-    return found
+    """All pieces.
+
+    Raises:
+        JournalError: it cannot be read, or a line is none.
+    """
+    return entries(path, lambda said: Piece(**said), "piece of fuzzing")
 
 
 def summary(found: Iterable[Piece]) -> dict[str, dict[str, Any]]:

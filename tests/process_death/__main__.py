@@ -37,7 +37,7 @@ from typing import Any
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
-from tests.process_death import journal  # noqa: E402
+from tests.journal import Journal, JournalError, rounds  # noqa: E402
 from tests.process_death.controller import die_with_parent  # noqa: E402
 from tests.process_death.defects import DEFECTS, planted  # noqa: E402
 from tests.process_death.laws import PROMISED  # noqa: E402
@@ -55,8 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     try:
-        known = {} if given.journal is None else journal.read(given.journal)
-    except ValueError as error:
+        known = rounds(given.journal, "broken", "seconds", "processor")
+        journal = Journal(given.journal)
+    except JournalError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
     numbers = range(given.start, given.start + given.rounds)
@@ -67,11 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder = Path(tempfile.mkdtemp(prefix="process_death_"))
     interrupted = False
     try:
-        for result in _played(missing, given.jobs, folder, given.defect):
-            results.append(result)
-            if given.journal is not None:
-                journal.append(given.journal, result)
-            _tell(result, len(results), len(wanted), folder, quiet=given.json)
+        with journal:
+            for result in _played(missing, given.jobs, folder, given.defect):
+                results.append(result)
+                journal.add(**result)
+                _tell(result, len(results), len(wanted), folder, quiet=given.json)
     except KeyboardInterrupt:
         interrupted = True
         sys.stderr.write("interrupted; with --journal the same command goes on from here\n")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hil.progress import reporter
 from tests.simulate.judging import judged
-from tests.simulate.many import Journal, JournalError, played, stage_folder
+from tests.simulate.many import Known, played, stage_folder
 from tests.simulate.observed import Observed
 from tests.simulate.playing import UndisturbedError
 from tests.simulate.script import GRAMMAR
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the children
     try:
         return _one(options) if options.seed is not None else _many(options)
-    except (JournalError, ValueError) as error:
+    except ValueError as error:
         sys.stderr.write(f"{error}\n")
         return 2
     except KeyboardInterrupt:
@@ -130,13 +130,13 @@ def _story(seen: Observed) -> list[str]:
 
 
 def _many(options: argparse.Namespace) -> int:
-    journal = Journal(options.journal)
+    known = Known(options.journal)
     seeds = range(options.start, options.start + options.seeds)
     tally, out = Tally(), sys.stderr if options.json else sys.stdout
     with redirect_stdout(out):
         told = reporter()
         with told.task("playing seeds", len(seeds)) as task:
-            for verdict in played(seeds, journal, options.jobs, shrink=not options.no_shrink):
+            for verdict in played(seeds, known, options.jobs, shrink=not options.no_shrink):
                 tally.add(verdict)
                 task.advance(1, f"{len(tally.failed)} failed")
                 if verdict.broken:

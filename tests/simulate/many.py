@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
@@ -18,6 +17,7 @@ from typing import Any, Final
 
 from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
 from planner.isolation import PlanningChild
+from tests.journal import Journal, entries
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage, Verdict
 
@@ -27,59 +27,35 @@ LONGEST: Final = 1200.0
 """s that a seed may take, made small included, on a busy machine."""
 DIED: Final = "the process lives"
 """Name of the law that a seed breaks which takes its process with it, or never ends."""
+SYNC_EVERY: Final = 60.0
+"""s of which a loss of power costs the verdicts; the death of a process costs one."""
 
 
 _PREFIX: Final = "hil_simulate_"
 
 
-class JournalError(Exception):
-    """A journal that cannot be used; one sentence."""
-
-
-class Journal:
-    """A file of JSON lines, one a seed. A line that a killed process left half is played again.
+class Known:
+    """Verdicts that a journal has, and those that are added to it.
 
     Args:
-        path: of the file; None keeps nothing.
+        path: of the journal; None keeps nothing.
 
     Attributes:
-        known: verdicts by seed.
+        verdicts: by seed.
 
     Raises:
-        JournalError: it is another file, or cannot be written.
+        JournalError: it is another file, or cannot be read or written.
     """
 
     def __init__(self, path: Path | None) -> None:
-        self.known: dict[int, Verdict] = {}
-        self._descriptor = -1
-        if path is None:
-            return
-        try:
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            whole = self._read(path.read_bytes(), path)
-            os.ftruncate(self._descriptor, whole)
-            os.lseek(self._descriptor, 0, os.SEEK_END)
-        except OSError as error:
-            raise JournalError(f"{path}: {error.strerror}; name another --journal") from error
-
-    def _read(self, content: bytes, path: Path) -> int:
-        """Take whole lines in; returns how many bytes they are."""
-        whole = content.rfind(b"\n") + 1
-        for number, line in enumerate(content[:whole].splitlines(), start=1):
-            try:
-                verdict = Verdict.from_dict(json.loads(line))
-            except (ValueError, KeyError, TypeError) as error:
-                raise JournalError(
-                    f"{path}, line {number}: no verdict on a seed ({error}); name another --journal"
-                ) from error
-            self.known[verdict.seed] = verdict
-        return whole
+        found = () if path is None else entries(path, Verdict.from_dict, "verdict on a seed")
+        self.verdicts = {verdict.seed: verdict for verdict in found}
+        self._journal = Journal(path, SYNC_EVERY)
 
     def add(self, verdict: Verdict) -> None:
         """Keep one more."""
-        self.known[verdict.seed] = verdict
-        if self._descriptor >= 0:
-            os.write(self._descriptor, (json.dumps(verdict.to_dict()) + "\n").encode())
+        self.verdicts[verdict.seed] = verdict
+        self._journal.add(**verdict.to_dict())
 
 
 @contextmanager
@@ -102,14 +78,14 @@ def stage_folder() -> Iterator[Path]:
 
 
 def played(
-    seeds: Sequence[int], journal: Journal, jobs: int, *, shrink: bool = True
+    seeds: Sequence[int], known: Known, jobs: int, *, shrink: bool = True
 ) -> Iterator[Verdict]:
-    """Verdicts as they come, those first that the journal knows; new ones are entered there.
+    """Verdicts as they come, those first that are known; new ones are added to these.
 
     Children end with this process, however it ends.
     """
-    yield from (journal.known[seed] for seed in seeds if seed in journal.known)
-    missing = [seed for seed in seeds if seed not in journal.known]
+    yield from (known.verdicts[seed] for seed in seeds if seed in known.verdicts)
+    missing = [seed for seed in seeds if seed not in known.verdicts]
     groups = deque(deque(group) for _, group in groupby(missing, lambda seed: seed // NEIGHBOURS))
     with stage_folder() as root, ExitStack() as children:
         desks = [_Desk(groups, str(root), shrink) for _ in range(min(jobs, len(groups)))]
@@ -122,7 +98,7 @@ def played(
             for desk in list(busy):
                 if desk.connection in ready or desk.deadline <= monotonic():
                     if (verdict := desk.fetch()) is not None:
-                        journal.add(verdict)
+                        known.add(verdict)
                         yield verdict
                     if not desk.begin():
                         busy.remove(desk)

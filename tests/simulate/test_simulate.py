@@ -11,7 +11,7 @@ import pytest
 
 from tests.simulate.__main__ import main
 from tests.simulate.drawing import DRAWS, Story, draw_script
-from tests.simulate.many import Journal, JournalError, stage_folder
+from tests.simulate.many import Known, stage_folder
 from tests.simulate.playing import SceneError, _twin, twin_of
 from tests.simulate.scenes import NEIGHBOURS, scene_of
 from tests.simulate.script import kind_of, parse_script, simpler
@@ -81,26 +81,18 @@ def verdict(seed: int, *broken: tuple[str, str]) -> Verdict:
 class TestJournal:
     def test_it_knows_what_it_was_told_after_a_half_line(self, tmp_path: Path) -> None:
         path = tmp_path / "seeds.jsonl"
-        journal = Journal(path)
+        known = Known(path)
         for seed in (3, 4):
-            journal.add(verdict(seed, ("guard", "too fast")))
+            known.add(verdict(seed, ("guard", "too fast")))
         whole = path.read_bytes()
         path.write_bytes(whole + b'{"seed": 5, "scr')
-        again = Journal(path)
-        assert again.known == {
+        again = Known(path)
+        assert again.verdicts == {
             3: verdict(3, ("guard", "too fast")),
             4: verdict(4, ("guard", "too fast")),
         }
-        assert path.read_bytes() == whole
         again.add(verdict(5))
-        assert set(Journal(path).known) == {3, 4, 5}
-
-    def test_another_file_is_refused_and_left_as_it_is(self, tmp_path: Path) -> None:
-        path = tmp_path / "notes.txt"
-        path.write_text("milk\nbread\n")
-        with pytest.raises(JournalError, match="line 1: no verdict"):
-            Journal(path)
-        assert path.read_text() == "milk\nbread\n"
+        assert set(Known(path).verdicts) == {3, 4, 5}
 
     def test_a_tally_counts_kinds_ends_and_failures(self) -> None:
         tally = Tally()

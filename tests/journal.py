@@ -1,0 +1,120 @@
+"""Results of long commands in a file of JSON lines, from which the same command goes on.
+
+A line is added by one call. A process that is killed leaves whole lines and at most one torn one at
+the end, which is left out by who reads and taken away by who adds.
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self, TypeVar
+
+COMPRESSED: Final = ".xz"
+"""End of the name of a journal that is kept small; nothing is added to it any more."""
+
+Entry = TypeVar("Entry")
+
+
+class JournalError(ValueError):
+    """A file that cannot be read, or written, or is no journal of this command; one sentence."""
+
+
+def entries(path: Path, entry: Callable[[Any], Entry], what: str) -> list[Entry]:
+    """What the whole lines say, in their order; nothing if there is no such file.
+
+    Args:
+        path: of the file; where its name ends in `.xz` it is compressed.
+        entry: makes an entry of what a line says, and raises where it is none.
+        what: a line should be, for a person: "result of a round".
+
+    Raises:
+        JournalError: it cannot be read, or a line is no such entry.
+    """
+    try:
+        content = path.read_bytes() if path.exists() else b""
+        if content and path.suffix == COMPRESSED:
+            content = lzma.decompress(content)
+    except (OSError, lzma.LZMAError) as error:
+        raise JournalError(f"{path} cannot be read: {error}; name another --journal") from error
+    found = []
+    for number, line in enumerate(content[: _whole(content)].splitlines(), 1):
+        try:
+            found.append(entry(json.loads(line)))
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            reason = f"{path}, line {number} is no {what}; name another --journal"
+            raise JournalError(reason) from error
+    return found
+
+
+def rounds(path: Path | None, *needed: str) -> dict[int, dict[str, Any]]:
+    """Results by number, of a journal whose lines have `round` and these facts; {} without one.
+
+    Raises:
+        JournalError: as `entries`.
+    """
+
+    def result(said: Any) -> tuple[int, dict[str, Any]]:
+        if missing := [name for name in needed if name not in said]:
+            raise KeyError(*missing)
+        return int(said["round"]), said
+
+    return {} if path is None else dict(entries(path, result, "result of a round"))
+
+
+class Journal:
+    """A journal that is added to; what was added stays, whatever becomes of the process.
+
+    Args:
+        path: of the file, made where it is missing, with its folder; None keeps nothing.
+        sync_every: s between two waits for the disk; 0 waits for it after each line.
+
+    Raises:
+        JournalError: it cannot be written.
+    """
+
+    def __init__(self, path: Path | None, sync_every: float = 0.0) -> None:
+        self._every, self._synced = sync_every, time.monotonic()
+        self._descriptor = -1
+        if path is None:
+            return
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+            self._descriptor = os.open(path, flags, 0o644)
+            os.ftruncate(self._descriptor, _whole(path.read_bytes()))
+        except OSError as error:
+            reason = f"{path} cannot be written: {error.strerror}; name another --journal"
+            raise JournalError(reason) from error
+
+    def add(self, **facts: Any) -> None:
+        """Add a line."""
+        if self._descriptor < 0:
+            return
+        os.write(self._descriptor, json.dumps(facts, separators=(",", ":")).encode() + b"\n")
+        if time.monotonic() - self._synced >= self._every:
+            os.fsync(self._descriptor)
+            self._synced = time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._descriptor >= 0:
+            os.fsync(self._descriptor)
+            os.close(self._descriptor)
+
+
+def _whole(content: bytes) -> int:
+    """Bytes of the whole lines."""
+    return content.rfind(b"\n") + 1
