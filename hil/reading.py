@@ -43,16 +43,16 @@ def opened(path: Path) -> BinaryIO:
         raise
 
 
-def text_of(path: Path) -> str:
+def text_of(path: Path, longest: int = LONGEST_TEXT) -> str:
     """A text file as a whole, any line ends as one.
 
     Raises:
-        OSError: as `opened`; or it is longer than `LONGEST_TEXT`.
+        OSError: as `opened`; or it has more bytes than `longest`.
         UnicodeDecodeError: it is no UTF-8.
     """
     with opened(path) as stream:
-        if os.fstat(stream.fileno()).st_size > LONGEST_TEXT:
-            raise OSError(errno.EFBIG, f"it has more than {LONGEST_TEXT} bytes", str(path))
+        if os.fstat(stream.fileno()).st_size > longest:
+            raise OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
         text = stream.read().decode("utf-8")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 

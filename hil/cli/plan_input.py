@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError
+from hil.reading import remedy_of, text_of
 from planner.errors import (
     InvalidPlanFile,
     InvalidViaPoints,
@@ -157,6 +158,7 @@ def _number(cell: str) -> float | None:
 def _text(path: Path) -> str:
     try:
         # Spreadsheets and editors begin a file with a byte order mark; it is no part of a cell.
-        return path.read_text("utf-8-sig")
+        return text_of(path).removeprefix("\ufeff")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"cannot be read ({error})", remedy="name another file") from error
+        remedy = remedy_of(error, "name another file")
+        raise InputError(path, f"cannot be read ({error})", remedy=remedy) from error

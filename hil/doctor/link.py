@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from hil.reading import text_of, toml_of
 
 if TYPE_CHECKING:
     from hil.cell.schema import ControllerTable
@@ -48,7 +49,7 @@ def controller_in(path: Path) -> ControllerTable:
     try:
         return Cell.load(path).controller
     except UnknownFieldsError as unknown:
-        table = tomllib.loads(path.read_text(encoding="utf-8")).get("controller")
+        table = toml_of(text_of(path)).get("controller")
         if table is None or any(name.startswith("controller.") for name in unknown.fields):
             raise
         try:

@@ -23,6 +23,7 @@ from scipy.io import loadmat, whosmat
 from hil.errors import SourceError
 from hil.importers.column_map import Column
 from hil.importers.mcap_arrays import read_mcap
+from hil.reading import opened, text_of
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.isolation import PlanningChild
 
@@ -80,6 +81,7 @@ class ArrayFile:
             SourceError: it cannot be read, or holds no array of numbers.
         """
         with _readable(path):
+            opened(path).close()  # no pipe, which would be waited for
             found = READERS[path.suffix.lower()](path)
         usable = {
             name: array
@@ -282,7 +284,7 @@ atexit.register(_close)
 
 def _matlab_text(path: Path) -> dict[str, Stored]:
     """Matrices of a MATLAB or Octave script."""
-    text = _COMMENT.sub("", path.read_text(encoding="utf-8-sig")).replace("...", " ")
+    text = _COMMENT.sub("", text_of(path).removeprefix("\ufeff")).replace("...", " ")
     found = {}
     for name, body in _ASSIGNED.findall(text):
         rows = [row.replace(",", " ").split() for row in re.split(r"[;\n]", body)]

@@ -19,6 +19,7 @@ from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.mcap_messages import Topic
 from hil.importers.mcap_sizes import MOST_INFLATION
+from hil.reading import opened
 
 SUFFIXES = (".db3", ".mcap")
 _PACKED = (".zstd", ".zst")
@@ -40,7 +41,7 @@ def bag_files(source: Path) -> list[Path]:
             source, "does not exist", remedy="name a .db3 or .mcap file, or a bag's folder"
         )
     if not source.is_dir():
-        return [source]
+        return [_regular(source)]
     try:
         files = [path for path in source.iterdir() if _storage(path) in SUFFIXES]
     except OSError as error:
@@ -49,7 +50,16 @@ def bag_files(source: Path) -> list[Path]:
         raise SourceError(
             source, "has no .db3 and no .mcap file in it", remedy="name the folder of a rosbag2"
         )
-    return sorted(files, key=_place)
+    return sorted(map(_regular, files), key=_place)
+
+
+def _regular(file: Path) -> Path:
+    """The same; no pipe, which would be waited for."""
+    try:
+        opened(file).close()
+    except OSError as error:
+        raise SourceError(file, f"cannot be read: {error.strerror}") from error
+    return file
 
 
 def topics(file: Path) -> dict[str, Topic]:

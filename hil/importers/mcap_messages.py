@@ -13,6 +13,7 @@ from mcap.records import Channel, Schema
 
 from hil.errors import SourceError
 from hil.importers.mcap_sizes import check_sizes
+from hil.reading import opened
 
 JOINT_STATES = frozenset({"sensor_msgs/msg/JointState", "sensor_msgs/JointState"})
 """Names of the type that ROS 2 has for joint states."""
@@ -102,7 +103,7 @@ def _topic(schema: Schema | None, channel: Channel) -> Topic:
 def _opened(path: Path) -> Iterator[Any]:
     """The file; whatever the readers say of it becomes our error."""
     try:
-        with path.open("rb") as stream:
+        with opened(path) as stream:
             yield stream
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror or error}") from error

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hil.errors import SourceError
 from hil.importers.column_map import Column, Format
+from hil.reading import text_of
 
 Array = NDArray[np.float64]
 
@@ -24,6 +25,7 @@ _WRITTEN = (
     (";", ","), ("\t", ","), ("|", ","), (None, ","),
 )  # fmt: skip
 _PROBED = 20  # lines
+_LONGEST = 1 << 31  # bytes, which become some times as many in memory
 _LONGEST_TIME = 30  # digits before the point, more than nanoseconds since 1970 have
 # 1.0D+03: double precision as Fortran writes it.
 _FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d)")
@@ -60,7 +62,7 @@ class Table:
             SourceError: it cannot be read, has no row of numbers, or a line without any.
         """
         try:
-            text = path.read_text(encoding="utf-8-sig")
+            text = text_of(path, _LONGEST).removeprefix("\ufeff")
         except (OSError, UnicodeDecodeError) as error:
             raise SourceError(
                 path,

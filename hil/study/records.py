@@ -8,9 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from pydantic import ValidationError
-
 from hil.files import make_folder, write_or_tell
+from hil.reading import text_of
 from hil.results.frozen import Frozen
 
 from .forms import MotionForm
@@ -101,8 +100,8 @@ R = TypeVar("R", bound=Record)
 def kept(path: Path, kind: type[R], inputs: str) -> R | None:
     """A record that rests on these inputs, if there is one that can be read."""
     try:
-        record = kind.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError):
+        record = kind.model_validate_json(text_of(path))
+    except (OSError, ValueError):
         return None
     return record if record.inputs == inputs else None
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from hil.errors import InputError
+from hil.reading import text_of
 from hil.results.frozen import Frozen
 
 from .records import ExampleRecord
@@ -330,8 +331,8 @@ class StudyResults(Frozen):
             InputError: the file is none.
         """
         try:
-            return cls.model_validate_json(path.read_bytes())
-        except (OSError, ValidationError) as error:
+            return cls.model_validate_json(text_of(path))
+        except (OSError, ValueError) as error:
             raise InputError(
                 path, f"is not the result of a study ({error})", remedy="run the study again"
             ) from error

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Final, Self
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from hil.errors import InputError
+from hil.reading import text_of
 from hil.results.frozen import Frozen
 
 Count = Annotated[int, Field(strict=True, ge=1)]
@@ -52,8 +53,8 @@ class StudySettings(Frozen):
             InputError: they cannot be read.
         """
         try:
-            return cls.model_validate_json(path.read_bytes())
-        except (OSError, ValidationError) as error:
+            return cls.model_validate_json(text_of(path))
+        except (OSError, ValueError) as error:
             raise InputError(
                 path, "is not the settings of a study", remedy="name another folder (--output)"
             ) from error

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Final
 
 import psutil
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from hil.errors import OutputError
 from hil.files import write_or_tell
+from hil.reading import text_of
 from hil.results.frozen import Frozen
 
 TIMES: Final = "times.json"
@@ -38,8 +39,8 @@ class Stages:
         """Go on from what is in the folder; `begun` says whether there was a study in it."""
         self._path = root / TIMES
         try:
-            self._times = Times.model_validate_json(self._path.read_bytes())
-        except (OSError, ValidationError):
+            self._times = Times.model_validate_json(text_of(self._path))
+        except (OSError, ValueError):
             self._times = Times(whole=not begun)
 
     @property

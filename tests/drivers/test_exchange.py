@@ -674,7 +674,7 @@ class TestWhoIsListenedTo:
         assert link.forgotten == [1]
 
     @pytest.mark.parametrize(("silence", "forgotten"), [(0.8, []), (1.1, [1])])
-    def test_or_falls_silent(self, silence, forgotten):
+    def test_until_it_falls_silent(self, silence, forgotten):
         link = Quiet([[self.SYNC]], silence)
         exchange(link, Rig().session, until=lambda: False)
         assert link.forgotten[:1] == forgotten

@@ -90,7 +90,7 @@ class TestFirstSetPoint:
         assert rig.ended.outcome == "completed"
 
     @pytest.mark.parametrize("column", [D1, D3, D4])
-    def test_nor_may_they_be_older_for_a_motion_that_begins_in_open_mode(self, column):
+    def test_none_may_be_older_for_a_motion_that_begins_in_open_mode(self, column):
         rig = Rig()
         rig.open()
         rig.ages = fresh()
@@ -129,7 +129,7 @@ class TestLongGaps:
         assert (rig.state, source.stops) == (State.OPEN, 0)
 
     @pytest.mark.parametrize("leaving", [False, True])
-    def test_nor_of_an_arm_that_is_held(self, leaving):
+    def test_a_velocity_from_before_the_gap_says_nothing_of_an_arm_that_is_held(self, leaving):
         rig = Rig()
         rig.open()
         if leaving:
@@ -164,7 +164,7 @@ class TestTargetsGivenBack:
         assert type(error) is FirstSetPointUnknown
         assert (error.joint, error.value) == (2, 1.0)
 
-    def test_nor_to_one_that_opens_again_on_the_way_out(self):
+    def test_one_of_an_earlier_cycle_is_not_given_to_one_that_opens_again_on_the_way_out(self):
         rig = Rig()
         rig.ages = fresh()
         rig.open()

@@ -79,7 +79,7 @@ class TestExitNotGranted:
         assert type(rig.refusal) is ExitNotGranted
         assert rig.ended is None
 
-    def test_and_when_it_was_the_controller_that_began_to_leave(self):
+    def test_it_holds_when_it_was_the_controller_that_began_to_leave(self):
         rig = Rig()
         rig.open()
         rig.cycle(2000)
@@ -277,13 +277,13 @@ class TestAStrayAxisWhileCorrectionsEnd:
         assert type(rig.refusal) is NotFinite
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_nor_one_far_from_the_arm(self, mode):
+    def test_one_far_from_the_arm_is_not_given_back(self, mode):
         rig, answer = self.stray(mode, 50.0)
         assert answer.axes["mode"].tolist() == [0, 0, 508, 0, 0, 0]
         assert type(rig.refusal) is FollowingError
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_nor_one_of_an_earlier_cycle(self, mode):
+    def test_one_of_an_earlier_cycle_is_not_given_back(self, mode):
         rig, answer = self.stray(mode, age=1)
         assert all_drive_off(answer)
         assert type(rig.refusal) is FirstSetPointUnknown

@@ -119,7 +119,7 @@ class TestLongGaps:
         assert source.advances == 300
 
     @pytest.mark.parametrize("factor", [0.0, 0.49, 1.51, -1.0, np.nan])
-    def test_nor_one_whose_target_velocity_is_another(self, factor):
+    def test_one_whose_target_velocity_is_another_is_not_run_away_from(self, factor):
         def change(d):
             d[0, 1] *= factor
 
@@ -127,7 +127,7 @@ class TestLongGaps:
         rig, _, answer = self.after_gap(3, change)
         self.refused(answer, rig, kind)
 
-    def test_nor_one_whose_arm_stands_whatever_its_target_velocity(self):
+    def test_one_whose_arm_stands_is_not_run_away_from_whatever_its_target_velocity(self):
         rig, _, answer = self.after_gap(3, lambda d: d[0].__setitem__(3, 0.0))
         self.refused(answer, rig, MotionHeld)
 
@@ -136,7 +136,7 @@ class TestLongGaps:
         assert rig.state is State.OPEN
 
     @pytest.mark.parametrize("sign", [-1, 1])
-    def test_nor_one_whose_target_went_elsewhere(self, sign):
+    def test_one_whose_target_went_elsewhere_is_not_one_that_stands(self, sign):
         def change(d):
             d[0, [0, 2]] += sign * 0.201
 

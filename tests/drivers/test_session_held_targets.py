@@ -136,7 +136,7 @@ class TestPause:
         assert rig.state is State.FAULTED
 
     @pytest.mark.parametrize("column", [0, 2])
-    def test_nor_where_the_arm_is_elsewhere(self, column):
+    def test_axes_still_open_are_not_held_at_a_target_that_is_far_from_the_arm(self, column):
         rig = self.paused()
         rig.axes["d"][0, column] += 2.1
         for _ in range(5):

@@ -289,12 +289,12 @@ class TestResume:
         with pytest.raises(RequestError, match="no motion was requested"):
             rig.session.resume()
 
-    def test_that_can(self):
+    def test_needs_a_motion_that_can_be_held(self):
         rig, _ = moving()
         with pytest.raises(RequestError, match="cannot be held"):
             rig.session.resume()
 
-    def test_and_is_not_being_stopped(self):
+    def test_needs_a_motion_that_is_not_being_stopped(self):
         rig = playing()
         rig.session.hold()
         rig.cycle(5)
@@ -398,7 +398,7 @@ class TestRequestAfterAStop:
         rig.run()
         assert rig.ended.outcome == "completed"
 
-    def test_nor_while_axes_open(self):
+    def test_none_is_taken_while_axes_open(self):
         rig = Rig()
         rig.close()
         rig.axes["mode"][: N - 1] = 4

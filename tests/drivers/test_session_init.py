@@ -252,7 +252,7 @@ class TestAcceptedInit:
         rig.start()
         assert rig.seen(InitReceived)[0].adopted
 
-    def test_nor_can_another_cycle_or_an_axis_that_is_closed(self):
+    def test_another_cycle_and_an_axis_that_is_closed_are_not_accepted(self):
         init = init_packet(sample_time=1)
         init.record["gear_ratio"][0, 0, 2] = -111.5
         rig = Rig(init=init, accept_init=True)

@@ -315,7 +315,7 @@ class TestPcThatStartsInMidSession:
         assert rig.cycle() is not None
 
     @pytest.mark.parametrize(("mode", "answered"), [(Mode.CLOSED, 0), (Mode.DELTA_POSITION, 505)])
-    def test_neither_right_after_init(self, mode, answered):
+    def test_open_axes_right_after_init_are_asked_to_switch_off(self, mode, answered):
         rig = Rig()
         for number in range(1, 10):
             rig.sync(number)
@@ -324,7 +324,7 @@ class TestPcThatStartsInMidSession:
         rig.modes = mode
         assert (rig.cycle().axes["mode"] == answered).all()
 
-    def test_nor_after_a_silence(self):
+    def test_open_axes_after_a_silence_are_asked_to_switch_off(self):
         rig = Rig()
         rig.open()
         rig.now += 60.0

@@ -464,7 +464,9 @@ class TestSession:
         another.send(init_packet().encode())
         assert near.receive(0.02) is None, "now the session has its port"
 
-    def test_nor_does_it_after_a_loss(self, near, controller, another):
+    def test_a_stray_datagram_after_a_loss_does_not_lock_the_controller_out(
+        self, near, controller, another
+    ):
         session = Session(drive_train(), Guard(limits(), 0.002), CycleRing(N), silence_timeout=0.15)
         controller.send(init_packet().encode())
         self.serve(near, session, 1)
@@ -498,7 +500,7 @@ class TestSession:
         controller.wait()
         assert session.state is State.INIT
 
-    def test_nor_does_one_that_began_a_start_and_did_not_go_on(
+    def test_one_that_began_a_start_and_did_not_go_on_does_not_keep_it_out(
         self, near, controller, another, session, monkeypatch
     ):
         monkeypatch.setattr(listening, "FALLEN_SILENT", 0.2)

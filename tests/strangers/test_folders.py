@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import zipfile
@@ -28,13 +29,19 @@ from hil.campaign.dry_run import DryRun
 from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.warmup import WarmUp
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.cli import app
+from hil.cli.plan_input import read_plan_file, read_via_points
 from hil.errors import ArchiveError, HilError, InputError
 from hil.files import write_atomically, write_together
+from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.bags import bag_files, topics
+from hil.importers.column_map import Format
+from hil.importers.table import Table
 from hil.outcome import SERIES, rewrite_report
 from hil.reading import json_of, opened, text_of, toml_of
 from hil.results import Results
+from hil.study.results import StudyResults
 from identification import IdentificationError
 from planner import PlannerError
 from tests.hil.fast_cell import fast_campaign, fast_cell
@@ -202,6 +209,28 @@ def test_an_archive_is_a_file(read: Callable[[Path], object], thing: str, tmp_pa
     put(tmp_path / "excitation_000_a1.mcap", thing)
     with within(20.0), pytest.raises(ArchiveError):
         read(tmp_path / "excitation_000_a1.mcap")
+
+
+RECORDINGS: dict[str, Callable[[Path], object]] = {
+    "log.csv": lambda path: Table.read(path, Format()),
+    **{f"log{suffix}": ArrayFile.read for suffix in READERS},
+    "bag.db3": bag_files,
+    "bag.mcap": lambda path: topics(*bag_files(path)),
+    "via.csv": lambda path: read_via_points(path, AngleFrame("urdf", np.ones(3), np.zeros(3))),
+    "plan.toml": read_plan_file,
+    "results.json": StudyResults.load,
+}
+
+
+@pytest.mark.parametrize("thing", ["a pipe", "a device", "a link to nothing", "a sparse terabyte"])
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_recording_or_plan_of_somebody_is_a_file(name: str, thing: str, tmp_path: Path) -> None:
+    if thing == "a sparse terabyte" and name == "bag.db3":
+        pytest.skip("rows are read one by one")
+    put(tmp_path / name, thing)
+    with within(20.0), pytest.raises(HilError, match=re.escape(name)) as refused:
+        RECORDINGS[name](tmp_path / name)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("named", ["/dev/zero", "pipe", ".", "/etc/shadow\0", "missing.urdf"])
