@@ -22,13 +22,15 @@ motion that loses 3 of 100: with a third of that all the time next to no motion 
 def judge_course(
     pieces: Sequence[Piece], settled: float, faults: list[str], doubts: list[str]
 ) -> None:
-    """What is wrong with the course of the pieces, and what only the machine's load explains.
+    """What is wrong with the course of the pieces, and what the machine explains.
+
+    It does where processes wait for a core, and where cores stand still (`tests.endurance.stalls`).
 
     Args:
         pieces: of a journal.
         settled: s of a piece after which nothing is to be added to a process any more.
         faults: told of what is wrong.
-        doubts: told of what load explains, or what cannot be told.
+        doubts: told of what the machine explains, or what cannot be told.
     """
     if not any(piece.campaigns for piece in pieces):
         faults.append("no campaign was run")
@@ -58,8 +60,8 @@ def _judge_end(number: int, piece: Piece, faults: list[str], doubts: list[str]) 
 def _judge_campaigns(number: int, piece: Piece, faults: list[str], doubts: list[str]) -> None:
     """Campaigns that were given up or resumed.
 
-    A controller that misses some answers in a row ends open mode, as it should. Where processes
-    wait for a core, that is the machine's doing; where none does, nothing excuses it.
+    A controller that misses some answers in a row ends open mode, as it should. Where that is not
+    the machine's doing, nothing excuses it.
     """
     given_up = [one for one in piece.campaigns if one.given_up]
     if len(given_up) > GIVEN_UP * len(piece.campaigns):
@@ -67,29 +69,36 @@ def _judge_campaigns(number: int, piece: Piece, faults: list[str], doubts: list[
             f"piece {number}: {len(given_up)} of {len(piece.campaigns)} campaigns were given up"
         )
         return
-    crowded = set(_crowded_campaigns(piece))
+    excused = set(_excused_campaigns(piece))
     faults += [
-        f"piece {number}: campaign {one.number} was given up, without any load"
+        f"piece {number}: campaign {one.number} was given up, without any load or stall"
         for one in given_up
-        if one.number not in crowded
+        if one.number not in excused
     ]
-    if excused := sum(one.number in crowded for one in given_up):
+    if count := sum(one.number in excused for one in given_up):
         doubts.append(
-            f"piece {number}: {excused} of {len(piece.campaigns)} campaigns were given up while "
-            "the machine had more to do than it has cores"
+            f"piece {number}: {count} of {len(piece.campaigns)} campaigns were given up while "
+            "the machine had more to do than it has cores, or stood still"
         )
-    quiet = [one for one in piece.campaigns if one.number not in crowded and one.complete]
-    if resumed := sum(len(one.restarts) for one in quiet):
-        doubts.append(f"piece {number}: {resumed} restarts of campaigns without any load")
+    calm = [one for one in piece.campaigns if one.number not in excused and one.complete]
+    if resumed := sum(len(one.restarts) for one in calm):
+        doubts.append(f"piece {number}: {resumed} restarts of campaigns without any load or stall")
 
 
-def _crowded_campaigns(piece: Piece) -> Iterator[int]:
-    """Numbers of the campaigns during which the machine had more to do than it has cores."""
+def _excused_campaigns(piece: Piece) -> Iterator[int]:
+    """Numbers of the campaigns that were disturbed by the machine, and by nothing else.
+
+    It had more to do than it has cores; or answers were missed, none of which is unexplained.
+    """
     begun = 0.0
     for one in piece.campaigns:
-        load = [sample.load for sample in piece.samples if begun <= sample.t <= one.t]
+        samples = [sample for sample in piece.samples if begun <= sample.t <= one.t]
         begun = one.t
-        if load and np.median(load) > cores(piece):
+        if not samples:
+            continue
+        crowded = np.median([sample.load for sample in samples]) > cores(piece)
+        missed = samples[-1].counters["missed"] - samples[0].counters["missed"]
+        if crowded or (missed and not _unexplained(piece, samples, "missed")):
             yield one.number
 
 
@@ -100,7 +109,7 @@ def cores(piece: Piece) -> float:
 
 
 def _judge_answers(number: int, piece: Piece, faults: list[str], doubts: list[str]) -> None:
-    """Answers that were missed or late: too many, or any of them without load."""
+    """Answers that were missed or late: too many, or any that the machine does not explain."""
     if not piece.samples:
         return
     counters = piece.samples[-1].counters
@@ -109,17 +118,21 @@ def _judge_answers(number: int, piece: Piece, faults: list[str], doubts: list[st
         count = counters[name]
         if count > NOT_IN_TIME * answered:
             faults.append(f"piece {number}: {count / answered:.1%} of the answers were {name}")
-        elif calm := _without_load(piece, name):
-            doubts.append(f"piece {number}: {calm:.0f} answers were {name} without any load")
+        elif rest := _unexplained(piece, piece.samples, name):
+            doubts.append(f"piece {number}: {rest:.0f} answers were {name} without load or stall")
 
 
-def _without_load(piece: Piece, name: str) -> float:
-    """How far a counter rose between samples at which no process had to wait for a core."""
-    most = cores(piece)
+def _unexplained(piece: Piece, samples: Sequence[Sample], name: str) -> float:
+    """How far a counter rose while no process waited for a core, and no core stood still so long.
+
+    A stall costs the cycles that it lasts, and the one in which it begins.
+    """
+    most, rate = cores(piece), float(piece.begun.get("rate", 0.0))
     return sum(
-        after.counters[name] - before.counters[name]
-        for before, after in pairwise(piece.samples)
+        max(0.0, after.counters[name] - before.counters[name] - stood)
+        for before, after in pairwise(samples)
         if max(before.load, after.load) <= most
+        for stood in (after.stalls - before.stalls + rate * (after.stood - before.stood),)
     )
 
 

@@ -38,6 +38,9 @@ class Sample:
         shared: files in /dev/shm, of whoever.
         counters: of the exchange, since it began.
         latencies: answers by duration, in the bins of `drivers.exchange.latency`, likewise.
+        stalls: of the machine since the piece began, see `tests.endurance.stalls`; 0 where nobody
+            could look.
+        stood: s that they lasted.
     """
 
     t: float
@@ -46,6 +49,8 @@ class Sample:
     shared: int
     counters: Mapping[str, float]
     latencies: Sequence[int]
+    stalls: int = 0
+    stood: float = 0.0
 
 
 @dataclass(frozen=True)

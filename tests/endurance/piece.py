@@ -29,6 +29,7 @@ from hil.demo_link import LOOPBACK, SIMULATE, free_port
 from hil.errors import HilError
 from hil.progress import Reporter, Silent, Task
 from tests.endurance.journal import SYNC_EVERY, Ran, Use
+from tests.endurance.stalls import Stalls
 from tests.hil.fast_cell import fast_cell
 from tests.journal import Journal
 
@@ -70,6 +71,7 @@ class Watched:
     seconds: float
     supervisor: subprocess.Popen[bytes]
     controller: subprocess.Popen[bytes]
+    stalls: Stalls
     began: float = field(default_factory=time.monotonic)
     error: str = ""
     _processes: dict[str, psutil.Process] = field(default_factory=dict)
@@ -120,6 +122,7 @@ class Watched:
         for name, process in self._processes.items():
             with suppress(psutil.Error):
                 used[name] = asdict(_use(process))
+        stalls, stood = self.stalls.so_far
         self.journal.add(
             kind="sample",
             t=self._at,
@@ -128,6 +131,8 @@ class Watched:
             shared=sum(1 for _ in Path("/dev/shm").iterdir()),
             counters=counters,
             latencies=latencies,
+            stalls=stalls,
+            stood=stood,
         )
         now = min(self._at, self.seconds)
         self.task.advance(now - self._told, f"{counters['ended_count']:.0f} motions")
@@ -210,8 +215,11 @@ def run_piece(
             folder=str(work),
             machine=f"{os.cpu_count()} cores, {platform.system()} {platform.release()}",
         )
-        with _processes(work, seconds) as (controller, supervisor, summary):
-            watched = Watched(work, journal, task, seconds, supervisor, controller)
+        with (
+            Stalls(work) as stalls,
+            _processes(work, seconds) as (controller, supervisor, summary),
+        ):
+            watched = Watched(work, journal, task, seconds, supervisor, controller, stalls)
             reason = watched.watch(stop)
             with suppress(subprocess.TimeoutExpired):
                 supervisor.wait(LEAVING)

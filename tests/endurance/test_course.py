@@ -68,7 +68,7 @@ def shared_growing(one: Piece) -> Piece:
     [
         (lambda one: with_given_up(one, *range(160)), "160 of 160 campaigns were given up"),
         (lambda one: with_given_up(loaded(one), *range(81)), "81 of 160 campaigns"),
-        (lambda one: with_given_up(one, 70), "campaign 70 was given up, without any load"),
+        (lambda one: with_given_up(one, 70), "campaign 70 was given up, without any load or stall"),
         (lambda one: counted(one, "missed", 0.2), "20.0% of the answers were missed"),
         (lambda one: counted(loaded(one), "late", 0.3), "30.0% of the answers were late"),
         (lambda one: replace(one, ended={"supervisor": 1}), "ended with exit status 1"),
@@ -112,8 +112,35 @@ def test_some_answers_missed_and_campaigns_resumed_without_load_are_doubts(sound
     verdict = judge([counted(replace(sound, campaigns=campaigns), "missed", 1e-4)])
     assert verdict.faults == []
     resumed, missed = verdict.doubts
-    assert "2 restarts of campaigns without any load" in resumed
-    assert "48 answers were missed without any load" in missed
+    assert "2 restarts of campaigns without any load or stall" in resumed
+    assert "48 answers were missed without load or stall" in missed
+
+
+def stalling(one: Piece, share: float) -> Piece:
+    """The same on a machine that stands still for this share of the time, 10 ms now and then."""
+    samples = [replace(s, stalls=round(100 * share * s.t), stood=share * s.t) for s in one.samples]
+    return replace(one, samples=samples)
+
+
+def test_answers_missed_while_the_machine_stood_still_are_its_own_doing(sound: Piece) -> None:
+    missed = counted(with_given_up(sound, 70), "missed", 0.004)
+    verdict = judge([stalling(missed, 0.005)])
+    assert verdict.faults == []
+    (doubt,) = verdict.doubts
+    assert "1 of 160 campaigns were given up while the machine had more to do" in doubt
+
+
+def test_a_stall_excuses_no_more_answers_than_it_lasts(sound: Piece) -> None:
+    missed = counted(with_given_up(sound, 70), "missed", 0.004)
+    verdict = judge([stalling(missed, 0.002)])
+    (fault,) = verdict.faults
+    assert "campaign 70 was given up, without any load or stall" in fault
+    assert "answers were missed without load or stall" in verdict.doubts[0]
+
+
+def test_a_stall_excuses_no_campaign_that_missed_nothing(sound: Piece) -> None:
+    (fault,) = judge([stalling(with_given_up(sound, 70), 0.005)]).faults
+    assert "campaign 70 was given up" in fault
 
 
 def test_a_piece_without_an_end_is_a_doubt(sound: Piece) -> None:

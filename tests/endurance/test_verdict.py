@@ -60,7 +60,7 @@ def piece(
                 latencies=counts.tolist(),
             )
         )
-    begun = {"scheduling": "SCHED_FIFO 50", "machine": "2 cores, Linux"}
+    begun = {"scheduling": "SCHED_FIFO 50", "machine": "2 cores, Linux", "rate": 100}
     return Piece(begun, samples, [ran(n) for n in range(3)], {"reason": "", "supervisor": 0})
 
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import signal
 import sys
 import threading
 import time
@@ -58,6 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
             teller.say(f"{name}: {keeping.keep(name, given.journal)}")
         return 0
     until = time.monotonic() + 60.0 * (given.stop_after or 1e6)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     try:
         Run(names, 60.0 * given.minutes, until, given.journal, teller).work(given.jobs)
     except KeyboardInterrupt:

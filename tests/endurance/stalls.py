@@ -1,0 +1,85 @@
+"""How often and how long a core of this machine stands still, whatever runs on it.
+
+A virtual machine is not run for some milliseconds now and then, and all its processes miss what was
+due meanwhile. A process that does nothing but wake each millisecond, before everything else that
+has a real-time priority, tells that from a fault of ours: `python -m tests.endurance.stalls`.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+PERIOD: Final = 0.001
+"""s between two looks at the clock; what lasts longer than that is a stall."""
+PRIORITY: Final = 90
+"""Real-time priority, above all that is measured."""
+_COUNTS: Final = struct.Struct("<qd")  # how many, s in all
+
+
+class Stalls:
+    """One watcher a core, while this lasts; none without the right to real-time priority.
+
+    Args:
+        folder: for what they write.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._paths: Sequence[Path] = ()
+        self._undo = ExitStack()
+        if os.geteuid() == 0:
+            self._paths = [folder / f"stalls_{core}" for core in sorted(os.sched_getaffinity(0))]
+
+    @property
+    def so_far(self) -> tuple[int, float]:
+        """Stalls of all cores, and how long they stood still [s]."""
+        found = [_COUNTS.unpack(path.read_bytes()) for path in self._paths]
+        return sum(count for count, _ in found), sum(seconds for _, seconds in found)
+
+    def __enter__(self) -> Self:
+        with ExitStack() as undo:
+            for path in self._paths:
+                path.write_bytes(_COUNTS.pack(0, 0.0))
+                command = [sys.executable, "-m", "tests.endurance.stalls", str(path)]
+                watcher = undo.enter_context(
+                    subprocess.Popen(command, cwd=Path(__file__).parents[2])
+                )
+                undo.callback(watcher.kill)
+            self._undo = undo.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._undo.close()
+
+
+def watch(path: Path) -> None:
+    """Watch the core that the name of the file ends with, until the parent ends."""
+    os.sched_setaffinity(0, {int(path.name.rpartition("_")[2])})
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    parent, count, stood = os.getppid(), 0, 0.0
+    with path.open("r+b", buffering=0) as file:
+        due = time.monotonic()
+        while os.getppid() == parent:
+            due += PERIOD
+            time.sleep(max(0.0, due - time.monotonic()))
+            late = time.monotonic() - due
+            if late > PERIOD:
+                count, stood, due = count + 1, stood + late, due + late
+                os.pwrite(file.fileno(), _COUNTS.pack(count, stood), 0)
+
+
+if __name__ == "__main__":
+    watch(Path(sys.argv[1]))
