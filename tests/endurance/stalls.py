@@ -12,7 +12,6 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -26,17 +25,15 @@ _COUNTS: Final = struct.Struct("<qd")  # how many, s in all
 
 
 class Stalls:
-    """One watcher a core, while this lasts; none without the right to real-time priority.
+    """One watcher a core, while this lasts; none sees any without the right to real-time priority.
 
     Args:
         folder: for what they write.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._paths: Sequence[Path] = ()
+        self._paths = [folder / f"stalls_{core}" for core in sorted(os.sched_getaffinity(0))]
         self._undo = ExitStack()
-        if os.geteuid() == 0:
-            self._paths = [folder / f"stalls_{core}" for core in sorted(os.sched_getaffinity(0))]
 
     @property
     def so_far(self) -> tuple[int, float]:
@@ -68,7 +65,10 @@ class Stalls:
 def watch(path: Path) -> None:
     """Watch the core that the name of the file ends with, until the parent ends."""
     os.sched_setaffinity(0, {int(path.name.rpartition("_")[2])})
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except PermissionError:
+        return  # it would wait for other processes, and take that for a stall
     parent, count, stood = os.getppid(), 0, 0.0
     with path.open("r+b", buffering=0) as file:
         due = time.monotonic()
