@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent / "fault_matrix"))
-
-import small_cell
-from laws import LIMITS, N
 
 from drivers import (
     CycleRing,
@@ -27,6 +20,8 @@ from drivers import (
 )
 from planner import TrajectoryPlayer, plan
 from sim_fixtures import Phase
+from tests.fault_matrix import small_cell
+from tests.fault_matrix.laws import LIMITS, N
 
 HOME = np.array(small_cell.HOME)
 WAY = np.array([0.3, 0.375])

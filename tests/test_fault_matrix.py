@@ -9,19 +9,22 @@ rest; and a new motion, requested after somebody has switched the drive on again
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent / "fault_matrix"))
-
-import numpy as np
-from faulty_runs import FAULTS, SITUATIONS, behaviours, cases, cycles_without_a_fault, play
-from laws import broken_in_records, broken_on_the_wire
-from outcomes import EXPECTED, HEADING, row
-
 from drivers import CyclicPacket, State
+from tests.fault_matrix.faulty_runs import (
+    FAULTS,
+    SITUATIONS,
+    behaviours,
+    cases,
+    cycles_without_a_fault,
+    play,
+)
+from tests.fault_matrix.laws import broken_in_records, broken_on_the_wire
+from tests.fault_matrix.outcomes import EXPECTED, HEADING, row
 
 
 def test_the_table_has_every_fault_in_every_situation() -> None:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 
 import numpy as np
-import oracle
 
 from drivers import CycleRing, DriveTrain, Guard, GuardLimits, InitPacket, Session
+from tests.drivers import oracle
 
 PERIOD = 0.002
 OPEN, CLOSED = 4, 0

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from can_bench import init_packet, random_packet
-from transport_contract import TransportContract
 
 from drivers import CyclicPacket
 from drivers.packets import next_number
 from sim_fixtures.can_end import CanFarEnd
+from tests.drivers.can_bench import init_packet, random_packet
+from tests.drivers.transport_contract import TransportContract
 
 
 class Far:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from can_bench import (
+
+from drivers import CycleRing, Guard, Session, exchange
+from tests.drivers.can_bench import (
     HOME,
     Cycles,
     N,
@@ -13,9 +15,7 @@ from can_bench import (
     virtual_ends,
     wide_limits,
 )
-from rig import smooth_move
-
-from drivers import CycleRing, Guard, Session, exchange
+from tests.drivers.rig import smooth_move
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 PERIOD = 0.002

@@ -1,13 +1,8 @@
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 
-# Helpers shared by these tests are modules beside them.
-sys.path.insert(0, str(Path(__file__).parent))
-pytest.register_assert_rewrite(
-    *("transport_contract", "can_contract", "rig", "judge", "judged", "reception", "oracle"),
-    *("session_machine", "arms_bench"),
-)
+_HELPERS = ("transport_contract", "can_contract", "rig", "judge", "judged", "reception", "oracle",
+            "session_machine", "arms_bench")  # fmt: skip
+
+pytest.register_assert_rewrite(*(f"tests.drivers.{name}" for name in _HELPERS))

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rig import N, limits
 
 from drivers import GuardLimits
 from drivers.errors import GuardError
+from tests.drivers.rig import N, limits
 
 REST = np.zeros(N)
 WIDE = 1e9

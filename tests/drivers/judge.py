@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import oracle
 
 from drivers import DriveTrain, GuardLimits, State
+from tests.drivers import oracle
 
 REFUSALS = (oracle.DRIVE_OFF_REQUEST, oracle.FOLLOWING_ERROR)
 MODE_FIELDS = {1: (1, 2, 4, 5), 2: (4, 5), 4: (1, 2), 5: (1, 2), 7: (1,), 8: (4,), 9: (5,)}

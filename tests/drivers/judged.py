@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import oracle
-from judge import Conduct
-from reception import Reception, number_of
-
 from drivers import CycleRing, InitReceived, MotionEnded, Session
+from tests.drivers import oracle
+from tests.drivers.judge import Conduct
+from tests.drivers.reception import Reception, number_of
 
 SILENCE = 301.0
 """s: longer than any silence may last."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import oracle
-from judge import POSITION_MODES
-from rig import START, drive_train, init_packet
+
+from tests.drivers import oracle
+from tests.drivers.judge import POSITION_MODES
+from tests.drivers.rig import START, drive_train, init_packet
 
 PERIOD = 0.002
 N = 6

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import oracle
+from tests.drivers import oracle
 
 LAST = 0x7FFF
 Kind = Literal["nothing", "again", "echo", "init", "cyclic"]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-import oracle
 from hypothesis import strategies as st
 from hypothesis.stateful import (
     RuleBasedStateMachine,
@@ -18,9 +17,18 @@ from hypothesis.stateful import (
     precondition,
     rule,
 )
-from judge import POSITION_MODES, Conduct
-from judged import Judged
-from model_controller import (
+
+from drivers import (
+    CycleRing,
+    Guard,
+    RequestError,
+    Session,
+    State,
+)
+from tests.drivers import oracle
+from tests.drivers.judge import POSITION_MODES, Conduct
+from tests.drivers.judged import Judged
+from tests.drivers.model_controller import (
     ARMS,
     AXES,
     GOOD_INIT,
@@ -31,17 +39,9 @@ from model_controller import (
     Controller,
     N,
 )
-from reception import number_of
-from rig import START, drive_train, limits
-from sources import WILD, corrections, motions
-
-from drivers import (
-    CycleRing,
-    Guard,
-    RequestError,
-    Session,
-    State,
-)
+from tests.drivers.reception import number_of
+from tests.drivers.rig import START, drive_train, limits
+from tests.drivers.sources import WILD, corrections, motions
 
 WINDOW = 500
 MAX_GAP = 2

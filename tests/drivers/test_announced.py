@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rig import PERIOD, drive_train
 
 from drivers import DriveTrain, InitPacket
 from drivers.announced import Announced, AnnouncedLimits, compare, shown
+from tests.drivers.rig import PERIOD, drive_train
 
 COUPLING = (0.02, 0.003, 0.04)
 

@@ -8,12 +8,9 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-import oracle
 import pytest
-from arms_bench import CLOSED, ON, OPEN, Bench
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from rig import Table
 
 from drivers import (
     FollowingError,
@@ -23,6 +20,9 @@ from drivers import (
     RequestError,
     State,
 )
+from tests.drivers import oracle
+from tests.drivers.arms_bench import CLOSED, ON, OPEN, Bench
+from tests.drivers.rig import Table
 
 
 @st.composite

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cantools
 import numpy as np
 import pytest
-from can_bench import PROFILES, N, Wire, decoded, init_packet, random_packet
 
 from drivers.packets import CyclicPacket
 from drivers.transports.can.answers import words_of
@@ -19,6 +18,7 @@ from drivers.transports.can.layout import (
     SLOW_FIELDS,
     Frame,
 )
+from tests.drivers.can_bench import PROFILES, N, Wire, decoded, init_packet, random_packet
 
 CODES = {"fd": FD_MODE_CODES, "classic": CLASSIC_MODE_CODES}
 AXES = range(1, N + 1)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from can_bench import PROFILES, N, Wire, decoded, init_packet, random_packet
-from rig import Rig, smooth_move
 
 from drivers import CyclicPacket, Mode
 from drivers.packets import next_number
@@ -13,6 +11,8 @@ from drivers.transports.can.answers import words_of
 from drivers.transports.can.errors import CanModeError, CanValueError
 from drivers.transports.can.layout import CLASSIC_MODE_CODES, FD_MODE_CODES
 from drivers.transports.can.slow import NEVER
+from tests.drivers.can_bench import PROFILES, N, Wire, decoded, init_packet, random_packet
+from tests.drivers.rig import Rig, smooth_move
 
 MODES = {"fd": FD_MODE_CODES, "classic": CLASSIC_MODE_CODES}
 STEP = 2.0**-16

@@ -6,7 +6,6 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from can_bench import PROFILES, N, Wire, random_packet
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,6 +15,7 @@ from drivers.transports.can.answers import words_of
 from drivers.transports.can.layout import SEGMENT_UP, Frame
 from drivers.transports.can.segments import LONGEST, SegmentAssembler, Segmenter
 from drivers.transports.can.slow import NEVER
+from tests.drivers.can_bench import PROFILES, N, Wire, random_packet
 
 FRESH = (0, 1, 3, 5)
 """Mode, D1, D3 and D5 among the nine words of an axis."""

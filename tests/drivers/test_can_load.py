@@ -8,7 +8,6 @@ import sys
 import can
 import numpy as np
 import pytest
-from can_bench import Cycles, PacedByPackets, ns16_controller, ns16_train, virtual_ends, wide_limits
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,6 +15,14 @@ from drivers import CycleRing, Guard, Session, exchange
 from drivers.transports.can.bus_load import LOAD_LIMIT, BusRates, classic_bits, fd_bits
 from drivers.transports.can.errors import CanBusLoadError
 from drivers.transports.can.layout import PAYLOADS_FD, SEGMENT_DOWN, SEGMENT_UP
+from tests.drivers.can_bench import (
+    Cycles,
+    PacedByPackets,
+    ns16_controller,
+    ns16_train,
+    virtual_ends,
+    wide_limits,
+)
 
 
 def test_a_classic_frame_of_eight_bytes_has_111_bits_and_135_at_worst():

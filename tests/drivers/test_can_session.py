@@ -6,7 +6,11 @@ import queue
 
 import numpy as np
 import pytest
-from can_bench import (
+
+from drivers import CycleRing, GapSeen, Guard, MotionEnded, PacketRejected, Session, State, exchange
+from drivers.transports.can import CanSpec
+from sim_fixtures.can_end import open_far_end
+from tests.drivers.can_bench import (
     HOME,
     PROFILES,
     Cycles,
@@ -17,12 +21,8 @@ from can_bench import (
     virtual_ends,
     wide_limits,
 )
-from can_run import MOVE, PERIOD, Run
-from slcan_adapter import SlcanBus
-
-from drivers import CycleRing, GapSeen, Guard, MotionEnded, PacketRejected, Session, State, exchange
-from drivers.transports.can import CanSpec
-from sim_fixtures.can_end import open_far_end
+from tests.drivers.can_run import MOVE, PERIOD, Run
+from tests.drivers.slcan_adapter import SlcanBus
 
 
 @pytest.fixture(scope="module", params=PROFILES)

@@ -9,13 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from can_bench import PROFILES, init_packet
-from can_contract import CanContract, Far
-from can_run import PERIOD, Run
 
 from drivers import CyclicPacket, MotionEnded
 from drivers.transports.can import CanSpec
 from sim_fixtures.can_end import open_far_end
+from tests.drivers.can_bench import PROFILES, init_packet
+from tests.drivers.can_contract import CanContract, Far
+from tests.drivers.can_run import PERIOD, Run
 
 CHANNEL = "vcan0"
 pytestmark = pytest.mark.skipif(

@@ -10,13 +10,6 @@ import pickle
 import can
 import numpy as np
 import pytest
-from can_bench import (
-    PROFILES,
-    init_packet,
-    virtual_ends,
-)
-from can_contract import CanContract, Far
-from slcan_adapter import SlcanBus
 
 from drivers import CyclicPacket, TransportClosed
 from drivers.transports.base import TransportError
@@ -31,6 +24,13 @@ from drivers.transports.can import (
 )
 from sim_fixtures.can_end import CanFarEnd, open_far_end
 from sim_fixtures.far_end import FarEndError
+from tests.drivers.can_bench import (
+    PROFILES,
+    init_packet,
+    virtual_ends,
+)
+from tests.drivers.can_contract import CanContract, Far
+from tests.drivers.slcan_adapter import SlcanBus
 
 GROUP = "239.74.163.77"
 _ports = itertools.count(20000 + os.getpid() % 10000)

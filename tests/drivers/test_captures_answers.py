@@ -12,10 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import oracle
 import pytest
-from captures import CAPTURES, conversation
-from rig import Table
 
 from drivers import (
     CycleRing,
@@ -31,6 +28,9 @@ from drivers import (
     VelocityLimit,
 )
 from drivers.packets import INIT_LENGTH
+from tests.drivers import oracle
+from tests.drivers.captures import CAPTURES, conversation
+from tests.drivers.rig import Table
 
 SEVEN_AXES = "s_TestMode4_movement_7ax_stagger"
 IMPOSSIBLE_MAP = "b_ufmg_literal"

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import oracle
 import pytest
-from captures import CAPTURES, conversation
 
 from drivers import CyclicPacket, InitPacket
 from drivers.packet_records import PacketRing
@@ -16,6 +14,8 @@ from drivers.transports import SimulatedTransport
 from drivers.transports.tapped import tapped
 from hil.archive import ArchiveWriter, open_archive
 from hil.archive.schema import PACKETS
+from tests.drivers import oracle
+from tests.drivers.captures import CAPTURES, conversation
 
 SEVEN_AXES = "s_TestMode4_movement_7ax_stagger"
 

@@ -6,12 +6,12 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import oracle
 import pytest
-from captures import CAPTURES, capture_path, conversation, read_datagrams
 
 from drivers import CyclicPacket, InitPacket
 from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, echo, is_init
+from tests.drivers import oracle
+from tests.drivers.captures import CAPTURES, capture_path, conversation, read_datagrams
 
 SEVEN_AXES = "s_TestMode4_movement_7ax_stagger"
 

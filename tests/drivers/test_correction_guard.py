@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rig import PERIOD, N, limits
 
 from drivers import Guard, GuardError, JerkLimit, NotFinite
 from drivers.correction_guard import CorrectionGuard
 from drivers.errors import CorrectionNotEnded, PositionLimit
+from tests.drivers.rig import PERIOD, N, limits
 
 BOUNDS = limits()
 FACTORS = {"plan": (1.0, 1.0), "override": (1.3, 1.7), "stop": (2.0, 3.0)}

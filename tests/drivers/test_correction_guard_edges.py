@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import edges
 import numpy as np
 import pytest
-from edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
-from rig import PERIOD, N, limits
 
 from drivers import Guard, GuardLimits
 from drivers.correction_guard import CorrectionGuard
@@ -20,6 +17,9 @@ from drivers.errors import (
     PositionLimit,
     VelocityLimit,
 )
+from tests.drivers import edges
+from tests.drivers.edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
+from tests.drivers.rig import PERIOD, N, limits
 
 
 def begun(kind: str, bounds: GuardLimits | None = None) -> CorrectionGuard:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rig import PERIOD, START, Cruise, N, Rig, smooth_move
 
 from drivers import (
     Corrupt,
@@ -23,6 +22,7 @@ from drivers import (
     exchange,
 )
 from drivers.exchange.intake import MOST_KINDS
+from tests.drivers.rig import PERIOD, START, Cruise, N, Rig, smooth_move
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 

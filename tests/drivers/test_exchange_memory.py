@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rig import Cruise, N, still
 
 from drivers import GapSeen, MotionEnded, StateChanged
 from drivers.events import AnswersLost, Outcome, PacketRejected
@@ -32,6 +31,7 @@ from drivers.exchange import (
 from drivers.exchange.digest import Digest
 from drivers.record import CycleRing, cycle_dtype
 from drivers.states import State
+from tests.drivers.rig import Cruise, N, still
 
 
 def write(ring: CycleRing, numbers) -> None:

@@ -15,8 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig import PERIOD, START, Cruise, N, drive_train, limits, smooth_move, still
-from udp_controller import HOST, UdpController
 
 from drivers import MotionEnded, MotionStarted, RequestError, State, StateChanged
 from drivers.exchange import (
@@ -39,6 +37,8 @@ from drivers.exchange import (
 )
 from drivers.exchange.serving import LONGEST_LINGER
 from drivers.transports import TransportError, UdpSpec, UdpTransport
+from tests.drivers.rig import PERIOD, START, Cruise, N, drive_train, limits, smooth_move, still
+from tests.drivers.udp_controller import HOST, UdpController
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 ORDINARY = RealTimeSettings(priority=0, lock_memory=False, hold_cpu_awake=False)
@@ -552,9 +552,9 @@ class TestStops:
 
 SUPERVISOR = """
 import sys, threading, time
-sys.path[:0] = {path!r}
-from rig import Cruise
-from test_exchange_process import settings
+sys.path.insert(0, {root!r})
+from tests.drivers.rig import Cruise
+from tests.drivers.test_exchange_process import settings
 from drivers.exchange import ExchangeProcess
 exchange = ExchangeProcess.start(settings({port}))
 print(exchange.pid, flush=True)
@@ -572,8 +572,7 @@ time.sleep(60)
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP])
 def test_the_death_of_the_supervisor_stops_the_arm_on_its_path(number):
     port = free_port()
-    here = str(Path(__file__).parent)
-    script = SUPERVISOR.format(path=[here, str(Path(here).parents[1])], port=port)
+    script = SUPERVISOR.format(root=str(Path(__file__).parents[2]), port=port)
     supervisor = subprocess.Popen(
         [sys.executable, "-c", script],
         stdout=subprocess.PIPE,

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import PERIOD, N, drive_train, limits
 
 from drivers import CyclicPacket, Mode, State
 from drivers.exchange.rehearsal import Rehearsal, rehearse
+from tests.drivers.rig import PERIOD, N, drive_train, limits
 
 
 @pytest.mark.parametrize("period", [0.001, 0.002])

@@ -6,7 +6,6 @@ import socket
 import time
 
 import pytest
-from rig import N
 
 from drivers.errors import RequestError
 from drivers.events import Counters, GapSeen, MotionEnded, PacketRejected
@@ -25,6 +24,7 @@ from drivers.exchange import (
 from drivers.exchange.control import PATIENCE, STALE
 from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Serving
 from drivers.states import State
+from tests.drivers.rig import N
 
 STEP = 0.01
 

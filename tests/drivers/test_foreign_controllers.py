@@ -10,13 +10,13 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import oracle
 import pytest
-from captures import CAPTURES, conversation
-from test_captures_answers import MOVED, Replay, fields, replace_mode, replay_of
 
 from drivers import FollowingError, MotionNotCarriedOn, Refused, State
 from drivers.packets import INIT_LENGTH
+from tests.drivers import oracle
+from tests.drivers.captures import CAPTURES, conversation
+from tests.drivers.test_captures_answers import MOVED, Replay, fields, replace_mode, replay_of
 
 FOLLOWING_ERROR = 0.05
 """Motor revolutions, in the cell: narrower than what these controllers announce."""

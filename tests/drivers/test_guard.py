@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rig import PERIOD, START, N, limits
 
 from drivers import AccelerationLimit, Guard, GuardError, JerkLimit, VelocityLimit
+from tests.drivers.rig import PERIOD, START, N, limits
 
 REST = np.zeros(N)
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import edges
 import numpy as np
 import pytest
-from edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
-from rig import PERIOD, START, N, limits
 
 from drivers import Guard
 from drivers.errors import (
@@ -23,6 +20,9 @@ from drivers.errors import (
     VelocityLimit,
     VelocityMismatch,
 )
+from tests.drivers import edges
+from tests.drivers.edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
+from tests.drivers.rig import PERIOD, START, N, limits
 
 EVERY = np.ones(N, dtype=bool)
 TURNS = np.array([40.0, -30.0, 20.0, -10.0, 5.0, -2.0])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import N, limits
 
 from drivers import Guard, GuardLimits
+from tests.drivers.rig import N, limits
 
 
 class TestLimits:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from rig import START, Cruise, N
 
 from drivers import Mode, RequestError, SourceFailed, State
 from drivers.events import (
@@ -19,6 +18,7 @@ from drivers.events import (
 from drivers.execution import Execution, execution_of
 from drivers.machine import LOSS_WINDOW, Machine
 from drivers.states import Input
+from tests.drivers.rig import START, Cruise, N
 
 TO_OPEN = (Input.INIT, Input.CLOSED, Input.OPEN)
 MAX_GAP = 2

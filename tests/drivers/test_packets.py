@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import CAPTURES, read_datagrams
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,6 +22,7 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
+from tests.drivers.captures import CAPTURES, read_datagrams
 
 
 class TestNumbers:

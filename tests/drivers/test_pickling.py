@@ -8,7 +8,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from rig import Cruise, Rig, init_packet, moving, still
 
 from drivers import errors, events
 from drivers.errors import (
@@ -27,6 +26,7 @@ from drivers.errors import (
 from drivers.packets import InitPacket
 from drivers.record import cycle_dtype
 from drivers.states import State
+from tests.drivers.rig import Cruise, Rig, init_packet, moving, still
 
 EXAMPLES = {
     DriverError: DriverError("anything"),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import START, Rig, all_drive_off
 
 from drivers import Mode
 from drivers.packets import LAST_NUMBER
 from drivers.reading import Reader
 from drivers.replies import safe_answer
 from drivers.sequence import Sequence
+from tests.drivers.rig import START, Rig, all_drive_off
 
 HALF = LAST_NUMBER // 2
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
+
+from drivers import Mode, MotionHeld, State
+from drivers.errors import FirstSetPointUnknown, MotionUnknown
+from tests.drivers.rig import (
     Cruise,
     N,
     Rig,
@@ -15,9 +18,6 @@ from rig import (
     smooth_move,
     still,
 )
-
-from drivers import Mode, MotionHeld, State
-from drivers.errors import FirstSetPointUnknown, MotionUnknown
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 D1, D2, D3, D4, D5 = range(5)

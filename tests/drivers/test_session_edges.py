@@ -4,15 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    PERIOD,
-    Cruise,
-    N,
-    Rig,
-    assert_refused,
-    init_packet,
-    moving,
-)
 
 from drivers import (
     CyclicPacket,
@@ -32,6 +23,15 @@ from drivers.errors import (
 from drivers.events import AnswersLost
 from drivers.packets import INIT_LENGTH, LAST_NUMBER
 from drivers.session import MAX_GAP
+from tests.drivers.rig import (
+    PERIOD,
+    Cruise,
+    N,
+    Rig,
+    assert_refused,
+    init_packet,
+    moving,
+)
 
 
 class TestConstruction:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import PERIOD, START, Cruise, N, Rig, all_drive_off, assert_refused, smooth_move, still
 
 from drivers import (
     CurrentLimit,
@@ -20,6 +19,17 @@ from drivers import (
 from drivers.answers import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
 from drivers.errors import ExitNotGranted, FirstSetPointUnknown
 from drivers.states import CORRECTION_MODES
+from tests.drivers.rig import (
+    PERIOD,
+    START,
+    Cruise,
+    N,
+    Rig,
+    all_drive_off,
+    assert_refused,
+    smooth_move,
+    still,
+)
 
 TIMEOUT = round(EXIT_TIMEOUT / PERIOD)
 

@@ -4,16 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    PERIOD,
-    START,
-    Cruise,
-    Rig,
-    assert_refused,
-    moving,
-    smooth_move,
-    still,
-)
 
 from drivers import (
     GapSeen,
@@ -25,6 +15,16 @@ from drivers import (
     NotFinite,
     RefusalError,
     State,
+)
+from tests.drivers.rig import (
+    PERIOD,
+    START,
+    Cruise,
+    Rig,
+    assert_refused,
+    moving,
+    smooth_move,
+    still,
 )
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])

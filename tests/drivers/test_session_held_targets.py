@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
+
+from drivers import FollowingError, Mode, NotFinite, Refused, State
+from drivers.errors import TargetNotFinite
+from drivers.packets import DRIVE_ON, CyclicPacket
+from tests.drivers.rig import (
     START,
     Cruise,
     N,
@@ -13,10 +17,6 @@ from rig import (
     init_packet,
     still,
 )
-
-from drivers import FollowingError, Mode, NotFinite, Refused, State
-from drivers.errors import TargetNotFinite
-from drivers.packets import DRIVE_ON, CyclicPacket
 
 NOT_FINITE = [np.nan, np.inf, -np.inf]
 

@@ -4,18 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    PERIOD,
-    START,
-    Correction,
-    Cruise,
-    N,
-    Rig,
-    all_drive_off,
-    limits,
-    moving,
-    smooth_move,
-)
 
 from drivers import (
     AccelerationLimit,
@@ -28,6 +16,18 @@ from drivers import (
     State,
 )
 from planner import JointLimits, TrajectoryPlayer, plan
+from tests.drivers.rig import (
+    PERIOD,
+    START,
+    Correction,
+    Cruise,
+    N,
+    Rig,
+    all_drive_off,
+    limits,
+    moving,
+    smooth_move,
+)
 
 WAY = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import START, N, Rig, drive_train, init_packet, smooth_move, still
 
 from drivers import InitReceived, Mode, RequestError, State
 from drivers.announced import narrower, shown
 from drivers.packets import NO_SLOT
+from tests.drivers.rig import START, N, Rig, drive_train, init_packet, smooth_move, still
 
 
 class TestInitOfAnotherArm:

@@ -7,10 +7,20 @@ import struct
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rig import NOT_SET_POINTS, PERIOD, START, GoesOn, N, Rig, Table, drive_train, limits
 
 from drivers import CyclicPacket, Mode, MotionEnded, State
 from drivers.packets import INIT_LENGTH, LAST_NUMBER, cyclic_length, next_number
+from tests.drivers.rig import (
+    NOT_SET_POINTS,
+    PERIOD,
+    START,
+    GoesOn,
+    N,
+    Rig,
+    Table,
+    drive_train,
+    limits,
+)
 
 TOLERANCE = 1e-5
 BOUNDS = limits()

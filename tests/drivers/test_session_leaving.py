@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import PERIOD, START, Correction, N, Rig, bump, moving
 
 from drivers import FollowingError, Mode, Refused, State
 from drivers.errors import MotionUnknown, NotAtStandstill
 from drivers.states import CORRECTION_MODES
+from tests.drivers.rig import PERIOD, START, Correction, N, Rig, bump, moving
 
 
 class TestRecordsWhileLeaving:

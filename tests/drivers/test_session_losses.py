@@ -4,15 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    Cruise,
-    N,
-    Rig,
-    all_drive_off,
-    assert_refused,
-    moving,
-    still,
-)
 
 from drivers import (
     AxisLeft,
@@ -20,6 +11,15 @@ from drivers import (
     InitReceived,
     Mode,
     State,
+)
+from tests.drivers.rig import (
+    Cruise,
+    N,
+    Rig,
+    all_drive_off,
+    assert_refused,
+    moving,
+    still,
 )
 
 

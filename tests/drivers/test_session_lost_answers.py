@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import START, Cruise, N, Rig, assert_refused, limits, moving, still
 
 from drivers import MotionNotCarriedOn, State
 from drivers.events import AnswersLost
+from tests.drivers.rig import START, Cruise, N, Rig, assert_refused, limits, moving, still
 
 STEP = 1.9 * 0.002 * 120.0 / (2.0 * np.pi)
 """Motor revolutions per cycle of joint 1 at full speed."""

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
-from model_controller import PERIOD, N
-from session_machine import SessionMachine
-from sources import Breaks, ScriptedMotion, smooth
 
 import drivers.machine
 from drivers import Guard, State
 from drivers.machine import Machine
 from drivers.states import TRANSITIONS, Input
+from tests.drivers.model_controller import PERIOD, N
+from tests.drivers.session_machine import SessionMachine
+from tests.drivers.sources import Breaks, ScriptedMotion, smooth
 
 QUICK = settings(
     max_examples=60,

@@ -4,21 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    PERIOD,
-    START,
-    Correction,
-    Cruise,
-    N,
-    Rig,
-    Table,
-    all_drive_off,
-    assert_refused,
-    bump,
-    init_packet,
-    limits,
-    smooth_move,
-)
 
 from drivers import (
     AccelerationLimit,
@@ -43,6 +28,21 @@ from drivers.errors import (
 )
 from drivers.packets import DRIVE_ON, MODE_FIELDS
 from drivers.states import CORRECTION_MODES, HOLDABLE, INCREMENTAL, POSITION_MODES
+from tests.drivers.rig import (
+    PERIOD,
+    START,
+    Correction,
+    Cruise,
+    N,
+    Rig,
+    Table,
+    all_drive_off,
+    assert_refused,
+    bump,
+    init_packet,
+    limits,
+    smooth_move,
+)
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 HEIGHT = np.array([0.01, -0.005, 0.02, 0.01, -0.01, 0.005])

@@ -4,15 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    START,
-    Cruise,
-    N,
-    Rig,
-    init_packet,
-    smooth_move,
-    still,
-)
 
 from drivers import (
     CyclicPacket,
@@ -24,6 +15,15 @@ from drivers import (
 )
 from drivers.answers import EXIT_RETRY_CYCLES
 from drivers.packets import NO_SLOT
+from tests.drivers.rig import (
+    START,
+    Cruise,
+    N,
+    Rig,
+    init_packet,
+    smooth_move,
+    still,
+)
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 

@@ -4,16 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    START,
-    Cruise,
-    N,
-    Rig,
-    init_packet,
-    limits,
-    smooth_move,
-    still,
-)
 
 from drivers import (
     CurrentLimit,
@@ -24,6 +14,16 @@ from drivers import (
     NotFinite,
     PositionLimit,
     State,
+)
+from tests.drivers.rig import (
+    START,
+    Cruise,
+    N,
+    Rig,
+    init_packet,
+    limits,
+    smooth_move,
+    still,
 )
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import PERIOD, START, Correction, Cruise, GoesOn, N, Rig, assert_refused, limits
 
 from drivers import AccelerationLimit, JerkLimit, RequestError, SourceFailed, State
+from tests.drivers.rig import (
+    PERIOD,
+    START,
+    Correction,
+    Cruise,
+    GoesOn,
+    N,
+    Rig,
+    assert_refused,
+    limits,
+)
 
 WIDE = {"jerk": np.full(N, 1e9)}
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    PERIOD,
-    START,
-    Rig,
-    smooth_move,
-)
 
 from drivers import (
     Mode,
     State,
+)
+from tests.drivers.rig import (
+    PERIOD,
+    START,
+    Rig,
+    smooth_move,
 )
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])

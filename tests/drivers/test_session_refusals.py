@@ -4,22 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import (
-    PERIOD,
-    START,
-    Cruise,
-    GoesOn,
-    N,
-    Rig,
-    Table,
-    all_drive_off,
-    assert_refused,
-    init_packet,
-    limits,
-    moving,
-    smooth_move,
-    still,
-)
 
 from drivers import (
     AccelerationLimit,
@@ -38,6 +22,22 @@ from drivers import (
     VelocityMismatch,
 )
 from drivers.session import FLIGHT_RECORDER, STOP_TIMEOUT
+from tests.drivers.rig import (
+    PERIOD,
+    START,
+    Cruise,
+    GoesOn,
+    N,
+    Rig,
+    Table,
+    all_drive_off,
+    assert_refused,
+    init_packet,
+    limits,
+    moving,
+    smooth_move,
+    still,
+)
 
 WIDE = {"jerk": np.full(N, 1e9)}
 

@@ -6,10 +6,10 @@ import struct
 
 import numpy as np
 import pytest
-from rig import N, Rig, init_packet, still
 
 from drivers import CyclicPacket, InitReceived, LinkLost, Mode, MotionEnded, PacketRejected, State
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
+from tests.drivers.rig import N, Rig, init_packet, still
 
 WORDS = 9
 

@@ -6,10 +6,10 @@ from time import perf_counter
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from transport_contract import TransportContract
 
 from drivers import Corrupt, Duplicate, Lose, SimulatedTransport, TransportClosed
 from drivers.transports.faults import Delay, FaultyLink, Reorder
+from tests.drivers.transport_contract import TransportContract
 
 
 class Script:

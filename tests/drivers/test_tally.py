@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from rig import Rig
 
 from drivers import PacketRejected
+from tests.drivers.rig import Rig
 
 
 def test_what_the_link_discarded_is_counted_and_told_once():

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rig import PERIOD, N, limits
 
 from drivers import Guard
 from drivers.errors import MotionNotCarriedOn, NotFinite
 from drivers.taken import TakenSetPoints
+from tests.drivers.rig import PERIOD, N, limits
 
 TURNS = np.array([40.0, -30.0, 20.0, -10.0, 5.0, -2.0])
 SLOW = 0.01

@@ -9,8 +9,6 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from rig import N, drive_train, init_packet, limits
-from transport_contract import TransportContract
 
 from drivers import (
     CycleRing,
@@ -26,6 +24,8 @@ from drivers.exchange import listening
 from drivers.transports import TransportError, UdpSpec, UdpTransport
 from drivers.transports.base import Stamped
 from drivers.transports.udp import MOST_PASSED_OVER
+from tests.drivers.rig import N, drive_train, init_packet, limits
+from tests.drivers.transport_contract import TransportContract
 
 HOST = "127.0.0.1"
 STRANGER = "127.0.0.2"

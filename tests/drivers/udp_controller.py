@@ -7,10 +7,10 @@ import socket
 import time
 
 import numpy as np
-from rig import START, N, drive_train, init_packet
 
 from drivers import CyclicPacket, Mode
 from drivers.packets import DRIVE_ON, next_number
+from tests.drivers.rig import START, N, drive_train, init_packet
 
 HOST = "127.0.0.1"
 

@@ -7,12 +7,9 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from faulty_runs import FAULTS, SITUATIONS, behaviours, play
-from outcomes import HEADING, row
+from tests.fault_matrix.faulty_runs import FAULTS, SITUATIONS, behaviours, play
+from tests.fault_matrix.outcomes import HEADING, row
 
 
 def main() -> None:

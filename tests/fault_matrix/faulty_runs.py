@@ -14,16 +14,6 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
-import small_cell
-from laws import (
-    LIMITS,
-    MAX_GAP,
-    PERIOD,
-    SESSION_THRESHOLD,
-    TOLERATED,
-    broken_in_records,
-    broken_on_the_wire,
-)
 from numpy.typing import NDArray
 
 from drivers import (
@@ -47,6 +37,16 @@ from drivers.packets import Mode, cyclic_length
 from planner import TrajectoryPlayer, plan
 from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.fault_script import parse_fault, split_faults
+from tests.fault_matrix import small_cell
+from tests.fault_matrix.laws import (
+    LIMITS,
+    MAX_GAP,
+    PERIOD,
+    SESSION_THRESHOLD,
+    TOLERATED,
+    broken_in_records,
+    broken_on_the_wire,
+)
 
 Array = NDArray[np.float64]
 

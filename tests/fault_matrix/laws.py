@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
-import small_cell
 from numpy.typing import NDArray
 
 from drivers import Counters, CyclicPacket, State
 from drivers.packets import DRIVE_ON, Mode, cyclic_length, is_init, next_number, packet_number
 from planner import JointLimits
+from tests.fault_matrix import small_cell
 
 Array = NDArray[np.float64]
 Exchanged = Sequence[Sequence[Any]]

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from faulty_runs import SITUATIONS
+from tests.fault_matrix.faulty_runs import SITUATIONS
 
 _SPANS: Final[dict[str, dict[str, str]]] = {
     "packet lost": {

@@ -8,27 +8,29 @@ stops, overrides. What must hold is what the judge of the drivers' tests says (`
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
-
-# Shared with the tests of the drivers, whose modules stand beside one another.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
-
-import oracle
-from judge import POSITION_MODES, Conduct
-from judged import Judged
-from reception import number_of
-from sources import FAULTS, WILD, Breaks, FedMotion, ScriptedCorrection, ScriptedMotion, smooth
 
 from drivers import (
     CycleRing,
     Guard,
     RequestError,
     Session,
+)
+from tests.drivers import oracle
+from tests.drivers.judge import POSITION_MODES, Conduct
+from tests.drivers.judged import Judged
+from tests.drivers.reception import number_of
+from tests.drivers.sources import (
+    FAULTS,
+    WILD,
+    Breaks,
+    FedMotion,
+    ScriptedCorrection,
+    ScriptedMotion,
+    smooth,
 )
 from tests.fuzz.draw import Draw
 from tests.fuzz.drawn_arm import arm_of, controller_of

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
-# Shared with the tests of the drivers, whose modules stand beside one another.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
-
-from arms_bench import train_of
-from model_controller import Controller
-
 from drivers import DriveTrain, GuardLimits, InitPacket
+from tests.drivers.arms_bench import train_of
+from tests.drivers.model_controller import Controller
 
 CYCLE_MS = 2
 """Of every arm: the tables of motions are made for it, and would be too fast in a shorter one."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-from rig import limits
 
 from drivers import State
+from tests.drivers.rig import limits
 
 PERIOD = 0.002
 POSITION_MODES = (1, 4, 5)

@@ -26,13 +26,10 @@ from typing import Any
 
 import numpy as np
 
-# Shared with the tests of the drivers, whose modules stand beside one another.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-from record_laws import POSITION_MODES, Violation, check_records
-from rig import START, drive_train, init_packet, limits
-from sources import (
+from drivers import CycleRing, Guard, LinkLost, MotionEnded, RequestError, Session, State
+from drivers.packets import INIT_LENGTH, cyclic_length
+from tests.drivers.rig import START, drive_train, init_packet, limits
+from tests.drivers.sources import (
     FAULTS,
     WILD,
     Breaks,
@@ -42,9 +39,7 @@ from sources import (
     at_the_edge,
     smooth,
 )
-
-from drivers import CycleRing, Guard, LinkLost, MotionEnded, RequestError, Session, State
-from drivers.packets import INIT_LENGTH, cyclic_length
+from tests.fuzz.record_laws import POSITION_MODES, Violation, check_records
 
 BLOCK = 10_000
 PERIOD = 0.002

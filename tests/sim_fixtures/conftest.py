@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import pi, radians
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,9 +21,6 @@ from sim_fixtures import (
     UnmodelledEffects,
     ns16,
 )
-
-# The small cell is shared with the fault matrix and lies beside it.
-sys.path.insert(0, str(Path(__file__).parents[1] / "fault_matrix"))
 
 Array = NDArray[np.float64]
 PERIOD = 0.001

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import small_cell
 
 from drivers.packets import CyclicPacket, echo, is_init, next_number, packet_number
 from sim_fixtures import Phase, SettingError, SimulatedController
@@ -20,6 +19,7 @@ from sim_fixtures.controller_faults import (
     Pause,
     Restart,
 )
+from tests.fault_matrix import small_cell
 
 N = small_cell.N
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import small_cell
 from numpy.typing import NDArray
 
 from drivers.packets import CyclicPacket, InitPacket, cyclic_length, echo, next_number
 from sim_fixtures import Phase, SettingError, SimulatedController
+from tests.fault_matrix import small_cell
 
 
 def init_of(controller: SimulatedController) -> InitPacket:

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import small_cell
 
 from drivers.packets import CyclicPacket, Mode, echo, next_number
 from sim_fixtures import Phase, SettingError, SimulatedController
+from tests.fault_matrix import small_cell
 
 N = small_cell.N
 STATUS_EXIT = 1

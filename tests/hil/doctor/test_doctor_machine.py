@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_system import Tree
 
 from hil.doctor import machine, permissions
 from hil.doctor.check import Status
 from hil.doctor.permissions import Obtained
 from hil.doctor.storage import DiskTrial, disk_checks
 from hil.doctor.system import run_command
+from tests.hil.doctor.made_up_system import Tree
 
 ALL = Obtained("SCHED_FIFO 50", True, True)
 NOTHING = Obtained("ordinary", False, False)

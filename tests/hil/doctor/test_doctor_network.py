@@ -7,7 +7,6 @@ import errno
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_system import Tree
 
 from hil.doctor import port, route
 from hil.doctor.canbus import can_check
@@ -15,6 +14,7 @@ from hil.doctor.check import Check, Status
 from hil.doctor.link import CanLink
 from hil.doctor.network import coalescing, device_check, firewall, network_checks
 from hil.doctor.system import Answer
+from tests.hil.doctor.made_up_system import Tree
 
 ROUTES = """Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT
 eth0\t00000000\t010200C0\t0003\t0\t0\t0\t00000000\t0\t0\t0

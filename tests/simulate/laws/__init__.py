@@ -6,12 +6,6 @@ are decoded here a second time, from the documents.
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
-# The tests of the drivers have an oracle and a judge; their modules stand beside one another.
-sys.path.append(str(Path(__file__).resolve().parents[2] / "drivers"))
-
 from tests.simulate.observed import Law
 
 from .archives import archives

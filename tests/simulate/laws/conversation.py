@@ -9,11 +9,11 @@ from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
-import oracle
 from numpy.typing import NDArray
-from reception import LAST, Kind, Reception, number_of
 
 from drivers.events import Event, InitReceived
+from tests.drivers import oracle
+from tests.drivers.reception import LAST, Kind, Reception, number_of
 from tests.simulate.observed import Exchanged, Life, Observed
 
 from .wire import CLOSED, PAUSES, Flags, Init, Packets, SafeAnswers, safe_answers

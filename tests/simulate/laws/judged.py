@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from judge import Conduct
 
 from drivers.events import MotionEnded
+from tests.drivers.judge import Conduct
 from tests.simulate.observed import Act, Broken, Observed
 
 from .conversation import Heard, Talk, heard

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import oracle
 from numpy.typing import NDArray
+
+from tests.drivers import oracle
 
 from .conversation import Talk
 from .wire import CLOSED, D1, MODE, PAUSES, REFUSALS, Array, Flags

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-import oracle
-from reception import LAST, number_of
 
+from tests.drivers import oracle
+from tests.drivers.reception import LAST, number_of
 from tests.simulate.observed import Broken, Life, Observed
 
 from .conversation import Heard, Talk, heard

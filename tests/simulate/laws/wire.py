@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import oracle
 from numpy.typing import NDArray
+
+from tests.drivers import oracle
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
