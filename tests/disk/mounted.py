@@ -220,7 +220,7 @@ class _Raw(io.FileIO):
         self._disk, self._path = disk, path
         super().__init__(path, mode)
 
-    def write(self, data: Any, /) -> int | None:
+    def write(self, data: Any, /) -> int | None:  # type: ignore[override]  # as FileIO itself
         self._disk.meet(WRITE, self._path)
         return super().write(data)
 

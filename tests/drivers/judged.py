@@ -7,6 +7,9 @@ What must hold is in `reception` (which packets are answered), `judge` (what ope
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 
 from drivers import CycleRing, InitReceived, MotionEnded, Session
 from tests.drivers import oracle
@@ -45,7 +48,7 @@ class Judged:
         self._n_axes, self._period, self._inits = n_axes, period, inits
         self.now = 0.0
         self.last: tuple[bytes, bytes] | None = None
-        self.ages = None
+        self.ages: np.ndarray[Any, Any] | None = None
         self.unanswered = 0
 
     def deliver(self, packet: bytes, elapsed: float | None = None) -> bytes | None:

@@ -88,7 +88,9 @@ class Scripted:
 class ScriptedMotion(Scripted):
     """A `MotionSource`; with `feed` also a `FeedForwardSource`, see `fed`."""
 
-    def __init__(self, motion, beside, breaks, bounds="plan"):
+    def __init__(
+        self, motion: np.ndarray, beside: np.ndarray, breaks: Breaks, bounds: str = "plan"
+    ):
         super().__init__(motion, beside, breaks)
         self._bounds = bounds
 

@@ -132,7 +132,7 @@ def motion(start: Array, way: Array) -> TrajectoryPlayer:
 
 
 def session(current_share: float = 1.0) -> Session:
-    table = {name: np.array(value) for name, value in small_cell.TABLE.items()}
+    table: dict[str, Any] = {name: np.array(value) for name, value in small_cell.TABLE.items()}
     guard = GuardLimits(
         lower=LIMITS.lower,
         upper=LIMITS.upper,

@@ -70,7 +70,8 @@ QUICK: dict[str, Any] = {
 
 def controller(**changes: Any) -> SimulatedController:
     """A controller with short phases; `changes` are settings, or arguments of the controller."""
-    options = {
+    options: dict[str, Any] = {"seed": 1, "initial_position": HOME}
+    options |= {
         name: changes.pop(name) for name in ("faults", "seed", "announced") if name in changes
     }
     physical = changes.pop("drive", None) or drive()
@@ -79,5 +80,5 @@ def controller(**changes: Any) -> SimulatedController:
         physical,
         truth(),
         ControllerSettings(**(QUICK | changes)),
-        **({"seed": 1, "initial_position": HOME} | options),
+        **options,
     )

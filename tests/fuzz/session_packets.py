@@ -133,8 +133,8 @@ class Fuzz:
             self.rest()
             waiting = self.rng.randint(1, 4)
             opening = self._staggered() if self.rng.random() < 0.3 else []
-            open_mode = [(5, self.mode)] * self.rng.randint(50, 600)
-            self.script = [(5, 0)] * waiting + opening + open_mode
+            open_for = self.rng.randint(50, 600)
+            self.script = [*[(5, 0)] * waiting, *opening, *[(5, self.mode)] * open_for]
             if self.rng.random() < 0.1:
                 self.script[:0] = [(0, 0), (5, 501)]
             self._request()

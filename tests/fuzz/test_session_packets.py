@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -10,22 +8,11 @@ import numpy as np
 import pytest
 
 from drivers import Guard, Session, State
-
-HERE = Path(__file__).parent
-
-
-def load():
-    spec = importlib.util.spec_from_file_location("session_packets", HERE / "session_packets.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["session_packets"] = module
-    spec.loader.exec_module(module)
-    return module
+from tests.fuzz import session_packets
+from tests.fuzz.record_laws import Violation, check_records
 
 
-session_packets = load()
-
-
-def test_twenty_thousand_packets_do_nothing_that_must_not_be():
+def test_twenty_thousand_packets_do_nothing_that_must_not_be() -> None:
     report = session_packets.fuzz(20_000, seed=7)
     assert report["violations"] == 0
     # And they do get deep into the session.
@@ -36,8 +23,8 @@ def test_twenty_thousand_packets_do_nothing_that_must_not_be():
     assert report["set-points"] > 2000
 
 
-def test_a_piece_is_the_same_whenever_it_is_run():
-    def piece(start):
+def test_a_piece_is_the_same_whenever_it_is_run() -> None:
+    def piece(start: int) -> dict[str, float]:
         report = session_packets.fuzz(2_000, seed=3, start=start)
         return {name: value for name, value in report.items() if name != "seconds"}
 
@@ -46,7 +33,7 @@ def test_a_piece_is_the_same_whenever_it_is_run():
         piece(5)
 
 
-def test_reports_of_pieces_add_up(tmp_path, capsys):
+def test_reports_of_pieces_add_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, report in (("a", {"packets": 3, "stale": 1}), ("b", {"packets": 4, "refused": 2})):
         (tmp_path / name).write_text(json.dumps({**report, "seconds": 1.0}))
     paths = [str(tmp_path / "a"), str(tmp_path / "b")]
@@ -57,21 +44,21 @@ def test_reports_of_pieces_add_up(tmp_path, capsys):
 
 
 class TestTheFuzzFindsWhatIsBroken:
-    def test_an_exception(self, monkeypatch):
+    def test_an_exception(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(Session, "_cyclic", lambda *_: 1 // 0)
-        with pytest.raises(session_packets.Violation, match="ZeroDivisionError"):
+        with pytest.raises(Violation, match="ZeroDivisionError"):
             session_packets.fuzz(1_000, seed=1)
 
-    def test_a_guard_that_lets_everything_pass(self, monkeypatch):
+    def test_a_guard_that_lets_everything_pass(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(Guard, "check_set_point", lambda *_: None)
-        with pytest.raises(session_packets.Violation):
+        with pytest.raises(Violation):
             session_packets.fuzz(100_000, seed=1)
 
     @pytest.mark.parametrize("column", ["state", "mode"])
-    def test_a_set_point_outside_of_open_mode(self, column):
+    def test_a_set_point_outside_of_open_mode(self, column: str) -> None:
         story = session_packets.Fuzz(1, 0, Counter())
         story.ring.rows[:] = np.zeros((), story.ring.rows.dtype)
         rows = story.ring.rows[:3].copy()
         rows["state"] = State.CLOSED if column == "state" else State.OPEN
-        with pytest.raises(session_packets.Violation):
-            session_packets.check_records(rows, 4, True, Counter())
+        with pytest.raises(Violation):
+            check_records(rows, 4, True, Counter())

@@ -22,7 +22,8 @@ from hil.campaign.folder import Entry
 from hil.errors import ArchiveError
 from sim_fixtures.program import Phase
 from tests.process_death.controller import LAG, REST, at_rest
-from tests.process_death.rig import Death, Seen
+from tests.process_death.rig import Seen
+from tests.process_death.watched import Death
 
 Records = NDArray[np.void]
 

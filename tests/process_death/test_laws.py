@@ -14,8 +14,9 @@ from drivers.record import cycle_dtype
 from tests.process_death.__main__ import summary
 from tests.process_death.controller import ROW
 from tests.process_death.laws import MOST, Kept, _archived, _readable, _told
-from tests.process_death.rig import Death, Seen
+from tests.process_death.rig import Seen
 from tests.process_death.rounds import Victim
+from tests.process_death.watched import Death
 
 CYCLES = 3000
 

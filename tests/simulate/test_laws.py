@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from drivers.events import MotionEnded
+from tests.drivers import oracle
 from tests.simulate.altered import ALL, found, played, with_life
 from tests.simulate.laws.conversation import heard, talks_of
 from tests.simulate.laws.open_mode import modes_of, stretches
-from tests.simulate.laws.wire import Packets, oracle, safe_answers
+from tests.simulate.laws.wire import Packets, safe_answers
 from tests.simulate.observed import Observed
 
 
@@ -141,6 +142,7 @@ def refused_instead(observed: Observed, index: int, modes: tuple[int, ...]) -> O
     one = observed.runs[0].exchanged[index]
     talk = heard(observed)[0].talks[0]
     n = talk.init.n_axes
+    assert talk.init.arms is not None
     safe = oracle.safe_answer(oracle.parse(one.packet, n), talk.init.arms)
     axes = tuple(
         axis._replace(mode=modes[k % len(modes)] or axis.mode) for k, axis in enumerate(safe.axes)

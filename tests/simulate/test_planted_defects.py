@@ -102,8 +102,8 @@ def takes_stopped_motions_for_whole(patch: pytest.MonkeyPatch) -> None:
 
 def does_whole_motions_again(patch: pytest.MonkeyPatch) -> None:
     """A run does not believe what the one before it has entered."""
-    whole, begun = CampaignFolder.whole, []
-    play = Runner.play
+    whole, play = CampaignFolder.whole, Runner.play
+    begun: list[bool] = []
 
     def believed(self: CampaignFolder, kind: str, index: int) -> str | None:
         return whole(self, kind, index) if begun else None
