@@ -231,8 +231,9 @@ class Recording:
             if name in self.held_joints:
                 continue
             if self.commanded_position is not None:
-                start, travel = _frozen_travel(self.position[:, j], self.commanded_position[:, j])
-                if travel > STUCK_MOVEMENT:
+                found = stuck(self.position[:, j], self.commanded_position[:, j])
+                if found is not None:
+                    start, travel = found
                     raise RecordingError(
                         "stuck",
                         f"joint {name} is stuck: its position stays {self.position[start, j]:.6g}"
@@ -251,12 +252,23 @@ class Recording:
                 )
 
 
-def _frozen_travel(position: Array, command: Array) -> tuple[int, float]:
-    """Stretch of identical readings with the widest travel of the command: (start, travel)."""
+def stuck(position: Array, command: Array) -> tuple[int, float] | None:
+    """Where a joint stays the same to the last bit while it is told to move.
+
+    Args:
+        position: readings (m,) [rad or m].
+        command: likewise (m,), NaN where there is none.
+
+    Returns:
+        First sample of the stretch during which the command travels farthest, and how far
+        [rad or m]; None where that is nowhere more than `STUCK_MOVEMENT`.
+    """
     edges = np.flatnonzero(np.diff(position, prepend=np.nan, append=np.nan) != 0.0)
     starts = edges[:-1]
     highest = np.fmax.reduceat(command, starts)
     lowest = np.fmin.reduceat(command, starts)
     travel = np.nan_to_num(highest - lowest, nan=0.0)
     worst = int(np.argmax(travel))
+    if travel[worst] <= STUCK_MOVEMENT:
+        return None
     return int(starts[worst]), float(travel[worst])

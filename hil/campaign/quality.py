@@ -20,6 +20,7 @@ from drivers.events import MotionStarted
 from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from identification.noise import STANDSTILL_WINDOW
+from identification.recording import stuck
 from planner import FourierSeries, PiecewiseCubic
 
 from .standstill import ARM_MOVED
@@ -142,7 +143,7 @@ def problem_of(
     if played.missed > MISSED_SHARE * wanted:
         words = f"{played.missed} of {wanted} packets were missed; {MISSED_SHARE:.0%} are bearable"
         return Problem(words)
-    return _saturation(played.current, cell)
+    return _stuck(played, cell) or _saturation(played.current, cell)
 
 
 def torn_or_slowed(
@@ -185,6 +186,19 @@ def unrest(played: Played, cell: Cell) -> Problem | None:
         f"{cell.joint_names[joint]} moved at {speed[joint]:.2g} rad/s while the arm was to stand "
         f"still; below {allowed[joint]:.2g} rad/s it counts as standing"
     )
+
+
+def _stuck(played: Played, cell: Cell) -> Problem | None:
+    """A joint that stands while it is told to move: no estimate is made of such a recording."""
+    for joint, name in enumerate(cell.joint_names):
+        found = stuck(played.position[:, joint], played.commanded[:, joint])
+        if found is not None:
+            start, travel = found
+            return Problem(
+                f"{name} is stuck: its position stays the same from {start * cell.period:.2f} s "
+                f"after the begin on while it is told to move by {travel:.3g}"
+            )
+    return None
 
 
 def _saturation(current: Array, cell: Cell) -> Problem | None:

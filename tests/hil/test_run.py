@@ -376,6 +376,12 @@ def test_the_check_by_itself_sees_missed_packets_saturation_and_missing_cycles(
     few, many = (replace(good, missed=round(share * len(good.position))) for share in (0.005, 0.03))
     assert check.problem(few) is None
     assert "packets were missed" in str(check.problem(many))
+    position = good.position.copy()
+    told = good.commanded[:, 1]
+    end = 100 + int(np.argmax(np.abs(told[100:] - told[100]) > 0.03))
+    position[100:end, 1] = position[100, 1]
+    found = check.problem(replace(good, position=position))
+    assert "elbow is stuck: its position stays the same from 0.20 s" in str(found)
     current = good.current.copy()
     limit = campaign.cell.drive_train.current_limit[1]
     current[100:102, 1] = limit

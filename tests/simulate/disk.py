@@ -26,6 +26,8 @@ class Disk:
     Attributes:
         struck: lines that came to pass.
         failures: kinds of the failures since the last `begin`.
+        torn: bytes that are missing at the end of an archive since its process died.
+        refused: archives that a write to failed.
         dead: whether the process was killed.
     """
 
@@ -40,6 +42,7 @@ class Disk:
         self.struck: list[str] = []
         self.failures: list[str] = []
         self.torn: dict[str, int] = {}
+        self.refused: set[str] = set()
         self.dead = False
 
     @property
@@ -55,7 +58,7 @@ class Disk:
     def begin(self) -> None:
         """A new process begins."""
         self.dead = False
-        self.failures, self.torn = [], {}
+        self.failures, self.torn, self.refused = [], {}, set()
         self._paths.clear()
         self._last.clear()
 
@@ -105,6 +108,7 @@ class Disk:
             self.dead = True
             self.torn[self._paths[descriptor].name] = len(data) - kept
             raise Killed(mishap.line)
+        self.refused.add(self._paths[descriptor].name)
         number = errno.EIO if mishap.kind == "disk-error" else errno.ENOSPC
         raise OSError(number, os.strerror(number))
 

@@ -15,6 +15,7 @@ from drivers.events import Event
 from hil.campaign.execution_result import RunResult
 from hil.campaign.plan import CampaignPlan
 from hil.cell import Cell
+from identification import RobotModel, Samples
 from identification.repetitions import RepeatedEstimate
 from sim_fixtures import ControllerSettings
 
@@ -78,6 +79,7 @@ class Life:
             in memory is lost.
         archives: names of the archives that this life began, in order.
         torn: archive name to bytes that its death took from the end of the file.
+        refused: archives that the disk took no more of before that.
         disk: names of the disk's failures that struck in this life.
         before, after: digests of the files in the folder when the life began and when it had
             ended (and been torn).
@@ -96,6 +98,7 @@ class Life:
     died: bool
     archives: tuple[str, ...]
     torn: Mapping[str, int]
+    refused: frozenset[str]
     disk: tuple[str, ...]
     before: Digests
     after: Digests
@@ -128,10 +131,14 @@ class Estimated(NamedTuple):
     Attributes:
         result: pooled and per repetition.
         pooled: names of the archives that were fitted, predicted or rested at.
+        model: of the arm.
+        fitted: what was fitted, one a repetition.
     """
 
     result: RepeatedEstimate
     pooled: tuple[str, ...]
+    model: RobotModel
+    fitted: tuple[Samples, ...]
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from hil.simulation import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures import Phase
 from tests.hil.fast_cell import fast_cell
+from tests.simulate.verdicts import Stage
 
 
 class TestAControllerThatDoesNotBeginASession:
@@ -100,6 +101,17 @@ def test_a_motion_that_is_stopped_while_its_axes_open_leaves_them_closed(tmp_pat
     assert Phase.OPENING in phases
     assert Phase.OPEN not in phases
     assert link.session.state is State.CLOSED
+
+
+def test_a_repetition_in_which_a_joint_was_stuck_is_run_again(tmp_path: Path) -> None:
+    """Seed 4982: it counted, the campaign was complete, and no estimate could be made of it."""
+    seen = Stage(tmp_path).observed(4982, ["following-error@349x26:axis=1"])
+    assert seen.complete
+    assert seen.found is not None, seen.unidentified
+    first = open_archive(seen.folder / "archives" / "excitation_000_a1.mcap").outcome or {}
+    assert first["outcome"] == "rejected"
+    assert first["reason"].startswith("joint_1 is stuck: its position stays the same from 0.")
+    assert "excitation_000_a2.mcap" in seen.found.pooled
 
 
 def short_way(

@@ -227,6 +227,23 @@ def test_an_estimate_elsewhere_than_the_undisturbed_one_is_found(
     assert f"{pooled.names[name]} is" in found(moved, "estimate")
 
 
+def test_a_model_that_predicts_other_torques_of_the_same_motion_is_found(
+    observed: Observed,
+) -> None:
+    """By far less than what the few degrees of freedom of each standard deviation allow."""
+    assert observed.found is not None
+    assert observed.twin_found is not None
+    found_one, pooled = observed.found, observed.found.result.pooled
+    (samples, *_) = found_one.fitted
+    for share, seen in ((0.1, False), (10.0, True)):
+        change = share * pooled.std * np.sign(pooled.values)
+        torque = samples.predicted_torque(found_one.model, change)
+        assert (np.abs(torque).max(axis=0) > pooled.noise_std).any() is np.bool_(seen)
+        result = replace(found_one.result, pooled=replace(pooled, values=pooled.values + change))
+        calm = replace(observed, found=found_one._replace(result=result), struck=())
+        assert ("predicted torques differ" in found(calm, "estimate")) is seen
+
+
 def test_what_does_not_count_must_not_be_pooled(copied: Observed) -> None:
     name = whole(copied).name
 

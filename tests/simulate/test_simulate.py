@@ -11,6 +11,7 @@ import pytest
 
 from tests.simulate.__main__ import main
 from tests.simulate.drawing import DRAWS, Story, draw_script
+from tests.simulate.judging import judged
 from tests.simulate.many import Known, stage_folder
 from tests.simulate.playing import SceneError, _twin, twin_of
 from tests.simulate.scenes import NEIGHBOURS, scene_of
@@ -169,6 +170,23 @@ class TestCommand:
     def test_a_script_that_is_not_there_is_named(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["--seed", "1", "--script", "/nowhere/script"]) == 2
         assert "/nowhere/script" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("seed", "script"),
+    [
+        # The arm itself trembles where it stands, so that two motions in a row may not begin.
+        (3121, ["hurry@0", "lurch@700x1:-0.3", "axis-leaves@372:axis=1"]),
+        # Standard deviations from few blocks of residuals: 6.5 of them are no finding.
+        (3886, ["e-stop@460"]),
+        # Joint angles of an arm whose calibration is fifteen revolutions of its motor.
+        (4536, ["lose@500"]),
+        # Records that the disk refused are not lost by the death that follows.
+        (4789, ["kill-at-save@1:left", "save-full@2", "kill@1100", "disk-error@10x1:keep=0.481"]),
+    ],
+)
+def test_laws_that_were_too_narrow_hold(seed: int, script: list[str], tmp_path: Path) -> None:
+    assert judged(Stage(tmp_path).observed(seed, script)) == []
 
 
 def test_a_scene_whose_arm_trembles_where_it_stands_is_drawn_anew(tmp_path: Path) -> None:

@@ -246,7 +246,9 @@ def _decoded(
     period = talk.init.period
     finite = np.isfinite(d).all(axis=(1, 2))  # a garbled packet may hold any number
     size = np.abs(np.linalg.inv(gears.matrix)).sum(axis=1).max() * (
-        1.0 + np.abs(d[finite, :, 0:4:2]).max(axis=(1, 2), initial=0.0, keepdims=True)[:, :, 0]
+        1.0
+        + np.abs(gears.offset).max()
+        + np.abs(d[finite, :, 0:4:2]).max(axis=(1, 2), initial=0.0, keepdims=True)[:, :, 0]
     )
     bound = 16.0 * len(slots) * _EPS * size
     for column, name in enumerate(_SI):
@@ -350,7 +352,7 @@ def _interval(
     stated = int((archived.outcome or {}).get("records_lost", 0))
     if archived.whole and archived.ended != "interrupted" and len(missing) > stated:
         yield f"{len(missing)} of its cycles are not in {archived.path.name}, which states {stated}"
-    torn = archived.path.name in life.torn
+    torn = archived.path.name in life.torn or archived.path.name in life.refused
     if not archived.whole and life.died and not torn and len(rows):
         # A chunk that was not full, and what had not been handed over yet.
         most = round(_FLUSHED / period) + _DRAINED
