@@ -18,10 +18,18 @@ SYNC_EVERY: Final = 60.0
 
 @dataclass(frozen=True)
 class Use:
-    """What a process takes: bytes, descriptors, threads, processor time in s."""
+    """What a process takes.
+
+    Attributes:
+        rss: bytes, resident.
+        own: bytes behind which is no file, swapped ones too.
+        fds: open descriptors.
+        threads: of it.
+        cpu: processor time [s].
+    """
 
     rss: int
-    uss: int
+    own: int
     fds: int
     threads: int
     cpu: float

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import mmap
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from drivers.exchange.latency import BINS, bin_of, upper_edge
 from tests.endurance.__main__ import main
 from tests.endurance.journal import Piece, Ran, Sample, Use, read_journal
+from tests.endurance.piece import _use
 from tests.endurance.trends import largest_rise, quantile, slope
 from tests.endurance.verdict import PROCESSES, judge, minutes_of
 from tests.journal import Journal
@@ -47,7 +50,7 @@ def piece(
         for name in PROCESSES:
             grown = leak * second / 3600.0 if name == "archive" else 0.0
             rss = int(40 * MIB + grown * MIB + 4096 * rng.integers(0, 64))
-            used[name] = Use(rss=rss, uss=rss, fds=11, threads=1, cpu=0.2 * second)
+            used[name] = Use(rss=rss, own=rss, fds=11, threads=1, cpu=0.2 * second)
         counters = dict.fromkeys(("missed", "late", "worst_turnaround_us"), 0.0)
         busy = load if second > slow_from else 1.0
         samples.append(
@@ -205,3 +208,19 @@ def test_minutes_are_taken_between_samples_at_their_ends(sound: list[Piece]) -> 
     minutes = minutes_of(sound[0])
     assert len(minutes) == 80
     assert sum(one.answered for one in minutes) == 500 * SECONDS // 5
+
+
+def test_memory_of_its_own_is_what_a_process_made_and_no_file_that_it_maps(tmp_path: Path) -> None:
+    process, size = psutil.Process(), 40 * MIB
+    before = _use(process).own
+    made = np.ones(size // 8)
+    after = _use(process).own
+    assert after - before == pytest.approx(size, rel=0.1)
+    path = tmp_path / "library"
+    path.write_bytes(made.tobytes())
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        assert np.frombuffer(bytes(mapped[:4096]))[0] == 1.0
+        touched = sum(mapped[place] for place in range(0, size, 4096))
+        assert touched >= 0
+        assert _use(process).own - after < size / 10
+        assert _use(process).rss >= before + 2 * size

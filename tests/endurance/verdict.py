@@ -52,8 +52,9 @@ class Minute:
 class Memory:
     """One process over all pieces: MiB of resident memory at the first and last, MiB/h.
 
-    What grows is judged by memory of its own (USS). The resident memory also grows while the rings
-    between the processes are gone through for the first time, and by no more than their size.
+    What grows is judged by memory of its own, behind which is no file. The resident memory also
+    grows while the rings between the processes are gone through for the first time, and by no more
+    than their size.
     """
 
     process: str
@@ -106,11 +107,11 @@ def memory_of(pieces: Sequence[Piece], process: str) -> Memory | None:
         return None
     growth = {
         name: slope([_by_minute(samples, process, name) for samples in settled], CONFIDENCE)
-        for name in ("rss", "uss")
+        for name in ("rss", "own")
     }
     first = settled[0][0].processes[process].rss / 2**20
     last = settled[-1][-1].processes[process].rss / 2**20
-    own = growth["uss"]
+    own = growth["own"]
     share, least = LONG * own.high / first, LONG * own.low / first
     return Memory(process, first, last, own, growth["rss"], share, least)
 
