@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# The tests start processes by the hundred, and each would compile all sources anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup demo docs pictures test test-slow coverage mutants audit bench clean
 

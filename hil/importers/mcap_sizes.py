@@ -64,14 +64,22 @@ def check_sizes(stream: BinaryIO) -> None:
 
 
 def _chunks(stream: BinaryIO, size: int) -> Iterator[_Chunk]:
-    """The chunks up to the end of the data, or to where the file is cut off."""
+    """The chunks up to the end of the data, or to where the file is cut off.
+
+    A hole of a file is zeros, and would be as many records as it has bytes.
+    """
+    stream.seek(0)
     at = len(container.MAGIC)
+    if stream.read(at) != container.MAGIC:
+        raise ValueError("it does not begin as MCAP files do")
     while at + container.RECORD.size <= size:
         stream.seek(at)
         opcode, length = container.RECORD.unpack(stream.read(container.RECORD.size))
         body, end = at + container.RECORD.size, at + container.RECORD.size + length
         if opcode in (container.DATA_END, container.FOOTER) or end > size:
             return
+        if opcode == 0:
+            raise ValueError(f"at byte {at} there is no record")
         if opcode == container.CHUNK:
             yield _chunk(at, stream.read(_FIXED.size + _LONGEST_NAME + _LENGTH.size), body, end)
         at = end

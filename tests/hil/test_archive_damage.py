@@ -100,6 +100,7 @@ def test_the_archive_itself_is_whole(archive_bytes: bytes, tmp_path: Path) -> No
     assert_nothing_lost(archive)
 
 
+@pytest.mark.slow
 def test_cut_off_at_every_byte_it_opens_up_to_its_last_whole_chunk(
     archive_bytes: bytes, tmp_path: Path
 ) -> None:

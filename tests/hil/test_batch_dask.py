@@ -281,6 +281,7 @@ def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
     assert _figures(found) == _figures(expected)
 
 
+@pytest.mark.slow
 def test_archives_behind_a_web_server_are_read_by_the_workers(
     campaign: Campaign, cluster: Cluster
 ) -> None:

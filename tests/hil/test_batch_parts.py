@@ -137,6 +137,7 @@ def test_factors_are_known_by_everything_they_depend_on() -> None:
 # Who does the work
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_or_hangs_its_process_costs_itself() -> None:
     """The child knows functions by their module, so these are ready-made ones."""
     fine = ArchiveTask("fine.mcap", Part, (2.0, "note"))

@@ -146,6 +146,7 @@ def test_a_copy_counts_once(campaign: Campaign, tmp_path: Path) -> None:
     assert len([one for one in result.skipped if "holds the same" in one.reason]) == 3
 
 
+@pytest.mark.slow
 def test_workers_order_and_cache_make_no_difference_to_the_last_bit(
     folder: Path, tmp_path: Path
 ) -> None:

@@ -131,6 +131,7 @@ def test_values_to_both_sides_of_a_history_make_no_level() -> None:
     assert all(found.departs[7:])
 
 
+@pytest.mark.slow
 def test_after_a_change_of_level_no_more_than_the_share_are_said_to_depart() -> None:
     random = np.random.default_rng(11)
     runs, share, after = 2000, 0.01, FEWEST

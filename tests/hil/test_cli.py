@@ -77,6 +77,7 @@ def test_identify_works_on_a_campaign_folder_and_on_loose_archives(
     assert whole.stdout.strip() == Results.load(tmp_path / "results.json").verdict.line
 
 
+@pytest.mark.slow
 def test_a_bag_becomes_an_archive_and_a_model(shared_data: Path, tmp_path: Path) -> None:
     """The UR10 recording: as good as the comparators, from the command line alone."""
     robots = pytest.importorskip("importlib.metadata").files("example-robot-data")
@@ -143,6 +144,7 @@ def test_bad_input_gets_one_sentence_and_status_2(
     assert sentence in capsys.readouterr().err.replace("\n", "")
 
 
+@pytest.mark.slow
 def test_a_stopped_demo_goes_on_where_it_was(campaign: Campaign, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(campaign.folder.root, folder)

@@ -502,6 +502,7 @@ def test_ctrl_c_leaves_the_best_so_far_and_resuming_ends_where_it_would_have(inv
     assert (out / "excitation.toml").read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_whoever_ends_the_process_gets_the_best_so_far(tmp_path):
     settings, out = tmp_path / "my.toml", tmp_path / "out"
     settings.write_text(SETTINGS.replace("generations = 2", "generations = 2000"))

@@ -145,6 +145,7 @@ def test_a_folder_without_archives_is_refused(tmp_path, cell):
         known_from([tmp_path, tmp_path / "a.mcap"], cell, Silent())
 
 
+@pytest.mark.slow
 def test_a_second_design_names_what_it_adds_to(campaign, tmp_path, monkeypatch):
     drawn = {}
 

@@ -67,6 +67,7 @@ def test_the_result_needs_the_archives_only(
     assert again.results == found.results.model_copy(update={"conduct": None})
 
 
+@pytest.mark.slow
 def test_the_papers_way_of_filtering_finds_the_same_parameters(
     campaign: Campaign, found: Identification
 ) -> None:

@@ -76,6 +76,7 @@ def test_the_honest_cell_is_green(honest: Campaign) -> None:
     assert found.good, found.line
 
 
+@pytest.mark.slow
 def test_effects_that_the_model_leaves_out_stay_green_at_their_usual_size(
     tmp_path: Path, short: Cell, motions: CampaignPlan, run: Run
 ) -> None:

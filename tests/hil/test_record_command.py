@@ -296,6 +296,7 @@ def test_an_arm_at_rest_is_left_after_a_second(tmp_path: Path, on_udp: tuple[Pat
     assert json.loads(said)["outcome"] == "completed"
 
 
+@pytest.mark.slow
 def test_a_session_that_ends_before_the_duration_is_over_is_told(
     tmp_path: Path, on_udp: tuple[Path, int]
 ) -> None:
@@ -328,6 +329,7 @@ def children(pid: int, module: str) -> int:
     raise AssertionError(f"no {module}")
 
 
+@pytest.mark.slow
 def test_a_killed_exchange_ends_a_recording_as_lost(
     tmp_path: Path, on_udp: tuple[Path, int]
 ) -> None:

@@ -250,6 +250,7 @@ def test_sines_run_over_real_sockets_as_they_are(tmp_path: Path, quick: Cell) ->
     assert sent == pytest.approx(planned, abs=2e-6)
 
 
+@pytest.mark.slow
 def test_sines_over_real_sockets_are_stopped_on_their_path(tmp_path: Path, quick: Cell) -> None:
     series, archive = live_run(tmp_path, quick, stop_after=2.5)
     sent = sent_by(archive)

@@ -262,6 +262,7 @@ def test_the_delay_of_the_simulated_cell_is_recovered_within_a_tenth_of_a_cycle(
         assert np.all(apart < 0.1 + 2.0 * one.std[known] / one.cycle)
 
 
+@pytest.mark.slow
 def test_the_smoothed_torque_of_a_real_ur10_does_not_tell_its_delay(shared_data: Path) -> None:
     """Its effort has come through a low-pass of 2 Hz; a number here would be an invention."""
     model, recording = ur10(shared_data)

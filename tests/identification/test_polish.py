@@ -332,6 +332,7 @@ print(result.genes.tobytes().hex())
 """
 
 
+@pytest.mark.slow
 def test_the_threads_of_linear_algebra_change_nothing():
     genes = [
         subprocess.run(

@@ -236,6 +236,7 @@ def test_a_crash_costs_a_search_one_individual(aborting_solver, six_axis_limits,
         assert not any(isinstance(motion, Exception) for motion in again)
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_changes_nothing(aborting_solver, six_axis_limits, random_points):
     points = [random_points(seed, 2 + seed % 5) for seed in range(70)]
     points[7] = points[7] + 100.0
