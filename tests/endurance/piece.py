@@ -29,7 +29,7 @@ from hil.demo_link import LOOPBACK, SIMULATE, free_port
 from hil.errors import HilError
 from hil.progress import Reporter, Silent, Task
 from tests.endurance.journal import SYNC_EVERY, Ran, Use
-from tests.endurance.stalls import Stalls
+from tests.endurance.stalls import Stalls, watched
 from tests.hil.fast_cell import fast_cell
 from tests.journal import Journal
 
@@ -230,11 +230,11 @@ def run_piece(
             machine=f"{os.cpu_count()} cores, {platform.system()} {platform.release()}",
         )
         with (
-            Stalls(work) as stalls,
+            watched(work) as stalls,
             _processes(work, seconds) as (controller, supervisor, summary),
         ):
-            watched = Watched(work, journal, task, seconds, supervisor, controller, stalls)
-            reason = watched.watch(stop)
+            piece = Watched(work, journal, task, seconds, supervisor, controller, stalls)
+            reason = piece.watch(stop)
             with suppress(subprocess.TimeoutExpired):
                 supervisor.wait(LEAVING)
                 controller.wait(LEAVING)

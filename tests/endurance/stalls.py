@@ -12,10 +12,11 @@ import struct
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 PERIOD: Final = 0.001
 """s between two looks at the clock; what lasts longer than that is a stall."""
@@ -24,42 +25,34 @@ PRIORITY: Final = 90
 _COUNTS: Final = struct.Struct("<qd")  # how many, s in all
 
 
+@dataclass(frozen=True)
 class Stalls:
+    """What the watchers have written so far, each to a file of its own."""
+
+    paths: tuple[Path, ...]
+
+    @property
+    def so_far(self) -> tuple[int, float]:
+        """Stalls of all cores, and how long they stood still [s]."""
+        found = [_COUNTS.unpack(path.read_bytes()) for path in self.paths]
+        return sum(count for count, _ in found), sum(seconds for _, seconds in found)
+
+
+@contextmanager
+def watched(folder: Path) -> Iterator[Stalls]:
     """One watcher a core, while this lasts; none sees any without the right to real-time priority.
 
     Args:
         folder: for what they write.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self._paths = [folder / f"stalls_{core}" for core in sorted(os.sched_getaffinity(0))]
-        self._undo = ExitStack()
-
-    @property
-    def so_far(self) -> tuple[int, float]:
-        """Stalls of all cores, and how long they stood still [s]."""
-        found = [_COUNTS.unpack(path.read_bytes()) for path in self._paths]
-        return sum(count for count, _ in found), sum(seconds for _, seconds in found)
-
-    def __enter__(self) -> Self:
-        with ExitStack() as undo:
-            for path in self._paths:
-                path.write_bytes(_COUNTS.pack(0, 0.0))
-                command = [sys.executable, "-m", "tests.endurance.stalls", str(path)]
-                watcher = undo.enter_context(
-                    subprocess.Popen(command, cwd=Path(__file__).parents[2])
-                )
-                undo.callback(watcher.kill)
-            self._undo = undo.pop_all()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._undo.close()
+    paths = tuple(folder / f"stalls_{core}" for core in sorted(os.sched_getaffinity(0)))
+    with ExitStack() as undo:
+        for path in paths:
+            path.write_bytes(_COUNTS.pack(0, 0.0))
+            command = [sys.executable, "-m", "tests.endurance.stalls", str(path)]
+            watcher = undo.enter_context(subprocess.Popen(command, cwd=Path(__file__).parents[2]))
+            undo.callback(watcher.kill)
+        yield Stalls(paths)
 
 
 def watch(path: Path) -> None:
