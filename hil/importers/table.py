@@ -64,9 +64,10 @@ class Table:
         try:
             text = text_of(path, _LONGEST).removeprefix("\ufeff")
         except (OSError, UnicodeDecodeError) as error:
+            why = getattr(error, "strerror", None) or error
             raise SourceError(
                 path,
-                f"cannot be read ({error})",
+                f"cannot be read ({why})",
                 remedy="name a text file, or one that ends in .npz, .npy, .mat or .m",
             ) from error
         kept = [
