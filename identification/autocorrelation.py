@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -88,9 +88,9 @@ def _products(values: Array, lags: int) -> Array:
     m, n = values.shape
     found = np.zeros((lags + 1, n))
     reach = min(lags, m - 1)
-    length = fft.next_fast_len(m + reach, real=True)  # so long that nothing wraps round
-    power = np.abs(fft.rfft(values, length, axis=0)) ** 2
-    found[: reach + 1] = fft.irfft(power, length, axis=0)[: reach + 1]
+    length = scipy.fft.next_fast_len(m + reach, real=True)  # so long that nothing wraps round
+    power = np.abs(scipy.fft.rfft(values, length, axis=0)) ** 2
+    found[: reach + 1] = scipy.fft.irfft(power, length, axis=0)[: reach + 1]
     return found
 
 

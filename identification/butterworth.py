@@ -16,8 +16,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_interp_spline
 
 from identification.errors import ShapeError
 from identification.motion import Motion
@@ -62,8 +62,6 @@ def choose_cutoff(
     Raises:
         RecordingError: no stretch is long enough.
     """
-    from scipy.signal import periodogram  # slow to import, and seldom used
-
     own = max(recording.segments(), key=lambda segment: int(segment.stop - segment.start))
     _refuse_short(own.stop - own.start)
     if noise_variance is None:
@@ -73,7 +71,7 @@ def choose_cutoff(
     highest = min(widest, HIGHEST_CUTOFF / step)
     candidates = np.geomspace(min(LOWEST_CUTOFF, 0.5 * highest), highest, _CANDIDATES)
     # A window that closes smoothly: what leaks from the slow motion would pass for fast signal.
-    frequency, power = periodogram(
+    frequency, power = scipy.signal.periodogram(
         uniform.position, 1.0 / step, window="blackmanharris", detrend="linear", axis=0
     )
     noise = 2.0 * step * np.asarray(noise_variance, dtype=np.float64)  # one-sided density
@@ -134,7 +132,7 @@ def _uniform(recording: Recording) -> Recording:
     return resample(recording)
 
 
-def _filtered_spline(one: Recording, cutoff: Array, order: int) -> BSpline:
+def _filtered_spline(one: Recording, cutoff: Array, order: int) -> scipy.interpolate.BSpline:
     """Quintic spline through the filtered positions of one stretch."""
     uniform = _uniform(_bare(one))
     step = float(np.median(np.diff(uniform.time)))
@@ -142,16 +140,14 @@ def _filtered_spline(one: Recording, cutoff: Array, order: int) -> BSpline:
         _filtered(channel, float(frequency), step, order)
         for channel, frequency in zip(uniform.position.T, cutoff, strict=True)
     ]
-    return make_interp_spline(uniform.time, np.column_stack(columns), k=5)
+    return scipy.interpolate.make_interp_spline(uniform.time, np.column_stack(columns), k=5)
 
 
 def _filtered(channel: Array, cutoff: float, step: float, order: int) -> Array:
     """One channel, forwards and backwards."""
-    from scipy.signal import butter, sosfiltfilt
-
-    sections = butter(order, cutoff, fs=1.0 / step, output="sos")
+    sections = scipy.signal.butter(order, cutoff, fs=1.0 / step, output="sos")
     padding = min(len(channel) - 1, int(np.ceil(_PADDING_PERIODS / (cutoff * step))))
-    return np.asarray(sosfiltfilt(sections, channel, padlen=padding))
+    return np.asarray(scipy.signal.sosfiltfilt(sections, channel, padlen=padding))
 
 
 def _refuse_short(samples: int) -> None:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from identification.errors import IdentificationError, ShapeError
 from identification.recording import Recording
@@ -66,7 +66,7 @@ def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recordi
 def _read_later(time: Array, values: Array, shift: Array) -> Array:
     """Values (m, n) of one stretch, each channel read its own shift (n,) later."""
     # Local: where Coulomb friction jumps, a global spline would ring.
-    source = CubicHermiteSpline(time, values, np.gradient(values, time, axis=0))
+    source = scipy.interpolate.CubicHermiteSpline(time, values, np.gradient(values, time, axis=0))
     later = values.copy()
     for joint in np.flatnonzero(shift):
         at = np.clip(time + shift[joint], time[0], time[-1])

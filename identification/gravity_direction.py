@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from identification.model import RobotModel
 from identification.standard_gram import StandardGram, solve, squared_errors
@@ -68,7 +68,7 @@ def find_gravity(
         direction = first / size + tilt @ across
         return np.asarray(size * direction / np.linalg.norm(direction))
 
-    found = minimize(
+    found = scipy.optimize.minimize(
         lambda tilt: _misfit(training, pulled(tilt)),
         np.zeros(2),
         method="Nelder-Mead",

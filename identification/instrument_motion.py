@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from identification.errors import IdentificationError, ShapeError
 from identification.motion import Motion
@@ -157,7 +157,7 @@ def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Arra
     for joint in np.flatnonzero(moves):
         best = int(np.argmin(table[:, joint]))
         around = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-        lags[joint] = minimize_scalar(
+        lags[joint] = scipy.optimize.minimize_scalar(
             lambda lag, j=joint: misfit(lag)[j],
             bounds=around,
             method="bounded",

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator, make_interp_spline
 
 from identification.recording import GAP_STEPS, Recording, RecordingError
 
@@ -240,11 +240,13 @@ def _uniform(one: Recording, step: float) -> Recording:
     count = int(np.floor((time[-1] - time[0]) / step + 1e-6)) + 1
     at = time[0] + step * np.arange(count)
     inside = np.clip(at, time[0], time[-1])
-    changed: dict[str, Any] = {"position": make_interp_spline(time, one.position, k=3)(inside)}
+    changed: dict[str, Any] = {
+        "position": scipy.interpolate.make_interp_spline(time, one.position, k=3)(inside)
+    }
     for name in ("torque", "motor_current"):
         values = getattr(one, name)
         if values is not None:
-            changed[name] = PchipInterpolator(time, values)(inside)
+            changed[name] = scipy.interpolate.PchipInterpolator(time, values)(inside)
     if one.commanded_position is not None:
         command = one.commanded_position
         changed["commanded_position"] = np.column_stack(

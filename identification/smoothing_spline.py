@@ -23,10 +23,9 @@ from math import comb
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.optimize import brentq
-from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
 
@@ -133,7 +132,7 @@ class _Problem:
     start: float
     spacing: float
     density: float  # samples per knot interval
-    rows: csr_array  # (m, k) values of the basis at the samples
+    rows: scipy.sparse.csr_array  # (m, k) values of the basis at the samples
     gram: Array  # (6, k) lower band of rows' rows
     penalty: Array  # (6, k) lower band of the roughness
     closest: Array  # (k, c) coefficients with the lightest penalty
@@ -195,7 +194,7 @@ class _Problem:
             return float(np.exp(lightest))
         if excess(heaviest) <= 0.0:
             return float(np.exp(heaviest))
-        return float(np.exp(brentq(excess, lightest, heaviest, xtol=1e-4)))
+        return float(np.exp(scipy.optimize.brentq(excess, lightest, heaviest, xtol=1e-4)))
 
     def solve(self, penalties: Array) -> SmoothingSpline:
         coefficients = self.closest.copy()
@@ -243,14 +242,16 @@ def _piece_derivative(order: int) -> Array:
     return pieces
 
 
-def _rows(start: float, spacing: float, intervals: int, time: Array, derivative: int) -> csr_array:
+def _rows(
+    start: float, spacing: float, intervals: int, time: Array, derivative: int
+) -> scipy.sparse.csr_array:
     """Basis functions, or their derivatives, at each time: sparse (m, intervals + 5)."""
     x = (np.asarray(time, dtype=np.float64) - start) / spacing
     interval = np.clip(np.floor(x).astype(np.int64), 0, intervals - 1)
     pieces = _piece_derivative(derivative)
     weights = np.vander(x - interval, len(pieces), increasing=True) @ pieces
     columns = interval[:, None] + np.arange(ORDER)
-    return csr_array(
+    return scipy.sparse.csr_array(
         (
             (weights / spacing**derivative).ravel(),
             columns.ravel(),
@@ -260,7 +261,7 @@ def _rows(start: float, spacing: float, intervals: int, time: Array, derivative:
     )
 
 
-def _gram_band(rows: csr_array) -> Array:
+def _gram_band(rows: scipy.sparse.csr_array) -> Array:
     """Lower band (6, k) of rows' rows."""
     columns = rows.indices.reshape(-1, ORDER)
     weights = rows.data.reshape(-1, ORDER)

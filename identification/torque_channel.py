@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from identification.estimation import estimate
 from identification.model import RobotModel
@@ -61,7 +61,9 @@ def find_torque_bandwidth(
     coarse = [misfit(point) for point in grid]
     best = int(np.argmin(coarse))
     around = grid[max(best - 1, 0)], grid[min(best + 1, _COARSE - 1)]
-    fine = minimize_scalar(misfit, bounds=around, method="bounded", options={"xatol": 0.02})
+    fine = scipy.optimize.minimize_scalar(
+        misfit, bounds=around, method="bounded", options={"xatol": 0.02}
+    )
     if fine.fun > float(np.mean(unfiltered)) + np.log(1.0 - _WORTHWHILE):
         return None
     return float(np.exp(fine.x))

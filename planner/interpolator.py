@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
 
 from planner.arguments import member, real, reals, whole
 from planner.arrays import Array, read_only
@@ -393,5 +393,6 @@ def _timed(queue: MotionQueue, settings: MoveSettings, target: Array) -> Move | 
     slow = 1.0
     while excess(slow) < 0.0:
         slow /= 2.0
-    share = 1.0 if slow == 1.0 else float(brentq(excess, slow, 1.0, xtol=1e-300, rtol=1e-15))
-    return replace(move, speed=share)
+    if slow < 1.0:
+        slow = float(scipy.optimize.brentq(excess, slow, 1.0, xtol=1e-300, rtol=1e-15))
+    return replace(move, speed=slow)

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from hil.archive import open_archive
 from hil.errors import InputError
@@ -18,6 +17,7 @@ from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Reporter
 from identification.errors import IdentificationError
+from identification.quantiles import normal_limit
 from identification.recording import RecordingError
 from identification.validation import over_all, prediction_error
 
@@ -100,7 +100,7 @@ def of_estimate(
     except (InputError, IdentificationError, RecordingError) as error:
         return _unjudged(str(error))
     model, found = twin.cell.model, estimation.result.pooled
-    factor = found.interval_factor / norm.ppf(0.975)
+    factor = found.interval_factor / normal_limit(0.025)
     ours, theirs = (
         over_all(prediction_error(model, values, prepared.held_out)).rms
         for values in (found.values, twin.truth)

@@ -22,7 +22,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import theilslopes
 
 from hil.archive import open_archive
 from hil.cell import Cell
@@ -206,7 +205,10 @@ def change_per_motion(friction: Sequence[Array] | Array) -> float:
     moves = np.isfinite(last).all(axis=0) if len(last) else np.zeros(0, bool)
     if len(last) < 2 or not moves.any():
         return float("nan")
-    slopes = np.array([theilslopes(column).slope for column in last[:, moves].T])
+    # Theil's slope: the median over all pairs, which one motion that went wrong does not move.
+    first, second = np.triu_indices(len(last), k=1)
+    pairs = (last[second] - last[first])[:, moves] / (second - first)[:, None]
+    slopes = np.median(pairs, axis=0)
     return float(np.max(np.abs(slopes) / np.abs(np.median(last[:, moves], axis=0))))
 
 

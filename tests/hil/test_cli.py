@@ -38,12 +38,14 @@ def test_help_says_where_to_start() -> None:
         assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
 
 
-def test_a_command_does_not_wait_for_the_libraries_of_another() -> None:
-    look = "import sys; from hil.cli import COMMANDS; COMMANDS['status']; print(*sys.modules)"
+@pytest.mark.parametrize("command", ["status", "run"])
+def test_a_command_does_not_wait_for_libraries_that_it_does_not_use(command: str) -> None:
+    look = f"import sys; from hil.cli import COMMANDS; COMMANDS['{command}']; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
-    loaded = done.stdout.split()
-    assert "hil.cli.status" in loaded
-    assert not {"hil.cli.design", "matplotlib", "cvxpy"} & set(loaded)
+    loaded = set(done.stdout.split())
+    assert f"hil.cli.{command}" in loaded
+    assert not {"hil.cli.design", "matplotlib", "cvxpy", "pymoo"} & loaded
+    assert not {f"scipy.{part}" for part in ("interpolate", "optimize", "signal", "stats")} & loaded
 
 
 def test_the_demo_leaves_archives_results_and_a_report_and_ends_with_the_verdict(

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from identification.errors import ShapeError
@@ -168,14 +169,12 @@ def _merits(scores: Scores, fitness: Fitness) -> _Merits:
 
 def _ranks(merits: _Merits) -> Array:
     """Return ranks from 1 for the best (m,), alike for motions that are alike."""
-    from scipy.stats import rankdata  # slow to import, and only a search needs it
-
     pairs = np.stack((-merits.fitness, merits.excess))
     order = np.lexsort(pairs)
     steps = np.any(np.diff(pairs[:, order], axis=1) != 0.0, axis=0)
     place = np.empty(len(order))
     place[order] = np.concatenate(([0.0], np.cumsum(steps)))
-    ranks: Array = rankdata(place, method="average")
+    ranks: Array = scipy.stats.rankdata(place, method="average")
     return ranks
 
 

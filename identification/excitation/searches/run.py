@@ -18,7 +18,6 @@ from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.design import Design
-from identification.excitation.searches.evolution import Evolution
 from identification.excitation.searches.front import Front
 from identification.excitation.searches.goal import Goal
 from identification.excitation.searches.journal import Journal
@@ -147,6 +146,8 @@ class _Search:
             raise self._ledger.failure(stopped=False) from None
 
     def _evolve(self, goal: Goal) -> None:
+        from identification.excitation.searches.evolution import Evolution  # pymoo: slow to import
+
         self._phase = "search"
         random = np.random.default_rng((_FIRST, self._settings.seed))
         first = self._genome.sample(random, self._settings.population)
