@@ -19,9 +19,9 @@ Four hours in three pieces:
 Merged are as many journals as are named, those compressed by `xz` (`long.jsonl.xz`) among them.
 
 The exit code is 1 if anything is wrong, 0 if not, and 2 if the journal is none. What a run is too
-short for is said as a doubt, and so is what the load of the machine explains: slower answers while
-more was to do, campaigns given up and answers missed while there was more to do than cores. Two
-bounds hold at any load: half of a piece's campaigns, and 1 % of its answers.
+short for is said as a doubt, and so is what the machine explains: slower answers while more was to
+do, campaigns given up and answers missed while its cores stood still, which a process on each of
+them tells that does nothing else. More than one answer in 10 000 beyond that is wrong at any load.
 """
 
 from __future__ import annotations
@@ -127,6 +127,11 @@ def _lines(verdict: Verdict) -> list[str]:
             f"{name:12} {one['first']:10.1f} {one['last']:9.1f} {growth['value']:9.3f}  "
             f"({growth['low']:.3f} to {growth['high']:.3f}) {one['rss_growth']['value']:12.3f}"
         )
+    lines += [
+        f"the supervisor holds {one['first']:.0f} {name}, per hour {one['value']:.0f} more "
+        f"({one['low']:.0f} to {one['high']:.0f})"
+        for name, one in figures["held"].items()
+    ]
     lines += ["", f"descriptors, most in each half: {figures['descriptors']}", ""]
     lines.append("latency, µs   first minute   last   least   median   most   rise of others")
     for number, piece in enumerate(latency["pieces"], 1):

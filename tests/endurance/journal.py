@@ -49,6 +49,7 @@ class Sample:
         stalls: of the machine since the piece began, see `tests.endurance.stalls`; 0 where nobody
             could look.
         stood: s that they lasted.
+        held: by the supervisor of its memory: bytes of malloc, blocks of Python's own allocator.
     """
 
     t: float
@@ -59,6 +60,7 @@ class Sample:
     latencies: Sequence[int]
     stalls: int = 0
     stood: float = 0.0
+    held: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from drivers.exchange.latency import BINS, bin_of, upper_edge
 from tests.endurance.__main__ import main
 from tests.endurance.journal import Piece, Ran, Sample, Use, read_journal
 from tests.endurance.piece import _use
+from tests.endurance.supervisor import held
 from tests.endurance.trends import largest_rise, quantile, slope
 from tests.endurance.verdict import PROCESSES, judge, minutes_of
 from tests.journal import Journal
@@ -106,6 +107,38 @@ def test_noise_is_not_taken_for_a_fault() -> None:
 def test_a_leak_is_found_in_the_process_that_has_it() -> None:
     (fault,) = judge([piece(3, leak=1.0)]).faults
     assert "the archive's memory grows" in fault
+
+
+def test_what_the_supervisor_holds_and_gives_back_at_some_time_is_no_leak() -> None:
+    rng = np.random.default_rng(4)
+    steps = piece(4)
+    for place, one in enumerate(steps.samples):  # more than ever before, from time to time
+        supervisor = one.processes["supervisor"]
+        higher = sum(3 * MIB for at in (900.0, 2400.0) if one.t > at)
+        used = {**one.processes, "supervisor": replace(supervisor, own=supervisor.own + higher)}
+        held = {"bytes": int(30 * MIB + MIB * rng.standard_normal()), "blocks": 400_000}
+        steps.samples[place] = replace(one, processes=used, held=held)
+    verdict = judge([steps])
+    assert verdict.faults == []
+    assert "the supervisor's memory grows" in verdict.doubts[0]
+    for name, much in (("bytes", MIB), ("blocks", 10_000)):
+        leaking = [
+            replace(one, held={**one.held, name: one.held[name] + round(much * one.t / 3600.0)})
+            for one in steps.samples
+        ]
+        (fault,) = judge([replace(steps, samples=leaking)]).faults
+        assert "what the supervisor holds grows" in fault
+        assert f" {name} an hour" in fault
+
+
+def test_what_a_process_holds_is_known_to_the_byte() -> None:
+    before = held()
+    kept = np.ones(MIB), [object() for _ in range(1000)]
+    after = held()
+    assert after["bytes"] - before["bytes"] == pytest.approx(8 * MIB, rel=0.01)
+    assert after["blocks"] - before["blocks"] == pytest.approx(1000, abs=50)
+    del kept
+    assert held()["bytes"] - before["bytes"] < MIB
 
 
 def test_a_leak_too_small_to_matter_is_not_hidden() -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any, Final
 
@@ -98,16 +99,11 @@ def _minute(before: Sample, after: Sample) -> Minute:
 
 def memory_of(pieces: Sequence[Piece], process: str) -> Memory | None:
     """How the memory of a process went after the warm-up; None if it was too short to tell."""
-    settled = [
-        [sample for sample in piece.samples if sample.t >= WARM_UP and process in sample.processes]
-        for piece in pieces
-    ]
-    settled = [samples for samples in settled if len(samples) >= 2]
+    settled = _settled(pieces, lambda sample: process in sample.processes)
     if not settled:
         return None
     growth = {
-        name: slope([_by_minute(samples, process, name) for samples in settled], CONFIDENCE)
-        for name in ("rss", "own")
+        name: _growth(settled, partial(_mib, process=process, name=name)) for name in ("rss", "own")
     }
     first = settled[0][0].processes[process].rss / 2**20
     last = settled[-1][-1].processes[process].rss / 2**20
@@ -116,12 +112,30 @@ def memory_of(pieces: Sequence[Piece], process: str) -> Memory | None:
     return Memory(process, first, last, own, growth["rss"], share, least)
 
 
+def _mib(sample: Sample, process: str, name: str) -> float:
+    return float(getattr(sample.processes[process], name)) / 2**20
+
+
+def _held(sample: Sample, name: str) -> float:
+    return float(sample.held[name])
+
+
+def _settled(pieces: Sequence[Piece], tells: Callable[[Sample], bool]) -> list[list[Sample]]:
+    """Of each piece the samples after its warm-up that tell something; none of a single one."""
+    found = [[one for one in piece.samples if one.t >= WARM_UP and tells(one)] for piece in pieces]
+    return [samples for samples in found if len(samples) >= 2]
+
+
+def _growth(settled: Sequence[Sequence[Sample]], value: Callable[[Sample], float]) -> Slope:
+    return slope([_by_minute(samples, value) for samples in settled], CONFIDENCE)
+
+
 def _by_minute(
-    samples: Sequence[Sample], process: str, name: str
+    samples: Sequence[Sample], value: Callable[[Sample], float]
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Hours, and the median MiB of each minute: a sample is much like the one before."""
+    """Hours, and the median of each minute: a sample is much like the one before."""
     minute = np.array([int(sample.t // 60.0) for sample in samples])
-    values = np.array([getattr(sample.processes[process], name) for sample in samples]) / 2**20
+    values = np.array([value(sample) for sample in samples])
     present = np.unique(minute)
     return present / 60.0, np.array([np.median(values[minute == one]) for one in present])
 
@@ -138,6 +152,7 @@ def judge(pieces: Sequence[Piece]) -> Verdict:
         "processor_share": _processor_share(pieces),
     }
     judge_course(pieces, WARM_UP, faults, doubts)
+    figures["held"] = _judge_held(pieces, faults)
     figures["memory"] = _judge_memory(pieces, faults, doubts)
     figures["descriptors"] = _judge_descriptors(pieces, faults, doubts)
     figures["archives"] = _judge_archives(pieces, faults)
@@ -171,14 +186,35 @@ def _judge_memory(
             continue
         found[name] = asdict(memory)
         if memory.least > 0.0 and memory.growth.value * LONG / memory.first > SHARE:
-            faults.append(
+            known = name == "supervisor" and any(s.held for piece in pieces for s in piece.samples)
+            (doubts if known else faults).append(
                 f"the {name}'s memory grows: {memory.growth.value:.3f} MiB/h "
                 f"({memory.growth.low:.3f} to {memory.growth.high:.3f})"
+                + ", while what it holds is told of its own"
+                * known
             )
         elif memory.share > SHARE:
             doubts.append(
                 f"memory of the {name}: too short to tell, it may grow by "
                 f"{memory.share:.0%} in {LONG:g} h"
+            )
+    return found
+
+
+def _judge_held(pieces: Sequence[Piece], faults: list[str]) -> dict[str, dict[str, float]]:
+    """What the supervisor holds of its memory, and gives back at some time, per hour."""
+    found: dict[str, dict[str, float]] = {}
+    for name in ("bytes", "blocks"):
+        settled = _settled(pieces, lambda sample: bool(sample.held))
+        if not settled or name not in settled[0][0].held:
+            continue
+        growth = _growth(settled, partial(_held, name=name))
+        first = _held(settled[0][0], name)
+        found[name] = {"first": first, **asdict(growth)}
+        if growth.low > 0.0 and growth.value * LONG > SHARE * first:
+            faults.append(
+                f"what the supervisor holds grows: {growth.value:.0f} {name} an hour "
+                f"({growth.low:.0f} to {growth.high:.0f}), of {first:.0f}"
             )
     return found
 
