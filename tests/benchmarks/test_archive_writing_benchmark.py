@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.slow
 def test_writing_costs_a_fraction_of_a_core() -> None:
     """Run as a person does, for a few seconds; it fails where a cycle is not archived."""
     done = subprocess.run(

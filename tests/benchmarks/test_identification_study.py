@@ -135,6 +135,7 @@ def recorded(folder: Path) -> Path:
 
 
 class TestRecordings:
+    @pytest.mark.slow
     def test_a_seed_is_one_recording_of_the_whole_excitation(
         self, folder: Path, recorded: Path
     ) -> None:

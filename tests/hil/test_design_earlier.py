@@ -63,6 +63,7 @@ def rows(found: Knowledge) -> np.ndarray:
     return np.diag(found.gram)[of_friction] / found.joint_weights[joints]
 
 
+@pytest.mark.slow
 def test_every_motion_counts_whether_fitted_or_held_out(known, excitations, campaign, cell):
     """Of three repetitions alone one is held out, of one the end; a campaign has other motions."""
     three = known_from(excitations, cell, Silent())

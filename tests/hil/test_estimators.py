@@ -222,6 +222,7 @@ def test_the_command_writes_results_of_the_estimator(written: Results) -> None:
     assert written.exports is not None and written.exports.written
 
 
+@pytest.mark.slow
 def test_what_is_named_to_be_predicted_is_not_fitted(campaign: Campaign, tmp_path: Path) -> None:
     first, last, *_ = campaign.folder.completed("excitation")
     command = ["identify", str(first), "--predict", str(last), "--output", str(tmp_path), "-q"]

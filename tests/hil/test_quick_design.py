@@ -165,6 +165,7 @@ def test_a_design_that_cannot_be_read_is_named_before_anything_is_made(tmp_path:
     assert not folder.exists()
 
 
+@pytest.mark.slow
 def test_a_campaign_has_one_excitation(tmp_path: Path, designs: dict[str, Path]) -> None:
     done = demo("--output", tmp_path, "--resume", "--excitation", designs["b"])
     assert done.returncode == 2

@@ -121,6 +121,7 @@ def test_the_archive_carries_the_series_itself(finished: Campaign) -> None:
         assert again.trajectory.to_dict() == finished.plan.excitation.trajectory.to_dict()
 
 
+@pytest.mark.slow
 def test_the_model_of_a_swinging_arm_predicts_unseen_motion(found: Identification) -> None:
     assert found.verdict.good, found.verdict.line
     coverage = found.results.coverage

@@ -181,6 +181,7 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.study.outcome.study_page", lambda _: b"")
 
 
+@pytest.mark.slow
 def test_the_study_leaves_results_and_one_self_contained_page(
     whole: tuple[Path, StudyResults],
 ) -> None:

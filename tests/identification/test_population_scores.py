@@ -79,6 +79,7 @@ def test_company_and_order_change_no_bit(population):
     assert np.concatenate(alone).tobytes() == population.score(rows[:3]).rows.tobytes()
 
 
+@pytest.mark.slow
 def test_a_motion_that_crashes_its_process_costs_no_other_motion(population):
     rows = genes(20, seed=3)
     rows[:, 0] *= 0.9

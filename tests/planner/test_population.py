@@ -80,6 +80,7 @@ def test_company_changes_no_bit(problem, data):
     assert bits(alone) == bits(together[index])
 
 
+@pytest.mark.slow
 def test_of_a_thousand_ordinary_motions_none_differs(six_axis_limits, random_points):
     points = np.array([random_points(seed) for seed in range(1000)])
     for via_points, motion in zip(
