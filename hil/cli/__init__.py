@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -19,6 +19,7 @@ from typer.core import TyperGroup
 
 from hil.errors import HilError, OperatorStopError
 from hil.printable import printable
+from hil.version import software
 from identification import IdentificationError
 from planner import PlannerError
 
@@ -74,10 +75,29 @@ class Group(TyperGroup):
             return super().invoke(ctx)
 
 
+def _tell_versions(asked: bool) -> None:
+    if asked:
+        hil, *others = (f"{name} {number}" for name, number in software().items())
+        typer.echo(f"{hil} ({', '.join(others)})")
+        raise typer.Exit
+
+
+_VERSION = typer.Option(
+    "--version",
+    callback=_tell_versions,
+    is_eager=True,
+    help="Tell the versions of hil and of what its numbers depend on.",
+)
+
+
+def _before_any_command(version: Annotated[bool, _VERSION] = False) -> None:
+    """Nothing: the option alone ends the program."""
+
+
 app = typer.Typer(
     name="hil",
     cls=Group,
-    callback=lambda: None,
+    callback=_before_any_command,
     help=(
         "Identify the dynamics of an industrial robot with its own controller in the loop.\n\n"
         "Start with `hil demo`: the whole way on a simulated COMAU NS 16, with a report."

@@ -9,8 +9,10 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -36,6 +38,12 @@ def test_help_says_where_to_start() -> None:
     for command in COMMANDS:
         assert f" {command} " in done.stdout
         assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
+
+
+def test_the_version_is_that_of_the_package_and_of_what_its_numbers_depend_on() -> None:
+    told = CliRunner().invoke(app, ["--version"])
+    assert told.exit_code == 0
+    assert told.stdout.startswith(f"hil {version('hil')} (numpy {np.__version__}, ")
 
 
 @pytest.mark.parametrize("command", ["status", "run"])
