@@ -175,6 +175,9 @@ class TestCommand:
 @pytest.mark.parametrize(
     ("seed", "script"),
     [
+        # What is left unexplained is correlated over much of a short motion.
+        (1227, ["restart@580:cold", "clock@900:+3600s"]),
+        (1791, ["drive-drop@400"]),
         # The arm itself trembles where it stands, so that two motions in a row may not begin.
         (3121, ["hurry@0", "lurch@700x1:-0.3", "axis-leaves@372:axis=1"]),
         # Standard deviations from few blocks of residuals: 6.5 of them are no finding.
