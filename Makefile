@@ -38,10 +38,7 @@ test: $(STAMP)  ## lint, types, floors, declared dependencies and the fast tests
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/deptry .
-	@# Real time: a virtual machine stands still for longer than an exchange bears, some times a
-	@# minute. What failed is run once more, alone, and has to pass then.
-	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder \
-	  || $(BIN)/pytest --last-failed --last-failed-no-failures none
+	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 test-slow: $(STAMP)  ## the tests that take minutes
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,fuzz,fuse]'

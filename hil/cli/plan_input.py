@@ -161,5 +161,5 @@ def _text(path: Path) -> str:
         return text_of(path).removeprefix("\ufeff")
     except (OSError, UnicodeDecodeError) as error:
         remedy = remedy_of(error, "name another file")
-        why = getattr(error, "strerror", None) or error
+        why = error.strerror if isinstance(error, OSError) else error
         raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error

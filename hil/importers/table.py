@@ -64,7 +64,7 @@ class Table:
         try:
             text = text_of(path, _LONGEST).removeprefix("\ufeff")
         except (OSError, UnicodeDecodeError) as error:
-            why = getattr(error, "strerror", None) or error
+            why = error.strerror if isinstance(error, OSError) else error
             raise SourceError(
                 path,
                 f"cannot be read ({why})",

@@ -21,7 +21,8 @@ Merged are as many journals as are named, those compressed by `xz` (`long.jsonl.
 The exit code is 1 if anything is wrong, 0 if not, and 2 if the journal is none. What a run is too
 short for is said as a doubt, and so is what the machine explains: slower answers while more was to
 do, campaigns given up and answers missed while its cores stood still, which a process on each of
-them tells that does nothing else. More than one answer in 10 000 beyond that is wrong at any load.
+them tells that does nothing else. More than one answer in 10 000 beyond that is wrong. Two bounds
+hold whatever stood still: half of a piece's campaigns, and 1 % of its answers.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ LAW: Final = "estimate"
 SEEDS: Final = 10_000
 FALSE_ALARM: Final = 1e-3
 ALLOWED: Final = 5.0
-"""About 1 is to be expected; the largest of 220 seeds in which nothing disturbed the arm is 1.9."""
+"""About 1 is to be expected; the largest of some 200 seeds with a calm arm is 1.9."""
 
 
 def estimate(observed: Observed) -> Iterator[Broken]:
