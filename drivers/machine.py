@@ -78,6 +78,7 @@ class Machine:
         self.offending: int | None = None
         self.events: list[Event] = []
         self._losses: deque[tuple[int, int]] = deque()
+        self._first_interval = 0
 
     def request(self, execution: Execution, unusable: str | None) -> None:
         """Keep a motion for the next time in open mode.
@@ -99,6 +100,8 @@ class Machine:
         if reason is not None:
             raise RequestError(self.state.name.lower(), reason)
         self.execution = execution
+        # Axes may still be open in an interval that was another motion's.
+        self._first_interval = self.interval + (self.state is not State.OPEN)
 
     def stop(self, reason: str) -> None:
         """Leave open mode, after coming to rest; drop a motion that has not begun."""
@@ -246,7 +249,7 @@ class Machine:
         if self.execution is None:
             return
         # A motion refused at its first set-point was in the interval without having begun.
-        reached = self.execution.started or self.in_interval
+        reached = self.in_interval and self.interval >= self._first_interval
+        interval = self.interval if self.execution.started or reached else -1
         self.execution = None
-        interval = self.interval if reached else -1
         self.events.append(MotionEnded(outcome, reason, interval, self.cycle))

@@ -148,6 +148,19 @@ class TestLostMotion:
         rig.run()
         assert rig.ended.outcome == "completed"
 
+    def test_a_motion_asked_for_while_axes_of_the_last_are_open_was_in_no_interval(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.open()
+        while rig.session.requested:
+            rig.cycle()
+            rig.status = 0 if rig.state is State.EXITING else 5  # as a corrupted packet says
+        assert (rig.ended.outcome, rig.ended.interval) == ("completed", 0)
+        rig.session.request(still(3))
+        rig.status = 5
+        assert all_drive_off(rig.cycle())
+        assert (rig.ended.outcome, rig.ended.interval) == ("lost", -1)
+
     @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.DRIVING_ON])
     def test_a_waiting_motion_is_lost_when_the_drive_goes_off(self, mode):
         rig = Rig()
