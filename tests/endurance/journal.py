@@ -49,7 +49,6 @@ class Sample:
         stalls: of the machine since the piece began, see `tests.endurance.stalls`; 0 where nobody
             could look.
         stood: s that they lasted.
-        held: by the supervisor of its memory: bytes of malloc, blocks of Python's own allocator.
     """
 
     t: float
@@ -60,7 +59,6 @@ class Sample:
     latencies: Sequence[int]
     stalls: int = 0
     stood: float = 0.0
-    held: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -81,6 +79,7 @@ class Ran:
         records: in them.
         records_lost: as they state.
         descriptors: open ones by process, with no archive open.
+        held: by the supervisor of its memory: bytes of malloc, blocks of Python's own allocator.
     """
 
     number: int
@@ -95,6 +94,7 @@ class Ran:
     records: int
     records_lost: int
     descriptors: Mapping[str, int]
+    held: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def given_up(self) -> bool:

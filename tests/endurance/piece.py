@@ -117,9 +117,7 @@ class Watched:
         self._processes = {name: psutil.Process(pid) for name, pid in pids.items()}
         self.journal.add(kind="link", scheduling=scheduling, notes=notes, t=self._at)
 
-    def _status(
-        self, counters: Mapping[str, float], latencies: list[int], held: Mapping[str, int]
-    ) -> None:
+    def _status(self, counters: Mapping[str, float], latencies: list[int]) -> None:
         used = {}
         for name, process in self._processes.items():
             with suppress(psutil.Error):
@@ -135,7 +133,6 @@ class Watched:
             latencies=latencies,
             stalls=stalls,
             stood=stood,
-            held=held,
         )
         now = min(self._at, self.seconds)
         self.task.advance(now - self._told, f"{counters['ended_count']:.0f} motions")

@@ -11,6 +11,7 @@ does. It tells what it knows in lines of JSON: the link's processes, the exchang
 from __future__ import annotations
 
 import ctypes
+import gc
 import json
 import os
 import signal
@@ -83,6 +84,7 @@ class Supervisor:
                 restarts=errors,
                 motions=self.link.exchange.status().ended_count - before,
                 descriptors=self._descriptors(),
+                held=held(),
             )
             self.number += 1
 
@@ -138,10 +140,12 @@ class Supervisor:
                 "status",
                 counters={name: getattr(status, name) for name in COUNTERS},
                 latencies=status.latencies,
-                held=held(),
             )
             if self._over.wait(TELL_EVERY):
                 return
+
+
+_LIBC: Final = ctypes.CDLL(None)
 
 
 class _MallInfo(ctypes.Structure):
@@ -160,10 +164,13 @@ def held() -> dict[str, int]:
     """What this process holds of its memory: bytes of malloc, blocks of Python's own allocator.
 
     What it once held and gave back stays its own until it is used again: only this tells a leak
-    from a campaign that needed more for a moment than any before. Only blocks without glibc.
+    from a campaign that needed more for a moment than any before. Python's free lists and its cache
+    of attributes (4096 names at most) do not count: they fill for hours. Only blocks without glibc.
     """
+    gc.collect()
+    sys._clear_type_cache()
     blocks = {"blocks": sys.getallocatedblocks()}
-    if (mallinfo := getattr(ctypes.CDLL(None), "mallinfo2", None)) is None:
+    if (mallinfo := getattr(_LIBC, "mallinfo2", None)) is None:
         return blocks
     mallinfo.restype = _MallInfo
     found = mallinfo()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -111,17 +112,20 @@ def test_a_leak_is_found_in_the_process_that_has_it() -> None:
 
 def test_a_leak_that_pages_do_not_show_yet_is_found_in_what_the_supervisor_holds() -> None:
     rng = np.random.default_rng(4)
-    even = piece(4)
-    for place, one in enumerate(even.samples):
-        held = {"bytes": int(30 * MIB + MIB * rng.standard_normal()), "blocks": 400_000}
-        even.samples[place] = replace(one, held=held)
-    assert judge([even]).faults == []
+    even = [
+        replace(
+            ran(number),
+            held={"bytes": int(30 * MIB + 0.1 * MIB * rng.standard_normal()), "blocks": 400_000},
+        )
+        for number in range(160)
+    ]
+    assert judge([replace(piece(4), campaigns=even)]).faults == []
     for name, much in (("bytes", MIB), ("blocks", 10_000)):
         leaking = [
             replace(one, held={**one.held, name: one.held[name] + round(much * one.t / 3600.0)})
-            for one in even.samples
+            for one in even
         ]
-        (fault,) = judge([replace(even, samples=leaking)]).faults
+        (fault,) = judge([replace(piece(4), campaigns=leaking)]).faults
         assert "what the supervisor holds grows" in fault
         assert f" {name} an hour" in fault
 
@@ -134,6 +138,17 @@ def test_what_a_process_holds_is_known_to_the_byte() -> None:
     assert after["blocks"] - before["blocks"] == pytest.approx(1000, abs=50)
     del kept
     assert held()["bytes"] - before["bytes"] < MIB
+
+
+def test_what_python_keeps_for_its_own_speed_is_not_held() -> None:
+    before = held()
+    names = ["no attribute is " + number % 40 * "x" + str(number) for number in range(5000)]
+    for name in names:
+        getattr(Ran, name, None)
+    tuples = [(name, name) for name in names]
+    del names, name, tuples
+    assert sys.getallocatedblocks() > before["blocks"] + 2000
+    assert held()["blocks"] == pytest.approx(before["blocks"], abs=50)
 
 
 def test_a_leak_too_small_to_matter_is_not_hidden() -> None:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from scipy.stats import mannwhitneyu
 
 from tests.endurance.course import judge_course
-from tests.endurance.journal import Piece, Sample
+from tests.endurance.journal import Piece, Ran, Sample
 from tests.endurance.trends import Slope, largest_rise, quantile, slope
+
+Told = TypeVar("Told", Sample, Ran)
 
 PROCESSES: Final = ("exchange", "archive", "supervisor", "controller")
 WARM_UP: Final = 300.0
@@ -99,7 +101,7 @@ def _minute(before: Sample, after: Sample) -> Minute:
 
 def memory_of(pieces: Sequence[Piece], process: str) -> Memory | None:
     """How the memory of a process went after the warm-up; None if it was too short to tell."""
-    settled = _settled(pieces, lambda sample: process in sample.processes)
+    settled = _settled((piece.samples for piece in pieces), lambda one: process in one.processes)
     if not settled:
         return None
     growth = {
@@ -116,26 +118,22 @@ def _mib(sample: Sample, process: str, name: str) -> float:
     return float(getattr(sample.processes[process], name)) / 2**20
 
 
-def _held(sample: Sample, name: str) -> float:
-    return float(sample.held[name])
+def _settled(told: Iterable[Sequence[Told]], tells: Callable[[Told], object]) -> list[list[Told]]:
+    """Of each piece what was told after its warm-up and tells something; none of a single one."""
+    found = [[one for one in piece if one.t >= WARM_UP and tells(one)] for piece in told]
+    return [settled for settled in found if len(settled) >= 2]
 
 
-def _settled(pieces: Sequence[Piece], tells: Callable[[Sample], bool]) -> list[list[Sample]]:
-    """Of each piece the samples after its warm-up that tell something; none of a single one."""
-    found = [[one for one in piece.samples if one.t >= WARM_UP and tells(one)] for piece in pieces]
-    return [samples for samples in found if len(samples) >= 2]
-
-
-def _growth(settled: Sequence[Sequence[Sample]], value: Callable[[Sample], float]) -> Slope:
-    return slope([_by_minute(samples, value) for samples in settled], CONFIDENCE)
+def _growth(settled: Sequence[Sequence[Told]], value: Callable[[Told], float]) -> Slope:
+    return slope([_by_minute(one, value) for one in settled], CONFIDENCE)
 
 
 def _by_minute(
-    samples: Sequence[Sample], value: Callable[[Sample], float]
+    told: Sequence[Told], value: Callable[[Told], float]
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Hours, and the median of each minute: a sample is much like the one before."""
-    minute = np.array([int(sample.t // 60.0) for sample in samples])
-    values = np.array([value(sample) for sample in samples])
+    minute = np.array([int(one.t // 60.0) for one in told])
+    values = np.array([value(one) for one in told])
     present = np.unique(minute)
     return present / 60.0, np.array([np.median(values[minute == one]) for one in present])
 
@@ -202,8 +200,8 @@ def _judge_held(pieces: Sequence[Piece], faults: list[str]) -> dict[str, dict[st
     """What the supervisor holds of its memory, per hour: a leak that pages do not show yet."""
     found: dict[str, dict[str, float]] = {}
     for name in ("bytes", "blocks"):
-        settled = _settled(pieces, lambda sample: bool(sample.held))
-        if not settled or name not in settled[0][0].held:
+        settled = _settled((piece.campaigns for piece in pieces), partial(_tells, name=name))
+        if not settled:
             continue
         growth = _growth(settled, partial(_held, name=name))
         first = _held(settled[0][0], name)
@@ -214,6 +212,14 @@ def _judge_held(pieces: Sequence[Piece], faults: list[str]) -> dict[str, dict[st
                 f"({growth.low:.0f} to {growth.high:.0f}), of {first:.0f}"
             )
     return found
+
+
+def _tells(ran: Ran, name: str) -> bool:
+    return name in ran.held
+
+
+def _held(ran: Ran, name: str) -> float:
+    return float(ran.held[name])
 
 
 def _judge_descriptors(
