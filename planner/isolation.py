@@ -62,7 +62,7 @@ class PlanningChild:
         deadline: When the call that was begun must have ended, on the monotonic clock [s].
 
     Raises, in `call`, `send` and `receive`:
-        PlannerCrashed: the process died; a new one is on its way for the next call.
+        PlannerCrashed: the process died (in `call`: over it); a new one is on its way.
         PlannerNotStarted: it died before it could be asked anything; why is on stderr.
         PlanningTimedOut: the call took too long; likewise a new one is on its way.
         PlannerOutOfStep: there is an answer, but not to the call begun last in this process.
@@ -96,8 +96,11 @@ class PlanningChild:
         return self._process.pid if self._process is not None else None
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Return what the function returns in the child."""
-        self.send(function, *args, **kwargs)
+        """Return what the function returns in the child; one that died idle is replaced."""
+        try:
+            self.send(function, *args, **kwargs)
+        except PlannerCrashed:  # nothing of this call: the system may have needed its memory
+            self.send(function, *args, **kwargs)
         result: T = self.receive()
         return result
 

@@ -32,6 +32,7 @@ from hil.errors import ControllerFault, OperatorStopError
 
 from .beginning import Beginning
 from .motion_link import (
+    END_TIMEOUT,
     Connection,
     Progress,
     Recorded,
@@ -250,15 +251,24 @@ class Link:
         )
 
     def close(self) -> None:
-        """Ask the far end to end the session and answer until it does."""
-        self.finish()
+        """Ask the far end to end the session and answer until it does, or was started anew.
 
-        def drop() -> bool:
+        Raises:
+            ControllerFault: an axis is still open `END_TIMEOUT` s of the controller's time later.
+        """
+        self.finish()
+        deadline = self.transport.now + END_TIMEOUT
+
+        def over() -> bool:
             self.ring.drain()
             self.drain_packets()
-            return False
+            return self.transport.now > deadline
 
-        exchange(self.transport, self.session, until=drop)
+        exchange(self.transport, self.session, until=over)
+        if self.session.state in HAS_SET_POINTS:
+            raise ControllerFault(
+                f"an axis is still open {END_TIMEOUT:g} s after the controller was asked to end"
+            )
 
     def _known(self, stop: Stop, until: float) -> bool:
         self._events()

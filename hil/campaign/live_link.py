@@ -38,6 +38,7 @@ from .heartbeat import Heartbeat
 from .live_motion import LiveMotion
 from .live_recording import LiveRecording
 from .motion_link import (
+    END_TIMEOUT,
     Connection,
     Recorded,
     Watch,
@@ -58,8 +59,6 @@ POLL = 0.02
 """s between two looks at everything while a motion runs."""
 OPEN_TIMEOUT = 10.0
 """s within which a file must have been created."""
-END_TIMEOUT = 30.0
-"""s within which the exchange must have ended after it was told to."""
 
 
 @dataclass(eq=False)

@@ -26,6 +26,9 @@ from .stop import Stop
 
 Array = NDArray[np.float64]
 
+END_TIMEOUT = 30.0
+"""s within which a session has to end after that was asked for."""
+
 
 @dataclass(frozen=True)
 class Recorded:

@@ -14,7 +14,7 @@ from drivers.packets import InitPacket
 from drivers.transports.base import TransportSpec
 from hil.campaign import Stop
 from hil.campaign.exchange_view import ExchangeView
-from hil.campaign.live_link import END_TIMEOUT
+from hil.campaign.motion_link import END_TIMEOUT
 from hil.errors import ControllerFault, OperatorStopError
 
 _POLL = 0.05

@@ -173,12 +173,17 @@ def test_a_solver_that_aborts_ends_the_child_only(aborting_solver, six_axis_limi
     assert same(plan_in_child(points, six_axis_limits), plan(points, six_axis_limits))
 
 
-def test_a_child_that_died_idle_is_an_error_once(six_axis_limits, random_points):
+def test_a_child_that_died_idle_is_replaced_and_told_only_to_who_begins_a_call():
     with PlanningChild() as child:
-        os.kill(child.call(os.getpid), signal.SIGKILL)
+        pid = child.call(os.getpid)
+        os.kill(pid, signal.SIGKILL)
+        assert gone(pid, 5.0)
+        pid = child.call(os.getpid)
+        os.kill(pid, signal.SIGKILL)
+        assert gone(pid, 5.0)
         with pytest.raises(PlannerCrashed, match="signal 9"):
-            child.call(os.getpid)
-        assert child.call(abs, -1) == 1
+            child.send(os.getpid)
+        assert child.call(os.getpid) != pid
 
 
 def test_a_process_that_cannot_start_is_not_the_fault_of_what_it_was_to_plan(

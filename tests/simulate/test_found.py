@@ -14,6 +14,7 @@ from drivers.exchange import exchange
 from drivers.transports import SimulatedTransport
 from hil.archive import ArchiveSpec, open_archive
 from hil.campaign import Link
+from hil.campaign import link as link_module
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.motion_link import not_ready
 from hil.campaign.stop import Stop
@@ -112,6 +113,35 @@ def test_a_repetition_in_which_a_joint_was_stuck_is_run_again(tmp_path: Path) ->
     assert first["outcome"] == "rejected"
     assert first["reason"].startswith("joint_1 is stuck: its position stays the same from 0.")
     assert "excitation_000_a2.mcap" in seen.found.pooled
+
+
+class TestALinkThatIsClosed:
+    """Seed 6625 with `restart@1102:warm`: started anew as it was told to end, it was never told so
+    again, and virtual time went on until the machine had no memory left."""
+
+    @pytest.fixture(autouse=True)
+    def patience(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(link_module, "END_TIMEOUT", 0.5)
+
+    def test_does_not_wait_without_end_for_a_controller_started_anew(self, tmp_path: Path) -> None:
+        cell = fast_cell(tmp_path)
+        controller = simulated_controller(cell)
+        link = Link.over(
+            SimulatedTransport(controller), cell, lambda: controller.restart(warm=True)
+        )
+        link.connect(Stop())
+        began = link.transport.now
+        link.close()
+        assert link.transport.now - began == pytest.approx(0.5, abs=0.01)
+        assert link.session.state is State.DRIVE_OFF
+
+    def test_says_that_axes_stay_open(self, tmp_path: Path) -> None:
+        cell = fast_cell(tmp_path)
+        link = Link.over(SimulatedTransport(simulated_controller(cell)), cell)
+        link.connect(Stop())
+        exchange(link.transport, link.session, until=lambda: link.session.state is State.OPEN)
+        with pytest.raises(ControllerFault, match=r"an axis is still open 0\.5 s after"):
+            link.close()
 
 
 def short_way(
