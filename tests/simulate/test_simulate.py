@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.simulate import world
 from tests.simulate.__main__ import main
 from tests.simulate.drawing import DRAWS, Story, draw_script
 from tests.simulate.judging import judged
@@ -190,6 +191,16 @@ class TestCommand:
 )
 def test_laws_that_were_too_narrow_hold(seed: int, script: list[str], tmp_path: Path) -> None:
     assert judged(Stage(tmp_path).observed(seed, script)) == []
+
+
+def test_a_campaign_that_never_ends_is_a_finding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(tmp_path)
+    assert judged(stage.observed(4, [])) == []
+    monkeypatch.setattr(world, "MOST_CYCLES", 500)
+    broken = judged(stage.observed(4, ["drive-drop@300"]))
+    assert any("EndlessError" in one.text for one in broken)
 
 
 def test_a_scene_whose_arm_trembles_where_it_stands_is_drawn_anew(tmp_path: Path) -> None:

@@ -39,6 +39,8 @@ from tests.simulate.watched import (
 )
 
 MOST_LIVES: Final = 16
+MOST_CYCLES: Final = 500_000
+"""Of one life; all lives together take 66 415 in the longest of some 7000 seeds."""
 _SECOND_CHANCES: Final = 5
 """Runs that may still fail once the script speaks of no later cycle, beside the disk's failures."""
 _JUST_BEFORE: Final = 10
@@ -51,6 +53,10 @@ _GIVES_UP: Final = 3000
 """Cycles without an init packet after which the person ends a run."""
 _JOG: Final = "jog the arm"
 """What a run says that cannot find a free way from where the arm stands."""
+
+
+class EndlessError(Exception):
+    """A run goes on and on in virtual time."""
 
 
 def unrest(scene: Scene, history: ArmHistory) -> float:
@@ -174,6 +180,8 @@ class World:
 
     def _look(self, cycle: int) -> None:
         """What is due in this cycle happens to the process."""
+        if cycle - self._begun > MOST_CYCLES:
+            raise EndlessError
         if cycle - self._begun > _GIVES_UP and self._session.state is State.SYNC:
             self._stop.requested = True  # nobody waits a minute for a controller in mid-session
         while self._due and self._due[0].at <= cycle:
