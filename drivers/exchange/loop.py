@@ -70,6 +70,7 @@ def exchange(
             if math.isfinite(session.deadline):
                 session.tick(max(transport.now, session.deadline))
             return
+    _count_rejected(transport, session)
 
 
 def _count_rejected(transport: Transport, session: Session) -> None:

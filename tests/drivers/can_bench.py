@@ -127,6 +127,9 @@ class PacedByPackets:
         if timeout <= 0.0:
             return self.near.receive(0.0)
         if self._awaiting:
+            # What others said on the bus waits there already.
+            if (waiting := self.near.receive(0.0)) is not None:
+                return waiting
             self._hand_over(None)
         packet = self.controller.next_packet()
         if packet is None:
