@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from identification.excitation.collision.bodies import described_shapes
 from identification.excitation.collision.poses import joint_poses
 from identification.kinematics import Chain, chain_from_urdf
 
@@ -121,9 +122,7 @@ def reach(corners: Sequence[Array]) -> tuple[Array, Array]:
 
 def _described(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> tuple[Solid, ...]:
     try:
-        shapes = pin.buildGeomFromUrdfString(
-            model, urdf, pin.GeometryType.COLLISION, None, list(mesh_folders)
-        )
+        shapes = described_shapes(model, urdf, mesh_folders)
     except (ValueError, RuntimeError):  # a mesh that is not on this computer
         return ()
     solids = []

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import pickle
 import time
 from itertools import combinations, pairwise
@@ -22,6 +23,7 @@ from identification.excitation import (
     WorkspaceError,
 )
 from identification.excitation.collision import checker as checker_module
+from identification.excitation.collision.bodies import link_bodies
 from identification.excitation.collision.built_in import told
 from identification.excitation.collision.checker import joint_poses
 from identification.excitation.sampling import sampled
@@ -94,6 +96,17 @@ def test_joint_frames_are_those_of_pinocchio():
         for i in range(4):
             np.testing.assert_allclose(rotations[i, k], data.oMi[i].rotation, atol=1e-12)
             np.testing.assert_allclose(translations[i, k], data.oMi[i].translation, atol=1e-12)
+
+
+def test_shapes_that_were_read_are_let_go_of(arm):
+    def living():
+        gc.collect()
+        return sum(isinstance(thing, pin.GeometryModel) for thing in gc.get_objects())
+
+    before = living()
+    for _ in range(5):
+        assert link_bodies(arm, urdf_text(), [])
+    assert living() == before
 
 
 def test_clear_postures_are_those_where_pinocchio_finds_no_distance_below_zero(arm):

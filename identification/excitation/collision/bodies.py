@@ -67,6 +67,18 @@ class Body:
     half_sides: Array | None = None
 
 
+def described_shapes(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> pin.GeometryModel:
+    """Return the collision shapes of a robot description as pinocchio reads them.
+
+    Raises:
+        ValueError, RuntimeError: a mesh is not to be found, or a shape cannot be read.
+    """
+    # One that pinocchio 4.1 makes itself it never lets go of, meshes and all.
+    shapes = pin.GeometryModel()
+    pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION, shapes, list(mesh_folders))
+    return shapes
+
+
 def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> list[Body]:
     """Return the collision shapes of a robot description, ordered by the joint that moves them.
 
@@ -77,9 +89,7 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
         CollisionModelError: a shape cannot be read, or no moving link has one.
     """
     try:
-        shapes = pin.buildGeomFromUrdfString(
-            model, urdf, pin.GeometryType.COLLISION, None, list(mesh_folders)
-        )
+        shapes = described_shapes(model, urdf, mesh_folders)
     except (ValueError, RuntimeError) as error:
         missing = _MISSING_MESH.search(str(error))
         if missing:
