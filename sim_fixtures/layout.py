@@ -85,8 +85,9 @@ class Layout:
         return targets
 
     def fill(self, values: NDArray[np.float64]) -> None:
-        """Set D1..D5, extra1..3 of this arm's axes, (8, n_axes)."""
-        self._values[:, self.own] = values
+        """Set D1..D5, extra1..3 of this arm's axes, (8, n_axes); infinite where float32 ends."""
+        with np.errstate(over="ignore"):
+            self._values[:, self.own] = values
 
     def set_modes(self, common: int | None, open_axes: Sequence[bool]) -> None:
         """Set all modes to `common`, or each axis to the open mode or to closed."""

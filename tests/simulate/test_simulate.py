@@ -185,6 +185,8 @@ class TestCommand:
         (3886, ["e-stop@460"]),
         # Joint angles of an arm whose calibration is fifteen revolutions of its motor.
         (4536, ["lose@500"]),
+        # A target velocity garbled to 1e37, converted to within as many digits as any.
+        (7339, ["corrupt@900x2:offset=23:mask=0x40:to_controller"]),
         # Records that the disk refused are not lost by the death that follows.
         (4789, ["kill-at-save@1:left", "save-full@2", "kill@1100", "disk-error@10x1:keep=0.481"]),
     ],

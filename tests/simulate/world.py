@@ -38,7 +38,7 @@ from tests.simulate.watched import (
     WatchedTransport,
 )
 
-MOST_LIVES: Final = 16
+MOST_LIVES: Final = 32
 MOST_CYCLES: Final = 500_000
 """Of one life; all lives together take 66 415 in the longest of some 7000 seeds."""
 _SECOND_CHANCES: Final = 5

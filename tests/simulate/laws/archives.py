@@ -248,7 +248,7 @@ def _decoded(
     size = np.abs(np.linalg.inv(gears.matrix)).sum(axis=1).max() * (
         1.0
         + np.abs(gears.offset).max()
-        + np.abs(d[finite, :, 0:4:2]).max(axis=(1, 2), initial=0.0, keepdims=True)[:, :, 0]
+        + np.abs(d[finite, :, :4]).max(axis=(1, 2), initial=0.0, keepdims=True)[:, :, 0]
     )
     bound = 16.0 * len(slots) * _EPS * size
     for column, name in enumerate(_SI):
