@@ -27,8 +27,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from identification.estimation import Estimate, mark_undetermined, solve
 from identification.phase_factor import FINE_BLOCK, PhaseFactor, merged
@@ -164,10 +164,10 @@ def left_out(information: Array, scores: Array, root: Array, left: Array | None 
     identity = np.eye(scores.shape[1])
     for b, (share, score) in enumerate(zip(shares, scores, strict=True)):
         others = identity - share
-        factor, pivots, _ = lapack.dgetrf(others)
-        certain, _ = lapack.dgecon(factor, np.abs(others).sum(axis=0).max(initial=0.0))
+        factor, pivots, _ = scipy.linalg.lapack.dgetrf(others)
+        certain, _ = scipy.linalg.lapack.dgecon(factor, np.abs(others).sum(axis=0).max(initial=0.0))
         if certain > _ALONE:
-            moved[b] = lapack.dgetrs(factor, pivots, score)[0]
+            moved[b] = scipy.linalg.lapack.dgetrs(factor, pivots, score)[0]
         else:
             moved[b] = np.linalg.lstsq(others, score, rcond=_ALONE)[0]
     return np.asarray(moved @ root.T)
@@ -214,12 +214,12 @@ def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:
         np.add(share, share.T, out=work)
         work *= -0.5
         work[diagonal, diagonal] += _OWN
-        if lapack.dpotrf(work, overwrite_a=1, clean=0)[1] != 0:
+        if scipy.linalg.lapack.dpotrf(work, overwrite_a=1, clean=0)[1] != 0:
             dependent.append(b)
             continue
         np.negative(share, out=work)
         work[diagonal, diagonal] += 1.0
-        corrected[b] = lapack.dgesv(work, score, overwrite_a=1)[2]
+        corrected[b] = scipy.linalg.lapack.dgesv(work, score, overwrite_a=1)[2]
     return corrected, dependent
 
 

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 
 from identification.covariance import block_length, spread
 from identification.errors import IdentificationError
@@ -242,7 +242,7 @@ def _smallest_error(full: Array, errors: Array, p: int) -> float:
     cross = full[np.ix_(exact, noisy)]
     left = full[np.ix_(noisy, noisy)] - cross.T @ projected @ cross
     scale = np.sqrt(errors[noisy - p])
-    smallest = eigh(left / np.outer(scale, scale), eigvals_only=True)[0]
+    smallest = scipy.linalg.eigh(left / np.outer(scale, scale), eigvals_only=True)[0]
     return float(max(smallest, _LEAST_ERROR))
 
 

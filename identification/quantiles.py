@@ -8,20 +8,20 @@ from __future__ import annotations
 
 from typing import Any
 
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import fdtrc, ndtri, stdtrit
 
 
 def normal_limit(share: ArrayLike) -> Any:
     """Value that a standard normal variable exceeds with probability `share`."""
-    return -ndtri(share)
+    return -scipy.special.ndtri(share)
 
 
 def student_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
     """Value that Student's t of so many degrees of freedom exceeds with probability `share`."""
-    return -stdtrit(freedom, share)
+    return -scipy.special.stdtrit(freedom, share)
 
 
 def fisher_tail(value: ArrayLike, freedom: ArrayLike, spare: ArrayLike) -> Any:
     """Probability that Fisher's F of (`freedom`, `spare`) degrees of freedom exceeds `value`."""
-    return fdtrc(freedom, spare, value)
+    return scipy.special.fdtrc(freedom, spare, value)

@@ -25,7 +25,6 @@ from typing import Final
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 Array = NDArray[np.float64]
 
@@ -148,9 +147,12 @@ class _Problem:
         start = float(time[0])
         rows = _rows(start, spacing, intervals, time, 0)
         gram, penalty = _gram_band(rows), _penalty_band(intervals)
-        factor = (cholesky_banded(gram + _LIGHTEST * density * penalty, lower=True), True)
-        closest = cho_solve_banded(factor, rows.T @ values)
-        closest += cho_solve_banded(
+        factor = (
+            scipy.linalg.cholesky_banded(gram + _LIGHTEST * density * penalty, lower=True),
+            True,
+        )
+        closest = scipy.linalg.cho_solve_banded(factor, rows.T @ values)
+        closest += scipy.linalg.cho_solve_banded(
             factor,
             rows.T @ (values - rows @ closest) - _LIGHTEST * density * _roughness(closest),
         )
@@ -165,9 +167,11 @@ class _Problem:
 
     def correction(self, channel: int | slice, penalty: float) -> Array:
         """How the coefficients of a channel, or all, differ from the least smoothed ones."""
-        factor = cholesky_banded(self.gram + penalty * self.penalty, lower=True)
+        factor = scipy.linalg.cholesky_banded(self.gram + penalty * self.penalty, lower=True)
         excess = penalty - _LIGHTEST * self.density
-        return np.asarray(cho_solve_banded((factor, True), -excess * self.roughness[:, channel]))
+        return np.asarray(
+            scipy.linalg.cho_solve_banded((factor, True), -excess * self.roughness[:, channel])
+        )
 
     def penalty_at(self, bandwidth: float) -> float:
         """Penalty that gives a bandwidth [Hz], within what the knots can show."""

@@ -37,6 +37,7 @@ from .exchange_view import ExchangeView
 from .heartbeat import Heartbeat
 from .live_motion import LiveMotion
 from .live_recording import LiveRecording
+from .memory import return_large_arrays
 from .motion_link import (
     END_TIMEOUT,
     Connection,
@@ -133,6 +134,7 @@ class LiveLink:
             ControllerFault: the link cannot be opened (port taken, not permitted, no adapter), or
                 the system refuses a process.
         """
+        return_large_arrays()
         spec = transport if transport is not None else cell.transport_spec()
         settings = ExchangeSettings(
             transport=spec,

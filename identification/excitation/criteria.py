@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from identification.factor import Factor
 
@@ -157,7 +157,7 @@ def _factorise(gram: Array) -> tuple[Array, Array | None]:
     scale = np.sqrt(np.diag(matrix))
     if not np.all(np.isfinite(scale) & (scale > 0.0)):
         return scale, None
-    lower, info = lapack.dpotrf(matrix / scale[:, None] / scale, lower=1)
+    lower, info = scipy.linalg.lapack.dpotrf(matrix / scale[:, None] / scale, lower=1)
     if info != 0 or np.min(np.diag(lower)) ** 2 <= _smallest_pivot(len(matrix)):
         return scale, None
     return scale, lower
@@ -174,7 +174,7 @@ def _coupling_index(lower: Array) -> float:
 
 def _lower_correlation(lower: Array) -> Array:
     """Return the lower triangle of the correlation matrix from the Cholesky factor."""
-    half, _ = lapack.dpotri(lower, lower=1)
+    half, _ = scipy.linalg.lapack.dpotri(lower, lower=1)
     deviation = np.sqrt(np.diag(half))
     return np.asarray(np.tril(half) / deviation[:, None] / deviation)
 
