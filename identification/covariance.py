@@ -161,13 +161,13 @@ def left_out(information: Array, scores: Array, root: Array, left: Array | None 
     left = root if left is None else left
     shares, scores = _shares(information, root, left), scores @ left
     moved = np.empty_like(scores)
-    identity = np.eye(scores.shape[1])
+    lapack, identity = scipy.linalg.lapack, np.eye(scores.shape[1])
     for b, (share, score) in enumerate(zip(shares, scores, strict=True)):
         others = identity - share
-        factor, pivots, _ = scipy.linalg.lapack.dgetrf(others)
-        certain, _ = scipy.linalg.lapack.dgecon(factor, np.abs(others).sum(axis=0).max(initial=0.0))
+        factor, pivots, _ = lapack.dgetrf(others)
+        certain, _ = lapack.dgecon(factor, np.abs(others).sum(axis=0).max(initial=0.0))
         if certain > _ALONE:
-            moved[b] = scipy.linalg.lapack.dgetrs(factor, pivots, score)[0]
+            moved[b] = lapack.dgetrs(factor, pivots, score)[0]
         else:
             moved[b] = np.linalg.lstsq(others, score, rcond=_ALONE)[0]
     return np.asarray(moved @ root.T)
@@ -207,19 +207,19 @@ def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:
 
     And which blocks those are. One block at a time, in memory that stays in the cache.
     """
+    lapack, k = scipy.linalg.lapack, scores.shape[1]
     corrected, dependent = np.zeros_like(scores), []
-    k = scores.shape[1]
     work, diagonal = np.empty((k, k), order="F"), np.arange(k)
     for b, (share, score) in enumerate(zip(shares, scores, strict=True)):
         np.add(share, share.T, out=work)
         work *= -0.5
         work[diagonal, diagonal] += _OWN
-        if scipy.linalg.lapack.dpotrf(work, overwrite_a=1, clean=0)[1] != 0:
+        if lapack.dpotrf(work, overwrite_a=1, clean=0)[1] != 0:
             dependent.append(b)
             continue
         np.negative(share, out=work)
         work[diagonal, diagonal] += 1.0
-        corrected[b] = scipy.linalg.lapack.dgesv(work, score, overwrite_a=1)[2]
+        corrected[b] = lapack.dgesv(work, score, overwrite_a=1)[2]
     return corrected, dependent
 
 

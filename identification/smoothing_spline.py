@@ -147,10 +147,8 @@ class _Problem:
         start = float(time[0])
         rows = _rows(start, spacing, intervals, time, 0)
         gram, penalty = _gram_band(rows), _penalty_band(intervals)
-        factor = (
-            scipy.linalg.cholesky_banded(gram + _LIGHTEST * density * penalty, lower=True),
-            True,
-        )
+        lightest = gram + _LIGHTEST * density * penalty
+        factor = (scipy.linalg.cholesky_banded(lightest, lower=True), True)
         closest = scipy.linalg.cho_solve_banded(factor, rows.T @ values)
         closest += scipy.linalg.cho_solve_banded(
             factor,

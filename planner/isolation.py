@@ -62,7 +62,7 @@ class PlanningChild:
         deadline: When the call that was begun must have ended, on the monotonic clock [s].
 
     Raises, in `call`, `send` and `receive`:
-        PlannerCrashed: the process died (in `call`: over it); a new one is on its way.
+        PlannerCrashed: the process died over a call; a new one is on its way for the next.
         PlannerNotStarted: it died before it could be asked anything; why is on stderr.
         PlanningTimedOut: the call took too long; likewise a new one is on its way.
         PlannerOutOfStep: there is an answer, but not to the call begun last in this process.
@@ -96,16 +96,13 @@ class PlanningChild:
         return self._process.pid if self._process is not None else None
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Return what the function returns in the child; one that died idle is replaced."""
-        try:
-            self.send(function, *args, **kwargs)
-        except PlannerCrashed:  # nothing of this call: the system may have needed its memory
-            self.send(function, *args, **kwargs)
+        """Return what the function returns in the child."""
+        self.send(function, *args, **kwargs)
         result: T = self.receive()
         return result
 
     def send(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Begin a call, whose result `receive` then fetches."""
+        """Begin a call, whose result `receive` then fetches; a child that died idle is replaced."""
         self._number += 1
         message = numbered(self._number, pack(Task(self._timeout, function, args, kwargs)))
         self._disown()
@@ -115,7 +112,10 @@ class PlanningChild:
         try:
             self._connection.send_bytes(message)
         except OSError:  # it died while it had nothing to do
-            raise self._crashed() from None
+            ended = self._crashed()
+            if isinstance(ended, PlannerNotStarted):
+                raise ended from None
+            self.send(function, *args, **kwargs)
         except BaseException:
             self.close()
             raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from datetime import date, time
 from typing import Any
 
 
@@ -21,7 +22,7 @@ def toml_text(value: str) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """Return a number, text, truth value, list or table (inline) of these.
+    """Return a number, text, truth value, date, time, list or table (inline) of these.
 
     Raises:
         TypeError: it is something else.
@@ -35,4 +36,6 @@ def toml_value(value: Any) -> str:
         return f"{{ {', '.join(entries)} }}"
     if isinstance(value, Sequence):
         return f"[{', '.join(toml_value(entry) for entry in value)}]"
+    if isinstance(value, date | time):
+        return value.isoformat()
     return json.dumps(value)

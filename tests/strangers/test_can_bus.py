@@ -94,13 +94,8 @@ def test_frames_of_another_node_are_counted_and_the_arm_goes_on(profile: str) ->
     others = [number for number in range(0x800) if number not in own | ANSWERS]
 
     def chat(bus: Overheard, _: int) -> None:
-        numbers = rng.choice(others, 3)
-        bus.say(
-            [
-                can.Message(arbitration_id=n, data=rng.bytes(8), is_extended_id=False)
-                for n in numbers
-            ]
-        )
+        for number in rng.choice(others, 3):
+            bus.say([can.Message(arbitration_id=number, data=rng.bytes(8), is_extended_id=False)])
 
     run, bus = played(profile, chat)
     (ended,) = run.seen(MotionEnded)
