@@ -137,11 +137,20 @@ def _arm(seen: Seen) -> Iterator[str]:
     if np.isin(answered["phase"], (Phase.TRIPPED,)).any():
         yield "the drive was lost while the exchange lived"
     if "exchange" not in seen.killed and "controller" not in seen.killed and len(answered):
-        left_open = Phase(answered["phase"][-1])
+        left_open = _seen_last(rows)
         if left_open in (Phase.OPENING, Phase.OPEN, Phase.CLOSING):
             yield f"the exchange ended by itself in {left_open.name}"
         if np.abs(answered["velocity"][-1]).max() > 0.01:
             yield "the exchange ended by itself while the arm moved"
+
+
+def _seen_last(rows: Records) -> Phase:
+    """The phase that the last answered packet told of: the one after the cycle before.
+
+    What a controller does after the last answer, say to open its axes once more, nobody knew.
+    """
+    last = int(np.flatnonzero(rows["replied"])[-1]) if rows["replied"].any() else 0
+    return Phase(rows["phase"][last - 1]) if last else Phase.START
 
 
 def _stands(rows: Records) -> bool:

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from drivers.record import cycle_dtype
+from sim_fixtures.program import Phase
 from tests.process_death.__main__ import summary
 from tests.process_death.controller import ROW
-from tests.process_death.laws import MOST, Kept, _archived, _readable, _told
+from tests.process_death.laws import MOST, Kept, _archived, _arm, _readable, _told
 from tests.process_death.rig import Seen
 from tests.process_death.rounds import Victim
 from tests.process_death.watched import Death
@@ -102,3 +103,26 @@ def test_a_supervisor_blames_who_died_and_nobody_else(
     victim: Victim, text: str, true: bool
 ) -> None:
     assert (not list(_told(seen(victim, text=text)))) is true
+
+
+@pytest.mark.parametrize(
+    ("phases", "deserted_answered", "broken"),
+    [
+        ((Phase.CLOSED, Phase.CLOSED, Phase.OPENING), False, False),  # opened after the last answer
+        ((Phase.CLOSED, Phase.OPENING, Phase.OPENING), False, True),
+        ((Phase.CLOSED, Phase.CLOSED, Phase.OPENING), True, True),  # it answered an opening axis
+        ((Phase.OPEN, Phase.CLOSING, Phase.CLOSED), False, True),
+        ((Phase.OPEN, Phase.CLOSED, Phase.CLOSED), False, False),
+    ],
+)
+def test_an_exchange_ends_when_the_last_packet_it_answered_told_of_closed_axes(
+    phases: tuple[Phase, ...], deserted_answered: bool, broken: bool
+) -> None:
+    rows = np.zeros(20, ROW)
+    rows["phase"], rows["replied"] = Phase.CLOSED, True
+    rows["phase"][7 : 7 + len(phases)] = phases
+    rows["deserted"][10:] = True
+    rows["replied"][10:] = False
+    rows["replied"][10] = deserted_answered
+    said = list(_arm(Seen([Death("supervisor", 1, 20)], None, {}, rows, rows, [], 0)))
+    assert any("ended by itself" in one for one in said) is broken
