@@ -26,6 +26,7 @@ from hil.batch.local import LocalWorkers
 from hil.batch.workers import Workers
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
+from tests.arguments import whole_number
 from tests.disk.harm import draw
 from tests.disk.laws import Undamaged, broken, undamaged
 from tests.hil.fast_cell import fast_campaign, fast_cell
@@ -96,8 +97,10 @@ def main(arguments: list[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--rounds", type=int, default=100)
-    parser.add_argument("--start", type=int, default=0, help="number of the first round: its seed")
+    parser.add_argument("--rounds", type=whole_number, default=100)
+    parser.add_argument(
+        "--start", type=whole_number, default=0, help="number of the first round: its seed"
+    )
     parser.add_argument("--journal", type=Path, help="JSON lines; rounds in it are not run again")
     parser.add_argument("--folder", type=Path, help="where a temporary folder is made")
     parser.add_argument("--json", action="store_true", help="print one line of JSON")

@@ -36,6 +36,7 @@ from typing import Any
 
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
+from tests.arguments import time_above_0
 from tests.endurance.journal import Piece, read_journal
 from tests.endurance.piece import run_piece
 from tests.endurance.verdict import SHARES, Verdict, judge
@@ -77,8 +78,8 @@ def _run(given: argparse.Namespace) -> None:
     """Run a piece, and append to the journal."""
     if given.folder is None or given.minutes is None:
         _parser().error("--minutes and --folder are needed to run a piece")
-    if not 0.0 < given.minutes <= LONGEST:
-        _parser().error(f"--minutes must be above 0 and at most {LONGEST:g}")
+    if given.minutes > LONGEST:
+        _parser().error(f"--minutes must be at most {LONGEST:g}")
     if len(given.journal) > 1 or given.journal[0].suffix == COMPRESSED:
         _parser().error("a piece is appended to one --journal, and not to a compressed one")
     seconds = 60.0 * given.minutes
@@ -96,7 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--journal", type=Path, required=True, nargs="+", help="JSON lines; appended to"
     )
-    parser.add_argument("--minutes", type=float, help="how long this piece takes, 90 at most")
+    parser.add_argument(
+        "--minutes", type=time_above_0, help="how long this piece takes, 90 at most"
+    )
     parser.add_argument("--folder", type=Path, help="where campaigns are made")
     parser.add_argument(
         "--rate", type=int, choices=(500, 1000), default=1000, help="packets per second"

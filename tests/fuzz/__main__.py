@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.progress import Reporter, reporter
+from tests.arguments import at_least_one, time_above_0
 from tests.fuzz import journal, keeping, targets
 from tests.fuzz.findings import known
 from tests.fuzz.lives import Places, live, shorten
@@ -45,9 +46,13 @@ def main(arguments: list[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("target", choices=(*targets.NAMES, "all"))
-    parser.add_argument("--minutes", type=float, default=1.0, help="of each target, in all pieces")
-    parser.add_argument("--stop-after", type=float, metavar="MIN", help="end this piece after that")
-    parser.add_argument("--jobs", type=int, default=1, help="targets at a time")
+    parser.add_argument(
+        "--minutes", type=time_above_0, default=1.0, help="of each target, in all pieces"
+    )
+    parser.add_argument(
+        "--stop-after", type=time_above_0, metavar="MIN", help="end this piece after that"
+    )
+    parser.add_argument("--jobs", type=at_least_one, default=1, help="targets at a time")
     parser.add_argument("--journal", type=Path, required=True, help="JSON lines, added to")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     parser.add_argument("--keep", action="store_true", help="make the repository's corpora anew")

@@ -37,6 +37,7 @@ from typing import Any
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
+from tests.arguments import at_least_one, whole_number  # noqa: E402
 from tests.journal import Journal, JournalError, rounds  # noqa: E402
 from tests.process_death.controller import die_with_parent  # noqa: E402
 from tests.process_death.defects import DEFECTS, planted  # noqa: E402
@@ -94,9 +95,9 @@ def _parser() -> argparse.ArgumentParser:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--rounds", type=int, default=50, help="how many (50)")
-    parser.add_argument("--start", type=int, default=0, help="number of the first (0)")
-    parser.add_argument("--jobs", type=int, default=1, help="rounds at a time (1)")
+    parser.add_argument("--rounds", type=whole_number, default=50, help="how many (50)")
+    parser.add_argument("--start", type=whole_number, default=0, help="number of the first (0)")
+    parser.add_argument("--jobs", type=at_least_one, default=1, help="rounds at a time (1)")
     parser.add_argument(
         "--only", choices=VICTIMS, help="of these rounds, those in which this process dies first"
     )

@@ -11,6 +11,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 from hil.progress import reporter
+from tests.arguments import at_least_one, whole_number
 from tests.simulate.judging import judged
 from tests.simulate.many import Known, played, stage_folder
 from tests.simulate.observed import Observed
@@ -56,27 +57,17 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--seed", type=_count, metavar="S", help="play this one and tell all of it")
-    what.add_argument("--seeds", type=_count, metavar="N", help="play N of them")
-    parser.add_argument("--start", type=_count, default=0, help="the first of N (0)")
+    what.add_argument(
+        "--seed", type=whole_number, metavar="S", help="play this one and tell all of it"
+    )
+    what.add_argument("--seeds", type=whole_number, metavar="N", help="play N of them")
+    parser.add_argument("--start", type=whole_number, default=0, help="the first of N (0)")
     parser.add_argument("--script", type=Path, metavar="FILE", help="of --seed: instead of its own")
-    parser.add_argument("--jobs", type=_jobs, default=1, help="child processes (1)")
+    parser.add_argument("--jobs", type=at_least_one, default=1, help="child processes (1)")
     parser.add_argument("--journal", type=Path, metavar="FILE", help="JSON lines, one a seed")
     parser.add_argument("--no-shrink", action="store_true", help="leave scripts of failures as is")
     parser.add_argument("--json", action="store_true", help="end with one JSON object")
     return parser
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of 0 or more")
-    return int(text)
-
-
-def _jobs(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of 1 or more")
-    return int(text)
 
 
 def _one(options: argparse.Namespace) -> int:
