@@ -146,6 +146,8 @@ class Supervisor:
 
 
 _LIBC: Final = ctypes.CDLL(None)
+_INTERNED: Final = 2**17
+"""More strings than the table takes before it is rebuilt; it has 32 000 that stay."""
 
 
 class _MallInfo(ctypes.Structure):
@@ -165,10 +167,14 @@ def held() -> dict[str, int]:
 
     What it once held and gave back stays its own until it is used again: only this tells a leak
     from a campaign that needed more for a moment than any before. Python's free lists and its cache
-    of attributes (4096 names at most) do not count: they fill for hours. Only blocks without glibc.
+    of attributes (4096 names at most) do not count: they fill for hours. Nor does what is used up
+    of its table of interned strings, as by names of files: that is rebuilt, to the size that those
+    in it need. Only blocks without glibc.
     """
     gc.collect()
     sys._clear_type_cache()
+    for number in range(_INTERNED):
+        sys.intern(f"number {number}")
     blocks = {"blocks": sys.getallocatedblocks()}
     if (mallinfo := getattr(_LIBC, "mallinfo2", None)) is None:
         return blocks

@@ -151,6 +151,13 @@ def test_what_python_keeps_for_its_own_speed_is_not_held() -> None:
     assert held()["blocks"] == pytest.approx(before["blocks"], abs=50)
 
 
+def test_a_table_of_strings_that_are_gone_is_not_held() -> None:
+    before = held()
+    for number in range(200_000):
+        sys.intern(f"excitation_{number}.mcap")
+    assert held()["bytes"] == pytest.approx(before["bytes"], abs=MIB / 10)
+
+
 def test_a_leak_too_small_to_matter_is_not_hidden() -> None:
     memory = judge([piece(5, leak=0.2)]).figures["memory"]["archive"]
     assert memory["growth"]["low"] > 0.0
