@@ -16,6 +16,7 @@ from typing import Final
 from drivers.errors import DriverError
 from drivers.transports.faults import FaultyLink
 from hil.errors import ControllerFault, InputError
+from hil.whole_number import LAST_PORT, whole_number
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import PlantDiverged, SettingError
 from sim_fixtures.far_end import FarEnd, FarEndError, UdpFarEnd
@@ -51,14 +52,15 @@ def open_far_end(
 
 
 def _udp(text: str) -> FarEnd:
-    host, colon, port = text.rpartition(":")
-    if not (colon and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+    host, _, port_text = text.rpartition(":")
+    port = whole_number(port_text)
+    if not host or port is None or not 0 < port <= LAST_PORT:
         raise InputError(
             None,
             f"--udp {text!r} is not an address",
             remedy="write HOST:PORT, for instance 127.0.0.1:2001",
         )
-    return UdpFarEnd(host, int(port))
+    return UdpFarEnd(host, port)
 
 
 def _can(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:

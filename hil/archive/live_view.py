@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 from hil.errors import InputError
+from hil.whole_number import LAST_PORT
 
 LOOPBACK: Final = "127.0.0.1"
 PORT: Final = 8765
 """That of the Foxglove WebSocket protocol."""
 RATE: Final = 50.0
 """Messages of a channel per second: more than a screen shows."""
-
-
-LAST_PORT: Final = 65535
 _ADDRESS: Final = re.compile(r"((?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]+):)?(?P<port>\d{1,5})")
 
 

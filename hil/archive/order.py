@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from hil.archive import container, index, schema
 from hil.archive.container import Damage, Record
 from hil.archive.description import DescriptionError, period
+from hil.whole_number import whole_number
 
 _DIGITS = 8  # of a checksum
-_MOST_DIGITS = 18  # of a cycle
 _BUT_METADATA = frozenset(range(256)) - {container.METADATA}
 
 
@@ -186,13 +186,12 @@ def _ends(metadata: Mapping[str, str], outcome: Mapping[str, str]) -> tuple[int,
         step = period(metadata)
     except DescriptionError:
         return None
-    texts = [outcome.get(key, "") for key in ("first_cycle", "last_cycle")]
-    if step is None or "repaired" in outcome:
+    first, last = (whole_number(outcome.get(key)) for key in ("first_cycle", "last_cycle"))
+    if step is None or "repaired" in outcome or first is None or last is None:
         return None
-    if not all(t.isascii() and t.isdecimal() and len(t) <= _MOST_DIGITS for t in texts):
+    if first > last:  # earlier versions took two sessions
         return None
-    first, last = (round(int(text) * (step * 1e9)) for text in texts)
-    return (first, last) if first <= last else None  # earlier versions took two sessions
+    return round(first * (step * 1e9)), round(last * (step * 1e9))
 
 
 def _is_ours(stream: BinaryIO, size: int) -> bool:

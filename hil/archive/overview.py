@@ -12,6 +12,7 @@ from hil.archive import container, foreign_json
 from hil.archive.names import WORDS, motion_name
 from hil.archive.reader import Archive, open_archive
 from hil.archive.survey import survey
+from hil.whole_number import whole_number
 
 _MOST_EVENTS = 20
 _SHOWN_ELSEWHERE = frozenset(
@@ -102,10 +103,10 @@ def overview(path: str | PathLike[str]) -> Overview:
 
 
 def _title(metadata: Mapping[str, str]) -> str:
-    kind, index = metadata["kind"], metadata.get("index", "")
-    if not index.isdecimal():
+    kind, index = metadata["kind"], whole_number(metadata.get("index"))
+    if index is None:
         return WORDS.get(kind, kind)
-    return f"{motion_name(kind, int(index))}, attempt {metadata.get('attempt', '1')}"
+    return f"{motion_name(kind, index)}, attempt {metadata.get('attempt', '1')}"
 
 
 def _outcome(archive: Archive) -> str:

@@ -28,8 +28,8 @@ from hil.archive.standing import Piece, Survey, announced_attachments
 from hil.archive.survey import HEADER, survey
 from hil.archive.written_anew import write_anew
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
+from hil.whole_number import whole_number
 
-_DIGITS = 18  # of a count
 _SEQUENCE_AT = container.RECORD.size + 2  # in a message record
 
 
@@ -116,13 +116,8 @@ def _is_described(found: Survey) -> bool:
 def _samples_lost(found: Survey) -> int | None:
     if not found.losses:
         return 0
-    stated = None if found.outcome is None else _count(found.outcome.get("samples", ""))
+    stated = None if found.outcome is None else whole_number(found.outcome.get("samples"))
     return None if stated is None else max(0, stated - found.samples)
-
-
-def _count(text: str) -> int | None:
-    """A number of samples; None where the text is none that a file could hold."""
-    return int(text) if text.isascii() and text.isdecimal() and len(text) <= _DIGITS else None
 
 
 def _write(found: Survey, target: Path) -> None:
@@ -235,7 +230,7 @@ def _outcome(found: Survey, chunks: Sequence[int]) -> dict[str, str]:
         lists = {schema.CHUNKS: listed(chunks)} if schema.CHUNKS in found.outcome else {}
         return {**found.outcome, **lists}  # other than before if another program cut the chunks
     before = found.outcome or {"outcome": "unknown", "reason": "the outcome is lost"}
-    lost, lost_before = _samples_lost(found), _count(before.get("repaired.samples_lost", "0"))
+    lost, lost_before = _samples_lost(found), whole_number(before.get("repaired.samples_lost", "0"))
     known = lost is not None and lost_before is not None
     earlier = foreign_json.names(before.get("repaired.losses", "[]")) or ()
     return {

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from hil.archive import Archive, ArchiveName, open_archive
+from hil.whole_number import whole_number
 
 from .cache import Store, Where
 from .errors import ChangedError, TornError
@@ -179,8 +180,8 @@ def _simulated(archive: Archive) -> bool:
 
 def _interval(metadata: Mapping[str, str], name: str) -> tuple[int, int]:
     """Index and attempt: as the archive says, whatever its file is called now; else by its name."""
-    said = metadata.get("index", ""), metadata.get("attempt", "")
-    if all(text.isdecimal() for text in said):
-        return int(said[0]), int(said[1])
+    index, attempt = (whole_number(metadata.get(key)) for key in ("index", "attempt"))
+    if index is not None and attempt is not None:
+        return index, attempt
     parsed = ArchiveName.parse(name)
     return (0, 0) if parsed is None else (parsed.index, parsed.attempt)

@@ -10,6 +10,7 @@ from hil.archive import ArchiveName, open_archive
 from hil.counted import counted
 from hil.errors import ArchiveError, HilError
 from hil.results.conduct import ConductResult, RecordedResult, StepResult, WarmUpResult
+from hil.whole_number import whole_number
 
 from .dry_run import DryRun
 from .folder import CampaignFolder, Entry
@@ -167,7 +168,7 @@ def _recorded(folder: CampaignFolder, entry: Entry) -> RecordedResult | None:
 
 def _count(text: str | None) -> int:
     """A counter of an archive; 0 where it has none, or one that is no number."""
-    return int(text) if text is not None and text.isdecimal() else 0
+    return whole_number(text) or 0
 
 
 def _tolerant(load: Callable[[], T]) -> T | str:

@@ -13,6 +13,7 @@ from hil.errors import InputError
 from hil.files import write_atomically
 from hil.lines import say
 from hil.new import Known, cell_of_urdf, from_archive, from_init, read_init
+from hil.whole_number import LAST_PORT, whole_number
 
 PORT = 1000
 """On which a PC listens to a C4G Open, as delivered."""
@@ -115,11 +116,11 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
     from drivers.transports.udp import UdpSpec
 
     host, _, port_text = address.partition(":")
-    if not host or not (port_text or "1").isdigit() or int(port_text or PORT) > 65535:
+    port = whole_number(port_text or str(PORT))
+    if not host or port is None or port > LAST_PORT:
         raise InputError(
             None, f"{address!r} is no HOST or HOST:PORT", remedy="e.g. 10.2.12.150:1000"
         )
-    port = int(port_text or PORT)
     if not quiet:
         typer.echo(
             f"listening on {bind}:{port}; now start the controller's Open program at {host} "

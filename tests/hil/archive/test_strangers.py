@@ -203,6 +203,19 @@ def test_what_identification_reads_of_the_metadata_is_checked(field, text, writt
         hil.open_recording(path)
 
 
+@pytest.mark.parametrize("number", ["9" * 5000, "\N{SUPERSCRIPT TWO}", "-1", "1e3", ""])
+def test_what_is_written_for_a_number_stops_no_reader(number, written, tmp_path):
+    path = stranger(
+        written,
+        tmp_path / NAME,
+        metadata=dict.fromkeys(("index", "attempt"), number),
+        outcome=dict.fromkeys(("first_cycle", "last_cycle", "late_answers"), number),
+    )
+    said = outcomes(path)
+    assert set(said.values()) == {""}, said
+    assert "validation" in overview(path).title
+
+
 @pytest.mark.parametrize("name", ["cell.toml", "robot.urdf"])
 def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
     path = stranger(written, tmp_path / NAME, attachments={name: b"\xff\xfe"})
