@@ -37,13 +37,13 @@ class Judged:
         *,
         n_axes: int,
         max_gap: int,
-        window: int,
+        silence: float,
         period: float,
         inits: Mapping[bytes, bool],
     ) -> None:
         """Begin; `inits` are init packets of which it is known whether the arm may be moved."""
         self.session, self.ring, self.conduct = session, ring, conduct
-        self.reception = Reception(window)
+        self.reception = Reception(silence)
         self.max_gap = max_gap
         self._n_axes, self._period, self._inits = n_axes, period, inits
         self.now = 0.0

@@ -8,6 +8,8 @@ from typing import Literal
 from tests.drivers import oracle
 
 LAST = 0x7FFF
+SAMPLE_TIME = slice(224, 228)
+"""Of an init packet, ms."""
 Kind = Literal["nothing", "again", "echo", "init", "cyclic"]
 
 
@@ -20,10 +22,13 @@ class Reception:
     """Which packets get an answer, and which packets are the last one once more.
 
     Attributes:
-        window: numbers ahead of the last one that are later packets of the same session.
+        silence: s after which a packet is none of the same session any more.
+        window: numbers ahead of the last one that are later packets of it; from the init packet on
+            what comes within `silence`, of two readings of a number the nearer one.
     """
 
-    window: int
+    silence: float
+    window: int = LAST // 2
     last: int = 0
     n_axes: int | None = None
     silent: bool = False
@@ -80,4 +85,6 @@ class Reception:
             return "again"
         self.cold = self.n_axes is None and self.synced
         self.n_axes, self.synced = n, False
+        cycle = max(1, int.from_bytes(packet[SAMPLE_TIME], "little", signed=True)) / 1000.0
+        self.window = max(1, int(min(self.silence / cycle, LAST // 2)))
         return "init"

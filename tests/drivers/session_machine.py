@@ -43,7 +43,8 @@ from tests.drivers.reception import number_of
 from tests.drivers.rig import START, drive_train, limits
 from tests.drivers.sources import WILD, corrections, motions
 
-WINDOW = 500
+SILENCE = 1.0
+"""s that a session bears while no axis is open."""
 MAX_GAP = 2
 
 open_modes = st.sampled_from([1, 2, 4, 5, 7, 8, 9])
@@ -77,7 +78,7 @@ class SessionMachine(Judged, RuleBasedStateMachine):
         )
         self.controller = Controller()
         self.hear(
-            session, ring, self.new_conduct(), n_axes=len(AXES), max_gap=MAX_GAP, window=WINDOW,
+            session, ring, self.new_conduct(), n_axes=len(AXES), max_gap=MAX_GAP, silence=SILENCE,
             period=PERIOD, inits={GOOD_INIT: True, OTHER_ARM: False},
         )  # fmt: skip
         if cold:

@@ -35,7 +35,8 @@ from tests.drivers.sources import (
 from tests.fuzz.draw import Draw
 from tests.fuzz.drawn_arm import arm_of, controller_of
 
-WINDOW = 500
+SILENCE = 1.0
+"""s that a session bears while no axis is open."""
 STRANGE = (0, 10, 501, 3, 6, 11, 12, 14, 17, 500, 502, 504, 505, 506, 508, -1, 1 << 30, 99)
 FREE = ((16, 228), (388, 548), (708, 1040))
 """Bytes of an init packet that may change without another layout or other limits."""
@@ -73,7 +74,7 @@ class Conversation(Judged):
             max_gap=max_gap,
         )  # fmt: skip
         self.hear(
-            session, ring, conduct, n_axes=len(arm.axes), max_gap=max_gap, window=WINDOW,
+            session, ring, conduct, n_axes=len(arm.axes), max_gap=max_gap, silence=SILENCE,
             period=arm.period, inits={arm.init: True, arm.other: False},
         )  # fmt: skip
         self.sent = 0

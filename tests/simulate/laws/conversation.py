@@ -122,7 +122,7 @@ class _Sorting:
         self._life, self._n_joints = life, n_joints
         self._arm = int(life.settings.get("arm", 1))
         self._silence = float(life.settings.get("silence_timeout", SILENCE_TIMEOUT))
-        self._reception = Reception(LAST // 2)
+        self._reception = Reception(self._silence)
         self._deadline = np.inf
         self._reply = b""
         self._parts: list[_Part] = []
@@ -224,8 +224,6 @@ class _Sorting:
         init = Init.of(one.packet, self._arm, self._n_joints)
         self._parts.append(_Part(one.packet, index))
         self._slots = init.slots or ()
-        window = self._silence / max(init.period, 1e-3)
-        self._reception.window = max(1, min(int(window), LAST // 2))
 
     def _patience(self, packet: bytes, kind: Kind) -> float:
         """s of silence from this packet on that are none."""
