@@ -124,10 +124,10 @@ class _Work(Generic[T]):
 
 
 def _begin(child: PlanningChild, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Give a child a task; one that died while it was started is replaced."""
+    """Give a child a task; one that died while idle, or while it was started, is replaced."""
     for _ in range(_FRESH_STARTS):
         try:
             return child.send(function, *arguments)
-        except PlannerNotStarted:
+        except (PlannerCrashed, PlannerNotStarted):
             continue
     return child.send(function, *arguments)

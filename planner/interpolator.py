@@ -13,7 +13,7 @@ from planner.arrays import Array, read_only
 from planner.commands import Fly, Move
 from planner.corners import Corner
 from planner.errors import InvalidSetting, PlannerError
-from planner.isolation import in_child
+from planner.isolation import in_child, in_child_now
 from planner.legs import Leg, corner
 from planner.limits import JointLimits
 from planner.motion_queue import CornerPlanner, MotionQueue
@@ -368,7 +368,7 @@ class Interpolator(MoveServices):
 
 
 def _isolated_corner(before: Leg, after: Leg, fly: Fly) -> Corner:
-    return in_child(corner, before, after, fly)
+    return in_child_now(corner, before, after, fly)  # the arm may move
 
 
 def _timed(queue: MotionQueue, settings: MoveSettings, target: Array) -> Move | None:

@@ -62,7 +62,7 @@ class PlanningChild:
         deadline: When the call that was begun must have ended, on the monotonic clock [s].
 
     Raises, in `call`, `send` and `receive`:
-        PlannerCrashed: the process died over a call; a new one is on its way for the next.
+        PlannerCrashed: the process died (in `call`: over it); a new one is on its way.
         PlannerNotStarted: it died before it could be asked anything; why is on stderr.
         PlanningTimedOut: the call took too long; likewise a new one is on its way.
         PlannerOutOfStep: there is an answer, but not to the call begun last in this process.
@@ -96,13 +96,19 @@ class PlanningChild:
         return self._process.pid if self._process is not None else None
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Return what the function returns in the child."""
-        self.send(function, *args, **kwargs)
+        """Return what the function returns in the child.
+
+        A child that has answered before and died while it was idle is replaced.
+        """
+        try:
+            self.send(function, *args, **kwargs)
+        except PlannerCrashed:  # nothing of this call: the system may have needed its memory
+            self.send(function, *args, **kwargs)
         result: T = self.receive()
         return result
 
     def send(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Begin a call, whose result `receive` then fetches; a child that died idle is replaced."""
+        """Begin a call, whose result `receive` then fetches."""
         self._number += 1
         message = numbered(self._number, pack(Task(self._timeout, function, args, kwargs)))
         self._disown()
@@ -112,10 +118,7 @@ class PlanningChild:
         try:
             self._connection.send_bytes(message)
         except OSError:  # it died while it had nothing to do
-            ended = self._crashed()
-            if isinstance(ended, PlannerNotStarted):
-                raise ended from None
-            self.send(function, *args, **kwargs)
+            raise self._crashed() from None
         except BaseException:
             self.close()
             raise
@@ -222,9 +225,27 @@ def in_child(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> 
         Exception: whatever the function itself raised.
     """
     with _lock:
-        if not _warm:
-            _warm.append(PlanningChild())
-        return _warm[0].call(function, *args, **kwargs)
+        return _warm_child().call(function, *args, **kwargs)
+
+
+def in_child_now(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
+    """Return the same, for who cannot wait until a process has started: none is replaced.
+
+    Raises:
+        PlannerCrashed: the child died, over this call or before it.
+        Exception: as `in_child`.
+    """
+    with _lock:
+        child = _warm_child()
+        child.send(function, *args, **kwargs)
+        result: T = child.receive()
+        return result
+
+
+def _warm_child() -> PlanningChild:
+    if not _warm:
+        _warm.append(PlanningChild())
+    return _warm[0]
 
 
 def plan_in_child(

@@ -38,4 +38,6 @@ def toml_value(value: Any) -> str:
         return f"[{', '.join(toml_value(entry) for entry in value)}]"
     if isinstance(value, date | time):
         return value.isoformat()
-    return json.dumps(value)
+    if isinstance(value, int):  # truth values are numbers, too
+        return json.dumps(value)
+    raise TypeError(f"TOML has no value like {value!r}")

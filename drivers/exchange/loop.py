@@ -69,7 +69,7 @@ def exchange(
         except TransportClosed:
             if math.isfinite(session.deadline):
                 session.tick(max(transport.now, session.deadline))
-            return
+            break
     _count_rejected(transport, session)
 
 

@@ -251,10 +251,12 @@ class Link:
         )
 
     def close(self) -> None:
-        """Ask the far end to end the session and answer until it does, or was started anew.
+        """Ask the far end to end the session, and answer until it does or `END_TIMEOUT` s are over.
+
+        A controller that was started anew meanwhile was never asked, and goes on with closed axes.
 
         Raises:
-            ControllerFault: an axis is still open `END_TIMEOUT` s of the controller's time later.
+            ControllerFault: after that time open axes still need set-points.
         """
         self.finish()
         deadline = self.transport.now + END_TIMEOUT

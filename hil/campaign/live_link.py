@@ -120,6 +120,8 @@ class LiveLink:
     ) -> LiveLink:
         """Start both processes on the cell's link, or on another `transport` to it.
 
+        From here on large arrays of this process go back to the system when they are freed.
+
         Args:
             cell: the cell.
             transport: in place of the cell's own.

@@ -219,7 +219,11 @@ class MotionLink(Protocol):
         ...
 
     def close(self) -> None:
-        """End the connection; nothing moves any more."""
+        """End the connection; nothing moves any more.
+
+        Raises:
+            ControllerFault: it did not end as it should.
+        """
         ...
 
 
@@ -247,7 +251,11 @@ class Recording(Protocol):
         ...
 
     def close(self) -> None:
-        """End the connection."""
+        """End the connection.
+
+        Raises:
+            ControllerFault: it did not end as it should.
+        """
         ...
 
 

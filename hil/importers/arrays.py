@@ -263,13 +263,17 @@ def _elsewhere(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T
         if not _readers:
             _readers.append(PlanningChild(timeout=_PATIENCE))
         try:
-            # Sizes in the file are not to be trusted.
-            _readers[0].call(resource.setrlimit, resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-            return _readers[0].call(function, *args, **kwargs)
+            return _readers[0].call(_within_memory, partial(function, *args, **kwargs))
         except PlannerCrashed as error:
             raise ValueError("it is damaged") from error
         except PlanningTimedOut as error:
             raise ValueError(f"that takes longer than {_PATIENCE:g} s") from error
+
+
+def _within_memory(read: Callable[[], T]) -> T:
+    """Read where it cannot take all there is: sizes in a file are not to be trusted."""
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    return read()
 
 
 def _close() -> None:

@@ -486,6 +486,31 @@ class Paced:
         pass
 
 
+class Rejecting(Paced):
+    """A link that discards a stranger's packet before each of the controller's."""
+
+    def __init__(self, costs):
+        super().__init__(costs)
+        self._strangers = 0
+
+    def receive(self, timeout):
+        self._strangers += 1
+        return super().receive(timeout)
+
+    def rejected(self):
+        strangers, self._strangers = self._strangers, 0
+        return {"foreign": strangers}
+
+
+@pytest.mark.parametrize("end", ["asked for", "closed link"])
+def test_what_the_link_rejected_last_is_counted_however_the_exchange_ends(end):
+    link, session = Rejecting([0.1] * 7), Mute()
+    session.reply = link.reply
+    exchange(link, session, until=lambda: end == "asked for" and not link.costs)
+    assert len(link.answered) == 7
+    assert session.counted["foreign"] >= 7
+
+
 @pytest.mark.parametrize("stamped", [True, False], ids=["stamped", "unstamped"])
 class TestLateness:
     def run(self, costs, *, state=State.OPEN, stamped=True, patient=False, max_late=2):

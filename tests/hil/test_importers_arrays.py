@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
+import resource
+import signal
 import tomllib
 import zipfile
 from pathlib import Path
@@ -19,6 +22,7 @@ from scipy.io import savemat
 from hil.archive import open_archive
 from hil.errors import SourceError
 from hil.importers import ColumnMap, Robot, import_log
+from hil.importers import arrays as array_files
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import Format
 from hil.importers.robot import _cell_text
@@ -342,3 +346,11 @@ def test_a_joint_that_was_not_recorded_has_to_be_locked(tmp_path, robot):
     found = read(tmp_path / "a.npz", locked, joints=JOINTS[:2], position={"columns": "q"})
     assert np.array_equal(found["position"], Q[:, :2])
     assert open_recording(tmp_path / "a.mcap").joint_names == JOINTS[:2]
+
+
+def test_the_process_that_reads_for_us_never_takes_all_memory_also_when_it_is_another() -> None:
+    pid = array_files._elsewhere(os.getpid)
+    os.kill(pid, signal.SIGKILL)
+    assert array_files._readers[0].connection.poll(5.0)
+    assert array_files._elsewhere(resource.getrlimit, resource.RLIMIT_AS) == (2**33, 2**33)
+    assert array_files._elsewhere(os.getpid) != pid

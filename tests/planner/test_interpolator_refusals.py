@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import os
+import signal
+
 import numpy as np
 import pytest
 
-from planner.errors import InvalidSetting, PlannerCrashed, PlannerNotStarted
+from planner import isolation
+from planner.errors import InvalidSetting, PlannerNotStarted
 from planner.interpolator import Interpolator
+from planner.isolation import in_child
 from planner.legs import corner
 from planner.rrs import EventKind, FlybyCriterion, SpeedCorrection, Status
 from tests.planner.interpolating import (
@@ -196,22 +201,22 @@ def test_what_would_make_a_moving_arm_jump_is_refused(six_axis_limits, random_po
     assert interpolator.get_next_step().status == Status.INCONSISTENT
 
 
-def test_a_target_no_motion_is_found_to_leaves_the_motion_to_the_one_before(
-    six_axis_limits, random_points, monkeypatch
+def test_a_planner_that_died_leaves_the_motion_to_the_target_before_and_nobody_waits(
+    six_axis_limits, random_points
 ):
     points = random_points(53, 3)
     interpolator = ready(six_axis_limits, points[0], fly=50.0, isolated=True)
     queue(interpolator, points[1:2])
 
-    def crash(*_):
-        raise PlannerCrashed(-11)
-
-    monkeypatch.setattr("planner.interpolator.in_child", crash)
+    dead = in_child(os.getpid)
+    os.kill(dead, signal.SIGKILL)
+    assert isolation._warm[0].connection.poll(5.0)
     assert interpolator.set_next_target(2, points[2]) == Status.FATAL == -68
-    assert "signal 11" in interpolator.refusal
+    assert "signal 9" in interpolator.refusal
     steps = steps_to_rest(interpolator)
     assert events(steps) == [(EventKind.MOTION_ENDED, 1)]
     np.testing.assert_array_equal(steps[-1].position, points[1])
+    assert in_child(os.getpid) != dead
 
 
 def test_a_corner_that_would_jump_is_not_taken(six_axis_limits, random_points, monkeypatch):

@@ -173,11 +173,21 @@ def test_a_solver_that_aborts_ends_the_child_only(aborting_solver, six_axis_limi
     assert same(plan_in_child(points, six_axis_limits), plan(points, six_axis_limits))
 
 
-def test_a_child_that_died_idle_is_replaced():
+def killed(child):
+    """The process of a child that has nothing to do is killed; its number."""
+    pid = child.call(os.getpid)
+    os.kill(pid, signal.SIGKILL)
+    assert child.connection.poll(5.0), "its end is closed once all its threads have ended"
+    return pid
+
+
+def test_a_child_that_died_idle_is_replaced_and_told_only_to_who_begins_a_call():
     with PlanningChild() as child:
-        pid = child.call(os.getpid)
-        os.kill(pid, signal.SIGKILL)
-        assert child.connection.poll(5.0), "its end is closed once all its threads have ended"
+        pid = killed(child)
+        assert child.call(os.getpid) != pid
+        pid = killed(child)
+        with pytest.raises(PlannerCrashed, match="signal 9"):
+            child.send(os.getpid)
         assert child.call(os.getpid) != pid
 
 

@@ -32,6 +32,7 @@ def test_every_kind_of_value_that_toml_has(name: str, value: object) -> None:
     assert tomllib.loads(f"{toml_key(name)} = {toml_value(value)}") == {name: value}
 
 
-def test_what_toml_has_not_is_refused() -> None:
-    with pytest.raises(TypeError):
-        toml_value(object())
+@pytest.mark.parametrize("value", [None, object(), {"inner": [None]}])
+def test_what_toml_has_not_is_refused(value: object) -> None:
+    with pytest.raises(TypeError, match="TOML has no value like"):
+        toml_value(value)
