@@ -295,7 +295,10 @@ class _Collected:
         share = (time[-1] - time[0]) / self._duration
         bins = max(2, round(self._bins * share))
         leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
-        for name, values in _shown(columns, scales):
+        # What is too large in degrees for any float is missing in the picture.
+        with np.errstate(over="ignore", invalid="ignore"):
+            shown = list(_shown(columns, scales))
+        for name, values in shown:
             lines = self._lines.setdefault(name, [([], []) for _ in self._joints])
             for (times, parts), joint in zip(lines, self._joints, strict=True):
                 for t, v in runs(time, values[:, joint], bins):

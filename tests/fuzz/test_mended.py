@@ -57,6 +57,19 @@ def test_limits_in_an_archive_that_are_none_are_not_drawn(tmp_path: Path, table:
     assert all(trace.high is None for one in view.quantities for trace in one.traces)
 
 
+def test_a_position_too_large_for_degrees_is_missing_in_the_picture(tmp_path: Path) -> None:
+    position = np.array([[0.1, 0.2], [1e307, -1e307], [0.3, 0.4]])
+    path = write_samples(
+        tmp_path / "imported.mcap",
+        Samples(np.arange(3) * 2_000_000, position=position, torque=np.ones((3, 2))),
+        joint_names=JOINTS,
+        metadata={},
+        durable=False,
+    )
+    (drawn,) = (one for one in view_of(path).quantities if one.title == "position [deg]")
+    assert np.nanmax(np.abs(drawn.traces[0].value)) == pytest.approx(np.degrees(0.3))
+
+
 @pytest.mark.parametrize(
     ("name", "content", "problem"),
     [
