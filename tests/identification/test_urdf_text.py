@@ -211,6 +211,7 @@ def checker(urdf: str) -> CollisionChecker:
         ("0.3 0.1", "of the 1 collision shapes of link 'upper' 0 could be read"),
         ("nan 0.1 0.1", "of the 1 collision shapes of link 'upper' 0 could be read"),
         ("0.3 -0.1 0.1", "a collision shape of link 'upper' has a negative size"),
+        ("0.3 1e308 0.1", r"a collision shape of link 'upper' is larger than 1e\+06 m"),
     ],
 )
 def test_no_collision_shape_is_left_out_without_a_word(size: str, why: str) -> None:
@@ -222,6 +223,15 @@ def test_no_collision_shape_is_left_out_without_a_word(size: str, why: str) -> N
         with pytest.raises(CollisionModelError, match=why):
             checker(text)
     assert RobotModel.from_urdf(urdf).n_joints == 1  # to an estimate shapes are nothing
+
+
+@pytest.mark.parametrize("of", ["<collision>", 'type="revolute">'])
+def test_what_is_farther_away_than_any_robot_reaches_is_refused(of: str) -> None:
+    far = arm(SHAPE, SHAPE)
+    assert of in far
+    checker(far)
+    with pytest.raises(CollisionModelError, match=r"more than 1e\+06 m away from what carries it"):
+        checker(far.replace(of, of + '<origin xyz="1e300 0 0"/>', 1))
 
 
 PIPE = '<collision><geometry><{0} radius="0.1" length="1"/></geometry></collision>'

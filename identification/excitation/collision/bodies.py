@@ -20,6 +20,8 @@ from identification.excitation.errors import CollisionModelError, MissingMeshErr
 
 Array = NDArray[np.float64]
 
+LARGEST: Final = 1e6
+"""m; no robot is larger, and squares of such lengths are numbers yet."""
 _MISSING_MESH: Final = re.compile(r"Mesh (.+) could not be found")  # pinocchio's words
 
 
@@ -86,7 +88,7 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
 
     Raises:
         MissingMeshError: a mesh is not to be found.
-        CollisionModelError: a shape cannot be read, or no moving link has one.
+        CollisionModelError: a shape cannot be read or is far away, or no moving link has one.
     """
     try:
         shapes = described_shapes(model, urdf, mesh_folders)
@@ -99,6 +101,7 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     names = [model.frames[item.parentFrame].name for item in shapes.geometryObjects]
     if (lost := lost_shapes(urdf, names)) is not None:
         raise CollisionModelError(lost)
+    _require_near(model, shapes)
     bodies = []
     for item in shapes.geometryObjects:
         shape = _body(item.geometry, model.frames[item.parentFrame].name)
@@ -118,23 +121,37 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     return sorted(bodies, key=lambda body: body.joint)
 
 
+def _require_near(model: pin.Model, shapes: pin.GeometryModel) -> None:
+    places = [*model.jointPlacements, *(item.placement for item in shapes.geometryObjects)]
+    if not max(float(np.abs(place.translation).max()) for place in places) <= LARGEST:
+        raise CollisionModelError(
+            "a joint or a collision shape of the robot description is more than "
+            f"{LARGEST:g} m away from what carries it"
+        )
+
+
 def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
     """The shape itself, or the convex hull of a mesh.
 
     Raises:
-        CollisionModelError: it is no body: turned inside out, flat, or without finite corners.
+        CollisionModelError: it is no body (turned inside out, flat), or larger than any.
     """
     if isinstance(shape, coal.BVHModelBase):
-        if np.all(np.isfinite(shape.vertices())):
+        if np.all(np.abs(shape.vertices()) <= LARGEST):
             with suppress(ValueError, RuntimeError):
                 shape.buildConvexHull(True, "Qt")
                 return shape.convex
         raise CollisionModelError(
-            f"a collision mesh of link {link!r} is no body: flat, or its corners no points"
+            f"a collision mesh of link {link!r} is no body: flat, or its corners no points "
+            f"within {LARGEST:g} m"
         )
     sides = [getattr(shape, name, 0.0) for name in ("halfSide", "radius", "halfLength")]
     if min(float(np.min(side)) for side in sides) < 0.0:
         raise CollisionModelError(f"a collision shape of link {link!r} has a negative size")
+    if not max(float(np.max(side)) for side in sides) <= LARGEST:
+        raise CollisionModelError(
+            f"a collision shape of link {link!r} is larger than {LARGEST:g} m"
+        )
     return shape
 
 
