@@ -27,8 +27,8 @@ from identification.kinematics import chain_from_urdf
 
 Array = NDArray[np.float64]
 
-_WINDOW: Final = 60.0
-"""s of an archive that are in memory at a time."""
+_SAMPLES: Final = 30_000
+"""Of an archive that are in memory at a time: a minute of an arm with cycles of 2 ms."""
 BINS: Final = 600
 """Stretches of the whole time of which the lowest and the highest sample are drawn."""
 _LEAP: Final = 10.0
@@ -139,7 +139,7 @@ def view_of(
     shown = _wanted(head.joint_names, joints)
     scales = _Scales.of(head)
     collected = _Collected(shown, end - begin, bins)
-    for archive in _windows(path, origin, begin, end):
+    for archive in _windows(path, stamp * 1e-9, origin + begin, origin + end):
         collected.take(archive, scales, origin)
     events = tuple(
         (event.time - origin, event.name, event.text, event.level >= 30)
@@ -159,10 +159,10 @@ def view_of(
     )
 
 
-def _windows(path: Path, origin: float, begin: float, end: float) -> Iterator[Archive]:
-    count = max(1, round((end - begin) / _WINDOW))
-    edges = np.linspace(origin + begin, origin + end, count + 1)
-    edges[-1] += 1e-6  # the last sample too
+def _windows(path: Path, time: Array, begin: float, end: float) -> Iterator[Archive]:
+    """Pieces of a recording from `begin` to `end`, as many as its samples at `time` (m,) need."""
+    first, last = np.searchsorted(time, (begin, end))
+    edges = [begin, *time[first + _SAMPLES : last : _SAMPLES], end + 1e-6]  # the last sample too
     for a, b in pairwise(edges):
         yield open_archive(path, fields=_FIELDS, start=float(a), stop=float(b))
 
@@ -298,10 +298,12 @@ class _Collected:
         # What is too large in degrees for any float is missing in the picture.
         with np.errstate(over="ignore", invalid="ignore"):
             shown = list(_shown(columns, scales))
+        gaps = np.flatnonzero(np.diff(time) > leap) + 1
+        broken = np.insert(time, gaps, time[gaps])
         for name, values in shown:
             lines = self._lines.setdefault(name, [([], []) for _ in self._joints])
             for (times, parts), joint in zip(lines, self._joints, strict=True):
-                for t, v in runs(time, values[:, joint], bins):
+                for t, v in runs(broken, np.insert(values[:, joint], gaps, np.nan), bins):
                     if times and t[0] - times[-1][-1] > leap:
                         times.append(np.array([np.nan]))
                         parts.append(np.array([np.nan]))

@@ -57,6 +57,19 @@ def test_limits_in_an_archive_that_are_none_are_not_drawn(tmp_path: Path, table:
     assert all(trace.high is None for one in view.quantities for trace in one.traces)
 
 
+def test_a_clock_that_jumps_by_a_lifetime_costs_no_time(tmp_path: Path) -> None:
+    path = write_samples(
+        tmp_path / "imported.mcap",
+        Samples(np.array([0, 2**60]), position=np.ones((2, 2)), torque=np.ones((2, 2))),
+        joint_names=JOINTS,
+        metadata={},
+        durable=False,
+    )
+    view = view_of(path)
+    assert view.stop == pytest.approx(2**60 * 1e-9)
+    assert np.count_nonzero(np.isfinite(view.quantities[0].traces[0].value)) == 2
+
+
 def test_a_position_too_large_for_degrees_is_missing_in_the_picture(tmp_path: Path) -> None:
     position = np.array([[0.1, 0.2], [1e307, -1e307], [0.3, 0.4]])
     path = write_samples(
