@@ -18,6 +18,8 @@ Check = Literal["shape", "finite", "clock", "stuck", "joints", "torque"]
 
 # A joint is not held still to the last bit of its encoder while it is told to move this far.
 STUCK_MOVEMENT: Final = 0.02  # rad or m
+LONGEST_PAUSE: Final = 600.0
+"""s without a sample. What is reckoned in stretches of time takes memory for empty ones, too."""
 # A step of the clock this many times the usual one is a gap, whether it was reported or not.
 GAP_STEPS: Final = 5.0
 
@@ -94,8 +96,8 @@ class Recording:
             joint_names: the model's joints; names and order have to be the recording's.
 
         Raises:
-            RecordingError: too short, NaN or infinity, a repeated or falling clock, joints that
-                are not the model's, or a stuck joint.
+            RecordingError: too short, NaN or infinity, a repeated, falling or leaping clock,
+                joints that are not the model's, or a stuck joint.
         """
         if self.n_samples < 2:
             raise RecordingError("shape", f"the recording has {self.n_samples} samples")
@@ -214,6 +216,14 @@ class Recording:
                 "clock",
                 f"the clock {what} at sample {sample}: {self.time[sample - 1]:.9g} s, then "
                 f"{self.time[sample]:.9g} s ({bad.size} such samples)",
+                sample=sample,
+            )
+        sample = int(np.argmax(steps)) + 1
+        if steps[sample - 1] > LONGEST_PAUSE:
+            raise RecordingError(
+                "clock",
+                f"the clock leaps by {steps[sample - 1]:.6g} s at sample {sample}; pauses of "
+                f"{LONGEST_PAUSE:g} s are borne: cut the recording there",
                 sample=sample,
             )
 

@@ -144,6 +144,19 @@ def test_joints_that_are_not_the_models_are_refused_by_name(
     assert (refused.value.check, refused.value.joint) == ("joints", named)
 
 
+@pytest.mark.parametrize(("leap", "refused"), [(599.0, False), (601.0, True), (2e9, True)])
+def test_a_clock_that_leaps_is_refused_at_its_sample(leap: float, refused: bool) -> None:
+    good = a_recording()
+    time = good.time.copy()
+    time[50:] += leap
+    leaping = replace(good, time=time)
+    if not refused:
+        assert leaping.checked() is leaping
+        return
+    with pytest.raises(RecordingError, match=r"leaps by .* at sample 50; .* cut the recording"):
+        leaping.checked()
+
+
 def test_reported_gaps_and_jumps_of_the_clock_split_a_recording() -> None:
     recording = a_recording()
     gap = np.zeros(200, dtype=bool)
