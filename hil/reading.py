@@ -7,12 +7,14 @@ A pipe without a writer is waited for without end, and a device has none. What i
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import stat
 import tomllib
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 LONGEST_TEXT: Final = 1 << 28
 """Bytes of the longest text that is read as a whole; the largest of ours has a hundredth of it."""
@@ -21,7 +23,7 @@ _DEEPEST: Final = 32
 _NO_FILE: Final = "it is a pipe or a device, no file"
 
 
-def opened(path: Path) -> BinaryIO:
+def opened(path: Path) -> BufferedReader:
     """A file of bytes, to be read.
 
     Raises:
@@ -55,6 +57,16 @@ def text_of(path: Path, longest: int = LONGEST_TEXT) -> str:
             raise OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
         text = stream.read().decode("utf-8")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal digits.
+
+    Raises:
+        OSError: as `opened`; or it cannot be read.
+    """
+    with opened(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def lies_there(path: Path) -> bool:

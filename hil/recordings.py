@@ -14,6 +14,7 @@ from drivers.events import AnswersLost
 from hil.archive import CONTROLLERS_OWN, Archive, foreign_json, open_archive
 from hil.errors import ArchiveError
 from identification.recording import Recording
+from planner.plain import DAMAGED, numbers
 
 Array = NDArray[np.float64]
 
@@ -158,8 +159,8 @@ def _check_motors(archive: Archive) -> None:
     if field not in archive.metadata:
         return
     try:
-        matrix = np.array(stated, np.float64)
-    except (TypeError, ValueError, OverflowError):
+        matrix = numbers(stated, 2)
+    except DAMAGED:
         matrix = np.zeros(0)
     if matrix.shape != (n, n) or not np.isfinite(matrix).all():
         raise _unfit(archive, field, f"is no JSON matrix of {n} by {n} numbers")

@@ -22,6 +22,7 @@ from planner.arrays import Array, read_only
 from planner.errors import InvalidSetting, InvalidTrajectory
 from planner.limits import JointLimits
 from planner.piecewise_cubic import Extrema
+from planner.plain import DAMAGED, number, numbers
 from planner.supremum import supremum
 
 # w(u) = 10 u³ - 15 u⁴ + 6 u⁵ and its derivatives in u, highest power first, and the largest
@@ -192,15 +193,15 @@ class FourierSeries:
             raise InvalidTrajectory(f"type is {data.get('type')!r}; expected 'fourier_series'")
         try:
             return cls(
-                offset=read_only(data["offset"]),
-                amplitude=read_only(data["amplitude"]),
-                frequency=read_only(data["frequency"]),
-                length=float(data["length"]),
-                ramp=float(data["ramp"]),
+                offset=numbers(data["offset"], 1),
+                amplitude=numbers(data["amplitude"], 2),
+                frequency=numbers(data["frequency"], 2),
+                length=number(data["length"]),
+                ramp=number(data["ramp"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InvalidTrajectory):
-                raise
+        except InvalidTrajectory:
+            raise
+        except DAMAGED as error:
             raise InvalidTrajectory(f"not a series of sines: {error!r}") from error
 
     def _of(self, joint: int) -> FourierSeries:

@@ -31,6 +31,20 @@ def number(value: Any) -> float:
     return float(value)
 
 
+def whole(value: Any) -> int:
+    """Return a whole number.
+
+    Raises:
+        TypeError: it is none.
+        OverflowError: 64 bits do not hold it.
+    """
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{value!r:.80} is not a whole number")
+    if not -(2**63) <= value < 2**63:
+        raise OverflowError("a whole number is too large")
+    return value
+
+
 def numbers(values: Any, dimensions: int) -> Array:
     """Return nested lists of numbers as a read-only array with so many dimensions.
 

@@ -19,7 +19,9 @@ WORDS = {
 }
 """What a person calls a kind, where that is another word."""
 
-_PATTERN = re.compile(r"(?P<kind>[a-z]+)_(?P<index>\d{3,})_a(?P<attempt>[1-9]\d*)\.mcap")
+_PATTERN = re.compile(
+    r"(?P<kind>[a-z]+)_(?P<index>[0-9]{3,18})_a(?P<attempt>[1-9][0-9]{0,17})\.mcap"
+)
 
 
 def motion_name(kind: str, index: int) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from .folder import CampaignFolder
 from .gravity_check import AGAINST, GravityCheck
 from .kind_of_arm import made_by
 from .operator import DryRunSummary
+from .read_back import read_back
 
 OVERRIDE: Final = 0.2
 """Largest share of the planned speed."""
@@ -87,6 +88,10 @@ class DryRun:
     against_gravity: tuple[str, ...] = ()
     gravity_not_seen: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        if not len(self.joint_names) == len(self.current_share) == len(self.following_error):
+            raise ValueError("there is not one current and one following error for each joint")
+
     @classmethod
     def load(cls, folder: CampaignFolder, plan_hash: str | None = None) -> Self | None:
         """That of a plan, as it was written down; None where there is none.
@@ -102,17 +107,12 @@ class DryRun:
         if not lies_there(path):
             return None
         try:
-            content: dict[str, Any] = json_of(text_of(path))
-            version = content.pop("format_version")
+            text = text_of(path)
+            version = json_of(text)["format_version"]
             if version != FORMAT_VERSION:
                 raise ValueError(f"format version {version}, this is {FORMAT_VERSION}")
-            accepted = content.pop("accepted")
-            lists = {key: tuple(item) for key, item in content.items() if isinstance(item, list)}
-            found = cls(**{**content, **lists})
-            found = replace(found, accepted=None if accepted is None else Acceptance(**accepted))
-            if not isinstance(found.simulated, bool):
-                raise TypeError(f"simulated is {found.simulated!r}, no truth value")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            found = read_back(cls, text)
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise CampaignFolderError(
                 path.parent,
                 f"{path.name} is damaged, or of another version ({error})",

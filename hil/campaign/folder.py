@@ -9,7 +9,6 @@ it.
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
 import os
 import time
@@ -22,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 from hil.archive import ArchiveName
 from hil.archive.amend import REJECTED
 from hil.files import write_atomically
-from hil.reading import json_of, lies_there, opened, text_of
+from hil.reading import digest_of, json_of, lies_there, opened, text_of
 
 from .errors import CampaignFolderError, NotRehearsedError
 from .sealed import MESH, MISSING, as_text, checksums, combined
@@ -258,7 +257,7 @@ class CampaignFolder:
             CampaignFolderError: the disk refuses.
         """
         content = self._content()
-        entry = Entry(name, outcome, _sha256(self.archives / name), reason)
+        entry = Entry(name, outcome, digest_of(self.archives / name), reason)
         self._save(content | {"archives": [*content["archives"], asdict(entry)]})
 
     def reject(self, name: str, reason: str) -> None:
@@ -268,7 +267,7 @@ class CampaignFolder:
             CampaignFolderError: the disk refuses.
         """
         content = self._content()
-        now = asdict(Entry(name, REJECTED, _sha256(self.archives / name), reason))
+        now = asdict(Entry(name, REJECTED, digest_of(self.archives / name), reason))
         entries = [now if one["name"] == name else one for one in content["archives"]]
         self._save(content | {"archives": entries})
 
@@ -321,8 +320,10 @@ class CampaignFolder:
         return ArchiveName(kind, index, attempt)
 
     def _unchanged(self, entry: Entry) -> bool:
-        path = self.archives / entry.name
-        return path.is_file() and _sha256(path) == entry.sha256
+        try:
+            return digest_of(self.archives / entry.name) == entry.sha256
+        except OSError:
+            return False
 
     def _contents(self) -> dict[str, bytes]:
         """Cell, plan and URDF by file name, each read once.
@@ -361,7 +362,10 @@ class CampaignFolder:
             return {"inputs": {}, "archives": []}
         try:
             content = json_of(text_of(self._manifest))
-            return {"inputs": dict(content["inputs"]), "archives": list(content["archives"])}
+            inputs = dict(content["inputs"])
+            if not all(isinstance(text, str) for pair in inputs.items() for text in pair):
+                raise TypeError("its inputs are not names and checksums")
+            return {"inputs": inputs, "archives": list(content["archives"])}
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self._damaged(error) from error
 
@@ -393,7 +397,3 @@ def _taken(lock: int, kind: int, patience: float) -> bool:
             if time.monotonic() >= deadline:
                 return False
             time.sleep(0.02)
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

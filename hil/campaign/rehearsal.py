@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final, Literal, Self
 
-from pydantic import StrictBool, ValidationError, model_validator
+from pydantic import StrictBool, model_validator
 
 from hil.files import write_or_tell
 from hil.reading import lies_there, text_of
@@ -16,6 +16,7 @@ from hil.results.frozen import Frozen
 
 from .errors import CampaignFolderError
 from .folder import CampaignFolder
+from .read_back import read_back
 
 FORMAT_VERSION: Final = 1
 PLAIN: Final = "as modelled"
@@ -84,11 +85,12 @@ class Rehearsal(Frozen):
         if not lies_there(path):
             return None
         try:
-            return cls.model_validate_json(text_of(path))
+            return read_back(cls, text_of(path))
         except (OSError, ValueError) as error:
+            why = (isinstance(error, OSError) and error.strerror) or error
             raise CampaignFolderError(
                 folder.root,
-                f"{path.name} cannot be read ({_why(error)})",
+                f"{path.name} cannot be read ({why})",
                 f"rehearse again (`hil rehearse {folder.root} --again`)",
             ) from error
 
@@ -130,13 +132,3 @@ class Rehearsal(Frozen):
                 f"in rehearsal.json (not_seen){but}"
             )
         return f"the rehearsal failed: {'; '.join(self.failures)}"
-
-
-def _why(error: OSError | ValueError) -> str:
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    if not isinstance(error, ValidationError):
-        return str(error)
-    first = error.errors()[0]
-    place = ".".join(map(str, first["loc"]))
-    return f"{place}: {first['msg']}" if place else str(first["msg"])

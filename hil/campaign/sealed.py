@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from hil.reading import digest_of, toml_of
 from identification.errors import ModelError
 from identification.urdf_tree import urdf_tree
 
@@ -33,12 +33,12 @@ def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
         root: folder that relative paths in them begin at.
 
     Returns:
-        By file name; a mesh that is not to be found is "missing" (no motion is checked without).
+        By file name; a mesh that cannot be read is "missing" (no motion is checked without).
     """
     sums = {name: checksum(content) for name, content in contents.items()}
     for mesh in _collision_meshes(contents.get("robot.urdf", b"")):
-        path = _found(mesh, _mesh_folders(contents.get("cell.toml", b""), root), root)
-        sums[MESH + mesh] = MISSING if path is None else checksum(path.read_bytes())
+        places = _places(mesh, _mesh_folders(contents.get("cell.toml", b""), root), root)
+        sums[MESH + mesh] = next(filter(None, map(_read, places)), MISSING)
     return sums
 
 
@@ -63,16 +63,22 @@ def _collision_meshes(urdf: bytes) -> list[str]:
 
 def _mesh_folders(cell: bytes, root: Path) -> list[Path]:
     try:
-        named = tomllib.loads(as_text(cell))["cell"]["mesh_folders"]
+        named = toml_of(as_text(cell))["cell"]["mesh_folders"]
         return [root / name for name in named]
     except (ValueError, KeyError, TypeError):  # likewise
         return []
 
 
-def _found(mesh: str, folders: list[Path], root: Path) -> Path | None:
+def _places(mesh: str, folders: list[Path], root: Path) -> list[Path]:
+    """Where a mesh is looked for, in that order."""
     if mesh.startswith(_PACKAGE):
-        places = [folder / mesh.removeprefix(_PACKAGE) for folder in folders]
-    else:
-        name = mesh.removeprefix(_FILE)
-        places = [root / name, *(folder / name for folder in folders)]
-    return next((place for place in places if place.is_file()), None)
+        return [folder / mesh.removeprefix(_PACKAGE) for folder in folders]
+    name = mesh.removeprefix(_FILE)
+    return [root / name, *(folder / name for folder in folders)]
+
+
+def _read(path: Path) -> str | None:
+    try:
+        return digest_of(path)
+    except OSError:
+        return None

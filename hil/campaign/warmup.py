@@ -18,7 +18,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,12 @@ from numpy.typing import NDArray
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.files import write_or_tell
-from hil.reading import json_of, lies_there, text_of
+from hil.reading import lies_there, text_of
 from planner import FourierSeries, PiecewiseCubic
 
 from .errors import CampaignFolderError
 from .operator import DriftCurve
+from .read_back import read_back
 
 Array = NDArray[np.float64]
 
@@ -97,9 +98,13 @@ class WarmUp:
     joint_names: tuple[str, ...]
     threshold: float
     motions: tuple[WarmMotion, ...] = ()
-    outcome: str = "going on"
+    outcome: Literal["going on", "warm", "not warm"] = "going on"
     earlier: tuple[WarmMotion, ...] = ()
     moved_at: float | None = None
+
+    def __post_init__(self) -> None:
+        if any(len(one.friction) != len(self.joint_names) for one in self.motions):
+            raise ValueError("a motion has not one friction for each joint")
 
     @classmethod
     def load(cls, path: Path, plan_hash: str) -> Self | None:
@@ -111,21 +116,8 @@ class WarmUp:
         if not lies_there(path):
             return None
         try:
-            content: dict[str, Any] = json_of(text_of(path))
-            motions, earlier = (
-                tuple(WarmMotion(one["archive"], tuple(one["friction"])) for one in content[key])
-                for key in ("motions", "earlier")
-            )
-            found = cls(
-                content["plan_hash"],
-                tuple(content["joint_names"]),
-                content["threshold"],
-                motions,
-                content["outcome"],
-                earlier,
-                _time_of_day(content.get("moved_at")),
-            )
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            found = read_back(cls, text_of(path))
+        except (OSError, ValueError) as error:
             raise CampaignFolderError(
                 path.parent, f"{path.name} is damaged ({error})", "remove that file"
             ) from error
@@ -183,15 +175,6 @@ class WarmUp:
         return replace(self, motions=(), outcome="going on", earlier=kept)
 
 
-def _time_of_day(found: object) -> float | None:
-    """A time as a number, None where there is none."""
-    if found is None:
-        return None
-    if not isinstance(found, int | float):
-        raise TypeError(f"moved_at is {found!r}, no number")
-    return float(found)
-
-
 def change_per_motion(friction: Sequence[Array] | Array) -> float:
     """Largest change per motion of any joint at the end of a row of motions, as a share.
 
@@ -207,9 +190,9 @@ def change_per_motion(friction: Sequence[Array] | Array) -> float:
         return float("nan")
     # Theil's slope: the median over all pairs, which one motion that went wrong does not move.
     first, second = np.triu_indices(len(last), k=1)
-    pairs = (last[second] - last[first])[:, moves] / (second - first)[:, None]
-    slopes = np.median(pairs, axis=0)
-    return float(np.max(np.abs(slopes) / np.abs(np.median(last[:, moves], axis=0))))
+    known = last[:, moves]
+    slopes = np.median((known[second] - known[first]) / (second - first)[:, None], axis=0)
+    return float(np.max(np.abs(slopes) / np.abs(np.median(known, axis=0))))
 
 
 class FrictionMeter:

@@ -8,7 +8,6 @@ here that the arm moved in.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -23,6 +22,7 @@ from hil.errors import InputError
 from hil.identify import Identification, identify_archives
 from hil.identify.sources import Source, Sources, cell_of, gather_sources
 from hil.progress import Reporter
+from hil.reading import digest_of
 from identification.excitation import SAMPLE_PERIOD
 from identification.preprocessing import prepare
 
@@ -62,7 +62,7 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
         samples=samples,
         repetitions=cell.campaign.repetitions,
         archives=tuple(
-            (path.name, _digest(path)) for path in archives if open_archive(path).kind in _MOTIONS
+            (path.name, digest_of(path)) for path in archives if open_archive(path).kind in _MOTIONS
         ),
     )
 
@@ -158,7 +158,3 @@ def _strength(cell: Cell) -> Array:
     return np.asarray(
         np.abs(drives.motor_from_joint.T) @ (drives.torque_constant * drives.current_limit)
     )
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

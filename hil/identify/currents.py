@@ -12,6 +12,7 @@ from hil.errors import ArchiveError
 from identification.current_scale import CurrentScale, scale_from_nominal
 from identification.preprocessing import smooth
 from identification.recording import Recording
+from planner.plain import numbers
 
 from .sources import Source, Sources
 
@@ -21,7 +22,7 @@ Array = NDArray[np.float64]
 def motor_from_joint(recording: Recording) -> Array:
     """Motor angles per joint angle (n, n) as imported; the identity where none were given."""
     stored = recording.provenance.get("motor_from_joint")
-    return np.eye(recording.n_joints) if stored is None else np.array(json.loads(stored))
+    return np.eye(recording.n_joints) if stored is None else numbers(json.loads(stored), 2)
 
 
 def with_torques(sources: Sources) -> Sources:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.importers import Findings
+from hil.reading import digest_of
 from hil.recordings import recording_of
 from identification.noise import standstill_variance
 from identification.recording import Recording, RecordingError
@@ -208,9 +208,10 @@ def _refuse_duplicates(paths: Sequence[Path]) -> None:
     """What is fitted must not be predicted as well."""
     seen: dict[str, Path] = {}
     for path in paths:
-        if not path.is_file():
+        try:
+            digest = digest_of(path)
+        except OSError:
             continue  # opening it will say so
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
         if digest in seen:
             raise InputError(path, f"holds the same as {seen[digest]}", remedy="name it once")
         seen[digest] = path

@@ -13,14 +13,16 @@ search can rank it last.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from identification.factor import Factor
+from planner.plain import number, whole
 
 Array = NDArray[np.float64]
 
@@ -53,6 +55,18 @@ class Criteria:
     n_samples: int
     condition: float | None = None
     scaled_condition: float | None = None
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Restore what `dataclasses.asdict` returned.
+
+        Raises:
+            TypeError, LookupError, OverflowError: the data are none, or of no numbers.
+        """
+        given = {**data}
+        n_samples = whole(given.pop("n_samples"))
+        known = {name: number(value) for name, value in given.items() if value is not None}
+        return cls(**known, n_samples=n_samples)
 
     @classmethod
     def of_gram(cls, gram: Array, n_samples: int) -> Self:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from identification.excitation.criteria import Criteria
 from identification.excitation.drawn import moves_through
 from planner import FourierSeries, Move, PiecewiseCubic
+from planner.plain import DAMAGED, number, numbers, table, text, whole
 
 Array = NDArray[np.float64]
 
@@ -81,33 +82,44 @@ class Excitation:
         Data without a method are those of a random search.
 
         Raises:
-            KeyError, TypeError, ValueError: the data are no excitation.
+            ValueError: the data are no excitation.
         """
-        trajectory = trajectory_from_dict(data["trajectory"])
-        planned: dict[str, Any] = {}
-        if isinstance(trajectory, PiecewiseCubic):
-            planned = {
-                "via_points": np.array(data["via_points"], dtype=np.float64),
-                "speed": np.array(data["speed"], dtype=np.float64),
-                "fly": float(data["fly"]),
-            }
-        return cls(
-            trajectory=trajectory,
-            criteria=Criteria(**data["criteria"]),
-            method=str(data.get("method", _FIRST_METHOD)),
-            seed=int(data["seed"]),
-            tried=int(data["tried"]),
-            rejected=dict(data["rejected"]),
-            **planned,
-        )
+        try:
+            trajectory = trajectory_from_dict(data["trajectory"])
+            sines = isinstance(trajectory, FourierSeries)
+            return cls(
+                trajectory=trajectory,
+                criteria=Criteria.from_dict(table(data["criteria"])),
+                method=_name(data.get("method", _FIRST_METHOD)),
+                seed=whole(data["seed"]),
+                tried=whole(data["tried"]),
+                rejected={_name(why): whole(n) for why, n in table(data["rejected"]).items()},
+                **({} if sines else _planned(data, trajectory.n_joints)),
+            )
+        except DAMAGED as error:
+            raise ValueError(f"not an excitation: {error!r}") from error
+
+
+def _planned(data: Mapping[str, Any], n_joints: int) -> dict[str, Any]:
+    points, speed = numbers(data["via_points"], 2), numbers(data["speed"], 1)
+    if len(points) < 2 or points.shape[1] != n_joints or len(speed) != n_joints:
+        raise ValueError(f"via points {points.shape} and speeds {speed.shape} of {n_joints} joints")
+    return {"via_points": points, "speed": speed, "fly": number(data["fly"])}
+
+
+def _name(value: Any) -> str:
+    name = text(value)
+    if not name.isprintable():
+        raise ValueError(f"{name!r:.80} cannot be printed")
+    return name
 
 
 def trajectory_from_dict(data: Mapping[str, Any]) -> PiecewiseCubic | FourierSeries:
     """Restore a motion of either kind from its plain data.
 
     Raises:
-        ValueError: the data are no motion.
+        TypeError, ValueError: the data are no motion.
     """
-    if data.get("type") == "fourier_series":
+    if table(data).get("type") == "fourier_series":
         return FourierSeries.from_dict(data)
     return PiecewiseCubic.from_dict(data)

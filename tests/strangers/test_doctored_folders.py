@@ -1,0 +1,212 @@
+"""A campaign folder in which somebody changed a value: it is read, or refused by an error of ours.
+
+Read as `hil status`, `hil run` and `hil identify` read it: its status, and how it was run.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil.archive import ArchiveName
+from hil.campaign import Campaign, CampaignFolderError
+from hil.campaign.conduct import conduct_of
+from hil.campaign.dry_run import Acceptance, DryRun
+from hil.campaign.folder import CampaignFolder
+from hil.campaign.warmup import WarmUp
+from hil.errors import HilError, InputError
+from identification import IdentificationError
+from planner import PlannerError
+from tests.hil.fast_cell import fast_campaign, fast_cell
+
+HUGE, DIGITS = 10**400, "9" * 5000
+ENTRY = {"name": "excitation_000_a1.mcap", "outcome": "completed", "sha256": "00", "reason": ""}
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("designed")
+    return fast_campaign(folder / "campaign", fast_cell(folder)).folder.root
+
+
+@pytest.fixture
+def root(designed: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(designed, tmp_path / "campaign")
+
+
+def read(root: Path) -> list[str]:
+    """What each way into a folder refuses it with; other errors than ours pass through and fail."""
+    refused = []
+    for way in (lambda: Campaign.open(root).status(), lambda: conduct_of(CampaignFolder(root))):
+        try:
+            way()
+        except (HilError, IdentificationError, PlannerError) as error:
+            refused.append(str(error))
+    return refused
+
+
+def doctored(path: Path, *place: str, value: object) -> None:
+    """Put another value into a JSON file."""
+    content = at = json.loads(path.read_text())
+    for key in place[:-1]:
+        at = at[key]
+    at[place[-1]] = value
+    path.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("archives", [ENTRY | {"name": f"excitation_{DIGITS}_a1.mcap"}]),
+        ("archives", [ENTRY | {"name": "a" * 300}]),
+        ("archives", [ENTRY | {"name": "a\0b"}]),
+        ("archives", [ENTRY | {"name": "\ud800.mcap", "reason": "\ud800"}]),
+        ("inputs", [[1, 2]]),
+        ("inputs", {"plan.json": 3}),
+    ],
+)
+def test_manifest(place: str, value: object, root: Path) -> None:
+    doctored(root / "manifest.json", place, value=value)
+    read(root)
+
+
+def test_an_archive_that_cannot_be_read_is_one_that_changed(root: Path) -> None:
+    doctored(root / "manifest.json", "archives", value=[ENTRY])
+    archives = root / "archives"
+    archives.mkdir(exist_ok=True)
+    (archives / ENTRY["name"]).symlink_to("/proc/self/mem")  # a file, and reading it fails
+    assert CampaignFolder(root).completed("excitation") == []
+    assert CampaignFolder(root).damaged()
+
+
+@pytest.mark.parametrize("name", [f"excitation_{DIGITS}_a1.mcap", f"move_000_a{DIGITS}.mcap"])
+def test_a_number_without_end_is_none_of_an_archive(name: str) -> None:
+    assert ArchiveName.parse(name) is None
+
+
+@pytest.mark.parametrize("mesh", ["m" * 300 + ".stl", "file:///proc/self/mem", "package://m.stl"])
+def test_meshes_that_cannot_be_read_are_missing(mesh: str, root: Path) -> None:
+    urdf = root / "robot.urdf"
+    box = '<box size="0.3 0.08 0.08"/>'
+    assert box in urdf.read_text()
+    urdf.write_text(urdf.read_text().replace(box, f'<mesh filename="{mesh}"/>'))
+    read(root)
+    (root / "cell.toml").write_text("a = " + "[" * 9999)
+    assert read(root)
+
+
+def dry_run(root: Path) -> DryRun:
+    return DryRun(
+        plan_hash=CampaignFolder(root).plan_hash, override=0.2, archives=(), duration=10.0,
+        simulated=True, joint_names=("a", "b"), current_share=(0.1, 0.2),
+        following_error=(0.1, float("nan")), missed=0, late=0, accepted=Acceptance("me", "now"),
+    )  # fmt: skip
+
+
+def test_a_dry_run_is_read_back_as_it_was(root: Path) -> None:
+    made = dry_run(root)
+    made.save(root / "dry_run.json")
+    found = DryRun.load(CampaignFolder(root))
+    assert found is not None
+    assert repr(found) == repr(made)  # NaN is like no other
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("override", "x"), ("archives", 3), ("current_share", [0.1]), ("current_share", ["x", 1]),
+        ("missed", "x"), ("against_gravity", 3), ("against_gravity", [3]),
+        ("joint_names", 3), ("accepted", {"by": "\ud800", "at": "x"}), ("accepted", []),
+        ("simulated", 1), ("format_version", [2]),
+    ],
+)  # fmt: skip
+def test_dry_run(key: str, value: object, root: Path) -> None:
+    dry_run(root).save(root / "dry_run.json")
+    doctored(root / "dry_run.json", key, value=value)
+    with pytest.raises(CampaignFolderError, match=r"dry_run\.json is damaged"):
+        DryRun.load(CampaignFolder(root))
+    assert not conduct_of(CampaignFolder(root)).steps[1].done
+    read(root)
+
+
+def warm_up(root: Path) -> WarmUp:
+    return (
+        WarmUp(CampaignFolder(root).plan_hash, ("a", "b"), 0.01, moved_at=1e9)
+        .with_motion("one.mcap", [1.0, float("nan")], 1, 9)
+        .cooled()
+        .with_motion("two.mcap", [1.0, 2.0], 1, 9)
+    )
+
+
+def test_a_warm_up_is_read_back_as_it_was(root: Path) -> None:
+    made = warm_up(root)
+    made.save(root / "warmup.json")
+    assert WarmUp.load(root / "warmup.json", made.plan_hash) == made
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("outcome", 3), ("outcome", "\ud800"), ("outcome", "hot"), ("threshold", "x"),
+        ("motions", [{"archive": "w", "friction": ["x", 1]}]),
+        ("motions", [{"archive": "w", "friction": [1.0]}]),
+        ("moved_at", "now"), ("earlier", 3),
+    ],
+)  # fmt: skip
+def test_warm_up(key: str, value: object, root: Path) -> None:
+    made = warm_up(root)
+    made.save(root / "warmup.json")
+    doctored(root / "warmup.json", key, value=value)
+    with pytest.raises(CampaignFolderError, match=r"warmup\.json is damaged"):
+        WarmUp.load(root / "warmup.json", made.plan_hash)
+    read(root)
+
+
+@pytest.mark.parametrize(
+    ("file", "key", "value"),
+    [
+        ("dry_run.json", "missed", HUGE),
+        ("dry_run.json", "duration", HUGE),
+        ("warmup.json", "motions", [{"archive": "w", "friction": [HUGE, 1]}] * 3),
+        ("warmup.json", "moved_at", HUGE),
+        ("warmup.json", "threshold", HUGE),
+    ],
+)
+def test_numbers_beyond_all_others(file: str, key: str, value: object, root: Path) -> None:
+    dry_run(root).save(root / "dry_run.json")
+    warm_up(root).save(root / "warmup.json")
+    doctored(root / file, key, value=value)
+    read(root)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("excitation", "seed"), float("inf")),
+        (("excitation", "fly"), HUGE),
+        (("excitation", "speed"), [HUGE, 1]),
+        (("excitation", "speed"), ["0.1", "0.2"]),
+        (("excitation", "via_points"), []),
+        (("excitation", "via_points"), 5.0),
+        (("excitation", "criteria", "log10_det"), "x"),
+        (("excitation", "trajectory"), []),
+        (("excitation", "trajectory", "knots"), [[0, HUGE], [0, 1]]),
+        (("excitation", "rejected"), {"a": []}),
+        (("excitation",), []),
+        (("validation",), 3),
+        (("validation",), {"a": 1}),
+        (("moves",), 3),
+    ],
+)
+def test_plan(place: tuple[str, ...], value: Any, root: Path) -> None:
+    with suppress(FileNotFoundError):
+        (root / "manifest.json").unlink()
+    doctored(root / "plan.json", *place, value=value)
+    with pytest.raises(InputError, match="is not a campaign plan"):
+        Campaign.open(root).status()
+    read(root)
