@@ -23,7 +23,6 @@ RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
 _NAME: Final = "example_archive"
 _LARGEST: Final = 1 << 30
 """Bytes of series that are read; those of a campaign of 30 repetitions have a hundredth of it."""
-_UNREADABLE: Final = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 
 
 def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
@@ -63,7 +62,7 @@ def rewrite_report(folder: Path) -> Results:
         OutputError: the folder cannot be written to.
     """
     results = Results.load(folder / RESULTS)
-    page = report_bytes(results, _load_series(folder / SERIES))
+    page = report_bytes(results, _load_series(folder / SERIES, len(results.joint_names)))
     write_together(folder, {REPORT: page})
     return results
 
@@ -75,14 +74,15 @@ def _series_bytes(series: ReportSeries) -> bytes:
     return content.getvalue()
 
 
-def _load_series(path: Path) -> ReportSeries:
+def _load_series(path: Path, n_joints: int) -> ReportSeries:
     try:
         with opened(path) as stream:
             _require_bounded(stream)
             with np.load(stream, allow_pickle=False) as found:
                 arrays = {name: found[name] for name in found.files}
-        return ReportSeries(**(arrays | {_NAME: str(arrays[_NAME])}))
-    except (*_UNREADABLE, MemoryError) as error:
+        series = ReportSeries(**(arrays | {_NAME: str(arrays[_NAME])}))
+        return series.checked_for(n_joints)
+    except (Exception, MemoryError) as error:  # a forged archive makes its readers raise anything
         raise InputError(
             path,
             f"does not hold the series of a report ({error})",

@@ -116,6 +116,20 @@ class Archive:
         """Number of samples."""
         return len(self.columns["stamp"])
 
+    def recorded(self, *names: str) -> Mapping[str, NDArray[Any]]:
+        """The columns, of an archive that has all of these.
+
+        Raises:
+            ArchiveError: one is missing, as in one that was imported.
+        """
+        if missing := [name for name in names if name not in self.columns]:
+            raise ArchiveError(
+                self.path,
+                f"is no recording of a motion of hil's own: it has no {missing[0]}",
+                remedy="take it out of the folder",
+            )
+        return self.columns
+
     def text(self, name: str) -> str:
         """An attachment that is text.
 

@@ -30,6 +30,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from hil.reading import json_of, opened, text_of
+from planner.plain import DAMAGED, table
 
 from .errors import CacheError
 from .keys import text_digest
@@ -185,8 +186,8 @@ def decoded(data: bytes, key: str) -> Entry | None:
                 return None
             arrays[name] = np.frombuffer(body, dtype, count, at).reshape(shape)
             at += count * dtype.itemsize
-        return Entry(content["header"], arrays)
-    except (ValueError, KeyError, TypeError, IndexError):  # sealed, and none of ours
+        return Entry(dict(table(content["header"])), arrays)
+    except DAMAGED:  # sealed, and none of ours
         return None
 
 

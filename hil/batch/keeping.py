@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from identification.estimation import Estimate
 from identification.phase_factor import PhaseFactor
+from planner.plain import DAMAGED
 
 from .cache import Entry, Where
 from .factors import BUNDLE, reduce_bundle
@@ -87,6 +88,12 @@ class _Shelf:
         entry = self._store.get(sum_key(refs, self._settings))
         if entry is None:
             return None
+        try:
+            return self._restored(refs, entry)
+        except DAMAGED:  # whole, and still nothing that was put there
+            return None
+
+    def _restored(self, refs: tuple[ArchiveRef, ...], entry: Entry) -> Bundle | None:
         summaries, broken = [], []
         for ref in refs:
             found = self._store.get(summary_key(ref, self._settings))
@@ -171,10 +178,15 @@ def summary_entry(summary: Summary) -> tuple[dict[str, Any], Arrays]:
 
 
 def summary_from(entry: Entry, ref: ArchiveRef) -> Summary:
-    """The summary of `summary_entry`, of an archive that may lie elsewhere by now."""
+    """The summary of `summary_entry`, of an archive that may lie elsewhere by now.
+
+    Raises:
+        errors of `planner.plain.DAMAGED`: the entry holds something else.
+    """
     total = phase_from(entry, "total.")
-    assert total is not None
     fits = {name: _fit(entry, name, told) for name, told in entry.header["fits"].items()}
+    if total is None or "weighted" not in fits:
+        raise ValueError("a summary without its sum or its fit")
     return Summary(
         ref, total, fits, entry.header["duration"], tuple(map(intern, entry.header["doubts"]))
     )
@@ -206,11 +218,14 @@ def settings_header(settings: Settings) -> dict[str, Any]:
     return asdict(settings)
 
 
-def settings_from(header: Mapping[str, Any]) -> Settings:
-    """The settings of `settings_header`."""
-    noise = header["noise_variance"]
-    known = dict(header) | {"noise_variance": None if noise is None else tuple(noise)}
-    return Settings(**known)
+def settings_from(header: Mapping[str, Any]) -> Settings | None:
+    """The settings of `settings_header`; None where they are something else."""
+    try:
+        noise = header["noise_variance"]
+        known = dict(header) | {"noise_variance": None if noise is None else tuple(noise)}
+        return Settings(**known)
+    except DAMAGED:
+        return None
 
 
 @lru_cache(maxsize=64)

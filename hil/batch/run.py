@@ -213,8 +213,9 @@ class _Estimates:
     def _cell(self, ref: ArchiveRef) -> Cell:
         """The cell of an archive."""
         kept = self._where.store(ref.location).get(ref.cell)
-        if kept is not None:
-            return cell_from(kept.header["cell.toml"], kept.header["robot.urdf"])
+        texts = [] if kept is None else [kept.header.get(n) for n in ("cell.toml", "robot.urdf")]
+        if texts and all(isinstance(text, str) for text in texts):
+            return cell_from(*texts)
         with opened(ref) as archive:
             return cell_in(archive)
 

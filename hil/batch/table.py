@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from hil.batch.types import Arm, BatchResult, LevelEstimate
+from hil.instant import instant
 from hil.version import software
 
 SCHEMA_VERSION: Final = 1
@@ -105,7 +106,7 @@ def _estimate_columns(arm: Arm, level: LevelEstimate) -> Row:
         "setup": level.setup,
         "archive": level.archive,
         "archive_sha256": level.sha256,
-        "when": _instant(level.when),
+        "when": instant(level.when),
     }
 
 
@@ -235,14 +236,6 @@ def relative_error(
         return math.nan
     whole = float(count[known] @ torque[known] ** 2)
     return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
-
-
-def _instant(when: str) -> datetime | None:
-    try:
-        at = datetime.fromisoformat(when)
-    except ValueError:
-        return None
-    return (at if at.tzinfo else at.replace(tzinfo=UTC)).astimezone(UTC)
 
 
 def _write_csv(path: Path, table: Table, result: BatchResult) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +19,7 @@ from hil.batch.axis_figures import friction_of, friction_weights
 from hil.batch.chart import Drift, Limits, chart, drift
 from hil.batch.payload_trend import LEAST_EFFECT, PayloadTrend, payload_trend
 from hil.batch.types import BatchResult, Broken, LevelEstimate
+from hil.instant import instant
 from identification import RobotModel
 
 Array = NDArray[np.float64]
@@ -212,7 +212,7 @@ def _in_time(
     campaigns: Sequence[LevelEstimate],
 ) -> tuple[list[LevelEstimate], Array, bool]:
     """Campaigns with a time, and their days; if none has one, all by name, and their numbers."""
-    known = [(at, one) for one in campaigns if (at := _instant(one.when)) is not None]
+    known = [(at.timestamp(), one) for one in campaigns if (at := instant(one.when)) is not None]
     if not known:
         named = sorted(campaigns, key=lambda one: _natural(one.campaign))
         return named, np.arange(1.0, len(named) + 1.0), False
@@ -225,14 +225,6 @@ def _natural(name: str) -> list[tuple[int, str]]:
     """Names in the order that people count in: the ninth before the tenth."""
     parts = re.split(r"([0-9]+)", name)
     return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
-
-
-def _instant(when: str) -> float | None:
-    try:
-        at = datetime.fromisoformat(when)
-    except ValueError:
-        return None
-    return (at if at.tzinfo else at.replace(tzinfo=UTC)).timestamp()
 
 
 def _axes(

@@ -174,7 +174,7 @@ class DryRun:
         missed = late = cycles = 0
         for name in names:
             archive = open_archive(folder.archives / name, fields=_FIELDS)
-            columns = archive.columns
+            columns = archive.recorded(*_FIELDS)
             current = np.maximum(current, np.abs(columns["target_current"]).max(axis=0) / limit)
             behind = np.abs(columns["target_position"] - columns["position"])
             following = np.maximum(following, np.nanmax(behind, axis=0))

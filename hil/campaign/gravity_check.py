@@ -98,7 +98,7 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
 
 def _slow_motion(path: Path, period: float) -> tuple[Array, Array, Array]:
     """Position, planned velocity and torque (m, n) of one archive, each every `_STEP`."""
-    columns = open_archive(path, fields=_FIELDS).columns
+    columns = open_archive(path, fields=_FIELDS).recorded(*_FIELDS)
     commanded = columns["commanded_position"]
     step = max(1, round(_STEP / period))
     rows = np.flatnonzero(~np.isnan(commanded).any(axis=1))[::step]

@@ -112,8 +112,11 @@ class Played:
         """Its rows from the first set-point of the motion on.
 
         A controller may open its axes before a motion is asked for; it is held there till then.
+
+        Raises:
+            ArchiveError: it is no archive of a motion of ours.
         """
-        columns = archive.columns
+        columns = archive.recorded("commanded_position", "target_current", "gap")
         began = [event.time for event in archive.events if event.name == MotionStarted.__name__]
         rows = ~np.isnan(columns["commanded_position"]).any(axis=1)
         if began:

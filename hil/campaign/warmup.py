@@ -219,7 +219,7 @@ class FrictionMeter:
         Raises:
             ArchiveError: the archive cannot be read.
         """
-        columns = open_archive(path, fields=_FIELDS).columns
+        columns = open_archive(path, fields=_FIELDS).recorded(*_FIELDS)
         rows = ~np.isnan(columns["commanded_position"]).any(axis=1)
         torque = columns["torque"][rows]
         # Measured, not commanded: while the arm lags behind, inertial torque works on the command.

@@ -136,7 +136,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
     packet = archive.attachments.get("init_packet.bin")
     if packet is not None:
         arm = known.values.get("controller.arm", 1)
-        arm = arm if arm in range(1, N_ARMS + 1) else 1
+        arm = arm if isinstance(arm, int) and 1 <= arm <= N_ARMS else 1
         try:
             known |= from_init(InitPacket.decode(packet), len(joint_names), arm)
         except PacketError as error:

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_TOO_LARGE: Final = 1e100
+
 
 class SeriesError(ValueError):
     """A series does not fit the others: carries the field, its shape and the one expected."""
 
     def __init__(self, field: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
-        super().__init__(f"{field} has shape {shape}; {expected} was expected")
+        super().__init__(
+            f"{field} has shape {shape}, or is of no numbers that can be drawn; "
+            f"{expected} was expected"
+        )
         self.field, self.shape, self.expected = field, shape, expected
 
 
@@ -44,7 +50,7 @@ class ReportSeries:
     example_predicted: Array
 
     def __post_init__(self) -> None:
-        n = self.excitation_position.shape[-1]
+        n = (*self.excitation_position.shape, 0, 0)[1]
         m, k = self.excitation_time.size, self.example_time.size
         expected = {
             "excitation_time": (m,),
@@ -55,9 +61,9 @@ class ReportSeries:
             "example_predicted": (k, n),
         }
         for field, shape in expected.items():
-            found = getattr(self, field).shape
-            if found != shape:
-                raise SeriesError(field, found, shape)
+            found = getattr(self, field)
+            if found.shape != shape or found.dtype != np.float64 or not _drawable(found):
+                raise SeriesError(field, found.shape, shape)
 
     @property
     def n_joints(self) -> int:
@@ -74,3 +80,8 @@ class ReportSeries:
             shape = self.excitation_position.shape
             raise SeriesError("excitation_position", shape, (shape[0], n_joints))
         return self
+
+
+def _drawable(values: Array) -> bool:
+    """Whether no number is so large that an axis cannot be divided."""
+    return bool(np.all(np.isnan(values) | (np.abs(values) < _TOO_LARGE)))

@@ -7,10 +7,11 @@ Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Self, get_args
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from hil.errors import InputError
 from hil.files import write_atomically
@@ -80,7 +81,7 @@ class ValidationResult(Frozen):
     """Torque prediction on one motion that was never used for fitting; lists are per joint."""
 
     archive: str
-    duration: float
+    duration: float = Field(gt=0.0)
     mean_abs_error: list[float]
     rms_error: list[float]
     mean_error: list[float]
@@ -247,6 +248,14 @@ class Results(Frozen):
     conduct: ConductResult | None = None
     """How the campaign was run; null of loose archives."""
 
+    @model_validator(mode="after")
+    def _lists_fit(self) -> Self:
+        """There is one figure for each joint, or each parameter."""
+        for name, found, count in _lists(self):
+            if found is not None and len(found) != count:
+                raise ValueError(f"{name} has {len(found)} entries and not {count}")
+        return self
+
     def to_json(self) -> str:
         """As indented JSON, the text of `results.json`."""
         return self.model_dump_json(indent=1) + "\n"
@@ -287,3 +296,24 @@ class Results(Frozen):
                 field=".".join(str(part) for part in first["loc"]),
                 remedy="identify again from the archives",
             ) from error
+
+
+def _lists(results: Results) -> Iterator[tuple[str, Sequence[Any] | None, int]]:
+    """Lists per joint and per parameter, by name, and how many there are of those."""
+    n, p = len(results.joint_names), len(results.parameters)
+    yield "noise_std", results.noise_std, n
+    for one in results.validation:
+        for name in ("mean_abs_error", "rms_error", "mean_error", "relative_error"):
+            yield f"validation.{name}", getattr(one, name), n
+    if results.fitted is not None:
+        yield "fitted.relative_error", results.fitted.relative_error, n
+    if results.delays is not None:
+        for name in ("found", "interval", "applied"):
+            yield f"delays.{name}", getattr(results.delays, name), n
+    yield "correlation", results.correlation, p
+    for row in results.correlation:
+        yield "correlation", row, p
+    for row in results.repetition_values:
+        yield "repetition_values", row, p
+    for name in get_args(UncertaintyResult.model_fields["reported"].annotation):
+        yield f"uncertainty.{name}", getattr(results.uncertainty, name), p

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from drivers.announced import compare
 from drivers.packets import InitPacket
 from drivers.transports.udp import UdpSpec
+from hil.archive import Samples, write_samples
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
 from hil.cell.unknown import UnknownFieldsError
@@ -26,7 +27,7 @@ from hil.cli import app
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError
 from hil.importers import Robot
-from hil.new import cell_of_urdf
+from hil.new import cell_of_urdf, from_archive
 from hil.new.controller import _nothing_moves
 from hil.new.fixing import with_fixed
 from hil.progress import Silent
@@ -274,6 +275,21 @@ def test_what_cannot_be_meant_is_refused_in_a_sentence(
     result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, InputError)
     assert sentence in str(result.exception)
+
+
+@pytest.mark.parametrize("arm", ["1.0", "7", "true", "nan", '"one"'])
+def test_an_archive_whose_cell_names_no_arm_is_of_the_first(arm: str, tmp_path: Path) -> None:
+    packet = InitPacket.build(2, 2, {"gear_ratio": [100.0, -80.0]}).encode()
+    cell = f"[controller]\narm = {arm}\n".encode()
+    path = write_samples(
+        tmp_path / "a.mcap",
+        Samples(np.arange(3) * 2_000_000, position=np.zeros((3, 2)), torque=np.ones((3, 2))),
+        joint_names=("shoulder", "elbow"),
+        metadata={},
+        attachments={"cell.toml": cell, "init_packet.bin": packet},
+    )
+    known = from_archive(path, ("shoulder", "elbow"))
+    assert list(known.values["drive_train.gear_ratio"]) == [100.0, -80.0]
 
 
 def test_namespace_and_encoding_of_the_urdf_change_nothing(

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
+from pydantic import ValidationError
 
 from hil.report import ReportSeries, SeriesError, numbers, render_report, report_bytes, validation
 from hil.report.figures import correlation_matrix
@@ -192,6 +193,20 @@ def html() -> str:
 @pytest.fixture(scope="module")
 def page(html: str) -> Page:
     return Page(html)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("noise_std", [1.0]),
+        ("correlation", [[1.0]]),
+        ("repetition_values", [[1.0]]),
+        ("joint_names", ["one"]),
+    ],
+)
+def test_lists_that_do_not_fit_are_no_results(field: str, value: object) -> None:
+    with pytest.raises(ValidationError, match=r"has \d+ entries and not \d+"):
+        make_results(**{field: value})
 
 
 def test_the_verdict_comes_before_everything_else(html: str) -> None:

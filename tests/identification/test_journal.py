@@ -217,6 +217,47 @@ def test_a_file_that_is_no_journal_is_refused_and_left_alone(content):
     assert file.getvalue() == content
 
 
+def header(text: str) -> bytes:
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+def shaped(shape: str) -> bytes:
+    return header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}")
+
+
+def array(values: object) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, np.array(values))
+    return stream.getvalue()
+
+
+SCORES = array(np.zeros((1, ROW)))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(array([["a"]]) + SCORES, array([[1j]]) + SCORES, array([[0.5]]) + array(["a"])),
+        *(b"PK\x03\x04" + bytes(50), b"", header("((((("), header("(" * 5000), header("{[]: 1}")),
+        *(shaped(f"({10**30},)"), shaped(f"({10**13},)"), shaped("(-1,)")),
+    ],
+)
+def test_a_record_that_somebody_forged_counts_as_none(content):
+    file, lengths = written(1)
+    file.seek(lengths[1])
+    file.write(struct.pack("<QI", len(content), zlib.crc32(content)) + content)
+    assert kept(file) == 1
+
+
+def test_an_identity_nested_without_end_is_no_journal():
+    content = b"[" * 100_000
+    frame = struct.pack("<QI", len(content), zlib.crc32(content))
+    file, _ = written(0)
+    first_line = file.getvalue().partition(b"\n")[0] + b"\n"
+    with pytest.raises(JournalError):
+        opened(io.BytesIO(first_line + frame + content))
+
+
 def test_a_journal_runs_nothing():
     """A pickle in it is as good as no record."""
     file, lengths = written(1)

@@ -11,15 +11,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from hil.archive import ArchiveName
+from hil.archive import ArchiveName, Samples, open_archive, write_samples
 from hil.campaign import Campaign, CampaignFolderError
 from hil.campaign.conduct import conduct_of
 from hil.campaign.dry_run import Acceptance, DryRun
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.warmup import WarmUp
-from hil.errors import HilError, InputError
+from hil.campaign.gravity_check import GravityCheck
+from hil.campaign.quality import Played
+from hil.campaign.warmup import FrictionMeter, WarmUp
+from hil.errors import ArchiveError, HilError, InputError
 from identification import IdentificationError
 from planner import PlannerError
 from tests.hil.fast_cell import fast_campaign, fast_cell
@@ -98,6 +101,31 @@ def test_meshes_that_cannot_be_read_are_missing(mesh: str, root: Path) -> None:
     read(root)
     (root / "cell.toml").write_text("a = " + "[" * 9999)
     assert read(root)
+
+
+@pytest.fixture
+def imported(tmp_path: Path) -> Path:
+    """Not a recording of a motion that hil made."""
+    still = Samples(np.arange(50) * 2_000_000, position=np.zeros((50, 2)), torque=np.ones((50, 2)))
+    return write_samples(
+        tmp_path / "imported.mcap", still, joint_names=("shoulder", "elbow"), metadata={}
+    )
+
+
+def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, root: Path) -> None:
+    folder, campaign = CampaignFolder(root), Campaign.open(root)
+    cell, motion = campaign.cell, campaign.plan.excitation.trajectory
+    (root / "archives").mkdir(exist_ok=True)
+    shutil.copy(imported, root / "archives" / "dryrun_000_a1.mcap")
+    names = ["dryrun_000_a1.mcap"]
+    for way in (
+        lambda: DryRun.of(folder, cell, names, plan_hash="", simulated=True),
+        lambda: Played.of(open_archive(imported)),
+        lambda: FrictionMeter(cell, motion).measure(imported),
+        lambda: GravityCheck.of(cell, [imported]),
+    ):
+        with pytest.raises(ArchiveError, match="is no recording of a motion of hil's own"):
+            way()
 
 
 def dry_run(root: Path) -> DryRun:

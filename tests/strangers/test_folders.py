@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import bag_files, topics
 from hil.importers.column_map import Format
 from hil.importers.table import Table
-from hil.outcome import SERIES, rewrite_report
+from hil.outcome import SERIES, _load_series, rewrite_report
 from hil.reading import json_of, opened, text_of, toml_of
 from hil.results import Results
 from hil.study.results import StudyResults
@@ -271,6 +272,35 @@ def claiming(shape: tuple[int, ...]) -> bytes:
     return head.getvalue()
 
 
+def member(values: object) -> bytes:
+    content = io.BytesIO()
+    np.save(content, np.array(values))
+    return content.getvalue()
+
+
+SHAPES = {"excitation_time": (5,), "excitation_position": (5, 2), "excitation_velocity": (5, 2),
+          "example_time": (3,), "example_measured": (3, 2), "example_predicted": (3, 2)}  # fmt: skip
+MEMBERS = {f"{name}.npy": member(np.zeros(shape)) for name, shape in SHAPES.items()}
+MEMBERS["example_archive.npy"] = member("one.mcap")
+NO_TIME = {
+    "no array": b"of bytes",
+    "another shape": member([1.0]),
+    "no shape": member(1.0),
+    "texts": member(["a", "b", "c"]),
+    "numbers that no axis shows": member([0.0, 1e308, -1e308]),
+    "a shape too large for any number": claiming((10**30,)),
+    "a head without end": b"\x93NUMPY\x01\x00\x04\x00((((",
+}
+"""What is no time of an example."""
+
+
+def test_the_series_of_a_report_are_read_as_they_were_written(folder: Path) -> None:
+    (folder / SERIES).write_bytes(series(MEMBERS))
+    assert _load_series(folder / SERIES, 2).example_archive == "one.mcap"
+    with pytest.raises(InputError, match=r"\(5, 3\) was expected"):
+        _load_series(folder / SERIES, 3)
+
+
 class Opens:
     """Leaves a trace where somebody unpickles it."""
 
@@ -294,7 +324,9 @@ def test_the_series_of_a_report_are_numbers_and_not_too_many(
         "a claim of terabytes": series({"time.npy": claiming((1 << 40,))}),
         "much out of little": series({f"{i}.npy": bytes(1 << 18) for i in range(17)}),
     }
-    monkeypatch.setattr(Results, "load", lambda _: None)
+    bombs |= {what: series(MEMBERS | {"example_time.npy": data}) for what, data in NO_TIME.items()}
+    loaded = SimpleNamespace(joint_names=["a", "b"])
+    monkeypatch.setattr(Results, "load", lambda _: loaded)
     monkeypatch.setattr("hil.outcome._LARGEST", 1 << 22)
     for data in bombs.values():
         (folder / SERIES).write_bytes(data)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import Any, Final
 
 import matplotlib.dates as mdates
@@ -14,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hil.batch.trend import ArmTrend, AxisTrend, ParameterTrend, Watched
+from hil.instant import instant
 from hil.report import numbers
 from hil.report.figures.canvas import TICK_SIZE, blank, headed, place, ruled
 from hil.report.figures.palette import BAND, FIRST, MUTED, OUTSIDE_3, SECOND
@@ -214,11 +214,10 @@ def _framed(axes: Axes, arm: ArmTrend, unit: str) -> None:
 
 def _when(arm: ArmTrend) -> list[float]:
     """Where campaigns stand: days of matplotlib, or their numbers."""
-    if not arm.dated:
+    first = instant(arm.when[0]) if arm.dated else None
+    if first is None:
         return [float(t) for t in arm.time]
-    first = datetime.fromisoformat(arm.when[0])
-    utc = first if first.tzinfo else first.replace(tzinfo=UTC)
-    start = utc.timestamp() / _DAY
+    start = first.timestamp() / _DAY
     return [start + float(t) for t in arm.time]
 
 

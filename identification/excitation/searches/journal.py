@@ -195,7 +195,7 @@ def _compare(there: dict[str, Any], ours: dict[str, Any]) -> None:
 def _identity(content: bytes | None) -> dict[str, Any]:
     try:
         found = json.loads(content or b"")
-    except ValueError:
+    except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict):
         raise JournalError(_NAMELESS)
@@ -208,12 +208,12 @@ def _generation(content: bytes | None) -> tuple[Array, Array] | None:
         return None
     stream = io.BytesIO(content)
     try:
-        genes, rows = (np.load(stream, allow_pickle=False) for _ in range(2))
-    except (ValueError, EOFError):
+        genes, rows = (np.lib.format.read_array(stream, allow_pickle=False) for _ in range(2))
+    except (Exception, MemoryError):  # there is little that a forged header does not raise
         return None
     if genes.ndim != 2 or rows.shape != (len(genes), ROW) or rows.dtype != np.float64:
         return None
-    return genes, rows
+    return (genes, rows) if genes.dtype.kind in "fiu" else None
 
 
 def _framed(content: bytes) -> bytes:
