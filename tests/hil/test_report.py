@@ -387,7 +387,8 @@ def test_an_arm_of_one_joint_without_friction_or_validation_has_a_report_too() -
     # fmt: off
     alone = whole.model_dump() | {
         "joint_names": ["q"], "parameters": [whole.parameters[5].model_dump()], "n_base": 1,
-        "correlation": [[1.0]], "noise_std": [0.1], "validation": [],
+        "correlation": [[1.0]], "noise_std": [0.1], "validation": [], "fitted": None,
+        "repetition_values": [[1.0] for _ in whole.repetitions],
         "uncertainty": whole.uncertainty.model_dump() | {"least_squares": [math.nan]},
         "excitation": whole.excitation.model_dump() | {"executed": executed},
     }

@@ -278,8 +278,14 @@ def member(values: object) -> bytes:
     return content.getvalue()
 
 
-SHAPES = {"excitation_time": (5,), "excitation_position": (5, 2), "excitation_velocity": (5, 2),
-          "example_time": (3,), "example_measured": (3, 2), "example_predicted": (3, 2)}  # fmt: skip
+SHAPES = {
+    "excitation_time": (5,),
+    "excitation_position": (5, 2),
+    "excitation_velocity": (5, 2),
+    "example_time": (3,),
+    "example_measured": (3, 2),
+    "example_predicted": (3, 2),
+}
 MEMBERS = {f"{name}.npy": member(np.zeros(shape)) for name, shape in SHAPES.items()}
 MEMBERS["example_archive.npy"] = member("one.mcap")
 NO_TIME = {
