@@ -245,7 +245,8 @@ class Conduct:
             self.motors, self.lag, self.lost = [], 0, 0
         else:
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
-            nearest = np.abs(np.array(self.motors[-3:]) - r[0]).min(axis=0)
+            late = self.max_gap + 1
+            nearest = np.abs(np.array(self.motors[-late:]) - r[0]).min(axis=0)
             assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
             low, high = np.float32(motor - rounding), np.float32(motor + rounding)
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
@@ -265,7 +266,7 @@ class Conduct:
             self._beside(a)
         if self.motor is not None:
             self._count_lost(r[0])
-        self.motors = [*self.motors, motor][-4:]
+        self.motors = [*self.motors, motor][-(self.max_gap + 2) :]
         self.motor = motor
         del self.sent[:-3]
 
