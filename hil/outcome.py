@@ -82,7 +82,7 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
                 arrays = {name: found[name] for name in found.files}
         series = ReportSeries(**(arrays | {_NAME: str(arrays[_NAME])}))
         return series.checked_for(n_joints)
-    except (Exception, MemoryError) as error:  # a forged archive makes its readers raise anything
+    except Exception as error:  # a forged archive makes its readers raise anything
         raise InputError(
             path,
             f"does not hold the series of a report ({error})",

@@ -8,6 +8,7 @@ it.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -38,6 +39,13 @@ _LOCKING: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """The folder may come from elsewhere: no link is followed, and no pipe waited for."""
 _ANOTHER: Final = "{} is not the one this campaign began with"
 _RESTORE: Final = "restore it, or begin a new campaign"
+_NO_FILE: Final = frozenset(
+    {
+        *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO),
+        errno.EINVAL,  # of `opened`: a pipe or a device
+    }
+)
+"""Errors of what is no file at all; others may be gone the next time."""
 
 
 @dataclass(frozen=True)
@@ -322,8 +330,12 @@ class CampaignFolder:
     def _unchanged(self, entry: Entry) -> bool:
         try:
             return digest_of(self.archives / entry.name) == entry.sha256
-        except OSError:
-            return False
+        except OSError as error:
+            if error.errno in _NO_FILE:
+                return False
+            raise CampaignFolderError(
+                self.root, f"{entry.name} cannot be read ({error.strerror})", "make it readable"
+            ) from error
 
     def _contents(self) -> dict[str, bytes]:
         """Cell, plan and URDF by file name, each read once.

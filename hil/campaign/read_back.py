@@ -9,14 +9,19 @@ from pydantic import TypeAdapter, ValidationError
 T = TypeVar("T")
 
 
-def read_back(kind: type[T], text: str) -> T:
+def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
     """An object of a dataclass or model, from the JSON that its fields were written as.
+
+    Args:
+        kind: of the object.
+        text: the JSON.
+        strict: numbers are no texts; not of a model, which writes infinite ones as words.
 
     Raises:
         ValueError: it is no JSON, or a field is not what it has to be; names the first one.
     """
     try:
-        return TypeAdapter(kind).validate_json(text, strict=True)
+        return TypeAdapter(kind).validate_json(text, strict=strict)
     except ValidationError as error:
         raise ValueError(first_of(error)) from error
 

@@ -85,7 +85,7 @@ class Rehearsal(Frozen):
         if not lies_there(path):
             return None
         try:
-            return read_back(cls, text_of(path))
+            return read_back(cls, text_of(path), strict=False)
         except (OSError, ValueError) as error:
             why = (isinstance(error, OSError) and error.strerror) or error
             raise CampaignFolderError(

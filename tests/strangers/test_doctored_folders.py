@@ -21,6 +21,7 @@ from hil.campaign.dry_run import Acceptance, DryRun
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gravity_check import GravityCheck
 from hil.campaign.quality import Played
+from hil.campaign.rehearsal import Criterion, Rehearsal
 from hil.campaign.warmup import FrictionMeter, WarmUp
 from hil.errors import ArchiveError, HilError, InputError
 from identification import IdentificationError
@@ -78,11 +79,14 @@ def test_manifest(place: str, value: object, root: Path) -> None:
     read(root)
 
 
-def test_an_archive_that_cannot_be_read_is_one_that_changed(root: Path) -> None:
+def test_an_archive_that_cannot_be_read_is_named_and_not_run_again(root: Path) -> None:
     doctored(root / "manifest.json", "archives", value=[ENTRY])
     archives = root / "archives"
     archives.mkdir(exist_ok=True)
     (archives / ENTRY["name"]).symlink_to("/proc/self/mem")  # a file, and reading it fails
+    with pytest.raises(CampaignFolderError, match=f"{ENTRY['name']} cannot be read"):
+        CampaignFolder(root).completed("excitation")
+    (archives / ENTRY["name"]).unlink()
     assert CampaignFolder(root).completed("excitation") == []
     assert CampaignFolder(root).damaged()
 
@@ -126,6 +130,16 @@ def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, root
     ):
         with pytest.raises(ArchiveError, match="is no recording of a motion of hil's own"):
             way()
+
+
+def test_a_rehearsal_is_read_back_as_it_was(root: Path) -> None:
+    found = Criterion(name="excitation", value=float("inf"), bound=1.0, passed=False, sentence="")
+    made = Rehearsal(
+        plan_hash="", seed=1, passed=False, criteria=[found], assumed=[], not_seen=[],
+        repetitions=2, motion_seconds=4.0, software={}, failed_seeds=(2, 3),
+    )  # fmt: skip
+    made.save(root / "rehearsal.json")
+    assert Rehearsal.load(CampaignFolder(root)) == made
 
 
 def dry_run(root: Path) -> DryRun:

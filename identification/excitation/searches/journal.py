@@ -209,7 +209,7 @@ def _generation(content: bytes | None) -> tuple[Array, Array] | None:
     stream = io.BytesIO(content)
     try:
         genes, rows = (np.lib.format.read_array(stream, allow_pickle=False) for _ in range(2))
-    except (Exception, MemoryError):  # there is little that a forged header does not raise
+    except Exception:  # there is little that a forged header does not raise
         return None
     if genes.ndim != 2 or rows.shape != (len(genes), ROW) or rows.dtype != np.float64:
         return None
