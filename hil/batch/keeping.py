@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from identification.estimation import Estimate
 from identification.phase_factor import PhaseFactor
@@ -184,9 +185,9 @@ def summary_from(entry: Entry, ref: ArchiveRef) -> Summary:
         errors of `planner.plain.DAMAGED`: the entry holds something else.
     """
     total = phase_from(entry, "total.")
+    if total is None:
+        raise ValueError("a summary without its sum")
     fits = {name: _fit(entry, name, told) for name, told in entry.header["fits"].items()}
-    if total is None or "weighted" not in fits:
-        raise ValueError("a summary without its sum or its fit")
     return Summary(
         ref, total, fits, entry.header["duration"], tuple(map(intern, entry.header["doubts"]))
     )
@@ -221,10 +222,8 @@ def settings_header(settings: Settings) -> dict[str, Any]:
 def settings_from(header: Mapping[str, Any]) -> Settings | None:
     """The settings of `settings_header`; None where they are something else."""
     try:
-        noise = header["noise_variance"]
-        known = dict(header) | {"noise_variance": None if noise is None else tuple(noise)}
-        return Settings(**known)
-    except DAMAGED:
+        return TypeAdapter(Settings).validate_python(dict(header))
+    except ValidationError:
         return None
 
 

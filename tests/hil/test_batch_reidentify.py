@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from hil.archive.repair import repair, repaired_name
 from hil.batch import factors
+from hil.batch.cache import Store, decoded
 from hil.batch.errors import NothingToFitError
 from hil.batch.local import LocalWorkers
 from hil.batch.run import Plan, reidentify
@@ -255,6 +256,26 @@ def test_damaged_entries_are_made_anew_and_never_believed(folder: Path) -> None:
         if path.exists():
             path.write_bytes(path.read_bytes()[:-1])
     assert same_bits(whole, batch(folder))
+
+
+def test_entries_that_are_whole_and_hold_something_else_count_as_absent(folder: Path) -> None:
+    whole = batch(folder)
+    store = Store(folder / "archives" / ".hil-cache")
+    kept = {
+        path.name: entry
+        for path in (folder / "archives" / ".hil-cache").rglob("*")
+        if path.is_file() and (entry := decoded(path.read_bytes(), path.name)) is not None
+    }
+    assert len(kept) > 5
+    for change in (
+        lambda header: {},
+        lambda header: header | {"total.joints": None},
+        lambda header: dict.fromkeys(header, 3),
+        lambda header: {key: [] for key in header},
+    ):
+        for key, entry in kept.items():
+            store.put(key, change(entry.header), {})
+        assert same_bits(whole, batch(folder))
 
 
 def test_a_read_only_folder_is_kept_elsewhere(
