@@ -15,13 +15,14 @@ def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
     Args:
         kind: of the object.
         text: the JSON.
-        strict: numbers are no texts; not of a model, which writes infinite ones as words.
+        strict: numbers are no texts. If not, each field is as strict as it says itself: a model
+            writes infinite numbers as words.
 
     Raises:
         ValueError: it is no JSON, or a field is not what it has to be; names the first one.
     """
     try:
-        return TypeAdapter(kind).validate_json(text, strict=strict)
+        return TypeAdapter(kind).validate_json(text, strict=strict or None)
     except ValidationError as error:
         raise ValueError(first_of(error)) from error
 
