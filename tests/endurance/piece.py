@@ -29,7 +29,7 @@ from hil.demo_link import LOOPBACK, SIMULATE, free_port
 from hil.errors import HilError
 from hil.progress import Reporter, Silent, Task
 from tests.endurance.journal import SYNC_EVERY, Ran, Use
-from tests.endurance.stalls import Stalls, watched
+from tests.endurance.stalls import watched
 from tests.hil.fast_cell import fast_cell
 from tests.journal import Journal
 
@@ -71,7 +71,6 @@ class Watched:
     seconds: float
     supervisor: subprocess.Popen[bytes]
     controller: subprocess.Popen[bytes]
-    stalls: Stalls
     began: float = field(default_factory=time.monotonic)
     error: str = ""
     _processes: dict[str, psutil.Process] = field(default_factory=dict)
@@ -117,12 +116,13 @@ class Watched:
         self._processes = {name: psutil.Process(pid) for name, pid in pids.items()}
         self.journal.add(kind="link", scheduling=scheduling, notes=notes, t=self._at)
 
-    def _status(self, counters: Mapping[str, float], latencies: list[int]) -> None:
+    def _status(
+        self, counters: Mapping[str, float], latencies: list[int], stalls: int, stood: float
+    ) -> None:
         used = {}
         for name, process in self._processes.items():
             with suppress(psutil.Error):
                 used[name] = asdict(_use(process))
-        stalls, stood = self.stalls.so_far
         self.journal.add(
             kind="sample",
             t=self._at,
@@ -230,10 +230,10 @@ def run_piece(
             machine=f"{os.cpu_count()} cores, {platform.system()} {platform.release()}",
         )
         with (
-            watched(work) as stalls,
+            watched(work),
             _processes(work, seconds) as (controller, supervisor, summary),
         ):
-            piece = Watched(work, journal, task, seconds, supervisor, controller, stalls)
+            piece = Watched(work, journal, task, seconds, supervisor, controller)
             reason = piece.watch(stop)
             with suppress(subprocess.TimeoutExpired):
                 supervisor.wait(LEAVING)

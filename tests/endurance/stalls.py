@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -23,36 +22,30 @@ PERIOD: Final = 0.001
 PRIORITY: Final = 90
 """Real-time priority, above all that is measured."""
 _COUNTS: Final = struct.Struct("<qd")  # how many, s in all
+_NAME: Final = "stalls_"  # of a file, and the number of the core
 
 
-@dataclass(frozen=True)
-class Stalls:
-    """What the watchers have written so far, each to a file of its own."""
-
-    paths: tuple[Path, ...]
-
-    @property
-    def so_far(self) -> tuple[int, float]:
-        """Stalls of all cores, and how long they stood still [s]."""
-        found = [_COUNTS.unpack(path.read_bytes()) for path in self.paths]
-        return sum(count for count, _ in found), sum(seconds for _, seconds in found)
+def so_far(folder: Path) -> tuple[int, float]:
+    """Stalls of all cores that watchers have written into a folder, and how long they stood [s]."""
+    found = [_COUNTS.unpack(path.read_bytes()) for path in folder.glob(f"{_NAME}*")]
+    return sum(count for count, _ in found), sum(seconds for _, seconds in found)
 
 
 @contextmanager
-def watched(folder: Path) -> Iterator[Stalls]:
+def watched(folder: Path) -> Iterator[None]:
     """One watcher a core, while this lasts; none sees any without the right to real-time priority.
 
     Args:
         folder: for what they write.
     """
-    paths = tuple(folder / f"stalls_{core}" for core in sorted(os.sched_getaffinity(0)))
+    paths = tuple(folder / f"{_NAME}{core}" for core in sorted(os.sched_getaffinity(0)))
     with ExitStack() as undo:
         for path in paths:
             path.write_bytes(_COUNTS.pack(0, 0.0))
             command = [sys.executable, "-m", "tests.endurance.stalls", str(path)]
             watcher = undo.enter_context(subprocess.Popen(command, cwd=Path(__file__).parents[2]))
             undo.callback(watcher.kill)
-        yield Stalls(paths)
+        yield
 
 
 def watch(path: Path) -> None:

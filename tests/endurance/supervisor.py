@@ -30,6 +30,7 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK
 from hil.errors import HilError
 from hil.progress import Silent
+from tests.endurance.stalls import so_far
 
 TELL_EVERY: Final = 5.0
 """s between two looks at the exchange's counters."""
@@ -136,10 +137,13 @@ class Supervisor:
     def _tell(self) -> None:
         while True:
             status = self.link.exchange.status()
+            stalls, stood = so_far(self.folder)  # at the same time: what one explains of the other
             say(
                 "status",
                 counters={name: getattr(status, name) for name in COUNTERS},
                 latencies=status.latencies,
+                stalls=stalls,
+                stood=stood,
             )
             if self._over.wait(TELL_EVERY):
                 return
