@@ -21,6 +21,12 @@ LONGEST_TEXT: Final = 1 << 28
 _DEEPEST: Final = 32
 """Tables and lists in one another; ours have four."""
 _NO_FILE: Final = "it is a pipe or a device, no file"
+_ABSENT: Final = frozenset(
+    {
+        *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO),
+        errno.EINVAL,  # a pipe or a device, or no path
+    }
+)
 
 
 def opened(path: Path) -> BufferedReader:
@@ -67,6 +73,11 @@ def digest_of(path: Path) -> str:
     """
     with opened(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def is_no_file(trouble: OSError) -> bool:
+    """Whether what `opened` refuses is no file at all; any other trouble may be gone next time."""
+    return trouble.errno in _ABSENT
 
 
 def lies_there(path: Path) -> bool:

@@ -16,7 +16,7 @@ from typing import Final
 from drivers.errors import DriverError
 from drivers.transports.faults import FaultyLink
 from hil.errors import ControllerFault, InputError
-from hil.whole_number import LAST_PORT, whole_number
+from hil.whole_number import port_number
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import PlantDiverged, SettingError
 from sim_fixtures.far_end import FarEnd, FarEndError, UdpFarEnd
@@ -53,8 +53,8 @@ def open_far_end(
 
 def _udp(text: str) -> FarEnd:
     host, _, port_text = text.rpartition(":")
-    port = whole_number(port_text)
-    if not host or port is None or not 0 < port <= LAST_PORT:
+    port = port_number(port_text)
+    if not host or port is None:
         raise InputError(
             None,
             f"--udp {text!r} is not an address",

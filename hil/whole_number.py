@@ -1,4 +1,4 @@
-"""Whole numbers that a stranger may have written: in an archive, or on a command line."""
+"""Whole numbers that a stranger may have written, in an archive or on a command line."""
 
 from __future__ import annotations
 
@@ -14,3 +14,9 @@ def whole_number(text: str | None) -> int | None:
     if text is None or not (text.isascii() and text.isdecimal()) or len(text) > _MOST_DIGITS:
         return None
     return int(text)
+
+
+def port_number(text: str) -> int | None:
+    """The number of a UDP or TCP port, 1 to 65535; None where the text is none."""
+    port = whole_number(text)
+    return port if port is not None and 0 < port <= LAST_PORT else None

@@ -8,13 +8,8 @@ it.
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
-import os
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -22,8 +17,9 @@ from typing import TYPE_CHECKING, Any, Final
 from hil.archive import ArchiveName
 from hil.archive.amend import REJECTED
 from hil.files import write_atomically
-from hil.reading import digest_of, json_of, lies_there, opened, text_of
+from hil.reading import digest_of, is_no_file, json_of, lies_there, opened, text_of
 
+from . import folder_lock
 from .errors import CampaignFolderError, NotRehearsedError
 from .sealed import MESH, MISSING, as_text, checksums, combined
 
@@ -32,20 +28,8 @@ if TYPE_CHECKING:
 
     from .plan import CampaignPlan
 
-LOCK = "campaign.lock"
-LOCK_PATIENCE = 0.5
-"""s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
-_LOCKING: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-"""The folder may come from elsewhere: no link is followed, and no pipe waited for."""
 _ANOTHER: Final = "{} is not the one this campaign began with"
 _RESTORE: Final = "restore it, or begin a new campaign"
-_NO_FILE: Final = frozenset(
-    {
-        *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO),
-        errno.EINVAL,  # of `opened`: a pipe or a device
-    }
-)
-"""Errors of what is no file at all; others may be gone the next time."""
 
 
 @dataclass(frozen=True)
@@ -158,40 +142,18 @@ class CampaignFolder:
         """Whether there is a manifest."""
         return lies_there(self._manifest)
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
+    def locked(self) -> AbstractContextManager[None]:
         """Keep every other run out of the folder; a run that dies lets go of it.
 
         Raises:
             CampaignFolderError: another run is at work on it, or the disk refuses.
         """
-        try:
-            lock = os.open(self.root / LOCK, _LOCKING | os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise CampaignFolderError(
-                self.root, f"{LOCK} cannot be written ({error.strerror})", "make it a writable file"
-            ) from error
-        if not _taken(lock, fcntl.LOCK_EX, LOCK_PATIENCE):
-            os.close(lock)
-            raise CampaignFolderError(
-                self.root, "another run is at work on it", "wait for its end, or stop it"
-            )
-        try:
-            yield
-        finally:
-            os.close(lock)
+        return folder_lock.locked(self.root)
 
     @property
     def busy(self) -> bool:
         """Whether a run is at work on the folder at this moment."""
-        try:
-            lock = os.open(self.root / LOCK, _LOCKING | os.O_RDONLY)
-        except OSError:  # nobody ever was, or it is not ours to look
-            return False
-        try:
-            return not _taken(lock, fcntl.LOCK_SH, 0.0)
-        finally:
-            os.close(lock)
+        return folder_lock.busy(self.root)
 
     def seal(self) -> None:
         """Begin the manifest with the checksums of what the campaign is about."""
@@ -331,7 +293,7 @@ class CampaignFolder:
         try:
             return digest_of(self.archives / entry.name) == entry.sha256
         except OSError as error:
-            if error.errno in _NO_FILE:
+            if is_no_file(error):
                 return False
             raise CampaignFolderError(
                 self.root, f"{entry.name} cannot be read ({error.strerror})", "make it readable"
@@ -396,16 +358,3 @@ class CampaignFolder:
         return CampaignFolderError(
             self.root, f"manifest.json is damaged ({error})", "restore it or start a new folder"
         )
-
-
-def _taken(lock: int, kind: int, patience: float) -> bool:
-    """Whether a lock on an open file could be had within some time [s]."""
-    deadline = time.monotonic() + patience
-    while True:
-        try:
-            fcntl.flock(lock, kind | fcntl.LOCK_NB)
-            return True
-        except OSError:
-            if time.monotonic() >= deadline:
-                return False
-            time.sleep(0.02)

@@ -11,7 +11,8 @@ from identification.excitation import Excitation
 
 from .campaign import Campaign
 from .errors import CampaignFolderError
-from .folder import LOCK, CampaignFolder
+from .folder import CampaignFolder
+from .folder_lock import LOCK
 
 _OURS = ("manifest.json", "cell.toml", "robot.urdf", "plan.json", "rehearsal.json", LOCK)
 """What a campaign has before anything is recorded; the manifest goes first, so that what a crash

@@ -87,7 +87,7 @@ class Rehearsal(Frozen):
         try:
             return read_back(cls, text_of(path), strict=False)
         except (OSError, ValueError) as error:
-            why = (isinstance(error, OSError) and error.strerror) or error
+            why = getattr(error, "strerror", None) or error
             raise CampaignFolderError(
                 folder.root,
                 f"{path.name} cannot be read ({why})",

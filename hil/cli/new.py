@@ -13,7 +13,7 @@ from hil.errors import InputError
 from hil.files import write_atomically
 from hil.lines import say
 from hil.new import Known, cell_of_urdf, from_archive, from_init, read_init
-from hil.whole_number import LAST_PORT, whole_number
+from hil.whole_number import port_number
 
 PORT = 1000
 """On which a PC listens to a C4G Open, as delivered."""
@@ -116,8 +116,8 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
     from drivers.transports.udp import UdpSpec
 
     host, _, port_text = address.partition(":")
-    port = whole_number(port_text or str(PORT))
-    if not host or port is None or port > LAST_PORT:
+    port = port_number(port_text or str(PORT))
+    if not host or port is None:
         raise InputError(
             None, f"{address!r} is no HOST or HOST:PORT", remedy="e.g. 10.2.12.150:1000"
         )

@@ -50,7 +50,8 @@ class ReportSeries:
     example_predicted: Array
 
     def __post_init__(self) -> None:
-        n = (*self.excitation_position.shape, 0, 0)[1]
+        position = self.excitation_position
+        n = position.shape[1] if position.ndim == 2 else 0
         m, k = self.excitation_time.size, self.example_time.size
         expected = {
             "excitation_time": (m,),

@@ -37,7 +37,8 @@ from hil.campaign.conduct import conduct_of
 from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import ArmChangedError, DryRunError, RepetitionsRejectedError
 from hil.campaign.execution_result import RunResult
-from hil.campaign.folder import LOCK, CampaignFolder
+from hil.campaign.folder import CampaignFolder
+from hil.campaign.folder_lock import LOCK
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.motion_watch import Wish
 from hil.campaign.operator import DryRunSummary, RunStatus

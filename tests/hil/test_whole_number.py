@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.whole_number import whole_number
+from hil.whole_number import port_number, whole_number
 
 
 @given(st.integers(0, 10**18 - 1))
@@ -22,3 +22,8 @@ def test_any_text_is_a_number_of_some_size_or_none(text: str) -> None:
 def test_what_is_missing_is_none() -> None:
     assert whole_number(None) is None
     assert whole_number("") is None
+
+
+def test_ports_are_those_that_there_are() -> None:
+    assert [port_number(text) for text in ("1", "1000", "65535")] == [1, 1000, 65535]
+    assert not any(map(port_number, ("", "0", "65536", "-1", "ten", "9" * 5000)))

@@ -26,27 +26,15 @@ from hil.campaign.warmup import FrictionMeter, WarmUp
 from hil.errors import ArchiveError, HilError, InputError
 from identification import IdentificationError
 from planner import PlannerError
-from tests.hil.fast_cell import fast_campaign, fast_cell
 
 HUGE, DIGITS = 10**400, "9" * 5000
 ENTRY = {"name": "excitation_000_a1.mcap", "outcome": "completed", "sha256": "00", "reason": ""}
 
 
-@pytest.fixture(scope="module")
-def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("designed")
-    return fast_campaign(folder / "campaign", fast_cell(folder)).folder.root
-
-
-@pytest.fixture
-def root(designed: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(designed, tmp_path / "campaign")
-
-
-def read(root: Path) -> list[str]:
+def read(folder: Path) -> list[str]:
     """What each way into a folder refuses it with; other errors than ours pass through and fail."""
     refused = []
-    for way in (lambda: Campaign.open(root).status(), lambda: conduct_of(CampaignFolder(root))):
+    for way in (lambda: Campaign.open(folder).status(), lambda: conduct_of(CampaignFolder(folder))):
         try:
             way()
         except (HilError, IdentificationError, PlannerError) as error:
@@ -74,21 +62,21 @@ def doctored(path: Path, *place: str, value: object) -> None:
         ("inputs", {"plan.json": 3}),
     ],
 )
-def test_manifest(place: str, value: object, root: Path) -> None:
-    doctored(root / "manifest.json", place, value=value)
-    read(root)
+def test_manifest(place: str, value: object, folder: Path) -> None:
+    doctored(folder / "manifest.json", place, value=value)
+    read(folder)
 
 
-def test_an_archive_that_cannot_be_read_is_named_and_not_run_again(root: Path) -> None:
-    doctored(root / "manifest.json", "archives", value=[ENTRY])
-    archives = root / "archives"
+def test_an_archive_that_cannot_be_read_is_named_and_not_run_again(folder: Path) -> None:
+    doctored(folder / "manifest.json", "archives", value=[ENTRY])
+    archives = folder / "archives"
     archives.mkdir(exist_ok=True)
     (archives / ENTRY["name"]).symlink_to("/proc/self/mem")  # a file, and reading it fails
     with pytest.raises(CampaignFolderError, match=f"{ENTRY['name']} cannot be read"):
-        CampaignFolder(root).completed("excitation")
+        CampaignFolder(folder).completed("excitation")
     (archives / ENTRY["name"]).unlink()
-    assert CampaignFolder(root).completed("excitation") == []
-    assert CampaignFolder(root).damaged()
+    assert CampaignFolder(folder).completed("excitation") == []
+    assert CampaignFolder(folder).damaged()
 
 
 @pytest.mark.parametrize("name", [f"excitation_{DIGITS}_a1.mcap", f"move_000_a{DIGITS}.mcap"])
@@ -97,14 +85,14 @@ def test_a_number_without_end_is_none_of_an_archive(name: str) -> None:
 
 
 @pytest.mark.parametrize("mesh", ["m" * 300 + ".stl", "file:///proc/self/mem", "package://m.stl"])
-def test_meshes_that_cannot_be_read_are_missing(mesh: str, root: Path) -> None:
-    urdf = root / "robot.urdf"
+def test_meshes_that_cannot_be_read_are_missing(mesh: str, folder: Path) -> None:
+    urdf = folder / "robot.urdf"
     box = '<box size="0.3 0.08 0.08"/>'
     assert box in urdf.read_text()
     urdf.write_text(urdf.read_text().replace(box, f'<mesh filename="{mesh}"/>'))
-    read(root)
-    (root / "cell.toml").write_text("a = " + "[" * 9999)
-    assert read(root)
+    read(folder)
+    (folder / "cell.toml").write_text("a = " + "[" * 9999)
+    assert read(folder)
 
 
 @pytest.fixture
@@ -116,14 +104,14 @@ def imported(tmp_path: Path) -> Path:
     )
 
 
-def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, root: Path) -> None:
-    folder, campaign = CampaignFolder(root), Campaign.open(root)
+def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, folder: Path) -> None:
+    campaign = Campaign.open(folder)
     cell, motion = campaign.cell, campaign.plan.excitation.trajectory
-    (root / "archives").mkdir(exist_ok=True)
-    shutil.copy(imported, root / "archives" / "dryrun_000_a1.mcap")
+    (folder / "archives").mkdir(exist_ok=True)
+    shutil.copy(imported, folder / "archives" / "dryrun_000_a1.mcap")
     names = ["dryrun_000_a1.mcap"]
     for way in (
-        lambda: DryRun.of(folder, cell, names, plan_hash="", simulated=True),
+        lambda: DryRun.of(campaign.folder, cell, names, plan_hash="", simulated=True),
         lambda: Played.of(open_archive(imported)),
         lambda: FrictionMeter(cell, motion).measure(imported),
         lambda: GravityCheck.of(cell, [imported]),
@@ -132,28 +120,28 @@ def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, root
             way()
 
 
-def test_a_rehearsal_is_read_back_as_it_was(root: Path) -> None:
+def test_a_rehearsal_is_read_back_as_it_was(folder: Path) -> None:
     found = Criterion(name="excitation", value=float("inf"), bound=1.0, passed=False, sentence="")
     made = Rehearsal(
         plan_hash="", seed=1, passed=False, criteria=[found], assumed=[], not_seen=[],
         repetitions=2, motion_seconds=4.0, software={}, failed_seeds=(2, 3),
     )  # fmt: skip
-    made.save(root / "rehearsal.json")
-    assert Rehearsal.load(CampaignFolder(root)) == made
+    made.save(folder / "rehearsal.json")
+    assert Rehearsal.load(CampaignFolder(folder)) == made
 
 
-def dry_run(root: Path) -> DryRun:
+def dry_run(folder: Path) -> DryRun:
     return DryRun(
-        plan_hash=CampaignFolder(root).plan_hash, override=0.2, archives=(), duration=10.0,
+        plan_hash=CampaignFolder(folder).plan_hash, override=0.2, archives=(), duration=10.0,
         simulated=True, joint_names=("a", "b"), current_share=(0.1, 0.2),
         following_error=(0.1, float("nan")), missed=0, late=0, accepted=Acceptance("me", "now"),
     )  # fmt: skip
 
 
-def test_a_dry_run_is_read_back_as_it_was(root: Path) -> None:
-    made = dry_run(root)
-    made.save(root / "dry_run.json")
-    found = DryRun.load(CampaignFolder(root))
+def test_a_dry_run_is_read_back_as_it_was(folder: Path) -> None:
+    made = dry_run(folder)
+    made.save(folder / "dry_run.json")
+    found = DryRun.load(CampaignFolder(folder))
     assert found is not None
     assert repr(found) == repr(made)  # NaN is like no other
 
@@ -167,28 +155,28 @@ def test_a_dry_run_is_read_back_as_it_was(root: Path) -> None:
         ("simulated", 1), ("format_version", [2]),
     ],
 )  # fmt: skip
-def test_dry_run(key: str, value: object, root: Path) -> None:
-    dry_run(root).save(root / "dry_run.json")
-    doctored(root / "dry_run.json", key, value=value)
+def test_dry_run(key: str, value: object, folder: Path) -> None:
+    dry_run(folder).save(folder / "dry_run.json")
+    doctored(folder / "dry_run.json", key, value=value)
     with pytest.raises(CampaignFolderError, match=r"dry_run\.json is damaged"):
-        DryRun.load(CampaignFolder(root))
-    assert not conduct_of(CampaignFolder(root)).steps[1].done
-    read(root)
+        DryRun.load(CampaignFolder(folder))
+    assert not conduct_of(CampaignFolder(folder)).steps[1].done
+    read(folder)
 
 
-def warm_up(root: Path) -> WarmUp:
+def warm_up(folder: Path) -> WarmUp:
     return (
-        WarmUp(CampaignFolder(root).plan_hash, ("a", "b"), 0.01, moved_at=1e9)
+        WarmUp(CampaignFolder(folder).plan_hash, ("a", "b"), 0.01, moved_at=1e9)
         .with_motion("one.mcap", [1.0, float("nan")], 1, 9)
         .cooled()
         .with_motion("two.mcap", [1.0, 2.0], 1, 9)
     )
 
 
-def test_a_warm_up_is_read_back_as_it_was(root: Path) -> None:
-    made = warm_up(root)
-    made.save(root / "warmup.json")
-    assert WarmUp.load(root / "warmup.json", made.plan_hash) == made
+def test_a_warm_up_is_read_back_as_it_was(folder: Path) -> None:
+    made = warm_up(folder)
+    made.save(folder / "warmup.json")
+    assert WarmUp.load(folder / "warmup.json", made.plan_hash) == made
 
 
 @pytest.mark.parametrize(
@@ -200,13 +188,13 @@ def test_a_warm_up_is_read_back_as_it_was(root: Path) -> None:
         ("moved_at", "now"), ("earlier", 3),
     ],
 )  # fmt: skip
-def test_warm_up(key: str, value: object, root: Path) -> None:
-    made = warm_up(root)
-    made.save(root / "warmup.json")
-    doctored(root / "warmup.json", key, value=value)
+def test_warm_up(key: str, value: object, folder: Path) -> None:
+    made = warm_up(folder)
+    made.save(folder / "warmup.json")
+    doctored(folder / "warmup.json", key, value=value)
     with pytest.raises(CampaignFolderError, match=r"warmup\.json is damaged"):
-        WarmUp.load(root / "warmup.json", made.plan_hash)
-    read(root)
+        WarmUp.load(folder / "warmup.json", made.plan_hash)
+    read(folder)
 
 
 @pytest.mark.parametrize(
@@ -219,11 +207,11 @@ def test_warm_up(key: str, value: object, root: Path) -> None:
         ("warmup.json", "threshold", HUGE),
     ],
 )
-def test_numbers_beyond_all_others(file: str, key: str, value: object, root: Path) -> None:
-    dry_run(root).save(root / "dry_run.json")
-    warm_up(root).save(root / "warmup.json")
-    doctored(root / file, key, value=value)
-    read(root)
+def test_numbers_beyond_all_others(file: str, key: str, value: object, folder: Path) -> None:
+    dry_run(folder).save(folder / "dry_run.json")
+    warm_up(folder).save(folder / "warmup.json")
+    doctored(folder / file, key, value=value)
+    read(folder)
 
 
 @pytest.mark.parametrize(
@@ -245,10 +233,10 @@ def test_numbers_beyond_all_others(file: str, key: str, value: object, root: Pat
         (("moves",), 3),
     ],
 )
-def test_plan(place: tuple[str, ...], value: Any, root: Path) -> None:
+def test_plan(place: tuple[str, ...], value: Any, folder: Path) -> None:
     with suppress(FileNotFoundError):
-        (root / "manifest.json").unlink()
-    doctored(root / "plan.json", *place, value=value)
+        (folder / "manifest.json").unlink()
+    doctored(folder / "plan.json", *place, value=value)
     with pytest.raises(InputError, match="is not a campaign plan"):
-        Campaign.open(root).status()
-    read(root)
+        Campaign.open(folder).status()
+    read(folder)

@@ -28,7 +28,8 @@ from hil.archive.container import MAGIC
 from hil.batch.cache import Store, decoded, encoded
 from hil.campaign import Campaign, CampaignFolderError
 from hil.campaign.dry_run import DryRun
-from hil.campaign.folder import LOCK, CampaignFolder
+from hil.campaign.folder import CampaignFolder
+from hil.campaign.folder_lock import LOCK
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.warmup import WarmUp
 from hil.cell import AngleFrame, Cell
@@ -46,7 +47,7 @@ from hil.results import Results
 from hil.study.results import StudyResults
 from identification import IdentificationError
 from planner import PlannerError
-from tests.hil.fast_cell import fast_campaign, fast_cell
+from tests.hil.fast_cell import fast_cell
 
 DEEP = "[" * 100_000 + "]" * 100_000
 NAMED = (HilError, IdentificationError, PlannerError)
@@ -70,17 +71,6 @@ def within(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
-
-
-@pytest.fixture(scope="module")
-def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("designed")
-    return fast_campaign(folder / "campaign", fast_cell(folder)).folder.root
-
-
-@pytest.fixture
-def folder(designed: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(designed, tmp_path / "campaign")
 
 
 def put(path: Path, what: str) -> None:
