@@ -23,7 +23,7 @@ from hil.archive import open_archive
 from hil.campaign import Link, Progress, Stop
 from hil.cell import Cell
 from hil.demo_link import SIMULATE, free_port
-from hil.errors import ControllerFault, InputError
+from hil.errors import ArchiveError, ControllerFault, InputError
 from hil.identify import identify_archives
 from hil.progress import Silent
 from hil.recording import archive_path, record
@@ -215,9 +215,17 @@ def own_motion(cell: Path, port: int, *options: str) -> tuple[object, ...]:
     return (*SIMULATE, cell, "--json", *where, *options)
 
 
+def archived_so_far(archive: Path) -> int:
+    """The cycles archived so far: none while the file is not yet there or still empty."""
+    try:
+        return open_archive(archive).n_samples
+    except ArchiveError:
+        return 0
+
+
 def wait_until_recorded(archive: Path, recorder: subprocess.Popen[str], cycles: int = 500) -> None:
     deadline = time.monotonic() + 60.0
-    while not (archive.exists() and open_archive(archive).n_samples > cycles):
+    while archived_so_far(archive) <= cycles:
         assert time.monotonic() < deadline
         assert recorder.poll() is None, recorder.communicate()
         time.sleep(0.1)
