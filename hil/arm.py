@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 
 from identification.excitation.collision.bodies import described_shapes
 from identification.excitation.collision.poses import joint_poses
-from identification.kinematics import Chain, chain_from_urdf
+from identification.kinematics import FARTHEST, Chain, chain_from_urdf
 
 Array = NDArray[np.float64]
 
@@ -135,7 +135,8 @@ def _described(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> tupl
             pose = item.placement
             placed = vertices @ pose.rotation.T + pose.translation
             name = model.frames[item.parentFrame].name
-            solids.append(Solid(name, item.parentJoint - 1, placed))
+            if np.all(np.abs(placed) <= FARTHEST):  # what the collision check refuses, too
+                solids.append(Solid(name, item.parentJoint - 1, placed))
     return tuple(solids)
 
 

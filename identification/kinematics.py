@@ -27,6 +27,9 @@ FROM_PINOCCHIO = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)
 MOST_JOINTS: Final = 64
 """Time and memory of a model grow faster than their square: a minute and 1.5 GB for 100."""
 
+FARTHEST: Final = 1e6
+"""m; no robot is larger, and squares of such lengths are numbers yet."""
+
 _LINK = "link "
 _UNIT: Final = 1e-6  # by which the length of an axis, made a unit vector by the reader, may be off
 
@@ -129,8 +132,8 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
 
     Raises:
         ModelError: the text is no URDF of an open chain or none that may be read
-            (:func:`identification.urdf_text.refusal`), has a joint without a direction, or no
-            joint of a name in `locked`.
+            (:func:`identification.urdf_text.refusal`), has a joint without a direction or beyond
+            `FARTHEST`, or no joint of a name in `locked`.
     """
     if (refused := refusal(urdf)) is not None:
         raise ModelError(f"the robot description is not a readable URDF: {refused}")
@@ -144,6 +147,7 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
         raise ModelError(f"the robot description is no open chain: {closed}")
     for index in range(1, model.njoints):
         _require_direction(model, index)
+    _require_near(model)
     if not locked:
         return model
     posture = locked_posture(model, locked)
@@ -199,6 +203,18 @@ def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:
     linear, angular = subspace[:3], subspace[3:]
     revolute = bool(np.any(angular))
     return (angular if revolute else linear).copy(), revolute
+
+
+def _require_near(model: pin.Model) -> None:
+    """Refuse joints and links that are farther away than any robot reaches."""
+    places = [*zip(model.names, model.jointPlacements, strict=True)]
+    places += [(frame.name, frame.placement) for frame in model.frames]
+    for name, place in places:
+        if not np.abs(place.translation).max() <= FARTHEST:
+            raise ModelError(
+                f"{name!r} of the robot description is more than {FARTHEST:g} m away from what "
+                "carries it"
+            )
 
 
 def _require_direction(model: pin.Model, index: int) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import container
+from hil.archive.announced import Announced
 from hil.archive.container import Damage
 
 Bytes = NDArray[np.uint8]
@@ -77,11 +78,10 @@ class _Place(NamedTuple):
 
 
 class ChunkParser:
-    """Finds schemas, channels and messages, chunk after chunk."""
+    """Finds messages, chunk after chunk, and takes the schemas and channels among them."""
 
     def __init__(self) -> None:
-        self.schemas: dict[int, container.SchemaRecord] = {}
-        self.channels: dict[int, container.ChannelRecord] = {}
+        self.announced = Announced()
         self._pattern: list[_Place] = []
 
     def repeats(self, chunk: bytes) -> bool:
@@ -109,7 +109,7 @@ class ChunkParser:
             offset: where the chunk's record begins in the file, for the error.
 
         Raises:
-            Damage: the chunk does not hold whole records, or a channel was never announced.
+            Damage: the chunk does not hold whole records, or announcements that fit its messages.
         """
         found: dict[int, Messages] = {}
         recent: deque[bytes] = deque(maxlen=_LONGEST_PATTERN)
@@ -131,15 +131,15 @@ class ChunkParser:
                 data = np.frombuffer(chunk, np.uint8, end - at - _HEAD.size, at + _HEAD.size)
                 _append(found, channel, data[None], np.array([sequence], np.uint32))
             else:
-                self.announce(opcode, chunk[at + _RECORD.size : end], offset)
+                self.announced.take(opcode, chunk[at + _RECORD.size : end], offset)
             at = end
         return self._by_topic(found, offset)
 
     def _by_topic(self, found: dict[int, Messages], offset: int) -> dict[str, Messages]:
-        unknown = found.keys() - self.channels.keys()
+        unknown = found.keys() - self.announced.channels.keys()
         if unknown:
             raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
-        return {self.channels[channel].topic: messages for channel, messages in found.items()}
+        return {self.announced.topic(channel): messages for channel, messages in found.items()}
 
     def _run(self, chunk: bytes, at: int) -> Bytes | None:
         """As many repetitions of the pattern as follow from `at` on, shape (k, size)."""
@@ -183,15 +183,6 @@ class ChunkParser:
         if changed:
             self._pattern = places
         return changed
-
-    def announce(self, opcode: int, body: bytes, offset: int) -> None:
-        """Take a schema or channel record; others are passed over."""
-        if opcode == container.SCHEMA:
-            schema = container.schema(body, offset)
-            self.schemas[schema.id] = schema
-        elif opcode == container.CHANNEL:
-            channel = container.channel(body, offset)
-            self.channels[channel.id] = channel
 
 
 def _bounds(chunk: bytes, at: int, offset: int) -> tuple[int, int]:

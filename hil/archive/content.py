@@ -63,6 +63,7 @@ class Content:
         self._size = 0
         self._decompressor = zstandard.ZstdDecompressor()
         self._channels: dict[str, _Channel] = {}
+        self._wanted: tuple[str, ...] = ()
         self._n_events = 0
         self._waiting: list[_Waiting] = []
         self._waiting_size = 0
@@ -105,7 +106,7 @@ class Content:
         elif record.opcode == container.METADATA:
             self._take_metadata(record)
         elif record.opcode in (container.SCHEMA, container.CHANNEL):
-            self.parser.announce(record.opcode, record.body, record.offset)
+            self.parser.announced.take(record.opcode, record.body, record.offset)
 
     def _take_metadata(self, record: Record) -> None:
         name, entries = container.metadata(record)
@@ -165,13 +166,15 @@ class Content:
 
     def _decode(self, found: dict[str, Messages], offset: int, compressed: int) -> None:
         """Decode messages, if they are what must follow now; else nothing of them counts."""
-        recorded = {channel.topic for channel in self.parser.channels.values()}
-        wanted = self._selection.numbers(recorded)
-        counts = {
-            len(found[topic]) if topic in found else 0 for topic in wanted if topic in recorded
-        }
+        recorded = self.parser.announced.topics
+        wanted = tuple(topic for topic in self._selection.numbers(recorded) if topic in recorded)
+        counts = {len(found[topic]) if topic in found else 0 for topic in wanted}
         if len(counts) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
+        if any(counts):
+            self._wanted = self._wanted or wanted
+            if wanted != self._wanted:
+                raise Damage(offset, "(chunk) has samples in other channels than those before")
         decoded = []
         for topic in wanted:
             if topic in found:
@@ -204,8 +207,7 @@ class Content:
 
     def _grows(self, topic: str) -> bool:
         """Whether the messages of a topic are of cycles, one each."""
-        recorded = {channel.topic for channel in self.parser.channels.values()}
-        return topic in schema.PER_CYCLE and schema.CYCLE in recorded
+        return topic in schema.PER_CYCLE and schema.CYCLE in self.parser.announced.topics
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout:
         assert self.description is not None
@@ -214,11 +216,10 @@ class Content:
             names, layout = joint_state_of(messages.first())
             check_joints(names, layout, joints)
             return layout
-        channels = self.parser.channels.values()
-        identity = next(channel.schema_id for channel in channels if channel.topic == topic)
-        if identity not in self.parser.schemas:
+        known = self.parser.announced.schema(topic)
+        if known is None:
             raise LayoutError("their schema is missing")
-        layout = fixed_layout(self.parser.schemas[identity].definition)
+        layout = fixed_layout(known.definition)
         schema.check_fields(topic, layout, len(joints))
         return layout
 
@@ -249,9 +250,7 @@ class Content:
         counts = {"samples": max([channel.read for channel in self._channels.values()], default=0)}
         if self._selection.events:
             counts["events"] = self._n_events
-        if not self._selection.numbers(
-            {channel.topic for channel in self.parser.channels.values()}
-        ):
+        if not self._selection.numbers(self.parser.announced.topics):
             del counts["samples"]
         elif schema.PACKETS in (self._selection.topics or ()):
             counts["packets"] = counts.pop("samples")

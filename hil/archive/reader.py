@@ -258,14 +258,14 @@ def _by_index(
     content = Content(selection, Order(written, gapless=False), gapless=False)
     try:
         for record in summary.announced:
-            content.parser.announce(record.opcode, record.body, record.offset)
+            content.parser.announced.take(record.opcode, record.body, record.offset)
     except Damage:
         return None
-    channels = content.parser.channels.values()
-    topics = {*selection.numbers({channel.topic for channel in channels})}
+    announced = content.parser.announced
+    topics = {*selection.numbers(announced.topics)}
     if selection.events:
         topics.add(EVENTS)
-    wanted = {channel.id for channel in channels if channel.topic in topics}
+    wanted = {channel.id for channel in announced.channels.values() if channel.topic in topics}
     start, stop = selection.times
     chunks = [chunk for chunk in summary.chunks if chunk.channels & wanted]
     taken = [chunk for chunk in chunks if chunk.start_time < stop and chunk.end_time >= start]
@@ -278,7 +278,7 @@ def _by_index(
 
 def _check_topics(path: Path, content: Content, selection: Selection) -> None:
     """Check that the archive has the channels wanted."""
-    recorded = sorted({channel.topic for channel in content.parser.channels.values()})
+    recorded = sorted(content.parser.announced.topics)
     for topic in selection.topics or ():
         if recorded and topic not in recorded:
             raise ArchiveError(

@@ -20,6 +20,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from hil.archive import container, index, schema
+from hil.archive.announced import Announced
 from hil.archive.container import Damage, Record
 from hil.archive.index import IndexBuilder, MessageHead, Summary
 from hil.archive.order import Contested, Order, Written
@@ -98,8 +99,7 @@ class _Surveyor:
         self._stream = stream
         self._summary = Summary.read(stream, survey.size)
         self._decompressor = zstandard.ZstdDecompressor()
-        self._types: dict[int, str] = {}
-        self._channels: dict[int, str] = {}
+        self._announced = Announced()
         self._next: dict[int, int] = {}
         self._shift: dict[int, int] = {}
         self._seen: set[int] = set()
@@ -217,13 +217,7 @@ class _Surveyor:
         self._keep(record)
 
     def _announce(self, opcode: int, body: bytes, offset: int) -> None:
-        if opcode == container.CHANNEL:
-            channel = container.channel(body, offset)
-            self._channels[channel.id] = channel.topic
-            self.survey.types[channel.topic] = self._types.get(channel.schema_id, "")
-        else:
-            found = container.schema(body, offset)
-            self._types[found.id] = found.name
+        self._announced.take(opcode, body, offset)
         self._index.announce(opcode, body)
 
     def _chunk(self, record: Record) -> None:
@@ -237,14 +231,14 @@ class _Surveyor:
         head = container.chunk(record)
         self._order.check_chunk(head.crc, record.offset)
         inside = _Inside.of(data, record.offset)
-        known = dict(self._channels), dict(self._types)
+        known = Announced(self._announced), self.survey.announced
         try:
             for item in inside.announced:
                 if item.opcode in (container.SCHEMA, container.CHANNEL):
                     self._announce(item.opcode, item.body, record.offset)
             shift = self._continued(inside, data, record.offset)
         except Damage:
-            self._channels, self._types = known  # what it announces goes with it
+            self._announced, self.survey.announced = known  # what it announces goes with it
             raise
         if (head.start_time, head.end_time) != inside.times:
             self._fault("index", Damage(record.offset, "(chunk) states other times"), loss=False)
@@ -267,9 +261,16 @@ class _Surveyor:
             if first < self._next.get(channel, 0):
                 raise Damage(offset, "(chunk) repeats messages that were before")
             shift[channel] = first - self._standing(channel)
-        numbers = [channel for channel in numbered if self._channels[channel] in NUMBERS]
-        if len({(len(numbered[channel]), shift[channel]) for channel in numbers}) > 1:
+        numbers = {
+            topic: (len(sequence), shift[channel])
+            for channel, sequence in numbered.items()
+            if (topic := self._announced.topic(channel)) in NUMBERS
+        }
+        if len({*numbers.values()}) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
+        before = self.survey.counts.keys() & {*NUMBERS}
+        if numbers and before and before != numbers.keys():
+            raise Damage(offset, "(chunk) has samples in other channels than those before")
         gaps = {channel: numbered[channel][0] - self._next.get(channel, 0) for channel in numbered}
         stamps = self._cycle_stamps(inside, data, offset)
         if any(gaps.values()):
@@ -277,7 +278,7 @@ class _Surveyor:
         if len(stamps):
             self._order.take(int(stamps[-1]))
         for channel, sequence in numbered.items():
-            topic = self._channels[channel]
+            topic = self._announced.topic(channel)
             self._next[channel] = sequence[-1] + 1
             self.survey.counts[topic] = self.survey.counts.get(topic, 0) + len(sequence)
             missing = self.survey.missing.get(topic, 0) + gaps[channel]
@@ -287,7 +288,7 @@ class _Surveyor:
     def _cycle_stamps(self, inside: _Inside, data: bytes, offset: int) -> NDArray[np.int64]:
         """The stamps of the cycles in a chunk, (k,) [ns], which follow those before."""
         for channel, places in inside.places.items():
-            if self._channels[channel] == schema.CYCLE:
+            if self._announced.topic(channel) == schema.CYCLE:
                 if places[-1] + _STAMP_AT + _STAMP.size > len(data):
                     raise Damage(offset, "(chunk) has messages without a stamp")
                 stamps = [_STAMP.unpack_from(data, at + _STAMP_AT) for at in places]
@@ -298,17 +299,17 @@ class _Surveyor:
         return np.zeros(0, np.int64)
 
     def _standing(self, channel: int) -> int:
-        return self.survey.counts.get(self._channels[channel], 0)
+        return self.survey.counts.get(self._announced.topic(channel), 0)
 
     def _recover_channels(self, numbered: dict[int, list[int]], offset: int) -> None:
         """Take channels that no record before announces from the summary."""
-        if numbered.keys() <= self._channels.keys():
+        if numbered.keys() <= self._announced.channels.keys():
             return
         summary = self._summary or self._moved_summary()
         announced = summary.announced if summary else ()
         for item in announced:
             self._announce(item.opcode, item.body, offset)
-        unknown = numbered.keys() - self._channels.keys()
+        unknown = numbered.keys() - self._announced.channels.keys()
         if unknown:
             raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
         self.survey.announced = announced
@@ -323,8 +324,8 @@ class _Surveyor:
 
     def _gap(self, gaps: dict[int, int], offset: int) -> None:
         """Note that messages are missing; a gap in samples must show in the samples behind it."""
-        samples = any(gap for channel, gap in gaps.items() if self._channels[channel] in NUMBERS)
-        if samples and schema.CYCLE not in self._channels.values():
+        topics = {self._announced.topic(channel) for channel, gap in gaps.items() if gap}
+        if topics & {*NUMBERS} and schema.CYCLE not in self._announced.topics:
             self._ended = True
             raise Damage(offset, "(chunk) comes after a gap that nothing would show")
         if not self._lost_since:
@@ -341,6 +342,9 @@ class _Surveyor:
         survey = self.survey
         if survey.metadata is None:
             return
+        for topic in self._announced.topics:
+            found = self._announced.schema(topic)
+            survey.types[topic] = found.name if found else ""
         if survey.header != (schema.PROFILE, schema.LIBRARY):
             self._fault("container", "the header is not that of the profile", loss=False)
         for name in announced_attachments(survey.metadata):
@@ -356,9 +360,8 @@ class _Surveyor:
             return
         if self.survey.mixed:
             self._fault("outcome", "the outcome is that of another recording", loss=True)
-        cycles = [
-            at for channel, at in self._next.items() if self._channels[channel] == schema.CYCLE
-        ]
+        topic = self._announced.topic
+        cycles = [at for channel, at in self._next.items() if topic(channel) == schema.CYCLE]
         if str(max(cycles, default=0)) == outcome.get("samples"):
             self._order.check_end(self.survey.size)
         counts = {"samples": self.survey.samples, "events": self.survey.events}

@@ -225,13 +225,26 @@ def test_no_collision_shape_is_left_out_without_a_word(size: str, why: str) -> N
     assert RobotModel.from_urdf(urdf).n_joints == 1  # to an estimate shapes are nothing
 
 
-@pytest.mark.parametrize("of", ["<collision>", 'type="revolute">'])
-def test_what_is_farther_away_than_any_robot_reaches_is_refused(of: str) -> None:
-    far = arm(SHAPE, SHAPE)
-    assert of in far
-    checker(far)
-    with pytest.raises(CollisionModelError, match=r"more than 1e\+06 m away from what carries it"):
-        checker(far.replace(of, of + '<origin xyz="1e300 0 0"/>', 1))
+AWAY = r"more than 1e\+06 m away from what carries it"
+FAR = '<origin xyz="1e300 0 0"/>'
+
+
+def test_a_shape_farther_away_than_any_robot_reaches_is_refused() -> None:
+    sound = arm(SHAPE, SHAPE)
+    far = sound.replace("<collision>", "<collision>" + FAR, 1)
+    checker(sound)
+    with pytest.raises(CollisionModelError, match=AWAY):
+        checker(far)
+
+
+@pytest.mark.parametrize("kind", ["revolute", "fixed"])
+def test_a_joint_farther_away_than_any_robot_reaches_is_refused(kind: str) -> None:
+    sound = chain(1, kind)
+    joint = '<joint name="j_l0" type="' + kind + '">'
+    assert joint in sound
+    chain_from_urdf(sound)
+    with pytest.raises(ModelError, match=f"'j_l0' .* {AWAY}"):
+        chain_from_urdf(sound.replace(joint, joint + FAR))
 
 
 PIPE = '<collision><geometry><{0} radius="0.1" length="1"/></geometry></collision>'

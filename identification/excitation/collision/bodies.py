@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from identification.excitation.collision.lost_shapes import lost_shapes
 from identification.excitation.collision.workspace import Workspace
 from identification.excitation.errors import CollisionModelError, MissingMeshError
+from identification.kinematics import FARTHEST
 
 Array = NDArray[np.float64]
 
-LARGEST: Final = 1e6
-"""m; no robot is larger, and squares of such lengths are numbers yet."""
 _MISSING_MESH: Final = re.compile(r"Mesh (.+) could not be found")  # pinocchio's words
 
 
@@ -101,7 +100,7 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     names = [model.frames[item.parentFrame].name for item in shapes.geometryObjects]
     if (lost := lost_shapes(urdf, names)) is not None:
         raise CollisionModelError(lost)
-    _require_near(model, shapes)
+    _require_near(shapes)
     bodies = []
     for item in shapes.geometryObjects:
         shape = _body(item.geometry, model.frames[item.parentFrame].name)
@@ -121,13 +120,13 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     return sorted(bodies, key=lambda body: body.joint)
 
 
-def _require_near(model: pin.Model, shapes: pin.GeometryModel) -> None:
-    places = [*model.jointPlacements, *(item.placement for item in shapes.geometryObjects)]
-    if not max(float(np.abs(place.translation).max()) for place in places) <= LARGEST:
-        raise CollisionModelError(
-            "a joint or a collision shape of the robot description is more than "
-            f"{LARGEST:g} m away from what carries it"
-        )
+def _require_near(shapes: pin.GeometryModel) -> None:
+    for item in shapes.geometryObjects:
+        if not np.abs(item.placement.translation).max() <= FARTHEST:
+            raise CollisionModelError(
+                f"collision shape {item.name!r} of the robot description is more than "
+                f"{FARTHEST:g} m away from what carries it"
+            )
 
 
 def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
@@ -137,20 +136,20 @@ def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
         CollisionModelError: it is no body (turned inside out, flat), or larger than any.
     """
     if isinstance(shape, coal.BVHModelBase):
-        if np.all(np.abs(shape.vertices()) <= LARGEST):
+        if np.all(np.abs(shape.vertices()) <= FARTHEST):
             with suppress(ValueError, RuntimeError):
                 shape.buildConvexHull(True, "Qt")
                 return shape.convex
         raise CollisionModelError(
             f"a collision mesh of link {link!r} is no body: flat, or its corners no points "
-            f"within {LARGEST:g} m"
+            f"within {FARTHEST:g} m"
         )
     sides = [getattr(shape, name, 0.0) for name in ("halfSide", "radius", "halfLength")]
     if min(float(np.min(side)) for side in sides) < 0.0:
         raise CollisionModelError(f"a collision shape of link {link!r} has a negative size")
-    if not max(float(np.max(side)) for side in sides) <= LARGEST:
+    if not max(float(np.max(side)) for side in sides) <= FARTHEST:
         raise CollisionModelError(
-            f"a collision shape of link {link!r} is larger than {LARGEST:g} m"
+            f"a collision shape of link {link!r} is larger than {FARTHEST:g} m"
         )
     return shape
 

@@ -280,6 +280,79 @@ class TestEvents:
         assert not {"\x1b", "\x07", "\r"} & set(shown)
 
 
+CYCLE, ELSEWHERE = 1, 9  # numbers of channels; the second is nobody's
+
+
+def channel(number: int, topic: str, *, schema_id: int = 1) -> bytes:
+    body = struct.pack("<HH", number, schema_id) + index.text(topic) + index.text("cdr")
+    return index.record(container.CHANNEL, body + struct.pack("<I", 0))
+
+
+def another_schema(chunk: bytes) -> bytes:
+    body = struct.pack("<H", 1) + index.text("x") + index.text("ros2msg") + index.text("bool x")
+    return index.record(container.SCHEMA, body) + chunk
+
+
+def without_cycles(chunk: bytes) -> bytes:
+    """A chunk whose cycles are announced, and counted, as something that nobody knows."""
+    announced = channel(CYCLE, schema.CYCLE)
+    assert announced in chunk
+    return chunk.replace(announced, channel(CYCLE, "/elsewhere"))
+
+
+def with_cycles(chunk: bytes) -> bytes:
+    """A chunk whose cycles are of another channel, announced only here, that counts from 0."""
+    changed, number = bytearray(chunk), 0
+    for message in index.messages(chunk, 0):
+        if isinstance(message, index.MessageHead) and message.channel == CYCLE:
+            struct.pack_into("<HI", changed, message.start + 9, ELSEWHERE, number)
+            number += 1
+    return channel(ELSEWHERE, schema.CYCLE) + changed
+
+
+class TestAnnouncements:
+    """What a number or a topic means is said once: else samples of one were taken for another's."""
+
+    @pytest.mark.parametrize(
+        ("second", "why"),
+        [
+            (lambda chunk: channel(CYCLE, "/elsewhere") + chunk, "channel 1 a second time"),
+            (lambda chunk: channel(ELSEWHERE, schema.CYCLE) + chunk, "channel 9 a second time"),
+            (another_schema, "schema 1 a second time"),
+        ],
+    )
+    def test_announced_again_as_something_else(self, second, why, written, tmp_path):
+        # Where cycles are counted, a gap shows, and what is behind it stands.
+        self.assert_first_alone(written, tmp_path, [bytes, second], why, repaired=33)
+
+    def test_announced_again_as_it_was(self, written, tmp_path):
+        again = channel(CYCLE, schema.CYCLE)
+        path = stranger(written, tmp_path / NAME, chunk=lambda chunk: again + chunk)
+        assert check_archive(path).keeps
+
+    def test_cycles_that_begin_behind_other_samples(self, written, tmp_path):
+        chunks, why = [without_cycles, with_cycles], "other channels than those before"
+        self.assert_first_alone(written, tmp_path, chunks, why, repaired=10)
+
+    @staticmethod
+    def assert_first_alone(
+        written, folder: Path, changes: list[Callable[[bytes], bytes]], why: str, *, repaired: int
+    ) -> None:
+        """Nothing behind the first chunk counts, and no column is longer than another."""
+        left = iter(changes)
+        path = stranger(written, folder / NAME, chunk=lambda chunk: next(left, bytes)(chunk))
+        archive = open_archive(path)
+        assert why in str(archive.damage)
+        assert {len(column) for column in archive.columns.values()} == {10}
+        assert not check_archive(path).keeps
+        done = repair(path)
+        assert done.samples == repaired
+        assert done.losses
+        mended = open_archive(done.output)
+        assert mended.damage is None
+        assert {len(column) for column in mended.columns.values()} == {repaired}
+
+
 class TestNames:
     def test_an_attachment_is_no_path(self, written, tmp_path):
         """No command writes attachments under names that the archive chooses."""
