@@ -16,6 +16,7 @@ from drivers.exchange.control import PATIENCE, STALE, ArchiveState, ControlBlock
 from drivers.exchange.digest import Digest
 from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import WITHDRAWN, Inbox
+from drivers.exchange.intake import POLL
 from drivers.exchange.latency import bin_of
 from drivers.exchange.notices import (
     NO_ARCHIVE,
@@ -26,6 +27,7 @@ from drivers.exchange.notices import (
     OverrideRefused,
     ResumeRefused,
 )
+from drivers.exchange.pulse import Pulse
 from drivers.exchange.shared_ring import SharedCycleRing
 from drivers.motion_source import MotionSource, progress_of
 from drivers.packets import InitPacket
@@ -96,7 +98,11 @@ class Serving:
         self._linger = ORPHAN_LINGER
         self._calls = 0
         self._answered = 0
-        self._heard = self._began = time.monotonic()
+        self._heard = began = time.monotonic()
+        # Of time in which the whole machine stood still nothing is to be concluded.
+        self._supervisor = Pulse(lambda: control.supervisor_heartbeat or began, longest_look=POLL)
+        self._archive = Pulse(lambda: control.archive_heartbeat, longest_look=POLL)
+        self._supervisor_silent = self._archive_silent = 0.0
         self._closed_since = math.inf
         self._closed_first = math.inf
         self._open = False
@@ -134,6 +140,8 @@ class Serving:
     def _orders(self, now: float) -> None:
         control, session = self._control, self._session
         self._calls += 1
+        self._supervisor_silent = self._supervisor.quiet()
+        self._archive_silent = self._archive.quiet()
         if self._calls % _SLOW_EVERY == 0 and self._inbox.hung_up():
             self._orphan("the supervisor closed its end")
         if control.stop_count != self._stops:
@@ -149,22 +157,21 @@ class Serving:
             self._change_hold(bool(control.held))
         # In a later call than it was read, so that a stop in between is seen first.
         if self._offered is not None:
-            self._take_program(self._offered, now)
+            self._take_program(self._offered)
         if control.program_offered != self._inbox.taken:
             self._read_program(now)
         if session.requested and self._needs_archive:
-            trouble = self._archive_trouble(now)
+            trouble = self._archive_trouble()
             if trouble:
                 session.stop(trouble)
-        self._reasons_to_leave(now)
+        self._reasons_to_leave()
         if self.reason:
             session.stop(self.reason)
 
-    def _reasons_to_leave(self, now: float) -> None:
-        silent = now - max(self._control.supervisor_heartbeat, self._began)
+    def _reasons_to_leave(self) -> None:
         if self._terminated:
             self._leave("the exchange process was told to terminate", ORPHAN_LINGER)
-        elif silent > (STALE if self._session.requested else PATIENCE):
+        elif self._supervisor_silent > (STALE if self._session.requested else PATIENCE):
             self._orphan(NO_SUPERVISOR)
         elif self._control.finish:
             self._leave("the supervisor wants to end", FINISH_LINGER)
@@ -178,10 +185,10 @@ class Serving:
             self.reason, self._linger = reason, linger
             self.say(Leaving(reason))
 
-    def _archive_trouble(self, now: float) -> str:
+    def _archive_trouble(self) -> str:
         if self._control.archive_state != ArchiveState.READY:
             return "the archive cannot be written"
-        if now - self._control.archive_heartbeat > STALE:
+        if not self._control.archive_heartbeat or self._archive_silent > STALE:
             return NO_ARCHIVE
         return ""
 
@@ -220,7 +227,7 @@ class Serving:
             self._inbox.read()
         self._control.pickup_us = 1e6 * (time.monotonic() - now)
 
-    def _take_program(self, source: MotionSource, now: float) -> None:
+    def _take_program(self, source: MotionSource) -> None:
         """Request the program that was read, once it may begin, and say what became of it."""
         control, identity = self._control, self._inbox.taken
         try:
@@ -228,7 +235,7 @@ class Serving:
                 raise RequestError(self._state, WITHDRAWN)
             if control.program_id != identity:
                 return  # the supervisor has not said yet
-            self._require_time_for_motions(now)
+            self._require_time_for_motions()
             self._session.request(source)
             self._source = source
             control.motion_time, control.rate = progress_of(source)
@@ -241,11 +248,11 @@ class Serving:
         control = self._control
         return control.program_id == -identity or control.program_offered != identity
 
-    def _require_time_for_motions(self, now: float) -> None:
+    def _require_time_for_motions(self) -> None:
         """Raise RequestError if no motion may begin now, whatever the session says."""
         trouble = self.reason
         if not trouble and self._needs_archive:
-            trouble = self._archive_trouble(now)
+            trouble = self._archive_trouble()
         if not trouble and self._session.init is not self._offered_to:
             trouble = "the controller began a new session since this motion was handed over"
         if trouble:

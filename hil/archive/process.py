@@ -31,6 +31,7 @@ from drivers.exchange import (
     PacketReader,
     RingReader,
 )
+from drivers.exchange.pulse import Pulse
 from hil.archive.commands import (
     Answer,
     Channel,
@@ -44,7 +45,6 @@ from hil.archive.commands import (
     Serving,
 )
 from hil.archive.live import LivePublisher
-from hil.archive.pulse import Pulse
 from hil.archive.recent import Recent
 from hil.archive.recorder import Recorder
 from hil.errors import ArchiveError, InputError
@@ -53,8 +53,8 @@ Records = NDArray[np.void]
 
 DRAIN_PERIOD = 0.02
 """s between two looks at the ring."""
-BEHIND = 0.005
-"""s by which raw packets may come later than the record made of them."""
+BEHIND, LONGEST_BEHIND = 0.005, 0.2
+"""s by which raw packets come later than the record made of them: as a rule, and at most."""
 PUNCTUAL = 0.0005
 """s after the last cycle of a chunk is due, when it is looked for."""
 BEAT_PERIOD = 0.05
@@ -317,7 +317,9 @@ class ArchiveProcess:
         self._control.archive_state = ArchiveState.NONE
         recorder = job.recorder
         try:
-            if self._packets is not None and recorder.newest_packet < recorder.newest:
+            until = time.monotonic() + LONGEST_BEHIND
+            packets = self._packets is not None
+            while packets and recorder.lacks_packets and time.monotonic() < until:
                 time.sleep(BEHIND)
                 self._take_packets(job)
             recorder.close(outcome, reason)

@@ -206,6 +206,11 @@ class Recorder:
         return self._newest
 
     @property
+    def lacks_packets(self) -> bool:
+        """Whether raw packets of the newest record archived are still to come, if any are."""
+        return self.newest_packet < self._newest
+
+    @property
     def over(self) -> bool:
         """Whether the interval is over and all of it archived, aftermath included."""
         if self.ended is None:

@@ -15,8 +15,8 @@ from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 from typing import IO, Protocol
 
 from drivers.exchange import ControlBlock
+from drivers.exchange.pulse import Pulse
 from hil.archive.commands import Answer, Channel, Command, End
-from hil.archive.pulse import Pulse
 
 END_TIMEOUT = 30.0
 """s for the last flush of a slow disk."""

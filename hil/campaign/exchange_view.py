@@ -17,8 +17,8 @@ from drivers.exchange import (
     ExchangeStatus,
     Leaving,
 )
+from drivers.exchange.pulse import Pulse
 from drivers.states import State
-from hil.archive.pulse import Pulse
 
 from .beginning import Beginning
 from .motion_link import Connection

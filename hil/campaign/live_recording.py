@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.exchange import RingReader
+from drivers.exchange.pulse import Pulse
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
@@ -131,8 +132,8 @@ class LiveRecording:
     def _answer_until_rest(self, why: str) -> None:
         """Do nothing, for as long as the exchange should go on answering."""
         stopped, still = self._stop.requested, Standstill(self._link.cell.period)
-        reader, heard = self._link.reader(), time.monotonic()
-        driven = heard
+        reader, driven, heard = self._link.reader(), time.monotonic(), 1
+        pulse = Pulse(lambda: heard, longest_look=5 * POLL)
         reader.drain()
         while not (self._stop.insisted or (self._stop.requested and not stopped)):
             failure, state, now = self._view.failure(), self._view.state, time.monotonic()
@@ -143,9 +144,9 @@ class LiveRecording:
             self._view.look()
             records = reader.drain()
             if len(records):
-                heard = now
+                heard += 1
                 self._position = records["position"][-1].copy()
-            if still.take(records) or now - heard > SILENCE:
+            if still.take(records) or pulse.quiet() > SILENCE:
                 return
             self._show(over=why)
             time.sleep(POLL)

@@ -51,8 +51,9 @@ def free_port() -> int:
 
 
 def settings(port: int, **changes) -> ExchangeSettings:
-    session = {"settle_cycles": 5, **changes.pop("session", {})}
-    # The controller here waits for its answers, however late they are.
+    # The controller here waits for its answers, however late they are, and so does the exchange:
+    # a second without packets is nothing on a machine that stands still now and then.
+    session = {"settle_cycles": 5, "silence_timeout": 20.0, **changes.pop("session", {})}
     chosen = {"needs_archive": False, "realtime": ORDINARY, "ring_capacity": 5000, **changes}
     link = chosen.pop("link", UdpSpec)(HOST, port, HOST)
     return ExchangeSettings(link, drive_train(), limits(), PERIOD, session, **chosen)
@@ -73,9 +74,9 @@ def running(**changes):
         exchange.close()
 
 
-def run_to_the_end(exchange: ExchangeProcess, controller: UdpController, seconds=5.0) -> list:
+def run_to_the_end(exchange: ExchangeProcess, controller: UdpController) -> list:
     """Cycle on until the process has ended; its events."""
-    controller.until(lambda: not exchange.alive, seconds)
+    controller.until(lambda: not exchange.alive)
     return exchange.events()
 
 
@@ -118,7 +119,7 @@ def test_a_whole_motion_is_run_recorded_and_told():
         assert status.heartbeat_age < 0.5
         exchange.finish()
         events = run_to_the_end(exchange, controller)
-        assert exchange.wait(1.0) == 0
+        assert exchange.wait(30.0) == 0
         assert exchange.status().finished
         assert the(ExchangeEnded, events).reason == "the supervisor wants to end"
         assert exchange.log == ""
@@ -135,7 +136,7 @@ def test_a_controller_that_opens_again_and_again_cannot_put_off_the_end():
             controller.open = True  # it closes when asked to, and opens with the next packet
             controller.cycle(3)
         assert controller.exits > 10
-        assert exchange.wait(1.0) == 0
+        assert exchange.wait(30.0) == 0
 
 
 def test_without_supervisor_it_answers_as_long_as_the_controllers_program_moves_the_arm():
@@ -149,7 +150,7 @@ def test_without_supervisor_it_answers_as_long_as_the_controllers_program_moves_
             controller.cycle()
             assert exchange.alive
         run_to_the_end(exchange, controller)
-        assert exchange.wait(1.0) == 0
+        assert exchange.wait(30.0) == 0
 
 
 def test_one_process_runs_one_motion_after_the_other():
@@ -209,8 +210,12 @@ class TestRefusedPrograms:
             control.archive_state = ArchiveState.READY
             with pytest.raises(RequestError, match="archive process gives no sign of life"):
                 exchange.submit(still(10))
-            control.archive_heartbeat = time.monotonic()
-            exchange.submit(still(10))
+
+            def wanted():
+                control.archive_heartbeat = time.monotonic()
+                return True
+
+            exchange.submit(still(10), wanted)
 
     def test_none_once_the_end_was_asked_for(self):
         with running() as (exchange, controller):
@@ -222,10 +227,11 @@ class TestRefusedPrograms:
 
 def test_a_program_that_was_given_up_does_not_begin_after_all(monkeypatch):
     with running() as (exchange, controller):
-        monkeypatch.setattr(process, "ANSWER_TIMEOUT", 0.3)
         os.kill(exchange.pid, signal.SIGSTOP)
-        with pytest.raises(ExchangeError, match=r"silent for 0\.3 s"):
-            exchange.submit(smooth_move(MOVE, 300))
+        with monkeypatch.context() as impatient:
+            impatient.setattr(process, "ANSWER_TIMEOUT", 0.3)
+            with pytest.raises(ExchangeError, match=r"silent for 0\.3 s"):
+                exchange.submit(smooth_move(MOVE, 300))
         os.kill(exchange.pid, signal.SIGCONT)
         controller.open = True
         controller.cycle(100)
@@ -237,7 +243,7 @@ def test_a_program_that_was_given_up_does_not_begin_after_all(monkeypatch):
 
 
 def test_a_program_is_asked_for_only_once_it_was_read_and_may_be_withdrawn_until_then():
-    with running() as (exchange, controller):
+    with running(preload=(__name__,)) as (exchange, controller):
         begin = time.monotonic()
         controller.open = True
         for said in (False, True):
@@ -360,8 +366,10 @@ class TestHeldUp:
             ended = []
             begin = due = time.monotonic()
             while not ended:
-                assert time.monotonic() < begin + 10.0
+                assert time.monotonic() < begin + 30.0
                 due += PERIOD
+                if time.monotonic() - due > 0.1:  # no burst after a stall
+                    due = time.monotonic()
                 controller.post()
                 time.sleep(max(0.0, due - time.monotonic()))
                 controller.take_what_came()
@@ -467,7 +475,7 @@ class TestStops:
             controller.assert_stopped_on_its_path(PERIOD)
             assert the(MotionEnded, events).outcome == "stopped"
             assert "told to terminate" in the(Leaving, events).reason
-            assert exchange.wait(1.0) == 0
+            assert exchange.wait(30.0) == 0
 
     def test_by_the_end_of_the_session(self):
         with running() as (exchange, controller):
@@ -515,7 +523,7 @@ class TestStops:
             events = run_to_the_end(exchange, controller)
             controller.assert_stopped_on_its_path(PERIOD)
             assert "no sign of life" in the(Leaving, events).reason
-            assert exchange.wait(1.0) == 0
+            assert exchange.wait(30.0) == 0
 
     def test_an_arm_that_is_only_held_is_let_go_too(self):
         with running() as (exchange, controller):
@@ -528,11 +536,11 @@ class TestStops:
             assert the(ExchangeEnded, events)
 
     def test_without_supervisor_and_controller_it_ends(self):
-        with running() as (exchange, controller):
+        with running(session={"silence_timeout": 1.0}) as (exchange, controller):
             set_going(exchange, controller)
             silent_from = time.monotonic()
             while exchange.alive:  # which is no sign of life
-                assert time.monotonic() - silent_from < 10.0
+                assert time.monotonic() - silent_from < 30.0
                 time.sleep(0.05)
             events = exchange.events()
             assert "no sign of life" in the(Leaving, events).reason
@@ -594,28 +602,27 @@ def test_the_death_of_the_supervisor_stops_the_arm_on_its_path(number):
         controller.until(lambda: controller.moved > 0.2)
         # As the end of a terminal does: to its whole process group.
         os.killpg(supervisor.pid, number)
-        supervisor.wait()
+        controller.until(lambda: supervisor.poll() is not None)
         died = time.monotonic()
         controller.until(lambda: not controller.open)
-        assert time.monotonic() - died < 5.0
         controller.assert_stopped_on_its_path(PERIOD)
         controller.unanswered = 0
-        controller.until(lambda: not Path(f"/proc/{pid}").exists() or _zombie(pid), 5.0)
+        controller.until(lambda: _process_state(pid) in ("", "Z"))
         assert time.monotonic() - died > 2.0, "it goes on answering for a while"
     finally:
         controller.close()
-        supervisor.stdin.close()
-        supervisor.stdout.close()
         supervisor.kill()
         supervisor.wait()
-
-
-def _zombie(pid: int) -> bool:
-    return _process_state(pid) == "Z"
+        supervisor.stdin.close()
+        supervisor.stdout.close()
 
 
 def _process_state(pid: int) -> str:
-    return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    """As ps shows it; empty for a process that is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
 
 
 class FaultySpec(UdpSpec):
@@ -638,7 +645,7 @@ class TestItsOwnEnd:
         with running() as (exchange, controller):
             set_going(exchange, controller)
             os.kill(exchange.pid, signal.SIGKILL)
-            assert exchange.wait(1.0) == -signal.SIGKILL
+            assert exchange.wait(30.0) == -signal.SIGKILL
             assert not exchange.alive
             assert not exchange.status().finished
             controller.cycle(2)
@@ -649,7 +656,7 @@ class TestItsOwnEnd:
     def test_a_fault_of_its_own_is_in_the_log_and_in_the_status(self):
         with running(link=FaultySpec) as (exchange, controller):
             controller.cycle(4)
-            assert exchange.wait(2.0) == 70
+            assert exchange.wait(30.0) == 70
             assert "TypeError" in the(ExchangeFailed, exchange.events()).trace
             assert "TypeError" in exchange.log
             assert not exchange.status().finished

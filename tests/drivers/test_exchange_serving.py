@@ -22,6 +22,7 @@ from drivers.exchange import (
     event_log,
 )
 from drivers.exchange.control import PATIENCE, STALE
+from drivers.exchange.intake import POLL
 from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Serving
 from drivers.states import State
 from tests.drivers.rig import N
@@ -182,11 +183,25 @@ class TestASilentSupervisor:
 
     def test_ends_a_motion_that_it_requests_after_its_silence(self, bench):
         bench.step()
-        bench.clock.time += 2.0
-        assert not bench.serving()
+        for _ in range(round(2.0 / STEP)):
+            bench.clock.time += STEP
+            assert not bench.serving()
         bench.session.requested = True
         bench.serving()
         assert bench.session.asked == ["stop"]
+
+    def test_is_not_concluded_from_time_in_which_this_process_stood_still_itself(self, bench):
+        bench.session.requested = True
+        bench.step()
+        for _ in range(round(0.9 * STALE / POLL)):  # each as long as the machine liked
+            bench.clock.time += 3600.0
+            bench.serving()
+        assert not bench.serving.reason
+        bench.clock.time += 0.2 * STALE
+        bench.serving()
+        bench.clock.time += 0.2 * STALE
+        bench.serving()
+        assert bench.serving.reason == NO_SUPERVISOR
 
 
 class TestHold:

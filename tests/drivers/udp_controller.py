@@ -46,7 +46,7 @@ class UdpController:
 
     def start(self) -> None:
         """The init packet, and one closed cycle."""
-        end = time.monotonic() + 5.0
+        end = time.monotonic() + 30.0
         self.number = 10
         while True:
             try:
@@ -55,6 +55,8 @@ class UdpController:
                 break
             except (TimeoutError, ConnectionError):
                 assert time.monotonic() < end, "the exchange does not answer"
+        while not self.quiet(0.0):
+            self.socket.recv(2048)  # to an init packet that was sent again
         self.cycle()
 
     def cycle(self, count: int = 1) -> None:
@@ -78,8 +80,11 @@ class UdpController:
 
     def receive(self) -> None:
         """Wait for the answer to the cycle begun last, and follow it."""
+        expected = next_number(self.number)
         reply = self.socket.recv(2048)
-        assert CyclicPacket.decode(reply, N).number == next_number(self.number)
+        while self.unanswered and CyclicPacket.decode(reply, N).number < expected:
+            reply = self.socket.recv(2048)  # that one came after it had been given up
+        assert CyclicPacket.decode(reply, N).number == expected
         self._obey(reply)
 
     def take_what_came(self) -> None:
@@ -107,7 +112,7 @@ class UdpController:
             self.exits += 1
             self.open = False
 
-    def until(self, condition, seconds: float = 10.0) -> None:
+    def until(self, condition, seconds: float = 30.0) -> None:
         """Cycle until something is so."""
         end = time.monotonic() + seconds
         while not condition():

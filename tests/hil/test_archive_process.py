@@ -6,8 +6,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 
@@ -261,9 +263,10 @@ def test_a_process_that_takes_no_command_is_ended(rig: Rig) -> None:
     assert rig.process.process.poll() is not None
 
 
-def test_raw_packets_overwritten_as_the_archive_closes_are_counted(tmp_path: Path) -> None:
-    memory = Memory()
-    ring = SharedPacketRing.create(10)
+@contextmanager
+def keeping_packets(path: Path) -> Iterator[tuple[ArchiveProcess, Memory, SharedPacketRing]]:
+    """An archive process in this one, with an archive of raw packets open; room for ten."""
+    memory, ring = Memory(), SharedPacketRing.create(10)
     ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
     channel, exchange = Channel(theirs), os.pidfd_open(memory.pid)
     process = ArchiveProcess(
@@ -274,19 +277,49 @@ def test_raw_packets_overwritten_as_the_archive_closes_are_counted(tmp_path: Pat
         exchange,
         PacketReader(ring.fd),
     )
-    path = tmp_path / NAME
     spec = ArchiveSpec(path, ("a", "b"), PERIOD, metadata={}, durable=False, packets=True)
     process._open(Open(1, spec, drive_train(), from_now=True, until_ended=False))
-    memory.cycles(3)
-    process._take()
-    for cycle in range(30):  # after the last look, and before the archive is closed
-        ring.put(cycle // 10, 0.0, False, b"packet")
-    process._close("completed", "")
-    outcome = open_archive(path).outcome
+    try:
+        yield process, memory, ring
+    finally:
+        for end in (ours, channel):
+            end.close()
+        os.close(exchange)
+        memory.close()
+
+
+def test_raw_packets_overwritten_as_the_archive_closes_are_counted(tmp_path: Path) -> None:
+    with keeping_packets(tmp_path / NAME) as (process, memory, ring):
+        memory.cycles(3)
+        process._take()
+        for cycle in range(30):  # after the last look, and before the archive is closed
+            ring.put(cycle // 10, 0.0, False, b"packet")
+        process._close("completed", "")
+    outcome = open_archive(tmp_path / NAME).outcome
     assert outcome is not None
     assert int(outcome["packets_lost"]) + int(outcome["packets"]) == 30
     assert outcome["packets_lost"] != "0"
-    for end in (ours, channel):
-        end.close()
-    os.close(exchange)
-    memory.close()
+
+
+def test_raw_packets_that_come_after_their_cycle_are_waited_for(tmp_path: Path) -> None:
+    """The exchange was held up between the two, as the archive is closed."""
+    with keeping_packets(tmp_path / NAME) as (process, memory, ring):
+        memory.cycles(3)
+        for cycle in range(2):
+            ring.put(cycle, 0.0, False, b"packet")
+        process._take()
+        late = threading.Timer(0.05, ring.put, (2, 0.0, False, b"packet"))
+        late.start()
+        process._close("completed", "")
+        late.join()
+    outcome = open_archive(tmp_path / NAME).outcome
+    assert outcome is not None
+    assert (outcome["packets"], outcome["packets_lost"]) == ("3", "0")
+
+
+def test_raw_packets_that_never_come_are_not_waited_for_long(tmp_path: Path) -> None:
+    with keeping_packets(tmp_path / NAME) as (process, memory, _):
+        memory.cycles(3)
+        process._take()
+        process._close("completed", "")
+    assert whole(tmp_path / NAME).n_samples == 3
