@@ -140,7 +140,8 @@ class Program:
         if options.miss and options.miss <= k < options.miss + options.miss_count:
             self.seen["kept silent"] += 1
             return None
-        code = {options.send_505: DRIVE_OFF, options.send_508: FOLLOWING}.get(k) if k else None
+        faults = {options.send_505: DRIVE_OFF, options.send_508: FOLLOWING}
+        code = faults.get(k) if k and not self.fault_sent else None
         leaving = bool(options.exit_after) and k >= options.exit_after
         asks = leaving and (k - options.exit_after) % 100 == 0  # in one packet; again if unheard
         # a sine that begins and ends each turn at rest

@@ -132,7 +132,7 @@ def test_a_packet_that_was_lost_is_not_there_and_those_around_it_keep_their_cycl
 def test_a_recording_over_udp_keeps_every_packet_of_both_ends(tmp_path: Path, cell: Cell) -> None:
     on_udp = keeping_packets(cell).with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
     path = tmp_path / NAME
-    with loopback_link(on_udp, simulated_by=cell.path, options=("--patience", "0.5")) as link:
+    with loopback_link(on_udp, simulated_by=cell.path, options=("--patience", "2")) as link:
         done = record(
             link, on_udp, path, kind="excitation", stop=Stop(), duration=1.0, durable=False
         )

@@ -213,7 +213,7 @@ def test_an_exchange_without_sign_of_life_that_lives_is_waited_for(rig: Rig) -> 
     path = rig.open(1)
     memory.control.program_accepted = 1
     memory.cycles(20)
-    assert rig.process.answer(2.0, 1) is None, "it was taken for dead"
+    assert rig.process.answer(4.0, 1) is None, "it was taken for dead"
     memory.control.exchange_heartbeat = time.monotonic()
     memory.cycles(30)
     memory.events.write(MotionEnded("completed", "the path is at its end", 0, 40))

@@ -120,24 +120,25 @@ def test_groups_are_added_up_apart(workers: DaskWorkers) -> None:
 
 def test_sums_come_in_turn_while_later_ones_are_worked_on(workers: DaskWorkers) -> None:
     finished: list[int] = []
-    groups = [[work.task(work.slow_numbers, 10 * g + k) for k in range(3)] for g in range(12)]
+    groups = [[work.task(work.slow_numbers, 10 * g + k) for k in range(3)] for g in range(24)]
     seen = [
         (sums.notes, sum(finished))
         for sums in workers.sums_in_turn(groups, work.add, done=finished.append)
     ]
-    assert [notes for notes, _ in seen] == [(10 * g, 10 * g + 1, 10 * g + 2) for g in range(12)]
-    assert seen[0][1] < 36  # the first did not wait for the last
+    assert [notes for notes, _ in seen] == [(10 * g, 10 * g + 1, 10 * g + 2) for g in range(24)]
+    assert seen[0][1] < 72  # the first did not wait for the last
 
 
-def test_sums_that_nobody_waits_for_any_more_are_dropped(workers: DaskWorkers) -> None:
-    groups = [[work.task(work.slow_numbers, k)] for k in range(100)]
-    begun = time.monotonic()
+def test_sums_that_nobody_waits_for_any_more_are_dropped(
+    tmp_path: Path, workers: DaskWorkers
+) -> None:
+    groups = [[work.task(work.marked, str(tmp_path / f"{k}"))] for k in range(100)]
     sums = workers.sums_in_turn(groups, work.add)
     next(sums)
     sums.close()
     (found,) = workers.sums([[work.task(work.numbers, 3)]], work.add)
     assert found.notes == (3,)
-    assert time.monotonic() - begun < 4.0  # a hundred take 5 s on two workers
+    assert len([*tmp_path.iterdir()]) < 50
 
 
 def test_every_archive_is_reported_once(workers: DaskWorkers) -> None:
@@ -253,7 +254,12 @@ def test_nobody_at_the_address_is_an_error_with_the_address() -> None:
         DaskWorkers("tcp://127.0.0.1:9", identity=work.identity, patience=1.0)
 
 
-def test_a_scheduler_without_workers_is_an_error(tmp_path: Path) -> None:
+def test_a_scheduler_without_workers_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # To be connected at all takes a second on a busy machine.
+    connect = dask_cluster._connected
+    monkeypatch.setattr(dask_cluster, "_connected", lambda at, _: connect(at, PATIENCE))
     with running(tmp_path) as cluster, pytest.raises(ClusterError, match="has no worker after"):
         connected(cluster, patience=1.0)
 

@@ -30,7 +30,7 @@ from hil.progress import Silent
 from hil.simulation import simulated_link
 from tests.hil.fast_cell import fast_cell
 
-PATIENT = ("--patience", "0.5")
+PATIENT = ("--patience", "2")
 """A test asks what happens, not how fast: the controller waits where this machine pauses."""
 
 
@@ -157,8 +157,11 @@ def taken_port() -> Iterator[int]:
 def test_a_refusal_comes_with_its_flight_recorder(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    campaign = campaign_of(tmp_path / "refused", on_loopback(cell), plan)
-    fault = ("--fault", "following-error@350x200:axis=2:slip")
+    # So slow a way to the first posture that the fault strikes on it.
+    text = replaced_value(cell.text, "campaign", "approach_speed", 0.1)
+    slow = Cell.from_texts(text, cell.urdf, cell.path)
+    campaign = campaign_of(tmp_path / "refused", on_loopback(slow), plan)
+    fault = ("--fault", "following-error@1500x200:axis=2:slip")
     with (
         loopback_link(campaign.cell, options=(*PATIENT, *fault)) as link,
         pytest.raises(MotionFailedError) as failed,

@@ -30,7 +30,7 @@ from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 
-PATIENT = ("--patience", "0.5")
+PATIENT = ("--patience", "2")
 """A test asks what happens, not how fast: the controller waits where this machine pauses."""
 
 
@@ -48,7 +48,7 @@ class Person:
 
     def wish(self) -> Wish:
         time = (self.seen[-1].motion_time or 0.0) if self.seen else 0.0
-        first, second = time > 0.5 and self._rested < 3, time > 0.8
+        first, second = time > 0.5 and self._rested < 3, time > 1.2
         return Wish(0.5 if time > 0.2 else 1.0, held=first or second)
 
 

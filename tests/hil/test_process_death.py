@@ -115,7 +115,7 @@ def rig(tmp_path: Path, cell: Cell, plan: CampaignPlan) -> Iterator[Rig]:
     with (
         subprocess.Popen(
             [*SIMULATE, str(campaign.folder.cell), "--udp", f"127.0.0.1:{port}", "--json",
-             "--patience", "0.5", "--intervals", "3"],
+             "--patience", "2", "--intervals", "3"],
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment,
         ) as controller,
         subprocess.Popen(

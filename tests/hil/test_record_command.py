@@ -211,7 +211,7 @@ HIL = (sys.executable, "-m", "hil")
 
 def own_motion(cell: Path, port: int, *options: str) -> tuple[object, ...]:
     """A simulated controller whose own program moves the arm without a rest of a second."""
-    where = ("--udp", f"127.0.0.1:{port}", "--own-motion", "--patience", "0.5")
+    where = ("--udp", f"127.0.0.1:{port}", "--own-motion", "--patience", "2")
     return (*SIMULATE, cell, "--json", *where, *options)
 
 

@@ -717,7 +717,10 @@ def test_a_warm_up_motion_whose_run_was_killed_before_it_was_noted_is_not_made_a
 # --- folder, disk, and the person who stops
 
 
-def test_whoever_looks_whether_a_run_is_at_work_keeps_none_out(tmp_path: Path) -> None:
+def test_whoever_looks_whether_a_run_is_at_work_keeps_none_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.campaign.folder_lock.LOCK_PATIENCE", 30.0)
     folder = CampaignFolder(tmp_path)
     lock = os.open(tmp_path / LOCK, os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_SH)

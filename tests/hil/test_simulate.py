@@ -38,6 +38,8 @@ from sim_fixtures.serve import Wish
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
 SLOW_MACHINE = ["--missed", "300"]
 """A test asks what happens, not how fast: pauses of this machine shall not end open mode."""
+PATIENT = [*SLOW_MACHINE, "--patience", "0.5"]
+"""Nor the session's begin, where an answer has one cycle's time. Answers may not come late then."""
 
 OFF, DRIVING, CLOSED, ENDED = (f"status {s}, modes {[m] * 6}" for s, m in
                                ((0, 0), (5, 501), (5, 0), (0, 504)))  # fmt: skip
@@ -175,7 +177,7 @@ def wait_for(states: list[str], lines: Iterable[str]) -> None:
 )
 def test_a_foreign_program_goes_through_a_whole_session(controller, pc, mode):
     ours, theirs = session(
-        [*controller, "--intervals", "1", *SLOW_MACHINE],
+        [*controller, "--intervals", "1", *PATIENT],
         [*pc, "--exit-after", "500", "--sine-period", "250", "--amplitude", "0.3"],
     )
     story = theirs["story"]
@@ -196,7 +198,7 @@ def test_a_foreign_program_goes_through_a_whole_session(controller, pc, mode):
 
 def test_axes_open_one_after_the_other_as_asked():
     _, theirs = session(
-        ["--cycle", "2", "--stagger", "4", "--intervals", "1", *SLOW_MACHINE],
+        ["--cycle", "2", "--stagger", "4", "--intervals", "1", *PATIENT],
         ["--exit-after", "50"],
     )
     openings = [f"status 5, modes {[4] * k + [0] * (6 - k)}" for k in range(1, 7)]
@@ -205,7 +207,7 @@ def test_axes_open_one_after_the_other_as_asked():
 
 def test_505_switches_the_drive_off_and_targets_beside_it_are_ignored():
     ours, theirs = session(
-        ["--cycle", "2", *SLOW_MACHINE],
+        ["--cycle", "2", *PATIENT],
         ["--send-505", "40", "--exit-after", "0", "--wrong-targets"],
         until=[opened(), OFF],
     )
@@ -218,7 +220,7 @@ def test_505_switches_the_drive_off_and_targets_beside_it_are_ignored():
 
 def test_508_closes_the_axes_and_targets_beside_it_are_ignored():
     ours, theirs = session(
-        ["--cycle", "2", "--intervals", "1", *SLOW_MACHINE],
+        ["--cycle", "2", "--intervals", "1", *PATIENT],
         ["--send-508", "40", "--exit-after", "0", "--wrong-targets"],
     )
     story = theirs["story"]
@@ -233,7 +235,7 @@ def test_508_closes_the_axes_and_targets_beside_it_are_ignored():
 def test_missing_replies_end_open_mode(behaviour: str, after: str):
     ours, theirs = session(
         ["--cycle", "2", "--intervals", "1", "--missed", "30", "--while-silent", behaviour],
-        ["--miss", "60", "--miss-count", "30", "--exit-after", "0"],
+        ["--miss", "5", "--miss-count", "30", "--exit-after", "0"],
         until=[opened(), after],
     )  # fmt: skip
     story = theirs["story"]
@@ -247,7 +249,7 @@ def test_missing_replies_end_open_mode(behaviour: str, after: str):
 def test_the_controller_waits_for_a_program_that_starts_later():
     port = free_port()
     with hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{port}", "--cycle", "2",
-                 "--intervals", "1", *SLOW_MACHINE) as cabinet:  # fmt: skip
+                 "--intervals", "1", *PATIENT) as cabinet:  # fmt: skip
         for line in cabinet.stdout:
             if "starting" in line:
                 break
@@ -264,7 +266,7 @@ def test_a_signal_ends_the_session_properly_and_buttons_are_signals():
     with (
         running(*FOREIGN, "--port", port, "--send-505", "20", "--exit-after", "0") as program,
         hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{port}", "--cycle", "2",
-                *SLOW_MACHINE) as cabinet,
+                *PATIENT) as cabinet,
     ):  # fmt: skip
         assert program.stdout is not None
         wait_for([opened(), OFF], program.stdout)
@@ -315,7 +317,9 @@ def test_scripted_faults_strike_over_real_sockets():
 
 def test_in_own_motion_the_arm_moves_while_its_axes_are_closed():
     ours, theirs = session(
-        ["--cycle", "2", "--own-motion", "--own-speed", "1"], [], until=["more than one revolution"]
+        ["--cycle", "2", "--own-motion", "--own-speed", "1", *PATIENT],
+        [],
+        until=["more than one revolution"],
     )
     assert set(theirs["story"]) <= {"sync", "init", "sync after init", OFF, DRIVING, CLOSED, ENDED}
     assert theirs["travel"] > 1.0

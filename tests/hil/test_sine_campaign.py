@@ -222,7 +222,7 @@ def live_run(
     spec = ArchiveSpec(
         name, cell.joint_names, cell.period, {}, {"drive_train.json": b"{}"}, durable=False
     )
-    with loopback_link(local, options=("--patience", "0.5")) as link:
+    with loopback_link(local, options=("--patience", "2")) as link:
         where = link.connect(stop)
         wide = sines(cell, length=5.0)
         series = replace(wide, offset=where, amplitude=0.3 * wide.amplitude)
