@@ -21,7 +21,7 @@ from identification.errors import ModelError
 
 Array = NDArray[np.float64]
 
-# Of the motor's own joint: a wrist couples by a tenth at least, rounding of a file by much less.
+# Of what turns a motor most: a wrist couples by a tenth at least, rounding of a file by much less.
 _UNCOUPLED = 1e-9
 
 
@@ -46,8 +46,9 @@ class Coupling:
             raise ModelError(f"the coupling has shape {matrix.shape}; it must be square")
         if not np.all(np.isfinite(matrix)):
             raise ModelError("the coupling holds a number that is not finite")
-        if not np.all(np.diag(matrix)):
-            motor = int(np.argmin(np.abs(np.diag(matrix)))) + 1
+        own, most = np.abs(np.diag(matrix)), np.abs(matrix).max(axis=1, initial=0.0)
+        if np.any(own <= _UNCOUPLED * most):
+            motor = int(np.argmax(own <= _UNCOUPLED * most)) + 1
             raise ModelError(
                 f"motor {motor} of the coupling does not turn with joint {motor}: order motors so"
                 " that each stands in the row of the joint that it drives"

@@ -121,6 +121,7 @@ def test_uncoupled_motors_add_nothing() -> None:
         (np.ones((2, 3)), "square"),
         (np.full((2, 2), np.nan), "not finite"),
         (np.array([[0.0, 1.0], [1.0, 0.0]]), "motor 1 .* does not turn with joint 1"),
+        (np.array([[1.0, 0.0], [16.0, 1e-308]]), "motor 2 .* does not turn with joint 2"),
         (np.ones((2, 2)), "singular"),
     ],
 )
