@@ -37,17 +37,12 @@ from drivers.exchange import (
 )
 from drivers.exchange.serving import LONGEST_LINGER
 from drivers.transports import TransportError, UdpSpec, UdpTransport
+from hil.demo_link import free_port
 from tests.drivers.rig import PERIOD, START, Cruise, N, drive_train, limits, smooth_move, still
 from tests.drivers.udp_controller import HOST, UdpController
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 ORDINARY = RealTimeSettings(priority=0, lock_memory=False, hold_cpu_awake=False)
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((HOST, 0))
-        return probe.getsockname()[1]
 
 
 def settings(port: int, **changes) -> ExchangeSettings:

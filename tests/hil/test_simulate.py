@@ -27,6 +27,7 @@ from hil.cell.text import replaced_value
 from hil.cli import main
 from hil.cli.simulate import simulate
 from hil.cli.simulation_status import WORDS, Status
+from hil.demo_link import free_port
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
 from hil.serving import Buttons, open_far_end
@@ -47,13 +48,6 @@ OFF, DRIVING, CLOSED, ENDED = (f"status {s}, modes {[m] * 6}" for s, m in
 
 def opened(mode: int = 4) -> str:
     return f"status 5, modes {[mode] * 6}"
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def far_end_at(udp: str | None = None, can: str | None = None) -> Any:
