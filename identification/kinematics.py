@@ -147,8 +147,8 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
         raise ModelError(f"the robot description is no open chain: {closed}")
     for index in range(1, model.njoints):
         _require_direction(model, index)
-    _require_near(model)
     if not locked:
+        _require_near(model)
         return model
     posture = locked_posture(model, locked)
     # Joints and links may share names, which the reduction takes for one and the same.
@@ -158,6 +158,7 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
     reduced = pin.buildReducedModel(model, [model.getJointId(name) for name in locked], posture)
     for frame in reduced.frames:
         frame.name = frame.name.removeprefix(_LINK)
+    _require_near(reduced)
     return reduced
 
 

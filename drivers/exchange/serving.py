@@ -102,7 +102,7 @@ class Serving:
         # Of time in which the whole machine stood still nothing is to be concluded.
         self._supervisor = Pulse(lambda: control.supervisor_heartbeat or began, longest_look=POLL)
         self._archive = Pulse(lambda: control.archive_heartbeat, longest_look=POLL)
-        self._supervisor_silent = self._archive_silent = 0.0
+        self._archive_silent = 0.0
         self._closed_since = math.inf
         self._closed_first = math.inf
         self._open = False
@@ -140,7 +140,6 @@ class Serving:
     def _orders(self, now: float) -> None:
         control, session = self._control, self._session
         self._calls += 1
-        self._supervisor_silent = self._supervisor.quiet()
         self._archive_silent = self._archive.quiet()
         if self._calls % _SLOW_EVERY == 0 and self._inbox.hung_up():
             self._orphan("the supervisor closed its end")
@@ -169,9 +168,11 @@ class Serving:
             session.stop(self.reason)
 
     def _reasons_to_leave(self) -> None:
+        # Read after `program_id`, which the supervisor writes after a beat: this is never older.
+        silent = self._supervisor.quiet()
         if self._terminated:
             self._leave("the exchange process was told to terminate", ORPHAN_LINGER)
-        elif self._supervisor_silent > (STALE if self._session.requested else PATIENCE):
+        elif silent > (STALE if self._session.requested else PATIENCE):
             self._orphan(NO_SUPERVISOR)
         elif self._control.finish:
             self._leave("the supervisor wants to end", FINISH_LINGER)

@@ -25,6 +25,7 @@ from hil.archive.events import ArchivedEvent
 from hil.archive.messages import check_joints, decode_log, joint_state_of
 from hil.archive.order import Order
 from hil.archive.selection import Selection
+from hil.archive.standing import NUMBERS
 
 _NEEDED = ("kind", "joint_names", "attachments")
 _MOST_EXPECTED = 1 << 20  # samples that room is made for on the word of one chunk
@@ -173,13 +174,20 @@ class Content:
             raise Damage(offset, "(chunk) has channels of different length")
         if any(counts):
             self._wanted = self._wanted or wanted
-            if wanted != self._wanted:
-                raise Damage(offset, "(chunk) has samples in other channels than those before")
+            elsewhere = wanted != self._wanted
+        else:
+            elsewhere = self._selection.topics is None and not found.keys().isdisjoint(NUMBERS)
+        if elsewhere:
+            raise Damage(offset, "(chunk) has samples in other channels than those before")
         decoded = []
         for topic in wanted:
             if topic in found:
                 channel = self._channel(topic, found[topic], offset)
                 decoded.append((channel, channel.verified(found[topic], offset)))
+        if len(decoded) > 1:
+            times = [channel.stamps(messages) for channel, messages in decoded]
+            if not all(np.array_equal(one, times[0]) for one in times):
+                raise Damage(offset, "(chunk) has channels of different times")
         logs = found.get(schema.EVENTS) if self._selection.events else None
         events = self._decoded_events(logs, offset)
         for channel, messages in decoded:
@@ -289,6 +297,10 @@ class _Channel:
             begins = self._gapless and not self.read
             self._order.check_cycles(self._columns.stamps(data), offset, begins=begins)
         return data
+
+    def stamps(self, data: Bytes) -> NDArray[np.int64]:
+        """Time stamps of messages, shape (k,) [ns]."""
+        return self._columns.stamps(data)
 
     def append(self, data: Bytes, expected: int) -> None:
         """Append verified messages; `expected` is a guess at the final count."""

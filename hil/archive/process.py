@@ -318,8 +318,7 @@ class ArchiveProcess:
         recorder = job.recorder
         try:
             until = time.monotonic() + LONGEST_BEHIND
-            packets = self._packets is not None
-            while packets and recorder.lacks_packets and time.monotonic() < until:
+            while self._packets and recorder.lacks_packets and time.monotonic() < until:
                 time.sleep(BEHIND)
                 self._take_packets(job)
             recorder.close(outcome, reason)

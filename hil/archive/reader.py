@@ -24,6 +24,7 @@ from hil.archive.index import Summary
 from hil.archive.order import Contested, Order, Written
 from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, LATER_FIELDS, METADATA
 from hil.archive.selection import Selection
+from hil.archive.standing import NUMBERS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import opened
 
@@ -265,6 +266,8 @@ def _by_index(
     topics = {*selection.numbers(announced.topics)}
     if selection.events:
         topics.add(EVENTS)
+    if selection.topics is None:
+        topics.update(NUMBERS)  # a chunk that has others than those wanted is to be seen, too
     wanted = {channel.id for channel in announced.channels.values() if channel.topic in topics}
     start, stop = selection.times
     chunks = [chunk for chunk in summary.chunks if chunk.channels & wanted]

@@ -8,9 +8,7 @@ cycles are those that were written (`hil.archive.order`).
 from __future__ import annotations
 
 import os
-import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
@@ -22,15 +20,14 @@ from numpy.typing import NDArray
 from hil.archive import container, index, schema
 from hil.archive.announced import Announced
 from hil.archive.container import Damage, Record
-from hil.archive.index import IndexBuilder, MessageHead, Summary
+from hil.archive.index import IndexBuilder, Summary
+from hil.archive.inside import Inside
 from hil.archive.order import Contested, Order, Written
 from hil.archive.standing import NUMBERS, Fault, Piece, Survey, announced_attachments
 from hil.errors import ArchiveError
 from hil.reading import opened
 
 HEADER = index.record(container.HEADER, index.text(schema.PROFILE) + index.text(schema.LIBRARY))
-_STAMP = struct.Struct("<iI")  # s, ns
-_STAMP_AT = 4  # in the data of a message, behind its encapsulation
 _BETWEEN = (container.MESSAGE_INDEX, container.HEADER, container.DATA_END)
 
 
@@ -54,40 +51,6 @@ def survey(path: str | PathLike[str]) -> Survey:
                 return _Surveyor(stream, Survey(path, size), order).run()
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
-
-
-@dataclass
-class _Inside:
-    """What a chunk holds.
-
-    Attributes:
-        numbered: sequence numbers of its messages, by channel.
-        places: where their data begin, by channel.
-        announced: its other records.
-        stamps: log times of all messages [ns].
-    """
-
-    numbered: dict[int, list[int]] = field(default_factory=dict)
-    places: dict[int, list[int]] = field(default_factory=dict)
-    announced: list[Record] = field(default_factory=list)
-    stamps: list[int] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, data: bytes, offset: int) -> _Inside:
-        found = cls()
-        for item in index.messages(data, offset):
-            if isinstance(item, MessageHead):
-                found.numbered.setdefault(item.channel, []).append(item.sequence)
-                found.places.setdefault(item.channel, []).append(item.data)
-                found.stamps.append(item.log_time)
-            else:
-                found.announced.append(item)
-        return found
-
-    @property
-    def times(self) -> tuple[int, int]:
-        """First and last log time."""
-        return min(self.stamps, default=0), max(self.stamps, default=0)
 
 
 class _Surveyor:
@@ -230,13 +193,13 @@ class _Surveyor:
         data = container.chunk_data(record, decompressor=self._decompressor)
         head = container.chunk(record)
         self._order.check_chunk(head.crc, record.offset)
-        inside = _Inside.of(data, record.offset)
+        inside = Inside.of(data, record.offset)
         known = Announced(self._announced), self.survey.announced
         try:
             for item in inside.announced:
                 if item.opcode in (container.SCHEMA, container.CHANNEL):
                     self._announce(item.opcode, item.body, record.offset)
-            shift = self._continued(inside, data, record.offset)
+            shift = self._continued(inside, record.offset)
         except Damage:
             self._announced, self.survey.announced = known  # what it announces goes with it
             raise
@@ -249,7 +212,7 @@ class _Surveyor:
         self.survey.pieces[-1] = self.survey.pieces[-1]._replace(times=inside.times)
         self._lost_since = False
 
-    def _continued(self, inside: _Inside, data: bytes, offset: int) -> dict[int, int]:
+    def _continued(self, inside: Inside, offset: int) -> dict[int, int]:
         """Check that the messages of a chunk count on; by how much they are ahead, by channel."""
         numbered = inside.numbered
         self._recover_channels(numbered, offset)
@@ -272,7 +235,7 @@ class _Surveyor:
         if numbers and before and before != numbers.keys():
             raise Damage(offset, "(chunk) has samples in other channels than those before")
         gaps = {channel: numbered[channel][0] - self._next.get(channel, 0) for channel in numbered}
-        stamps = self._cycle_stamps(inside, data, offset)
+        stamps = self._cycle_stamps(inside, offset)
         if any(gaps.values()):
             self._gap(gaps, offset)
         if len(stamps):
@@ -285,17 +248,20 @@ class _Surveyor:
             self.survey.missing[topic] = missing
         return shift
 
-    def _cycle_stamps(self, inside: _Inside, data: bytes, offset: int) -> NDArray[np.int64]:
-        """The stamps of the cycles in a chunk, (k,) [ns], which follow those before."""
-        for channel, places in inside.places.items():
-            if self._announced.topic(channel) == schema.CYCLE:
-                if places[-1] + _STAMP_AT + _STAMP.size > len(data):
-                    raise Damage(offset, "(chunk) has messages without a stamp")
-                stamps = [_STAMP.unpack_from(data, at + _STAMP_AT) for at in places]
-                found = np.array([s * 10**9 + ns for s, ns in stamps], np.int64)
-                begins = inside.numbered[channel][0] == 0
-                self._order.check_cycles(found, offset, begins=begins)
-                return found
+    def _cycle_stamps(self, inside: Inside, offset: int) -> NDArray[np.int64]:
+        """The stamps of the cycles in a chunk, (k,) [ns], which follow those before.
+
+        Where there are no cycles, none; but then all channels must have the same.
+        """
+        channels = {self._announced.topic(channel): channel for channel in inside.places}
+        if schema.CYCLE in channels:
+            channel = channels[schema.CYCLE]
+            found = inside.stamps(channel)
+            self._order.check_cycles(found, offset, begins=inside.numbered[channel][0] == 0)
+            return found
+        stamps = [inside.stamps(channels[topic]) for topic in NUMBERS if topic in channels]
+        if not all(np.array_equal(one, stamps[0]) for one in stamps):
+            raise Damage(offset, "(chunk) has channels of different times")
         return np.zeros(0, np.int64)
 
     def _standing(self, channel: int) -> int:

@@ -35,6 +35,7 @@ class Told:
 
     requested = False
     interval = -1
+    init = None
 
     def __init__(self):
         self.state = State.CLOSED
@@ -49,6 +50,10 @@ class Told:
 
     def stop(self, reason):
         self.asked.append("stop")
+
+    def request(self, source):
+        self.requested = True
+        self.asked.append(source)
 
     def hold(self):
         if not self.requested:
@@ -189,6 +194,28 @@ class TestASilentSupervisor:
         bench.session.requested = True
         bench.serving()
         assert bench.session.asked == ["stop"]
+
+    def test_ends_with_the_beat_that_comes_with_its_consent(self, bench, monkeypatch):
+        """Which may come between any two looks of one call."""
+        offered, consent = object(), bench.serving._archive.quiet
+        bench.step()
+        bench.serving._offered = offered
+        bench.serving._inbox.taken = bench.control.program_offered = 1
+        monkeypatch.setattr(bench.serving._inbox, "answer", lambda refusal: None)
+        for _ in range(round(2.0 * STALE / STEP)):
+            bench.clock.time += STEP
+            bench.serving()
+
+        def consents():
+            bench.control.supervisor_heartbeat = bench.clock.time
+            bench.control.program_id = 1
+            return consent()
+
+        monkeypatch.setattr(bench.serving._archive, "quiet", consents)
+        bench.clock.time += STEP
+        bench.serving()
+        assert bench.session.asked == [offered]
+        assert not bench.serving.reason
 
     def test_is_not_concluded_from_time_in_which_this_process_stood_still_itself(self, bench):
         bench.session.requested = True

@@ -247,6 +247,13 @@ def test_a_joint_farther_away_than_any_robot_reaches_is_refused(kind: str) -> No
         chain_from_urdf(sound.replace(joint, joint + FAR))
 
 
+def test_a_joint_is_locked_no_farther_away_than_any_robot_reaches() -> None:
+    sound = chain(1, "prismatic")
+    chain_from_urdf(sound, {"j_l0": 1.0})
+    with pytest.raises(ModelError, match=AWAY):
+        chain_from_urdf(sound, {"j_l0": 1e200})
+
+
 PIPE = '<collision><geometry><{0} radius="0.1" length="1"/></geometry></collision>'
 
 

@@ -11,7 +11,9 @@ import struct
 import tracemalloc
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import pytest
 import zstandard
 from typer.testing import CliRunner
@@ -22,16 +24,20 @@ from hil.archive.cdr import LayoutError, fixed_layout
 from hil.archive.check import check_archive
 from hil.archive.container import Record
 from hil.archive.description import Description, DescriptionError
+from hil.archive.file_writer import ArchiveFile
 from hil.archive.index import IndexBuilder
 from hil.archive.order import listed
 from hil.archive.overview import overview
 from hil.archive.repair import repair
+from hil.archive.schema import SampleEncoder
+from hil.archive.writer import checked_metadata
 from hil.cli import app
 from hil.errors import ArchiveError
 from hil.identify.sources import cell_of, gather_sources
 
 MEMORY = 60_000_000  # bytes; the small archive needs one million
 NAME = "validation_003_a1.mcap"
+IMPORTED = "imported.mcap"
 READERS: dict[str, Callable[[Path], object]] = {
     "open_archive": open_archive,
     "a range": lambda path: open_archive(path, start=50.0, stop=50.2),
@@ -110,6 +116,12 @@ def stranger(
             made.put(record.opcode, record.body)
     path.write_bytes(made.written())
     return path
+
+
+def in_turn(*changes: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """A change for each of the first chunks, none of the others."""
+    left = iter(changes)
+    return lambda chunk: next(left, bytes)(chunk)
 
 
 def attachment(name: str, content: bytes) -> bytes:
@@ -339,8 +351,7 @@ class TestAnnouncements:
         written, folder: Path, changes: list[Callable[[bytes], bytes]], why: str, *, repaired: int
     ) -> None:
         """Nothing behind the first chunk counts, and no column is longer than another."""
-        left = iter(changes)
-        path = stranger(written, folder / NAME, chunk=lambda chunk: next(left, bytes)(chunk))
+        path = stranger(written, folder / NAME, chunk=in_turn(*changes))
         archive = open_archive(path)
         assert why in str(archive.damage)
         assert {len(column) for column in archive.columns.values()} == {10}
@@ -351,6 +362,70 @@ class TestAnnouncements:
         mended = open_archive(done.output)
         assert mended.damage is None
         assert {len(column) for column in mended.columns.values()} == {repaired}
+
+
+@pytest.fixture
+def imported(tmp_path) -> Imported:
+    """An imported recording of 60 samples in three chunks: joints and currents, no cycles."""
+    path = tmp_path / IMPORTED
+    encoder = SampleEncoder(["a", "b"], velocity=False, torque=False, motor_current=True)
+    entries = checked_metadata(path, {"kind": "imported"}, {"joint_names": ["a", "b"]})
+    file = ArchiveFile(
+        path, channels=encoder.channels, metadata=entries, attachments={}, durable=False
+    )
+    for start in range(0, 60, 20):
+        stamps = np.arange(start, start + 20, dtype=np.int64) * 10**9
+        values = np.arange(2.0 * start, 2.0 * start + 40).reshape(20, 2)
+        file.add(encoder.encode(stamps, values, None, None, -values))
+        file.flush()
+    file.finish({"outcome": "completed", "reason": "", "samples": "60", "events": "0"})
+    with path.open("rb") as stream:
+        return Imported([*container.records(stream, path.stat().st_size)])
+
+
+class Imported(NamedTuple):
+    records: list[Record]
+
+
+class TestImported:
+    """Two channels make the samples: each at the time of the other, or not at all."""
+
+    def test_as_it_was(self, imported, tmp_path):
+        path = stranger(imported, tmp_path / IMPORTED)
+        assert check_archive(path).keeps
+        assert open_archive(path).n_samples == 60
+
+    def test_currents_of_other_times_than_the_positions(self, imported, tmp_path):
+        change = in_turn(bytes, self.later_currents)
+        path = stranger(imported, tmp_path / IMPORTED, chunk=change)
+        assert "channels of different times" in str(open_archive(path).damage)
+        self.assert_equally_long(path, 20)
+
+    def test_cycles_that_are_announced_and_never_come(self, imported, tmp_path):
+        change = in_turn(bytes, lambda chunk: channel(ELSEWHERE, schema.CYCLE) + chunk)
+        outcome = {"samples": "20"}
+        path = stranger(imported, tmp_path / IMPORTED, chunk=change, outcome=outcome)
+        assert "other channels than those before" in str(open_archive(path).damage)
+        self.assert_equally_long(path, 20)
+
+    @staticmethod
+    def later_currents(chunk: bytes) -> bytes:
+        """A chunk whose currents are half a second later, their log times with them."""
+        changed = bytearray(chunk)
+        for message in index.messages(chunk, 0):
+            if isinstance(message, index.MessageHead) and message.channel == 2:
+                time = message.log_time + 5 * 10**8
+                struct.pack_into("<QQ", changed, message.start + 15, time, time)
+                struct.pack_into("<iI", changed, message.data + 4, *divmod(time, 10**9))
+        return bytes(changed)
+
+    @staticmethod
+    def assert_equally_long(path: Path, sound: int) -> None:
+        """What is read, whole or in part, is of one length, and no more than what is sound."""
+        for part in (open_archive(path), open_archive(path, start=0.0, stop=1e3)):
+            assert {len(column) for column in part.columns.values()} == {sound}
+            assert part.damage is not None
+        assert not check_archive(path).keeps
 
 
 class TestNames:
