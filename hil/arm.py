@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -11,7 +12,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from identification.excitation.collision.bodies import described_shapes
 from identification.excitation.collision.poses import joint_poses
@@ -41,8 +42,13 @@ class Solid:
 
     @cached_property
     def faces(self) -> NDArray[np.intp]:
-        """Triangles of the surface as indices of corners (f, 3), anticlockwise from outside."""
-        hull = ConvexHull(self.vertices)
+        """Triangles of the surface as indices of corners (f, 3), anticlockwise from outside.
+
+        Of a flat body those of both its sides; of fewer than four corners none.
+        """
+        hull = _hull(self.vertices)
+        if hull is None:
+            return np.zeros((0, 3), dtype=np.intp)
         a, b, c = (self.vertices[hull.simplices[:, k]] for k in range(3))
         turn = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3])
         faces: NDArray[np.intp] = hull.simplices.astype(np.intp)
@@ -140,6 +146,13 @@ def _described(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> tupl
     return tuple(solids)
 
 
+def _hull(points: Array) -> ConvexHull | None:
+    for options in ("Qt", "QJ"):  # the second moves points a little, so that a plate is a body
+        with suppress(QhullError):
+            return ConvexHull(points, qhull_options=options)
+    return None
+
+
 def surface_points(shape: coal.CollisionGeometry) -> Array | None:
     """Return points (v, 3) whose convex hull is the shape (for round ones: close to it) [m]."""
     if isinstance(shape, coal.Box):
@@ -194,7 +207,7 @@ def _tip(model: pin.Model, solids: Sequence[Solid]) -> Array:
         return np.array(model.inertias[last].lever, dtype=np.float64)
     cloud = np.concatenate(corners)
     reach = np.linalg.norm(cloud, axis=1)
-    return np.asarray(cloud[reach > 0.98 * reach.max()].mean(axis=0), dtype=np.float64)
+    return np.asarray(cloud[reach >= 0.98 * reach.max()].mean(axis=0), dtype=np.float64)
 
 
 def _sticks(chain: Chain, tip: Array) -> tuple[Solid, ...]:
