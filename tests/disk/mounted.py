@@ -113,6 +113,11 @@ class PlantedDisk:
     def root(self) -> Path:
         return self._root
 
+    @property
+    def struck(self) -> list[str]:
+        """What was refused since the rules came."""
+        return self._faults.struck
+
     def do_wrong(self, *rules: Rule) -> list[str]:
         struck = self._faults.struck
         self._faults.set(rules)

@@ -79,7 +79,9 @@ def test_times_that_cannot_be_written_are_told_when_the_stage_ends(
     before = (disk.root / TIMES).read_text()
     disk.do_wrong(Rule((SYNC,), error="EDQUOT"))
     with pytest.raises(OutputError, match=rf"{TIMES} {TOLD}"), stages.stage("plans"):
-        time.sleep(0.05)
+        until = time.monotonic() + 10.0
+        while not disk.struck and time.monotonic() < until:
+            time.sleep(0.005)
     assert len(disk.do_wrong()) > 1, "the thread was refused and went on"
     assert (disk.root / TIMES).read_text() == before
     with stages.stage("campaigns"):

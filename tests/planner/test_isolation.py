@@ -207,9 +207,9 @@ def test_a_process_that_cannot_start_is_not_the_fault_of_what_it_was_to_plan(
 
 
 def test_a_call_that_takes_too_long_is_ended():
-    with PlanningChild(timeout=0.3) as child:
+    with PlanningChild(timeout=2.0) as child:
         pid = child.call(os.getpid)
-        with pytest.raises(PlanningTimedOut, match=r"0\.3 s"):
+        with pytest.raises(PlanningTimedOut, match="2 s"):
             child.call(time.sleep, 60.0)
         assert gone(pid, 5.0)
         assert child.call(abs, -1) == 1
