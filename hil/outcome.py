@@ -62,7 +62,16 @@ def rewrite_report(folder: Path) -> Results:
         OutputError: the folder cannot be written to.
     """
     results = Results.load(folder / RESULTS)
-    page = report_bytes(results, _load_series(folder / SERIES, len(results.joint_names)))
+    series = _load_series(folder / SERIES, len(results.joint_names))
+    try:
+        page = report_bytes(results, series)
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        # What was written by us can be drawn; what somebody wrote has lists of any length.
+        raise InputError(
+            folder / RESULTS,
+            f"holds what no page can be drawn from ({error})",
+            remedy="identify again from the archives (`hil identify`)",
+        ) from error
     write_together(folder, {REPORT: page})
     return results
 

@@ -10,7 +10,7 @@ import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_type_hints
 
 from hil.archive import Archive, ArchiveName, open_archive
 from hil.whole_number import whole_number
@@ -68,6 +68,9 @@ class Facts(NamedTuple):
     when: str
 
 
+_KINDS = get_type_hints(Facts)
+
+
 class Examined(NamedTuple):
     """What an archive is, and of which state of its file that was told."""
 
@@ -89,6 +92,8 @@ def noted(place: Place, where: Where) -> Examined | None:
         return None
     facts = note.get("facts")
     if not isinstance(facts, dict) or facts.keys() != set(Facts._fields):
+        return None
+    if any(type(facts[name]) is not kind for name, kind in _KINDS.items()):
         return None
     return Examined(Facts(**facts), stamp)
 

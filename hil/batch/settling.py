@@ -54,6 +54,8 @@ def consulted(refs: Sequence[ArchiveRef]) -> tuple[ArchiveRef, ...]:
 
 def known_settings(refs: Sequence[ArchiveRef], choices: Choices, where: Where) -> Settings | None:
     """What was settled from these archives (see `consulted`) before; None if nothing."""
+    if not refs:
+        return None
     found = where.store(refs[0].location).get(choices_digest(choices, refs))
     return None if found is None else settings_from(found.header)
 

@@ -178,7 +178,11 @@ class Work:
             self._settle(asked)
             for one in asked:
                 if one.settings is None and len(one.refs) == left[id(one)]:
-                    one.reason = one.reason or "none of its archives says how it is to be read"
+                    one.reason = one.reason or (
+                        "none of its archives says how it is to be read"
+                        if consulted(one.refs)
+                        else "it holds no excitation"
+                    )
 
     def _settle(self, campaigns: Sequence[Campaign]) -> None:
         tasks = [

@@ -12,6 +12,7 @@ from typing import BinaryIO, cast
 
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically
+from hil.reading import opened
 
 from .result import RESULT
 from .settings import DesignSettings, SettingsError, load_settings
@@ -125,7 +126,7 @@ class DesignFolder:
     def _begun(self) -> bool:
         """Return whether the settings in the folder are those of a design, not a person's own."""
         try:
-            with self.settings.open("rb") as file:
+            with opened(self.settings) as file:
                 return file.read(len(_HEAD)) == _HEAD.encode()
         except OSError:
             return False
@@ -139,6 +140,8 @@ class DesignFolder:
         """
         with self._written():
             # Without a buffer nothing is left that closing the file would fail to write.
+            if self.journal.exists():
+                opened(self.journal).close()  # which refuses what is no file
             file = self.journal.open("r+b" if self.journal.exists() else "x+b", buffering=0)
         with file:
             yield cast(BinaryIO, file)

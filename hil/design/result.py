@@ -210,6 +210,7 @@ class DesignResult:
                 raise ValueError(f"version is {data.get('version')!r:.60}, this reads {VERSION}")
             seal = data.pop("seal")
             digest, motion = seal["sha256"], seal["motion_sha256"]
+            positions = np.array(seal["positions"], dtype=np.float64)
             if digest != _seal(text):
                 raise InputError(
                     path, "was changed after it was written", remedy=f"restore it, or {_REMEDY}"
@@ -224,7 +225,7 @@ class DesignResult:
                 path, f"is not a designed excitation ({error})", remedy=_REMEDY
             ) from error
         if motion_digest(result.excitation.trajectory) != motion:
-            result._require_alike(path, np.array(seal["positions"], dtype=np.float64))
+            result._require_alike(path, positions)
         return result
 
     def require_cell(self, cell: Cell, path: Path) -> None:

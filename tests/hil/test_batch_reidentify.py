@@ -278,6 +278,21 @@ def test_entries_that_are_whole_and_hold_something_else_count_as_absent(folder: 
         assert same_bits(whole, batch(folder))
 
 
+def test_notes_that_hold_something_else_count_as_absent(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.batch.examining._SETTLED", 0)  # else nothing is noted of files so new
+    whole = batch(folder)
+    notes = list((folder / "archives" / ".hil-cache").glob("*.mcap.json"))
+    assert len(notes) > 5
+    before = {note: json.loads(note.read_text()) for note in notes}
+    for key in ("kind", "number", "attempt", "simulated", "arm", "when", "motion"):
+        for value in (None, 1.5, {}, "x" if key in ("number", "attempt") else 3):
+            for note, entry in before.items():
+                note.write_text(json.dumps(entry | {"facts": entry["facts"] | {key: value}}))
+            assert same_bits(whole, batch(folder))
+
+
 def test_a_read_only_folder_is_kept_elsewhere(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -394,6 +409,19 @@ def test_nothing_to_fit_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "worse.mcap").write_bytes(b"x")
     with pytest.raises(NothingToFitError, match=r"2 could not be used, the first of them \S+bad"):
         batch(tmp_path)
+
+
+def test_a_campaign_of_validation_alone_costs_only_itself(folder: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    shutil.copy(folder / "archives" / "validation_000_a1.mcap", alone)
+    with pytest.raises(NothingToFitError, match="alone could not be used: it holds no excitation"):
+        batch(alone)
+    found = batch(alone, folder)
+    assert len(found.campaigns) == 1
+    assert [(broken.path, broken.reason) for broken in found.broken] == [
+        (str(alone), "it holds no excitation")
+    ]
 
 
 # The command

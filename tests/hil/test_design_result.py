@@ -194,6 +194,11 @@ def test_another_planner_may_differ_in_the_last_digits_and_no_more(made, text, t
     elsewhere = re.sub(r"(positions_deg = \[\[)[^,]+", r"\g<1>45.0", other)
     with pytest.raises(InputError, match="do not plan to the motion that was designed"):
         load_design(written(tmp_path, elsewhere))
+    for nothing in ('"x"', "{ a = 1 }", "2026-11-21", "[[1.0], [2.0, 3.0]]"):
+        odd = re.sub(r"positions_deg = \[\[.*\]\]", f"positions = {nothing}", other, flags=re.S)
+        assert odd != other
+        with pytest.raises(InputError, match="is not a designed excitation"):
+            load_design(written(tmp_path, odd))
 
 
 def test_a_cell_with_other_limits_is_refused_by_name(made, cell):

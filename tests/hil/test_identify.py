@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from hil.campaign import Campaign
 from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Identification, Options, identify_archives, identify_campaign
 from hil.importers import Robot
-from hil.outcome import write_outcome
+from hil.outcome import rewrite_report, write_outcome
 from hil.progress import Silent
 from hil.results import Results
 from sim_fixtures.ns16 import URDF_PATH
@@ -92,6 +93,18 @@ def test_the_outcome_is_all_of_one_generation_or_untouched(
         write_outcome(tmp_path, other, Silent())
     del first["report.html"]
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == first
+
+
+def test_results_that_no_page_can_be_drawn_from_are_named(
+    found: Identification, tmp_path: Path
+) -> None:
+    write_outcome(tmp_path, found, Silent())
+    results = tmp_path / "results.json"
+    content = json.loads(results.read_text())
+    content["judgement"]["effective_rows"].pop()
+    results.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"results\.json: holds what no page can be drawn from"):
+        rewrite_report(tmp_path)
 
 
 def test_results_survive_their_file(found: Identification, tmp_path: Path) -> None:
