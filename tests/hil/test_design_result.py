@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 
 import numpy as np
@@ -267,3 +268,15 @@ def test_an_unpolished_one_grew_from_nothing(made, text):
     assert DesignResult.load(made[0].result).polished_from is None
     assert "polished_from" not in text
     assert "chosen, counting from 0, is the motion of this file" in text
+
+
+def test_what_is_no_file_in_a_folder_is_neither_waited_for_nor_read(tmp_path):
+    folder = DesignFolder(tmp_path)
+    os.mkfifo(folder.settings)
+    with pytest.raises(InputError, match="holds no design to go on with"):
+        folder.interrupted()
+    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
+        make(folder.journal)
+        with pytest.raises(InputError, match="cannot be written to"), folder.opened_journal():
+            pass
+        folder.journal.unlink()
