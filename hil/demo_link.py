@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import itertools
-import os
 import signal
 import subprocess
 import sys
@@ -29,8 +26,6 @@ LOOPBACK = "127.0.0.1"
 CAN = CanTable(interface="udp_multicast", channel="239.74.163.31")
 """A CAN bus within this computer: python-can's, without an adapter."""
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
-_PORTS = range(30_000, 32_768)
-_next_port = itertools.count(int.from_bytes(os.urandom(4)))  # another begin in each process
 END_TIMEOUT = 20.0
 """s a simulated controller may take to end its session."""
 
@@ -126,14 +121,8 @@ def loopback_link(
 
 
 def free_port() -> int:
-    """A UDP port of the loopback device that nobody uses now, and the system gives to nobody.
-
-    Raises:
-        OSError: none is free.
-    """
-    for _ in range(len(_PORTS)):
-        port = _PORTS[next(_next_port) % len(_PORTS)]
-        with socket(AF_INET, SOCK_DGRAM) as probe, contextlib.suppress(OSError):
-            probe.bind((LOOPBACK, port))
-            return port
-    raise OSError(errno.EADDRINUSE, f"no UDP port of {_PORTS[0]} to {_PORTS[-1]} is free")
+    """A UDP port of the loopback device that nobody uses now."""
+    with socket(AF_INET, SOCK_DGRAM) as probe:
+        probe.bind((LOOPBACK, 0))
+        port: int = probe.getsockname()[1]
+    return port
