@@ -75,6 +75,15 @@ def text(value: Any) -> str:
     return value
 
 
+def texts(value: Any) -> tuple[str, ...]:
+    """Return a list of texts.
+
+    Raises:
+        TypeError: it is none.
+    """
+    return tuple(text(one) for one in rows(value))
+
+
 def table(value: Any) -> Mapping[str, Any]:
     """Return named values.
 

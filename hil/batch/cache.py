@@ -63,7 +63,7 @@ class Where:
 
     Attributes:
         root: of all that is kept; None: beside each archive, and below the user's own cache folder
-            where that cannot be written to.
+            where that cannot be written to or something else has its name.
     """
 
     root: str | None = None
@@ -73,7 +73,9 @@ class Where:
         folder = location.rsplit("/", 1)[0] if "/" in location else "."
         if self.root is None and "://" not in location:
             beside = Path(folder) / BESIDE
-            if os.access(beside if beside.is_dir() else folder, os.W_OK | os.X_OK):
+            there = os.path.lexists(beside)
+            usable = beside.is_dir() or not there
+            if usable and os.access(beside if there else folder, os.W_OK | os.X_OK):
                 return Store(beside)
         root = Path(self.root) if self.root is not None else _users_own()
         name = folder if "://" in location else _resolved(folder)

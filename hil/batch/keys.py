@@ -25,7 +25,7 @@ _PROGRAMS: Final = (
     (identification, ("*.py",)),
     (hil, ("recordings.py", "archive/*.py", "cell/*.py", "identify/sources.py")),
     (hil, ("importers/findings.py",)),
-    (hil, ("batch/examining.py", "batch/factors.py", "batch/settling.py", "batch/keeping.py")),
+    (hil, ("batch/examining.py", "batch/factors.py", "batch/settling.py", "batch/kept_forms.py")),
     (hil, ("batch/keys.py", "batch/setup.py")),
 )
 _LIBRARIES: Final = ("numpy", "scipy", "pin")

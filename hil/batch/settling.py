@@ -18,7 +18,7 @@ from identification.torque_channel import find_torque_bandwidth
 
 from .cache import Where
 from .factors import cell_in, opened, preprocessing
-from .keeping import settings_from, settings_header
+from .kept_forms import settings_from, settings_header
 from .keys import choices_digest, code_digest
 from .setup import stated_delay
 from .types import ArchiveRef, Broken, Choices, Settings

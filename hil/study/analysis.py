@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from hil.archive import Archive, foreign_json, open_archive
 from hil.campaign import CampaignFolder
 from hil.campaign.plan import moves_from_dict
-from hil.errors import InputError
+from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
-from planner import FlyDistance, FlyPercent
+from planner import FlyDistance, FlyPercent, InvalidPlanFile
 from planner.commands import Fly
 
 from .motions import CLASSES, MotionClass
@@ -169,8 +169,8 @@ def classes_of(run: Run) -> dict[MotionClass, list[str]]:
     found: dict[MotionClass, list[str]] = {}
     folder = CampaignFolder(run.root)
     for name, _ in run.archives("validation"):
-        plan = plan_in(open_archive(folder.archives / name))
-        found.setdefault(class_of(plan), []).append(name)
+        motion_class = class_in(open_archive(folder.archives / name))
+        found.setdefault(motion_class, []).append(name)
     return found
 
 
@@ -180,10 +180,25 @@ def plan_in(archive: Archive) -> dict[str, Any]:
     return plan if isinstance(plan, dict) else {}
 
 
+def class_in(archive: Archive) -> MotionClass:
+    """Class of the planned motion in an archive.
+
+    Raises:
+        ArchiveError: its plan is not what it should be.
+    """
+    try:
+        return class_of(plan_in(archive))
+    except InvalidPlanFile as error:
+        raise ArchiveError(archive.path, f"its plan cannot be read: {error}") from error
+
+
 def class_of(plan: Mapping[str, Any]) -> MotionClass:
     """Class of a planned motion: what an archive's `plan.json` says of it.
 
     A motion in pieces whose moves were not kept is taken for fly-by, the interpolator's own way.
+
+    Raises:
+        InvalidPlanFile: the moves that it lists are none.
     """
     trajectory = plan.get("trajectory")
     if isinstance(trajectory, dict) and trajectory.get("type") == "fourier_series":

@@ -10,9 +10,11 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from hil.results.frozen import Frozen
 from identification import RobotModel
@@ -35,6 +37,21 @@ class MotionForm(Frozen):
     """Of the low-passed [Phi | tau] of each joint, in these columns: packed lower triangles."""
     whole: str
     """Of Phi as it is, all joints together (p, p)."""
+
+    @property
+    def whole_size(self) -> int:
+        """Number p of parameters."""
+        return len(unpacked(self.whole))
+
+    @model_validator(mode="after")
+    def _of_one_model(self) -> Self:
+        if not len(self.torque_squared) == len(self.columns) == len(self.slow) > 0:
+            raise ValueError("torque_squared, columns and slow have one entry for each joint")
+        parameters = range(self.whole_size)
+        for used, text in zip(self.columns, self.slow, strict=True):
+            if not set(used) <= set(parameters) or len(unpacked(text)) != len(used) + 1:
+                raise ValueError("columns that are none of the parameters")
+        return self
 
 
 def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:
@@ -131,8 +148,12 @@ def packed(gram: Array) -> str:
 
 
 def unpacked(text: str) -> Array:
-    """Return the symmetric matrix of which `packed` made a text."""
-    triangle = np.frombuffer(base64.b64decode(text), dtype="<f8")
+    """Return the symmetric matrix of which `packed` made a text.
+
+    Raises:
+        ValueError: it is the text of something else.
+    """
+    triangle = np.frombuffer(base64.b64decode(text, validate=True), dtype="<f8")
     size = round((np.sqrt(8.0 * len(triangle) + 1.0) - 1.0) / 2.0)
     gram = np.zeros((size, size))
     gram[np.tril_indices(size)] = triangle

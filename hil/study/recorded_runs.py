@@ -22,7 +22,7 @@ from hil.identify.sources import cell_of
 from hil.identify.summary import planted_in
 from identification.excitation import Excitation
 
-from .analysis import Run, class_of, plan_in
+from .analysis import Run, class_in, plan_in
 from .designs import AP, B0, A, B
 from .records import PLANTED
 
@@ -135,7 +135,7 @@ def _method(archive: Archive) -> str:
     excitation = _excitation(archive)
     if excitation is None or excitation.method not in (A, B):
         return ""
-    stops = excitation.method == B and class_of(plan_in(archive)) == "stop-to-stop"
+    stops = excitation.method == B and class_in(archive) == "stop-to-stop"
     return B0 if stops else excitation.method
 
 

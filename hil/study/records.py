@@ -6,7 +6,9 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, Self, TypeVar
+
+from pydantic import Field, model_validator
 
 from hil.files import make_folder, write_or_tell
 from hil.reading import text_of
@@ -19,6 +21,9 @@ VERSION = 2
 
 PLANTED: Final = "planted"
 """Name of the planted parameters among the estimates."""
+
+
+Count = Annotated[int, Field(ge=0, lt=2**53)]
 
 
 class Record(Frozen):
@@ -39,7 +44,7 @@ class FitRecord(Record):
     noise_std: list[float]
     log10_det: float
     coupling_index: float
-    n_samples: int
+    n_samples: Count
     """Of one repetition, as it was executed."""
     correlation: list[list[float]]
     duration: float
@@ -47,6 +52,17 @@ class FitRecord(Record):
     position: list[list[float]]
     """Joint by joint, of the first repetition."""
     velocity: list[list[float]]
+
+    @model_validator(mode="after")
+    def _of_one_model(self) -> Self:
+        p, n = len(self.pooled), len(self.noise_std)
+        _require(p > 0 and n > 0 and len(self.repetitions) > 0, "pooled, noise_std, repetitions")
+        _require(_shaped(self.values, len(self.repetitions), p), "values")
+        _require(len(self.pooled_std) == p, "pooled_std")
+        _require(_shaped(self.correlation, p, p), "correlation")
+        _require(_shaped(self.position, n, len(self.time)), "position")
+        _require(_shaped(self.velocity, n, len(self.time)), "velocity")
+        return self
 
 
 class MotionScore(Frozen):
@@ -70,6 +86,11 @@ class MotionScore(Frozen):
     mean_abs: list[float]
     mean: list[float]
 
+    @model_validator(mode="after")
+    def _of_one_arm(self) -> Self:
+        _require(len(self.relative) == len(self.mean_abs) == len(self.mean) > 0, "mean")
+        return self
+
 
 class ExampleRecord(Frozen):
     """One motion in time, low-passed for the eye; lists are joint by joint."""
@@ -79,19 +100,39 @@ class ExampleRecord(Frozen):
     measured: list[list[float]]
     predicted: dict[str, list[list[float]]]
 
+    @model_validator(mode="after")
+    def _of_one_motion(self) -> Self:
+        for name, joints in {"measured": self.measured, **self.predicted}.items():
+            _require(_shaped(joints, len(self.measured), len(self.time)), name)
+        return self
+
 
 class ScoreRecord(Record):
     """How well several estimates predict the motions of one class."""
 
     durations: list[float]
-    samples: list[int]
+    samples: list[Count]
     """Of each motion, from the first to the last at which a joint moves."""
-    left_out: list[list[int]]
+    left_out: list[list[Count]]
     """How many of them the errors leave out, each per joint: at rest, near ends, at reversals."""
     forms: list[MotionForm]
     """Of each motion: the error of any other estimate."""
     scores: dict[str, list[MotionScore]]
     examples: list[ExampleRecord]
+
+    @model_validator(mode="after")
+    def _of_the_same_motions(self) -> Self:
+        motions = len(self.durations)
+        _require(motions == len(self.samples) == len(self.forms) > 0, "samples, forms")
+        n = len(self.forms[0].columns)
+        _require(all(len(one.columns) == n for one in self.forms), "forms")
+        _require(len({one.whole_size for one in self.forms}) == 1, "forms")
+        _require(_shaped(self.left_out, motions, n), "left_out")
+        for name, scores in self.scores.items():
+            each = [one.relative for one in scores]
+            _require(_shaped(each, motions, n), f"scores of {name}")
+        _require(all(len(one.measured) == n for one in self.examples), "examples")
+        return self
 
 
 R = TypeVar("R", bound=Record)
@@ -125,3 +166,13 @@ def read_or_make(path: Path, kind: type[R], inputs: str, make: Callable[[], R]) 
         record = make()
         keep(path, record)
     return record
+
+
+def _shaped(rows: Sequence[Sequence[Any]], count: int, length: int) -> bool:
+    """Whether there are so many rows of one length."""
+    return len(rows) == count and all(len(row) == length for row in rows)
+
+
+def _require(fits: bool, field: str) -> None:
+    if not fits:
+        raise ValueError(f"{field}: lengths that do not belong together")

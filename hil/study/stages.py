@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import psutil
 from pydantic import Field
@@ -22,11 +22,14 @@ _EVERY: Final = 10.0
 """s between two writings: what a kill may cost."""
 
 
+Seconds = Annotated[float, Field(ge=0.0, le=1e9)]
+
+
 class Times(Frozen):
     """s by stage, over all sessions."""
 
-    wall: dict[str, float] = Field(default_factory=dict)
-    processor: dict[str, float] = Field(default_factory=dict)
+    wall: dict[str, Seconds] = Field(default_factory=dict)
+    processor: dict[str, Seconds] = Field(default_factory=dict)
     """Of this process and its children."""
     whole: bool = True
     """False for a study that was begun before times were kept."""

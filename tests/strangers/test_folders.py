@@ -25,7 +25,6 @@ from typer.testing import CliRunner
 from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.container import MAGIC
-from hil.batch.cache import Store, decoded, encoded
 from hil.campaign import Campaign, CampaignFolderError
 from hil.campaign.dry_run import DryRun
 from hil.campaign.folder import CampaignFolder
@@ -329,29 +328,6 @@ def test_the_series_of_a_report_are_numbers_and_not_too_many(
         with pytest.raises(InputError, match="does not hold the series of a report"):
             rewrite_report(folder)
     assert not trace.exists()
-
-
-KEY = "ab" * 32
-
-
-FORGED: tuple[object, ...] = (
-    *([["a", "|O", [1]]], [["a", "<f8", [1 << 40]]], [["a", "?!", []]], [["a", "<f8", [-1]]]),
-    *([["a", "<f8", [1 << 62, 4]]], [[]], 3, [["a", 7, {}]]),
-)
-
-
-@pytest.mark.parametrize("arrays", FORGED)
-def test_a_kept_sum_that_somebody_forged_badly_counts_as_absent(
-    arrays: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dumps = json.dumps
-    monkeypatch.setattr(
-        "hil.batch.cache.json.dumps", lambda found: dumps(found | {"arrays": arrays})
-    )
-    assert decoded(encoded(KEY, {}, {}), KEY) is None
-    store = Store(tmp_path)
-    store.put(KEY, {}, {})
-    assert store.get(KEY) is None
 
 
 @pytest.mark.parametrize("thing", ["a pipe", "a device", DEEP])

@@ -38,6 +38,9 @@ _NAMELESS: Final = "this journal does not say which search it belongs to"
 _FRAME: Final = struct.Struct("<QI")
 # What the content of a generation's frame begins with, by which frames are found behind damage.
 _ARRAY: Final = b"\x93NUMPY"
+# How many times the length of the file is summed up in vain, at most, to find records behind
+# damage. Damage costs one or none; a forged file could ask for the sum of its rest at every place.
+_PATIENCE: Final = 4
 # s; what the operating system has is safe from a crash of ours, what is synced from one of its own.
 _SYNCED_EVERY: Final = 5.0
 
@@ -139,10 +142,13 @@ class Journal:
 
     def _read(self, there: bytes) -> None:
         """Take in every whole record; the next one belongs behind the last of them."""
-        begin = self._next
+        begin, patience = self._next, _PATIENCE * len(there)
         while begin < len(there):
             content = _content(there, begin)
             if content is None:
+                patience -= _claimed(there, begin)
+                if patience < 0:
+                    return
                 # Only the next record's own beginning tells where it is.
                 array = there.find(_ARRAY, begin + _FRAME.size + 1)
                 begin = len(there) if array < 0 else array - _FRAME.size
@@ -161,6 +167,14 @@ def _content(there: bytes, begin: int) -> bytes | None:
     length, checksum = _FRAME.unpack_from(there, begin)
     content = there[begin + _FRAME.size : begin + _FRAME.size + length]
     return content if len(content) == length and zlib.crc32(content) == checksum else None
+
+
+def _claimed(there: bytes, begin: int) -> int:
+    """Return how many bytes a frame here has that is whole by its length, else 0."""
+    if begin + _FRAME.size > len(there):
+        return 0
+    length: int = _FRAME.unpack_from(there, begin)[0]
+    return length if begin + _FRAME.size + length <= len(there) else 0
 
 
 def _key(genes: Array) -> bytes:
