@@ -15,8 +15,9 @@ def printable(text: str, *, keep: str = "\n") -> str:
     """
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c in keep else _written_out(c) for c in text)
+    return "".join(c if c.isprintable() or c in keep else written_out(c) for c in text)
 
 
-def _written_out(character: str) -> str:
+def written_out(character: str) -> str:
+    """A character as Python writes it in a string."""
     return character.encode("unicode_escape").decode("ascii")

@@ -5,17 +5,22 @@ from __future__ import annotations
 import base64
 import hashlib
 import itertools
+import re
 from pathlib import Path
 from typing import Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from hil.printable import written_out
+
 _TEMPLATES: Final = Path(__file__).parent / "templates"
-
-
 _STYLE: Final = "report.css"
 _SCRIPT: Final = "page.js"
+_STEERING: Final = re.compile(
+    r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
+)
+"""Control characters, and those that turn the order of the others (Unicode Annex 9)."""
 
 
 class Numbering:
@@ -45,10 +50,18 @@ def environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=_shown,
     )
     style, script = ((_TEMPLATES / name).read_text("utf-8") for name in (_STYLE, _SCRIPT))
     found.globals |= {"style": Markup(style), "script": Markup(script), "policy": policy(script)}
     return found
+
+
+def _shown(value: object) -> object:
+    """A text with what turns others round written out; anything else as it is."""
+    if isinstance(value, Markup) or not isinstance(value, str):
+        return value
+    return _STEERING.sub(lambda found: written_out(found[0]), value)
 
 
 def policy(script: str) -> str:

@@ -116,6 +116,9 @@ def score_all(
         kept(place, ScoreRecord, inputs)
         for place, (_, _, _, inputs) in zip(places, tasks, strict=True)
     ]
+    for k, (record, (_, _, names, _)) in enumerate(zip(found, tasks, strict=True)):
+        if record is not None and not record.tells_of(names, estimates):
+            found[k] = None
     missing = [k for k, record in enumerate(found) if record is None]
     with reporter.task("predicting (classes of motion)", len(tasks)) as task:
         task.advance(len(tasks) - len(missing))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Annotated, Any, Final, Self, TypeVar
 
@@ -133,6 +133,15 @@ class ScoreRecord(Record):
             _require(_shaped(each, motions, n), f"scores of {name}")
         _require(all(len(one.measured) == n for one in self.examples), "examples")
         return self
+
+    def tells_of(self, archives: Sequence[str], estimates: Mapping[str, Sized]) -> bool:
+        """Whether it is about these motions and estimates, by name and number of parameters."""
+        sizes = {len(one) for one in estimates.values()}
+        return (
+            [one.archive for one in self.forms] == list(archives)
+            and self.scores.keys() == estimates.keys()
+            and sizes <= {self.forms[0].whole_size}
+        )
 
 
 R = TypeVar("R", bound=Record)

@@ -198,3 +198,10 @@ def test_a_machine_is_no_reason_and_no_doubt(arm: IdentifiedArm) -> None:
     doubts = (*consistency_doubts("the solver gave up"), *essential_doubts("no motion"))
     assert len(doubts) == 2
     assert "the solver gave up" in doubts[0]
+
+
+def test_a_name_on_a_page_turns_no_other_text_round() -> None:
+    page = environment().from_string("{{ name }}|{{ kept }}|{{ number }}")
+    name, kept = "a\u202eb\x1b[31m\u2066c\x7f", "1\u2009234\u00a0N\n\té"
+    shown = page.render(name=name, kept=kept, number=3)
+    assert shown == r"a\u202eb\x1b[31m\u2066c\x7f" + f"|{kept}|3"

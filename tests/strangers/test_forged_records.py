@@ -267,6 +267,15 @@ def test_a_form_that_is_none_is_refused(how: str) -> None:
         MotionForm.model_validate(FORM | ODD_FORMS[how])
 
 
+def test_a_record_tells_of_its_own_motions_and_estimates_only() -> None:
+    record = ScoreRecord.model_validate(SCORE)
+    assert record.tells_of(["one"], {"A": np.ones(3)})
+    assert not record.tells_of(["another"], {"A": np.ones(3)})
+    assert not record.tells_of(["one"], {"B": np.ones(3)})
+    assert not record.tells_of(["one"], {"A": np.ones(4)})
+    assert not record.model_copy(update={"scores": {}}).tells_of(["one"], {"A": np.ones(3)})
+
+
 def test_a_study_reads_its_archives_again_where_a_record_does_not_fit(tmp_path: Path) -> None:
     path = tmp_path / "run.json"
     keep(path, FitRecord.model_validate(FIT))
