@@ -55,12 +55,10 @@ def phase_from(entry: Entry, prefix: str) -> PhaseFactor | None:
     grams, columns = [], []
     for joint in range(joints):
         used = _array(entry, f"{prefix}columns{joint}", np.intp, (None,))
-        if not set(used) <= set(range(len(names))) or len(set(used)) < len(used):
+        if not _are_columns(used.tobytes(), len(names)):
             raise ValueError("columns that are none of the parameters")
         row, column = _triangle(len(used) + 1)
         triangle = _array(entry, f"{prefix}gram{joint}", np.float64, (len(samples), len(row)))
-        if not np.isfinite(triangle).all():
-            raise ValueError("a sum that is not finite")
         gram = np.empty((len(triangle), len(used) + 1, len(used) + 1))
         gram[:, row, column] = triangle
         gram[:, column, row] = triangle
@@ -169,6 +167,13 @@ def settings_from(header: Mapping[str, Any]) -> Settings | None:
         return TypeAdapter(Settings).validate_python(dict(header))
     except ValidationError:
         return None
+
+
+@lru_cache(maxsize=256)
+def _are_columns(used: bytes, count: int) -> bool:
+    """Whether indices are some of so many parameters, none of them twice."""
+    found = np.frombuffer(used, dtype=np.intp).tolist()
+    return set(found) <= set(range(count)) and len(set(found)) == len(found)
 
 
 @lru_cache(maxsize=64)
