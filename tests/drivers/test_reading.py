@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drivers import Mode
-from drivers.packets import LAST_NUMBER
+from drivers.packets import DRIVE_ON, LAST_NUMBER
 from drivers.reading import Reader
-from drivers.replies import safe_answer
+from drivers.replies import D1, safe_answer
 from drivers.sequence import Sequence
 from tests.drivers.rig import START, Rig, all_drive_off
 
@@ -112,3 +112,14 @@ def test_where_drive_off_is_asked_for_what_is_no_number_is_zero():
     expected[2] = 0.0
     np.testing.assert_allclose(answer.axes["d"][:, 0], expected, rtol=1e-6)
     np.testing.assert_array_equal(answer.axes["d"][:, 1:], 0.0)
+
+
+def test_slots_of_unknown_arms_are_the_first_arms_and_driven_if_any_drive_is_on():
+    modes = np.full(2, Mode.CLOSED, np.int32)
+    off, other_on = bytes([3, 4, 7, 9]), bytes([3, DRIVE_ON, 7, 9])
+    answer = safe_answer(off, modes, None)
+    assert answer.status == bytes([3, 0, 0, 0])
+    assert answer.mask[:, D1:].all()  # echoed whole, as with the drive off
+    answer = safe_answer(other_on, modes, None)
+    assert answer.status == bytes(4)
+    assert not answer.mask[:, D1:].all()
