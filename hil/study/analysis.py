@@ -112,13 +112,11 @@ def score_all(
             )
             tasks.append((run, motion_class, names, inputs))
     places = [_place(fits, f"{run.key}-{motion_class}") for run, motion_class, _, _ in tasks]
-    found = [
-        kept(place, ScoreRecord, inputs)
-        for place, (_, _, _, inputs) in zip(places, tasks, strict=True)
-    ]
-    for k, (record, (_, _, names, _)) in enumerate(zip(found, tasks, strict=True)):
-        if record is not None and not record.tells_of(names, estimates):
-            found[k] = None
+    found: list[ScoreRecord | None] = []
+    for place, (_, _, names, inputs) in zip(places, tasks, strict=True):
+        record = kept(place, ScoreRecord, inputs)
+        known = record is not None and record.tells_of(names, estimates)
+        found.append(record if known else None)
     missing = [k for k, record in enumerate(found) if record is None]
     with reporter.task("predicting (classes of motion)", len(tasks)) as task:
         task.advance(len(tasks) - len(missing))

@@ -39,7 +39,7 @@ class MotionForm(Frozen):
     """Of Phi as it is, all joints together (p, p)."""
 
     @property
-    def whole_size(self) -> int:
+    def n_parameters(self) -> int:
         """Number p of parameters."""
         return len(unpacked(self.whole))
 
@@ -47,7 +47,7 @@ class MotionForm(Frozen):
     def _of_one_model(self) -> Self:
         if not len(self.torque_squared) == len(self.columns) == len(self.slow) > 0:
             raise ValueError("torque_squared, columns and slow have one entry for each joint")
-        parameters = range(self.whole_size)
+        parameters = range(self.n_parameters)
         for used, text in zip(self.columns, self.slow, strict=True):
             if not set(used) <= set(parameters) or len(unpacked(text)) != len(used) + 1:
                 raise ValueError("columns that are none of the parameters")

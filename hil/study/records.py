@@ -24,6 +24,7 @@ PLANTED: Final = "planted"
 
 
 Count = Annotated[int, Field(ge=0, lt=2**53)]
+"""What a float holds exactly: counts are averaged."""
 
 
 class Record(Frozen):
@@ -126,7 +127,7 @@ class ScoreRecord(Record):
         _require(motions == len(self.samples) == len(self.forms) > 0, "samples, forms")
         n = len(self.forms[0].columns)
         _require(all(len(one.columns) == n for one in self.forms), "forms")
-        _require(len({one.whole_size for one in self.forms}) == 1, "forms")
+        _require(len({one.n_parameters for one in self.forms}) == 1, "forms")
         _require(_shaped(self.left_out, motions, n), "left_out")
         for name, scores in self.scores.items():
             each = [one.relative for one in scores]
@@ -140,7 +141,7 @@ class ScoreRecord(Record):
         return (
             [one.archive for one in self.forms] == list(archives)
             and self.scores.keys() == estimates.keys()
-            and sizes <= {self.forms[0].whole_size}
+            and sizes <= {self.forms[0].n_parameters}
         )
 
 

@@ -23,6 +23,7 @@ _EVERY: Final = 10.0
 
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e9)]
+"""What a clock may have counted: a finite time of at most some thirty years."""
 
 
 class Times(Frozen):

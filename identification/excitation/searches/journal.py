@@ -39,7 +39,8 @@ _FRAME: Final = struct.Struct("<QI")
 # What the content of a generation's frame begins with, by which frames are found behind damage.
 _ARRAY: Final = b"\x93NUMPY"
 # How many times the length of the file is summed up in vain, at most, to find records behind
-# damage. Damage costs one or none; a forged file could ask for the sum of its rest at every place.
+# damage. Damaged records together cost it once; a forged file could ask for the sum of its rest at
+# every place.
 _PATIENCE: Final = 4
 # s; what the operating system has is safe from a crash of ours, what is synced from one of its own.
 _SYNCED_EVERY: Final = 5.0
@@ -146,7 +147,7 @@ class Journal:
         while begin < len(there):
             content = _content(there, begin)
             if content is None:
-                patience -= _claimed(there, begin)
+                patience -= _length(there, begin) or 0
                 if patience < 0:
                     return
                 # Only the next record's own beginning tells where it is.
@@ -162,19 +163,19 @@ class Journal:
 
 def _content(there: bytes, begin: int) -> bytes | None:
     """Return the content of the frame that begins here, None where there is no whole one."""
+    length = _length(there, begin)
+    if length is None:
+        return None
+    content = there[begin + _FRAME.size : begin + _FRAME.size + length]
+    return content if zlib.crc32(content) == _FRAME.unpack_from(there, begin)[1] else None
+
+
+def _length(there: bytes, begin: int) -> int | None:
+    """Return how long the content of the frame here says it is, None where it would not fit."""
     if begin + _FRAME.size > len(there):
         return None
-    length, checksum = _FRAME.unpack_from(there, begin)
-    content = there[begin + _FRAME.size : begin + _FRAME.size + length]
-    return content if len(content) == length and zlib.crc32(content) == checksum else None
-
-
-def _claimed(there: bytes, begin: int) -> int:
-    """Return how many bytes a frame here has that is whole by its length, else 0."""
-    if begin + _FRAME.size > len(there):
-        return 0
     length: int = _FRAME.unpack_from(there, begin)[0]
-    return length if begin + _FRAME.size + length <= len(there) else 0
+    return length if begin + _FRAME.size + length <= len(there) else None
 
 
 def _key(genes: Array) -> bytes:
