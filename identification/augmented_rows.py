@@ -51,7 +51,10 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
         raise ShapeError("usable", samples.usable.shape, str(q.shape))
     chunks: Iterator[Rows]
     if samples.torque_bandwidth is None:
-        chunks = (Rows(*chunk) for chunk in model.plan.chunks(q, qd, qdd, torque))
+        chunks = (
+            Rows(*chunk)
+            for chunk in model.plan.chunks(q, qd, qdd, samples.motion.direction, response=torque)
+        )
     else:
         chunks = _filtered(model, samples)
     for part, blocks in chunks:

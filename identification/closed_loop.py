@@ -80,7 +80,7 @@ def simulated_motion(
     friction = _Friction.of(model, values)
     ahead = np.zeros(command.position.shape)
     if servo.feedforward:
-        ahead = model.torque(values, *command[1:]) + model.load_torque(*command[1:])
+        ahead = model.torque(values, *command[1:]) + model.load_torque(*command[1:4])
     q, qd = _run(arm, coupled, friction, servo, command, ahead)
     qdd = np.gradient(qd, command.time, axis=0)
     return Instruments(

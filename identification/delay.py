@@ -315,7 +315,7 @@ class _Problem:
         usable = np.column_stack([self.usable(j, delay) for j in range(self.model.n_joints)])
         if samples.torque_bandwidth is not None:
             return replace(samples, motion=motion, usable=usable).factor(self.model)
-        thinned = Motion(*(array[thin] for array in motion))
+        thinned = motion.rows(thin)
         return Factor.from_samples(self.model, thinned, samples.torque[thin], usable[thin])
 
     def factor(self, delays: Array, stride: int = 1) -> Factor:

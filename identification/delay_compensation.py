@@ -56,6 +56,7 @@ def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recordi
         recording,
         time=time[keep],
         position=recording.position[keep],
+        velocity=None if recording.velocity is None else recording.velocity[keep],
         commanded_position=None if commanded is None else commanded[keep],
         gap_before=gap[keep],
         torque=moved["torque"][keep] if "torque" in moved else None,

@@ -89,7 +89,7 @@ class Factor:
             raise ShapeError("mask", mask.shape, str(q.shape))
         columns = model.plan.columns
         sums = [np.zeros((len(c) + 1, len(c) + 1)) for c in columns]
-        for part, rows in model.plan.chunks(q, qd, qdd, torque):
+        for part, rows in model.plan.chunks(q, qd, qdd, motion.direction, response=torque):
             for joint, block in enumerate(rows):
                 if mask is not None:
                     # Assigned, not multiplied: a row left out may hold NaN.

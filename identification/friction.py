@@ -3,10 +3,18 @@ r"""Joint friction, linear in its coefficients.
 .. math:: \tau_f = f_0\,\mathrm{sgn}(v) + f_1 v + f_d |v| + f_2\,\mathrm{sgn}(v)\,v^2
                    + f_s\,\mathrm{sgn}(v)\,e^{-(v/v_s)^2} + f_o
 
-with the joint's speed v. The source equation of the paper (after eq. 1: three coefficients per
-joint) could not be read. The quadratic third term is what the same authors' later software uses;
-the cubic one, ``v**3``, is the other form found in the field, so the term can be chosen or left
-out.
+with the joint's speed v. Dry friction does not jump at a reversal: over a displacement of some
+1e-4 rad, while teeth and bearings bend, it turns round like a spring (presliding). Dahl (1968)
+describes it by a state z in place of sgn(v), which follows the displacement dq alone,
+
+.. math:: z \leftarrow s + (z - s)\,e^{-|dq| / d}, \qquad s = \mathrm{sgn}(dq)
+
+so that the torque stays linear in the coefficients once the distance d is fixed, and friction at
+rest is what was left of the motion before it.
+
+The source equation of the paper (after eq. 1: three coefficients per joint) could not be read. The
+quadratic third term is what the same authors' later software uses; the cubic one, ``v**3``, is the
+other form found in the field, so the term can be chosen or left out.
 """
 
 from __future__ import annotations
@@ -51,6 +59,7 @@ class FrictionLaw:
             f1 - fd backwards, with a term ``fd |v|``. Coulomb friction is f0 + fo forwards and
             f0 - fo backwards: its asymmetry is the constant column of the offset, which is there
             then too, and the two cannot be told apart.
+        presliding: displacement d [rad, m] over which dry friction turns round; zero for a jump.
         zone: what becomes of rows slower than standstill. "exclude": they are not fitted, see
             :meth:`moving`. "linear": they are, with sgn(v) replaced by v / standstill.
     """
@@ -63,6 +72,7 @@ class FrictionLaw:
     stribeck: float | None = None
     asymmetric: bool = False
     zone: Zone = "exclude"
+    presliding: float = 0.0
 
     def __post_init__(self) -> None:
         if self.third is not None and self.third not in _THIRD_EXPONENT:
@@ -77,6 +87,11 @@ class FrictionLaw:
         if self.stribeck is not None and not (math.isfinite(self.stribeck) and self.stribeck > 0.0):
             raise ModelError(
                 f"friction's Stribeck speed is {self.stribeck!r}; it must be finite and positive"
+            )
+        if not (math.isfinite(self.presliding) and self.presliding >= 0.0):
+            raise ModelError(
+                f"friction's presliding displacement is {self.presliding!r}; "
+                "it must be a finite number, zero or more"
             )
         if self.zone not in ("exclude", "linear"):
             raise ModelError(f'friction zone = {self.zone!r}: "exclude" or "linear" are known')
@@ -121,12 +136,23 @@ class FrictionLaw:
         scaled = np.divide(velocity, self.standstill, out=out)
         return np.asarray(np.clip(scaled, -1.0, 1.0, out=out))
 
-    def columns(self, velocity: Array, out: Array) -> None:
-        """Write one row of `out` (k, ...) per coefficient for speeds `velocity` (...)."""
+    def direction(self, position: Array, velocity: Array) -> Array:
+        """Return the direction of dry friction (m,) along a motion: presliding state, or sign.
+
+        Args:
+            position: of the joint or motor at m instants [rad, m], in joint units.
+            velocity: likewise [rad/s, m/s].
+        """
+        if self.presliding == 0.0:
+            return self.sign(velocity)
+        return presliding_state(position, self.presliding)
+
+    def columns(self, velocity: Array, direction: Array, out: Array) -> None:
+        """Write one row of `out` (k, ...) per coefficient, for speeds and directions (...)."""
         for row, symbol in enumerate(self.symbols):
             target = out[row]
             if symbol == "f0":
-                self.sign(velocity, out=target)
+                target[...] = direction
             elif symbol == "f1":
                 target[...] = velocity
             elif symbol == "fd":
@@ -140,7 +166,7 @@ class FrictionLaw:
                 assert self.stribeck is not None
                 ratio = velocity / self.stribeck
                 np.exp(-ratio * ratio, out=target)
-                target *= self.sign(velocity)
+                target *= direction
             else:
                 target[...] = 1.0
 
@@ -149,3 +175,25 @@ class FrictionLaw:
         if self.zone == "linear":
             return np.ones(np.shape(velocity), dtype=np.bool_)
         return np.asarray(np.abs(velocity) > self.standstill)
+
+
+def presliding_state(position: Array, distance: float) -> Array:
+    """Return Dahl's state z (m,) of positions (m,), zero at the first of them.
+
+    Within a stretch of one direction it is ``s + (z0 - s) exp(-travel / distance)``.
+    """
+    steps = np.diff(position, prepend=position[:1])
+    travel = np.cumsum(np.abs(steps))
+    moved = np.flatnonzero(steps)
+    state = np.zeros(len(position))
+    if not moved.size:
+        return state
+    sign = np.sign(steps[moved])
+    turns = np.append(0, np.flatnonzero(np.diff(sign)) + 1)
+    starts, signs = moved[turns], sign[turns]
+    stops = np.append(starts[1:], len(position))
+    before, value = travel[starts - 1], 0.0
+    for start, stop, s, origin in zip(starts, stops, signs, before, strict=True):
+        stretch = s + (value - s) * np.exp((origin - travel[start:stop]) / distance)
+        state[start:stop], value = stretch, stretch[-1]
+    return state

@@ -120,7 +120,7 @@ class GainFactor:
 def _load(model: RobotModel, payload: Payload | None, samples: Samples) -> Array:
     if payload is None:
         return np.zeros_like(samples.motion.position)
-    return Load(model.chain, model.gravity, payload).torque(*samples.motion[1:])
+    return Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
 
 
 def _block_edges(time: Array) -> NDArray[np.intp]:

@@ -116,6 +116,20 @@ class JointFriction:
             return np.zeros((0, self.n_joints))
         return self.coupling.speeds[list(self.motors)]
 
+    def direction(self, position: Array, velocity: Array) -> Array:
+        """Return the direction of dry friction (m, n + k), of joints and then of `motors`.
+
+        Args:
+            position: of the joints along a motion (m, n) [rad or m].
+            velocity: likewise (m, n).
+        """
+        joints = [law.direction(position[:, j], velocity[:, j]) for j, law in enumerate(self.laws)]
+        motors = [
+            self.laws[motor].direction(position @ speed, velocity @ speed)
+            for motor, speed in zip(self.motors, self.motor_speeds(), strict=True)
+        ]
+        return np.column_stack([*joints, *motors])
+
     def moving(self, velocity: Array) -> NDArray[np.bool_]:
         """Return where the row of a joint can be fitted (m, n), from joint speeds (m, n).
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +40,18 @@ SHORTEST_TOP: Final = 5  # samples
 # parabola has fallen by at most 8 r, and by 12 r with the worst rounding.
 _FALL: Final = 16.0
 
+# A joint that rests keeps whatever torque its servo was left with; shorter halts belong to a
+# reversal, which says what dry friction is. On the recording of an arm with a balancer fitting
+# such rests doubles the error of prediction.
+LONGEST_HALT: Final = 0.25  # s
+
+LeftOut = Literal["rests", "slow", "none"]
+
 TORN: Final = "beside a gap or an end of the recording"
 SATURATED: Final = "torque or current saturated"
-STANDSTILL: Final = "standing still"
-REVERSAL: Final = "turning round"
+REST: Final = "at rest"
+STANDSTILL: Final = "slower than standstill"
+REVERSAL: Final = "near a velocity reversal"
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +73,12 @@ class RowMask:
         for rows in self.reasons.values():
             usable &= ~rows
         return usable
+
+    def rows(self, part: slice) -> RowMask:
+        """The mask of some of the rows."""
+        reasons = {reason: rows[part] for reason, rows in self.reasons.items()}
+        length = len(range(*part.indices(self.shape[0])))
+        return RowMask(MappingProxyType(reasons), (length, self.shape[1]))
 
     @property
     def counts(self) -> dict[str, NDArray[np.intp]]:
@@ -97,6 +111,7 @@ def mask_rows(
     current_limit: Array | None = None,
     torque_bandwidth: Array | None = None,
     delay: float = 0.0,
+    left_out: LeftOut = "rests",
     reversal_periods: float = REVERSAL_PERIODS,
 ) -> RowMask:
     """Reasons against each row of a recording.
@@ -110,7 +125,11 @@ def mask_rows(
         current_limit: largest current a motor is given (n,) [A].
         torque_bandwidth: of a low-pass that torque and regressor go through (n,) [Hz].
         delay: the motion was read this much earlier than the recording's rows [s].
-        reversal_periods: of the smoothing's bandwidth that are left out beside a reversal.
+        left_out: "rests": rows of a joint that is slower than standstill for longer than
+            `LONGEST_HALT`; "slow": all rows slower than that, and those near a velocity reversal;
+            "none": neither.
+        reversal_periods: with "slow", periods of the smoothing's bandwidth on either side of a
+            reversal.
 
     Raises:
         ShapeError: an array does not have the shape it should have.
@@ -135,13 +154,23 @@ def mask_rows(
     torn = torn_rows(recording, min(LONGEST_END, END_PERIODS / slowest), delay)
     if torque_bandwidth is not None:
         torn |= torn_rows(recording, min(LONGEST_END, END_PERIODS / float(torque_bandwidth.min())))
-    reasons = {
-        TORN: np.broadcast_to(torn[:, None], shape),
-        STANDSTILL: standing,
-        REVERSAL: near_any_reversal(model, motion, reversal_periods / bandwidth),
-        SATURATED: saturated,
-    }
+    reasons = {TORN: np.broadcast_to(torn[:, None], shape)}
+    if left_out == "rests":
+        reasons[REST] = long_halts(motion.time, standing)
+    elif left_out == "slow":
+        reasons[STANDSTILL] = standing
+        reasons[REVERSAL] = near_any_reversal(model, motion, reversal_periods / bandwidth)
+    reasons[SATURATED] = saturated
     return RowMask(MappingProxyType(reasons), (shape[0], shape[1]))
+
+
+def long_halts(time: Array, standing: Rows) -> Rows:
+    """Rows (m, n) within a run of standing rows (m, n) that lasts longer than `LONGEST_HALT`."""
+    resting = np.zeros_like(standing)
+    for joint, column in enumerate(standing.T):
+        for start, stop in _runs(column):
+            resting[start:stop, joint] = time[stop - 1] - time[start] > LONGEST_HALT
+    return resting
 
 
 def at_limit(values: Array, limit: Array) -> Rows:

@@ -164,19 +164,31 @@ class RobotModel:
         values[self.layout.links] = self.chain.inertial
         return values
 
-    def regressor(self, q: Array, qd: Array, qdd: Array) -> Regressor:
+    def regressor(
+        self, q: Array, qd: Array, qdd: Array, direction: Array | None = None
+    ) -> Regressor:
         """Return W for m samples of motion, each array (m, n).
+
+        `direction` (m, n + k) is that of dry friction, see :attr:`Motion.direction`; without it
+        the sign of the velocity.
 
         Raises:
             ShapeError: an array does not have that shape.
         """
         q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
-        return self.plan.evaluate(q, qd, qdd)
+        return self.plan.evaluate(q, qd, qdd, direction)
 
-    def torque(self, values: Array, q: Array, qd: Array, qdd: Array) -> Array:
+    def torque(
+        self,
+        values: Array,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        direction: Array | None = None,
+    ) -> Array:
         """Return the joint torques [N·m, N] for parameter values (p,), shape (m, n).
 
-        Without that of a payload: see :meth:`load_torque`.
+        Without that of a payload: see :meth:`load_torque`; `direction` as in :meth:`regressor`.
 
         Raises:
             ShapeError: an array does not have the shape it should have.
@@ -187,7 +199,7 @@ class RobotModel:
         q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
         torque = np.empty(q.shape)
         weights = [values[columns] for columns in self.plan.columns]
-        for part, rows in self.plan.chunks(q, qd, qdd):
+        for part, rows in self.plan.chunks(q, qd, qdd, direction):
             for joint, block in enumerate(rows):
                 torque[part, joint] = weights[joint] @ block
         return torque

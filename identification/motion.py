@@ -18,12 +18,26 @@ class Motion(NamedTuple):
         position: q, shape (m, n).
         velocity: qd, shape (m, n).
         acceleration: qdd, shape (m, n).
+        direction: of dry friction, shape (m, n + k), joints and then k coupled motors, from -1 to
+            1; None for the sign of the velocity. See :meth:`JointFriction.direction`.
     """
 
     time: Array
     position: Array
     velocity: Array
     acceleration: Array
+    direction: Array | None = None
+
+    def rows(self, which: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Motion:
+        """The motion at some of the instants."""
+        direction = None if self.direction is None else self.direction[which]
+        return Motion(
+            self.time[which],
+            self.position[which],
+            self.velocity[which],
+            self.acceleration[which],
+            direction,
+        )
 
     @property
     def n_samples(self) -> int:

@@ -109,7 +109,8 @@ def _friction(
     first = model.base.rank
     for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
         column = np.zeros((len(law.symbols), 1))
-        law.columns(speed[joint : joint + 1], column)
+        one = speed[joint : joint + 1]
+        law.columns(one, law.sign(one), column)
         at_speed = dict(zip(law.symbols, column[:, 0], strict=True))
         top, coulomb = np.zeros((2, len(estimate.values)))
         for k, term in enumerate(model.friction.terms, start=first):

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from identification.butterworth import butterworth_motion, choose_cutoff
 from identification.factor import Factor
-from identification.masks import REVERSAL_PERIODS, SHORTEST_STRETCH, RowMask, mask_rows
+from identification.masks import (
+    REVERSAL_PERIODS,
+    SHORTEST_STRETCH,
+    LeftOut,
+    RowMask,
+    mask_rows,
+)
 from identification.model import RobotModel
 from identification.motion import Motion
 from identification.noise import difference_variance
@@ -20,12 +26,14 @@ from identification.smoothing_spline import fit_smoothing_spline, low_pass
 
 Array = NDArray[np.float64]
 
-# Planned motion has next to nothing above 10 Hz, and the first resonance of a large arm lies at
-# 10 to 30 Hz. On the simulated NS 16 everything from 20 to 60 Hz is as good as noise allows.
-RIGID_BANDWIDTH: Final = 40.0  # Hz
+# What a rigid model leaves out (elasticity of gears, the clock of a logger, the servo) begins at
+# some 10 Hz on most arms, and planned motion has next to nothing above. Measured on recordings of
+# real arms (``benchmarks.board``).
+RIGID_BANDWIDTH: Final = 10.0  # Hz
 _SHORTEST_SEGMENT: Final = 12  # samples: twice what a quintic spline needs
 
 Smoother = Literal["spline", "butterworth"]
+VelocitySource = Literal["position", "measured"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,11 @@ class Preprocessing:
             they have. A rigid model has nothing to say above the first resonance of the arm,
             where motors accelerate without their links; and a wide one lets ripple that has
             found a resonance pass for inertia.
+        velocity: where the velocity comes from: the slope of the smoothed position, or the
+            measured velocity, smoothed alike, whose slope is then the acceleration. Recordings
+            without a measured velocity take the position's.
+        left_out: which rows do not count for being slow, see
+            :func:`identification.masks.mask_rows`.
         smooth_torque: the paper's way. The torque is smoothed, and the regressor goes through the
             same linear smoother. By default the torque is left as measured: least squares
             averages it better.
@@ -49,11 +62,13 @@ class Preprocessing:
             is left alone. None: it has come through none.
         torque_delay: time by which the recorded torque lags the recorded position [s].
         reversal_periods: of the smoothing's bandwidth that are left out on either side of a
-            reversal.
+            reversal, where `left_out` is "slow".
     """
 
     smoother: Smoother = "spline"
     rigid_bandwidth: float = RIGID_BANDWIDTH
+    velocity: VelocitySource = "position"
+    left_out: LeftOut = "rests"
     smooth_torque: bool = False
     torque_bandwidth: float | None = None
     torque_delay: float = 0.0
@@ -81,6 +96,8 @@ class Samples:
         torque_bandwidth: of the low-pass the torque has come through, per joint (n,) [Hz]; the
             regressor has to go through it as well. None: it has come through none.
         mask: why rows do not count; None where nobody asked.
+        whole: the samples that these are part of, and which part: a low-pass reads what comes
+            before and after. None where they are all there is.
     """
 
     motion: Motion
@@ -91,6 +108,25 @@ class Samples:
     position_bandwidth: Array
     torque_bandwidth: Array | None = None
     mask: RowMask | None = None
+    whole: tuple[Samples, slice] | None = None
+
+    def between(self, start: int, stop: int) -> Samples:
+        """Return samples start to stop (exclusive), still filtered as part of these."""
+        part = slice(start, stop)
+        segments = [
+            slice(max(one.start, start) - start, min(one.stop, stop) - start)
+            for one in self.segments
+            if one.start < stop and one.stop > start
+        ]
+        return replace(
+            self,
+            motion=self.motion.rows(part),
+            torque=self.torque[part],
+            usable=self.usable[part],
+            segments=tuple(segments),
+            mask=None if self.mask is None else self.mask.rows(part),
+            whole=None if self.torque_bandwidth is None else (self, part),
+        )
 
     def as_measured(self, joint: int, columns: Array) -> Array:
         """Columns (m, c) of a joint's row as the torque channel would have recorded them."""
@@ -101,6 +137,10 @@ class Samples:
 
     def regressor(self, model: RobotModel) -> Regressor:
         """Regressor of every row, usable or not, as the torque channel would record it."""
+        if self.whole is not None:
+            samples, part = self.whole
+            blocks, columns = samples.regressor(model)
+            return Regressor(tuple(block[part] for block in blocks), columns)
         blocks, columns = model.regressor(*self.motion[1:])
         return Regressor(
             tuple(self.as_measured(joint, block) for joint, block in enumerate(blocks)), columns
@@ -108,6 +148,9 @@ class Samples:
 
     def predicted_torque(self, model: RobotModel, values: Array) -> Array:
         """Torque (m, n) that parameters (p,) predict, as the torque channel would record it."""
+        if self.whole is not None:
+            samples, part = self.whole
+            return samples.predicted_torque(model, values)[part]
         torque = model.torque(values, *self.motion[1:])
         for joint in range(model.n_joints):
             torque[:, joint] = self.as_measured(joint, torque[:, joint : joint + 1])[:, 0]
@@ -147,7 +190,9 @@ def smooth(
         delay: time by which what the motion is to be compared with lags it [s].
         widest: see `Preprocessing.rigid_bandwidth` [Hz].
     """
-    return _spline_motion(recording, noise_variance, delay, widest)[0]
+    return _spline_motion(
+        recording, noise_variance, Preprocessing(torque_delay=delay, rigid_bandwidth=widest)
+    )[0]
 
 
 def prepare(
@@ -181,6 +226,9 @@ def prepare(
     if recording.torque is None:
         raise RecordingError("torque", "the recording has no joint torque to fit")
     motion, bandwidth = _motion(recording, noise_variance, options)
+    if any(law.presliding > 0.0 for law in model.friction.laws):
+        direction = model.friction.direction(motion.position, motion.velocity)
+        motion = motion._replace(direction=direction)
     segments = tuple(recording.segments())
     torque, torque_bandwidth = recording.torque, None
     if options.torque_bandwidth is not None:
@@ -198,6 +246,7 @@ def prepare(
         current_limit=current_limit,
         torque_bandwidth=torque_bandwidth,
         delay=options.torque_delay,
+        left_out=options.left_out,
         reversal_periods=options.reversal_periods,
     )
     samples = Samples(
@@ -215,7 +264,7 @@ def prepare(
 
 def _unloaded(samples: Samples, model: RobotModel) -> Samples:
     """These samples without the torque of the payload, whose parameters are known."""
-    load = model.load_torque(*samples.motion[1:])
+    load = model.load_torque(*samples.motion[1:4])
     for joint in range(model.n_joints):
         load[:, joint] = samples.as_measured(joint, load[:, joint : joint + 1])[:, 0]
     return replace(samples, torque=samples.torque - load)
@@ -225,21 +274,21 @@ def _motion(
     recording: Recording, noise_variance: Array | None, options: Preprocessing
 ) -> tuple[Motion, Array]:
     """Smoothed motion, and the bandwidth of the smoothing (n,) [Hz]."""
-    delay, widest = options.torque_delay, options.rigid_bandwidth
     if options.smoother == "spline":
-        return _spline_motion(recording, noise_variance, delay, widest)
-    cutoff = choose_cutoff(recording, noise_variance, widest=widest)
-    return butterworth_motion(recording, cutoff, delay=delay), cutoff
+        return _spline_motion(recording, noise_variance, options)
+    cutoff = choose_cutoff(recording, noise_variance, widest=options.rigid_bandwidth)
+    return butterworth_motion(recording, cutoff, delay=options.torque_delay), cutoff
 
 
 def _spline_motion(
-    recording: Recording, noise_variance: Array | None, delay: float, widest: float
+    recording: Recording, noise_variance: Array | None, options: Preprocessing
 ) -> tuple[Motion, Array]:
     """Motion, and the bandwidth (n,) of the longest segment."""
     position = recording.position.copy()
     velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
     bandwidth = np.full(recording.n_joints, np.inf)
-    longest = 0
+    longest, widest = 0, options.rigid_bandwidth
+    speed = recording.velocity if options.velocity == "measured" else None
     for segment in recording.segments():
         time, measured = recording.time[segment], recording.position[segment]
         if len(time) < SHORTEST_STRETCH:
@@ -248,9 +297,16 @@ def _spline_motion(
         spline = fit_smoothing_spline(
             time, measured, _attainable(variance, measured), widest=widest
         )
-        at = time - delay
-        position[segment], velocity[segment] = spline(at), spline(at, 1)
-        acceleration[segment] = spline(at, 2)
+        at = time - options.torque_delay
+        position[segment] = spline(at)
+        if speed is None:
+            velocity[segment], acceleration[segment] = spline(at, 1), spline(at, 2)
+        else:
+            own = difference_variance(time, speed[segment])
+            slope = fit_smoothing_spline(
+                time, speed[segment], _attainable(own, speed[segment]), widest=widest
+            )
+            velocity[segment], acceleration[segment] = slope(at), slope(at, 1)
         if len(time) > longest:
             longest, bandwidth = len(time), spline.bandwidth
     return Motion(recording.time, position, velocity, acceleration), bandwidth

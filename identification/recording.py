@@ -50,6 +50,7 @@ class Recording:
         time: (m,) [s], the controller's clock.
         position: measured (m, n) [rad or m].
         joint_names: n names, in the order of the columns.
+        velocity: measured (m, n) [rad/s or m/s], None where it was not.
         torque: joint torque or force (m, n) [N·m or N], None where only currents are known.
         motor_current: (m, n) [A]; no use is made of it here but to carry it along.
         commanded_position: (m, n) [rad or m], NaN where nothing was commanded.
@@ -63,6 +64,7 @@ class Recording:
     position: Array
     joint_names: tuple[str, ...]
     torque: Array | None = None
+    velocity: Array | None = None
     motor_current: Array | None = None
     commanded_position: Array | None = None
     gap_before: NDArray[np.bool_] | None = None
@@ -150,6 +152,7 @@ class Recording:
         """Channels present, each (m, n), by attribute name."""
         channels = {
             "position": self.position,
+            "velocity": self.velocity,
             "torque": self.torque,
             "motor_current": self.motor_current,
             "commanded_position": self.commanded_position,

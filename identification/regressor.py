@@ -111,9 +111,18 @@ class RegressorPlan:
         self.__dict__.update(state, _spare=[], _lock=Lock())
 
     def chunks(
-        self, q: Array, qd: Array, qdd: Array, response: Array | None = None
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        direction: Array | None = None,
+        *,
+        response: Array | None = None,
     ) -> Iterator[tuple[slice, list[Array]]]:
         """Yield the regressor in chunks of samples: (which samples, per joint its rows).
+
+        `direction` is that of dry friction, of joints and coupled motors (m, n + k); without it
+        the sign of their speeds.
 
         The rows of joint j have shape (c_j, k) for k samples, one more with `response` (m, n)
         as the last. They are views of a working array: valid until the next chunk.
@@ -126,7 +135,8 @@ class RegressorPlan:
             for start in range(0, m, work.size):
                 part = slice(start, min(start + work.size, m))
                 k = part.stop - start
-                work.update(q[part], qd[part], qdd[part])
+                turned = None if direction is None else direction[part]
+                work.update(q[part], qd[part], qdd[part], turned)
                 if response is not None:
                     for joint in range(n):
                         work.rows[joint, self.response_row(joint), :k] = response[part, joint]
@@ -147,11 +157,13 @@ class RegressorPlan:
             with self._lock:
                 self._spare = [*self._spare, work][-_SPARE:]
 
-    def evaluate(self, q: Array, qd: Array, qdd: Array) -> Regressor:
-        """Return the whole regressor for motion arrays of shape (m, n)."""
+    def evaluate(
+        self, q: Array, qd: Array, qdd: Array, direction: Array | None = None
+    ) -> Regressor:
+        """Return the whole regressor for motion arrays (m, n); `direction` as in :meth:`chunks`."""
         m = q.shape[0]
         full = [np.empty((len(columns), m)) for columns in self.columns]
-        for part, rows in self.chunks(q, qd, qdd):
+        for part, rows in self.chunks(q, qd, qdd, direction):
             for target, block in zip(full, rows, strict=True):
                 target[:, part] = block
         return Regressor(tuple(block.T for block in full), self.columns)
@@ -206,6 +218,8 @@ class _Workspace:
         # Not the plan itself, which keeps this: large memory would wait for the cycle collector.
         self._own, self._joint_friction = plan.own, plan.friction
         self._motion = LinkMotion(plan.chain, plan.gravity, size)
+        motors = 0 if plan.friction is None else len(plan.friction.motors)
+        self._direction = np.zeros((n + motors, size))
         self._primitives = np.empty((n, N_PRIMITIVES, size))
         self._friction = self._friction_parts()
         self._drives = self._drive_parts()
@@ -244,16 +258,17 @@ class _Workspace:
             )
         )
 
-    def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array]]:
-        """Return laws, the speeds that they read, and the rows that they write."""
+    def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array, Array]]:
+        """Return laws, the speeds and directions that they read, and the rows that they write."""
         velocity = self._motion.velocity
+        direction = self._direction[: len(velocity)]
         if self._joint_friction is None:
             return []
         if (one := self._joint_friction.one_law) is not None:
             rows = self.rows[:, self._own[0].friction]
-            return [(one, velocity, rows.transpose(1, 0, 2))]
+            return [(one, velocity, direction, rows.transpose(1, 0, 2))]
         return [
-            (law, velocity[j], self.rows[j, self._own[j].friction])
+            (law, velocity[j], direction[j], self.rows[j, self._own[j].friction])
             for j, law in enumerate(self._joint_friction.laws)
         ]
 
@@ -275,15 +290,32 @@ class _Workspace:
 
     def _write_motor_friction(self, friction: JointFriction) -> None:
         """Friction f(c qd) of a motor acts on the joints as c' f(c qd)."""
-        for motor, share in zip(friction.motors, friction.motor_speeds(), strict=True):
-            speed = share @ self._motion.velocity
-            column = {"f0": friction.laws[motor].sign(speed), "f1": speed}
+        directions = self._direction[friction.n_joints :]
+        for motor, share, direction in zip(
+            friction.motors, friction.motor_speeds(), directions, strict=True
+        ):
+            column = {"f0": direction, "f1": share @ self._motion.velocity}
             for joint in np.flatnonzero(share):
                 for (index, symbol), row in self._own[joint].motors.items():
                     if index == motor:
                         np.multiply(share[joint], column[symbol], out=self.rows[joint, row])
 
-    def update(self, q: Array, qd: Array, qdd: Array) -> None:
+    def _write_direction(self, friction: JointFriction, direction: Array | None, k: int) -> None:
+        if direction is not None:
+            self._direction[:, :k] = direction.T
+            return
+        velocity, n = self._motion.velocity, friction.n_joints
+        if (one := friction.one_law) is not None:
+            one.sign(velocity, out=self._direction[:n])
+        else:
+            for law, speed, out in zip(friction.laws, velocity, self._direction, strict=False):
+                law.sign(speed, out=out)
+        for motor, share, out in zip(
+            friction.motors, friction.motor_speeds(), self._direction[n:], strict=True
+        ):
+            friction.laws[motor].sign(share @ velocity, out=out)
+
+    def update(self, q: Array, qd: Array, qdd: Array, direction: Array | None = None) -> None:
         """Make all columns for k <= size samples (k, n); those behind mean nothing."""
         motion = self._motion
         motion.update(q, qd, qdd)
@@ -294,8 +326,10 @@ class _Workspace:
                 np.einsum("jrt,crt->jct", c.twists, c.wrenches, out=c.target)
             else:
                 c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
-        for law, velocity, target in self._friction:
-            law.columns(velocity, target)
+        if self._joint_friction is not None:
+            self._write_direction(self._joint_friction, direction, len(q))
+        for law, velocity, turned, target in self._friction:
+            law.columns(velocity, turned, target)
         for source, target in self._drives:
             np.copyto(target, source)
         if self._joint_friction is not None and self._joint_friction.motors:

@@ -243,7 +243,7 @@ def _uniform(one: Recording, step: float) -> Recording:
     changed: dict[str, Any] = {
         "position": scipy.interpolate.make_interp_spline(time, one.position, k=3)(inside)
     }
-    for name in ("torque", "motor_current"):
+    for name in ("velocity", "torque", "motor_current"):
         values = getattr(one, name)
         if values is not None:
             changed[name] = scipy.interpolate.PchipInterpolator(time, values)(inside)
@@ -255,7 +255,7 @@ def _uniform(one: Recording, step: float) -> Recording:
     return replace(one, time=at, gap_before=None, **changed)
 
 
-_CHANNELS: Final = ("position", "torque", "motor_current", "commanded_position")
+_CHANNELS: Final = ("position", "velocity", "torque", "motor_current", "commanded_position")
 
 
 def _present(recording: Recording) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ def turned(samples: Samples, joint: int) -> Samples:
     motion = samples.motion
     return replace(
         samples,
-        motion=Motion(motion.time, *(part * sign for part in motion[1:])),
+        motion=Motion(motion.time, *(part * sign for part in motion[1:4])),
         torque=samples.torque * sign,
     )
 

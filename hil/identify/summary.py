@@ -26,7 +26,7 @@ from hil.results import (
 )
 from hil.simulation import planted_values
 from hil.version import software
-from identification import Factor, Motion, RobotModel
+from identification import Factor, RobotModel
 from identification.consistency_check import ConsistencyCheck
 from identification.essential_choice import EssentialChoice
 from identification.excitation import (
@@ -137,7 +137,7 @@ def _executed(model: RobotModel, training: Sequence[Samples], rows: Sequence[sli
     """Every sample of the motion, standing joints included, as the criteria of a plan see it."""
     factor = Factor.zero(model)
     for samples, part in zip(training, rows, strict=True):
-        motion = Motion(*(series[part] for series in samples.motion))
+        motion = samples.motion.rows(part)
         factor = factor + Factor.from_samples(model, motion, samples.torque[part])
     return factor
 

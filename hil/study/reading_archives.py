@@ -18,7 +18,7 @@ from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import executed_rows, moving_rows
 from hil.progress import Silent
-from identification import Factor, Motion, RobotModel
+from identification import Factor, RobotModel
 from identification.excitation import correlation, coupling_index, information, log10_det
 from identification.preprocessing import Samples
 from identification.repetitions import estimate_repetitions
@@ -59,7 +59,7 @@ def fit(reading: Reading, inputs: str) -> FitRecord:
     executed = Factor.zero(model)
     for one, own in zip(recordings, prepared.sources.training, strict=True):
         part = executed_rows(own, one)
-        motion = Motion(*(series[part] for series in one.motion))
+        motion = one.motion.rows(part)
         executed = executed + Factor.from_samples(model, motion, one.torque[part])
     gram, count = information(executed), rows.stop - rows.start
     shown = _thinned(rows)

@@ -60,7 +60,7 @@ class CurrentModel:
 
     def torque(self, motion: Motion) -> Array:
         """Return the joint torques (m, n) [N·m] that a motion needs at most, payload included."""
-        _, q, qd, qdd = motion
+        q, qd, qdd = motion[1:4]
         nominal = self.model.torque(self.values, q, qd, qdd) + self.model.load_torque(q, qd, qdd)
         return (1.0 + self.uncertainty) * nominal
 

@@ -53,12 +53,12 @@ def cut(places: Sequence[int]) -> Pieces:
         (
             replace(
                 samples,
-                motion=Motion(*(series[part] for series in samples.motion)),
+                motion=samples.motion.rows(part),
                 torque=samples.torque[part],
                 usable=samples.usable[part],
                 segments=(slice(0, part.stop - part.start),),
             ),
-            Motion(*(series[part] for series in plan)),
+            plan.rows(part),
         )
         for part in parts
     ]

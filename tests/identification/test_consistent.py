@@ -253,7 +253,7 @@ def test_one_chunk_or_many_are_the_same(two_link: RobotModel) -> None:
     parts = Factor.zero(two_link)
     for start in range(0, 600, 50):
         cut = slice(start, start + 50)
-        chunk = Motion(*(x[cut] for x in motion))
+        chunk = motion.rows(cut)
         parts = parts + Factor.from_samples(two_link, chunk, torque[cut])
     one, other = (consistent_estimate(two_link, f, estimate(two_link, f)) for f in (whole, parts))
     np.testing.assert_allclose(one.estimate.values, other.estimate.values, rtol=1e-9)

@@ -252,7 +252,7 @@ def test_every_sample_k_times_over_changes_nothing(
     model: RobotModel, motion: PiecewiseCubic, k: int
 ) -> None:
     once = midpoints(motion, 0.008)
-    often = Motion(*(np.repeat(series, k, axis=0) for series in once))
+    often = Motion(*(np.repeat(series, k, axis=0) for series in once[:4]))
     expected, found = Objective(model).measures(once), Objective(model).measures(often)
     assert found.log10_det == pytest.approx(expected.log10_det, abs=1e-7)
     assert found.coupling_index == pytest.approx(expected.coupling_index, rel=1e-8)

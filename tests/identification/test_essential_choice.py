@@ -16,7 +16,6 @@ from identification.essential_choice import choose_essential, relative_error
 from identification.estimation import joint_weights
 from identification.friction import FrictionLaw
 from identification.model import RobotModel
-from identification.motion import Motion
 from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Samples
 from identification.validation import over_all, prediction_error
@@ -83,7 +82,7 @@ def test_a_blind_choice_never_sees_the_held_out_motion(seed: int) -> None:
 
 
 def part_of(run: Samples, rows: slice) -> Samples:
-    motion = Motion(*(series[rows] for series in run.motion))
+    motion = run.motion.rows(rows)
     return replace(
         run,
         motion=motion,

@@ -117,7 +117,7 @@ def test_pooling_is_the_estimate_from_all_samples_at_once(pieces: int, seed: int
     whole = Factor.from_samples(model, motion, torque)
     edges = np.linspace(0, 600, pieces + 1).astype(int)
     parts = [
-        Factor.from_samples(model, Motion(*(x[a:b] for x in motion)), torque[a:b])
+        Factor.from_samples(model, motion.rows(slice(a, b)), torque[a:b])
         for a, b in pairwise(edges)
     ]
     np.testing.assert_allclose(

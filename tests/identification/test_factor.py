@@ -24,7 +24,7 @@ def samples(m: int, seed: int = 0) -> tuple[Motion, np.ndarray]:
 
 
 def part(motion: Motion, which: slice) -> Motion:
-    return Motion(*(array[which] for array in motion))
+    return motion.rows(which)
 
 
 def assert_same(one: Factor, other: Factor) -> None:
@@ -79,9 +79,9 @@ def test_masked_rows_do_not_count_whatever_they_hold() -> None:
 
 def test_the_inputs_are_left_alone() -> None:
     model, (motion, torque) = ns16(), samples(50)
-    before = [array.copy() for array in (*motion, torque)]
+    before = [array.copy() for array in (*motion[:4], torque)]
     Factor.from_samples(model, motion, torque, np.zeros((50, 6), dtype=bool))
-    for array, copy in zip((*motion, torque), before, strict=True):
+    for array, copy in zip((*motion[:4], torque), before, strict=True):
         assert np.array_equal(array, copy)
 
 

@@ -11,7 +11,7 @@ SPEED = np.array([-2.0, -1e-9, 0.0, 1e-9, 0.5])
 
 def columns(law: FrictionLaw) -> np.ndarray:
     out = np.full((len(law.symbols), len(SPEED)), np.nan)
-    law.columns(SPEED, out)
+    law.columns(SPEED, law.sign(SPEED), out)
     return out
 
 

@@ -85,8 +85,8 @@ def test_asymmetric_friction_brings_the_offset_that_its_coulomb_part_is() -> Non
     law = FrictionLaw(third=None, asymmetric=True)
     assert law.symbols == ("f0", "f1", "fd", "fo")
     forwards, backwards = np.empty((2, 4, 1))
-    law.columns(np.array([2.0]), forwards)
-    law.columns(np.array([-2.0]), backwards)
+    law.columns(np.array([2.0]), np.ones(1), forwards)
+    law.columns(np.array([-2.0]), -np.ones(1), backwards)
     f0, f1, fd, fo = 5.0, 3.0, 0.5, 1.0
     values = np.array([f0, f1, fd, fo])
     assert (values @ forwards)[0] == (f0 + fo) + (f1 + fd) * 2.0

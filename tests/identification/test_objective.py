@@ -148,7 +148,7 @@ def earlier_of(trajectory) -> tuple[np.ndarray, int]:
 
 
 def part_of(motion, count: int) -> Motion:
-    return Motion(*(series[:count] for series in motion))
+    return motion.rows(slice(count))
 
 
 @given(seed=seeds, repetitions=st.integers(1, 30))
@@ -336,7 +336,7 @@ def test_samples_for_checks_are_uniform_and_reach_both_ends(seed: int, period: f
     np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
     assert steps[0] <= period * (1.0 + 1e-6)
     assert steps[0] > period * (1.0 - 1.0 / len(steps)) - 1e-12  # no denser than needed
-    for series, expected in zip(motion[1:], trajectory.sample(motion.time), strict=True):
+    for series, expected in zip(motion[1:4], trajectory.sample(motion.time), strict=True):
         np.testing.assert_array_equal(series, expected)
 
 
@@ -348,7 +348,7 @@ def test_samples_for_criteria_lie_in_the_middle_of_those_steps(seed: int, period
     middle = 0.5 * (ends.time[1:] + ends.time[:-1])
     np.testing.assert_allclose(motion.time, middle, rtol=1e-12)
     assert np.all(motion.velocity[[0, -1]] != 0.0)  # neither end, where nothing moves
-    for series, expected in zip(motion[1:], trajectory.sample(motion.time), strict=True):
+    for series, expected in zip(motion[1:4], trajectory.sample(motion.time), strict=True):
         np.testing.assert_array_equal(series, expected)
 
 

@@ -211,7 +211,7 @@ def test_data_in_two_steps_are_data_at_once(seed: int) -> None:
     parts = [
         replace(
             samples,
-            motion=Motion(*(array[s] for array in samples.motion)),
+            motion=samples.motion.rows(s),
             torque=samples.torque[s],
             usable=samples.usable[s],
         ).factor(MODEL)

@@ -19,7 +19,6 @@ from identification.estimation import estimate
 from identification.friction import FrictionLaw
 from identification.losses import Huber, LeastSquares, Loss, Tukey
 from identification.model import RobotModel
-from identification.motion import Motion
 from identification.preprocessing import Samples, prepare
 from identification.robust import robust_estimate, robust_weights
 from identification.validation import prediction_error
@@ -187,7 +186,7 @@ def test_one_recording_or_many_pieces_give_the_same_to_nine_digits(pieces: int, 
     parts = [
         replace(
             whole,
-            motion=Motion(*(array[a:b] for array in motion)),
+            motion=motion.rows(slice(a, b)),
             torque=whole.torque[a:b],
             usable=whole.usable[a:b],
         )

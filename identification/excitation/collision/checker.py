@@ -176,10 +176,10 @@ class CollisionChecker:
             ShapeError: a motion of another arm.
             PostureError: a position that is no finite number.
         """
-        motion = Motion(*(column[_looked_at(self._scene, trajectory, motion)] for column in motion))
+        motion = motion.rows(_looked_at(self._scene, trajectory, motion))
         deepest: PathContact | None = None
         for start in range(0, max(motion.n_samples - 1, 1), _PART):
-            part = Motion(*(column[start : start + _PART + 1] for column in motion))
+            part = motion.rows(slice(start, start + _PART + 1))
             contact = self._deepest_in(trajectory, part, between)
             if deepest is None or (contact is not None and contact.distance < deepest.distance):
                 deepest = contact
