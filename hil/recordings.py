@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 _ALWAYS = ("cycle", "gap", "position")
 _CHANNELS = {
+    "velocity": ("velocity",),
     "torque": ("torque",),
     "motor_current": ("target_current", "motor_current"),
     "commanded_position": ("commanded_position", "target_position"),
@@ -45,8 +46,8 @@ def open_recording(
 
     Args:
         path: the archive.
-        channels: of ``torque``, ``motor_current`` and ``commanded_position`` those that are wanted
-            beside the position; None for all that were recorded.
+        channels: of ``velocity``, ``torque``, ``motor_current`` and ``commanded_position`` those
+            that are wanted beside the position; None for all that were recorded.
         start: first instant wanted [s], on the archive's clock; the recording's own time begins at
             zero all the same.
         stop: end of the time wanted [s]; what happened then is left out.
@@ -97,6 +98,7 @@ def recording_of(archive: Archive) -> Recording:
         position=columns["position"],
         joint_names=archive.joint_names,
         torque=_known(columns.get("torque")),
+        velocity=_measured_velocity(archive),
         motor_current=current,
         commanded_position=_commanded(archive),
         gap_before=_gaps(archive),
@@ -109,6 +111,13 @@ def _commanded(archive: Archive) -> Array | None:
     """What the arm was told: by the PC, or by the controller's own program."""
     own = archive.metadata.get("motion") == CONTROLLERS_OWN
     return archive.columns.get("target_position" if own else "commanded_position")
+
+
+def _measured_velocity(archive: Archive) -> Array | None:
+    """Of an imported recording; a controller's own is the slope of its positions."""
+    if archive.kind != "imported":
+        return None
+    return _known(archive.columns.get("velocity"))
 
 
 def _time(archive: Archive) -> Array:

@@ -72,19 +72,28 @@ class Clustered:
     words: str
 
 
-def block_covariance(phase: PhaseFactor, weights: Array, values: Array) -> Clustered:
+def block_covariance(
+    phase: PhaseFactor, weights: Array, values: Array, prior: Array | None = None
+) -> Clustered:
     """Cluster-robust covariance of a weighted least-squares estimate, from its factor alone.
+
+    With a Gaussian prior H = A + diag(prior) takes the place of the information A, and the prior's
+    own part, ``H^-1 diag(prior) H^-1``, counts times the design effect, as the data's does.
 
     Args:
         phase: the samples, of one repetition or of all.
         weights: per joint (n,).
         values: solution of `phase.total` with these weights (p,).
+        prior: information of an independent prior per parameter (p,).
     """
     phase = phase.occupied()
     scores = phase.scores(weights, values)
     length = block_length(scores)
     longer = phase.merged(length)
-    solution = solve(phase.total.weighted(weights))
+    equations = phase.total.weighted(weights)
+    if prior is not None:
+        equations = equations._replace(A=equations.A + np.diag(prior))
+    solution = solve(equations)
     root, scores = solution.root, merged(scores, length)
     shares = np.empty((len(scores), root.shape[1], root.shape[1]))
     for start in range(0, len(scores), _AT_ONCE):
@@ -94,12 +103,15 @@ def block_covariance(phase: PhaseFactor, weights: Array, values: Array) -> Clust
     corrected = leverage_corrected(shares, scores @ root)
     moved = corrected @ root.T
     covariance = np.asarray(moved.T @ moved)
+    effect = float((corrected**2).sum() / max(1, corrected.shape[1]))
+    if prior is not None:
+        covariance += max(1.0, effect) * (solution.inverse * prior) @ solution.inverse
     mark_undetermined(covariance, solution.determined)
     count = len(scores)
     return Clustered(
         covariance=covariance,
         determined=solution.determined,
-        design_effect=float((corrected**2).sum() / max(1, corrected.shape[1])),
+        design_effect=effect,
         interval_factor=float(student_limit(0.025, max(1, count - 1))),
         words=f"cluster-robust covariance over {count} blocks of {length * FINE_BLOCK:g} s",
     )

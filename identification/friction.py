@@ -197,3 +197,18 @@ def presliding_state(position: Array, distance: float) -> Array:
         stretch = s + (value - s) * np.exp((origin - travel[start:stop]) / distance)
         state[start:stop], value = stretch, stretch[-1]
     return state
+
+
+def law_words(law: FrictionLaw) -> tuple[str, str]:
+    """The terms of a law, and what dry friction does at a reversal, in words."""
+    terms = {
+        "Coulomb": law.coulomb,
+        "viscous": law.viscous,
+        law.third or "": law.third is not None,
+        f"Stribeck ({law.stribeck or 0.0:g} rad/s)": law.stribeck is not None,
+        "by direction": law.asymmetric,
+        "offset": law.offset,
+    }
+    listed = ", ".join(word for word, present in terms.items() if present)
+    reversal = f"presliding over {law.presliding:g} rad" if law.presliding else "sgn(v)"
+    return listed or "no friction", reversal

@@ -111,7 +111,7 @@ def mask_rows(
     current_limit: Array | None = None,
     torque_bandwidth: Array | None = None,
     delay: float = 0.0,
-    left_out: LeftOut = "rests",
+    left_out: LeftOut = "slow",
     reversal_periods: float = REVERSAL_PERIODS,
 ) -> RowMask:
     """Reasons against each row of a recording.

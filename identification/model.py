@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +124,22 @@ class RobotModel:
             coupling=coupling,
             payload=payload,
             _load=None if payload is None else Load(chain, down, payload),
+        )
+
+    def with_friction(self, **changes: Any) -> RobotModel:
+        """Return the model with other friction, as :class:`FrictionLaw` names its parts.
+
+        Raises:
+            ModelError: some joint's law would be none, see :class:`FrictionLaw`.
+        """
+        laws = tuple(replace(law, **changes) for law in self.friction.laws)
+        friction = replace(self.friction, laws=laws)
+        return replace(
+            self,
+            friction=friction,
+            parameter_names=self.base.names + friction.names,
+            units=tuple(self.layout.units[k] for k in self.base.kept) + friction.units,
+            plan=_plan(self.chain, self.gravity, self.layout, self.base.kept, friction),
         )
 
     @property

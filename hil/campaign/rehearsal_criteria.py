@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil.archive import open_archive
 from hil.errors import InputError
 from hil.identify.estimating import estimate_with
-from hil.identify.options import Options
+from hil.identify.options import FIXED
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Reporter
@@ -93,7 +93,7 @@ def of_estimate(
         for kind in ("excitation", "validation", "standstill")
         for path in folder.completed(kind)
     ]
-    options = Options()
+    options = FIXED
     try:
         prepared = prepare_sources(gather_sources(paths, options.split), options, reporter)
         estimation = estimate_with(prepared, options, reporter)

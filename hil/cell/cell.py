@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -137,6 +137,23 @@ class Cell:
             self.file.robot,
             lambda: self.drive_train.motor_from_joint,
         )
+
+    def with_friction(self, **changes: Any) -> Cell:
+        """The cell with another friction law of all joints, entries as in `[robot.friction]`.
+
+        Raises:
+            CellError: there is no such law.
+        """
+        table = self.file.robot.friction
+        joints = {
+            name: one.model_copy(update=dict.fromkeys(changes))
+            for name, one in table.joints.items()
+        }
+        friction = table.model_copy(update={**changes, "joints": joints})
+        robot = self.file.robot.model_copy(update={"friction": friction})
+        changed = replace(self, file=self.file.model_copy(update={"robot": robot}))
+        _ = changed.model
+        return changed
 
     @property
     def joint_names(self) -> tuple[str, ...]:

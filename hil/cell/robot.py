@@ -84,6 +84,7 @@ def _law(path: Path, field: str, table: FrictionTable) -> FrictionLaw:
             stribeck=table.stribeck or None,
             asymmetric=table.asymmetric,
             zone=table.zone,
+            presliding=table.presliding,
         )
 
 

@@ -65,6 +65,9 @@ class JointFrictionTable(Table):
     zone: Literal["exclude", "linear"] | None = Field(
         default=None, description='"exclude" or "linear"'
     )
+    presliding: NonNegative | None = Field(
+        default=None, description="displacement in rad (m) over which dry friction turns round"
+    )
 
 
 class FrictionTable(Table):
@@ -89,6 +92,11 @@ class FrictionTable(Table):
         default="exclude",
         description='"exclude" (rows below standstill are not used) or "linear" (they are, with '
         "qd / standstill for the sign)",
+    )
+    presliding: NonNegative = Field(
+        default=0.0,
+        description="displacement in rad (m) over which dry friction turns round at a reversal "
+        "(Dahl), 0 for a jump; identification chooses its own unless it is told otherwise",
     )
     joints: dict[str, JointFrictionTable] = Field(
         default_factory=dict, description="tables of what is different for a joint, by its name"

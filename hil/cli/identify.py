@@ -12,7 +12,7 @@ from hil.cli.verdict import finish
 from hil.errors import InputError
 from hil.files import make_folder
 from hil.identify import Options, identify_archives, identify_campaign
-from hil.identify.options import ESTIMATORS, Estimator
+from hil.identify.options import ESTIMATORS, Estimator, friction_from
 from hil.outcome import write_outcome
 from hil.progress import reporter as make_reporter
 from hil.reading import lies_there
@@ -78,7 +78,37 @@ def identify(
         typer.Option(
             help="; ".join(f"{name}: {words}" for name, words in ESTIMATORS.items()) + "."
         ),
-    ] = "wls",
+    ] = "auto",
+    bandwidth: Annotated[
+        str,
+        typer.Option(
+            metavar="HZ|auto",
+            help="Widest bandwidth of the smoothed positions; auto: the one with which parts of "
+            "the fitted recordings are best predicted from the rest.",
+        ),
+    ] = "auto",
+    velocity: Annotated[
+        Literal["auto", "position", "measured"],
+        typer.Option(help="Slope of the smoothed positions, or the measured velocity, if any."),
+    ] = "auto",
+    friction: Annotated[
+        str,
+        typer.Option(
+            metavar="TERMS|auto",
+            help="Friction law, whatever the archive says: some of coulomb, viscous, quadratic, "
+            "cubic, offset, asymmetric, stribeck=RAD/S, presliding=RAD, with commas between "
+            "them. auto: the archive's, with what predicts best at reversals (and, of imported "
+            "recordings, at speed).",
+        ),
+    ] = "auto",
+    standstill: Annotated[
+        Literal["auto", "rests", "slow", "none"],
+        typer.Option(
+            help="Rows that are not fitted: rests longer than 0.25 s; all slow rows and those near "
+            "a velocity reversal; or none. auto: slow with a friction that jumps at a reversal, "
+            "rests otherwise."
+        ),
+    ] = "auto",
     delay: Annotated[
         str | None,
         typer.Option(
@@ -121,6 +151,10 @@ def identify(
         torque_bandwidth=bandwidth_from(torque_bandwidth),
         smoother=smoother,
         estimator=estimator,
+        bandwidth=_bandwidth(bandwidth),
+        velocity=velocity,
+        friction=friction_from(friction),
+        standstill=None if standstill == "auto" else standstill,
         in_sample=in_sample,
     )
     unseen = predict or ()
@@ -173,7 +207,19 @@ def _delay(text: str | None) -> float | Literal["auto"] | None:
     return value
 
 
-def bandwidth_from(text: str) -> float | Literal["auto"] | None:
+def _bandwidth(text: str) -> float | Literal["auto"]:
+    found = None if text == "none" else bandwidth_from(text, "--bandwidth")
+    if found is None:
+        raise InputError(
+            None,
+            "the positions have to be smoothed",
+            field="--bandwidth",
+            remedy='give a frequency above 0 Hz, or "auto"',
+        )
+    return found
+
+
+def bandwidth_from(text: str, option: str = "--torque-bandwidth") -> float | Literal["auto"] | None:
     """Bandwidth in Hz as the option says it.
 
     Raises:
@@ -191,7 +237,7 @@ def bandwidth_from(text: str) -> float | Literal["auto"] | None:
         raise InputError(
             None,
             f"{text!r} is no bandwidth",
-            field="--torque-bandwidth",
+            field=option,
             remedy='give a frequency above 0 Hz, "none" or "auto"',
         )
     return value

@@ -14,7 +14,7 @@ from identification.preprocessing import smooth
 from identification.recording import Recording
 from planner.plain import numbers
 
-from .sources import Source, Sources
+from .sources import Sources
 
 Array = NDArray[np.float64]
 
@@ -58,17 +58,15 @@ def with_torques(sources: Sources) -> Sources:
             remedy="give drive.torque_constant in the column map, or find it by `hil gains`",
         )
 
-    def made(source: Source) -> Source:
-        one = source.recording
+    def with_torque(one: Recording) -> Recording:
         if one.torque is not None or one.motor_current is None:
-            return source
-        torque = (one.motor_current * scale.values) @ turns
-        return replace(source, recording=replace(one, torque=torque))
+            return one
+        return replace(one, torque=(one.motor_current * scale.values) @ turns)
 
     sources = replace(
         sources,
-        training=tuple(made(source) for source in sources.training),
-        held_out=tuple(made(source) for source in sources.held_out),
+        training=tuple(source.changed(with_torque) for source in sources.training),
+        held_out=tuple(source.changed(with_torque) for source in sources.held_out),
     )
     for doubt in _doubts(sources.cell.joint_names, scale):
         sources = sources.with_doubt(doubt)

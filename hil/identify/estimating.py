@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +15,16 @@ from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
 from identification.consistent import consistent_estimate
 from identification.endogeneity import EndogeneityTest
-from identification.estimation import Estimate, nothing_usable
+from identification.estimation import Estimate, joint_weights, nothing_usable
 from identification.least_squares import Weighting, fit_least_squares
 from identification.losses import Huber, Loss, Tukey
-from identification.phase_factor import PhaseFactor
+from identification.phase_factor import PhaseFactor, total_phase
 from identification.preprocessing import Samples
 from identification.prior import GaussianPrior, PosteriorEstimate, fit_with_prior
 from identification.qr_factor import QR_CONDITION
 from identification.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.robust import RobustEstimate, robust_estimate
+from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 
 from .cad_prior import cad_prior
 from .instruments import InstrumentalFit, fit_instrumental, widely_smoothed
@@ -66,9 +68,10 @@ class _Case:
         fitted: Sequence[Samples],
         prior: GaussianPrior | str,
         instrumental: InstrumentalFit | str,
+        shrinkage: Shrinkage,
     ) -> None:
         self.model, self.fitted = model, fitted
-        self.prior, self.instrumental = prior, instrumental
+        self.prior, self.instrumental, self.shrinkage = prior, instrumental, shrinkage
 
 
 _Found = tuple[RepeatedEstimate, list[str]]
@@ -91,7 +94,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         instrumental = fit_instrumental(model, prepared, fitted)
         task.advance(1, options.estimator)
         prior = cad_prior(prepared.sources.cell)
-        case = _Case(model, fitted, prior, instrumental)
+        case = _Case(model, fitted, prior, instrumental, prepared.shrinkage)
         result, doubts = _ESTIMATORS[options.estimator](case)
         task.advance(1, "prior")
         posterior = _posterior(case, result.phase)
@@ -128,6 +131,23 @@ def _least_squares(weighting: Weighting) -> Callable[[_Case], _Found]:
         return estimate_repetitions(case.model, case.fitted, fit), []
 
     return run
+
+
+def _automatic(case: _Case) -> _Found:
+    """Least squares, or drawn towards one consistent solution, that of all repetitions."""
+    if case.shrinkage.strength == 0.0:
+        return _least_squares("weighted")(case)
+    total = total_phase(case.model, case.fitted).total
+    centre = consistent_centre(case.model, total, joint_weights(total), case.shrinkage.prior_weight)
+
+    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+        return fit_shrunk(case.model, some, case.shrinkage, centre=centre, phase=phase)
+
+    def free(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+        return fit_least_squares(case.model, some, phase=phase)
+
+    each = free if math.isinf(case.shrinkage.strength) else fit
+    return estimate_repetitions(case.model, case.fitted, fit, each=each), []
 
 
 def _robust(loss: Loss) -> Callable[[_Case], _Found]:
@@ -225,6 +245,7 @@ def _instrumental(case: _Case) -> _Found:
 
 
 _ESTIMATORS: Final[dict[Estimator, Callable[[_Case], _Found]]] = {
+    "auto": _automatic,
     "wls": _least_squares("weighted"),
     "ols": _least_squares("ordinary"),
     "huber": _robust(Huber()),

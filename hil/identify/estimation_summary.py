@@ -14,7 +14,9 @@ def estimator_result(model: RobotModel, estimation: Estimation) -> EstimatorResu
     posterior, pooled = estimation.posterior, estimation.result.pooled
     return EstimatorResult(
         name=estimation.estimator,
-        words=ESTIMATORS[estimation.estimator],
+        words=ESTIMATORS[estimation.estimator]
+        if estimation.estimator != "auto"
+        else estimation.result.pooled.method,
         prior=posterior if isinstance(posterior, str) else posterior.words,
         condition=pooled.condition,
         grouping=model.base.explanation(),

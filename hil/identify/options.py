@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 from hil.errors import InputError
-from identification.preprocessing import Smoother
+from identification.masks import LeftOut
+from identification.preprocessing import RIGID_BANDWIDTH, Smoother, VelocitySource
 
 Method = Literal["default", "paper"]
-Estimator = Literal["wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
+Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
 
 ESTIMATORS: Final[dict[Estimator, str]] = {
+    "auto": "weighted least squares, drawn towards the consistent solution as far as that predicts "
+    "better (chosen by inner prediction)",
     "wls": "weighted least squares (eq. 4): every joint's residual in its own noise",
     "ols": "ordinary least squares: every joint's residual alike, in N·m",
     "huber": "iteratively reweighted least squares, Huber's loss",
@@ -38,10 +43,18 @@ class Options:
             known to have come through none.
         smoother: of the positions: "spline" or "butterworth".
         estimator: by name, see `ESTIMATORS`.
+        bandwidth: widest of the smoothed positions [Hz].
+        velocity: the slope of the smoothed positions, or the measured velocity.
+        friction: entries of `[robot.friction]` that differ from the cell's.
+        standstill: which rows are left out for being slow: long "rests", all "slow" ones and
+            those near a reversal, or "none"; None goes by the friction law.
         in_sample: everything is fitted and nothing predicted: all errors are in-sample.
 
+    What is "auto" is chosen by predicting parts of what is fitted from the rest
+    (:mod:`identification.inner_prediction`).
+
     Raises:
-        InputError: a name is unknown, or the split no share.
+        InputError: a name is unknown, the split no share or the bandwidth no frequency.
     """
 
     method: Method = "default"
@@ -49,7 +62,11 @@ class Options:
     delay: float | Literal["auto"] | None = None
     torque_bandwidth: float | Literal["auto"] | None = "auto"
     smoother: Smoother = "spline"
-    estimator: Estimator = "wls"
+    estimator: Estimator = "auto"
+    bandwidth: float | Literal["auto"] = "auto"
+    velocity: VelocitySource | Literal["auto"] = "auto"
+    friction: Mapping[str, Any] | Literal["auto"] = "auto"
+    standstill: LeftOut | None = None
     in_sample: bool = False
 
     def __post_init__(self) -> None:
@@ -63,7 +80,75 @@ class Options:
                 raise InputError(
                     None, f"{value!r} is no {name}", field=name, remedy=f"use {', '.join(known)}"
                 )
+        if self.bandwidth != "auto" and not 0.0 < self.bandwidth < math.inf:
+            raise InputError(
+                None,
+                f"{self.bandwidth} is no bandwidth",
+                field="bandwidth",
+                remedy='give a frequency above 0 Hz, or "auto"',
+            )
         if not 0.0 < self.split < 1.0:
             raise InputError(
                 None, f"{self.split} is no share", field="split", remedy="give one between 0 and 1"
             )
+
+
+_TERMS: Final = ("coulomb", "viscous", "quadratic", "cubic", "offset", "asymmetric")
+
+
+def friction_from(text: str) -> Mapping[str, Any] | Literal["auto"]:
+    """A friction law from its terms: ``coulomb,viscous,offset,presliding=1e-4``.
+
+    Returns:
+        Entries of `[robot.friction]`; terms that are not named are left out of the law.
+
+    Raises:
+        InputError: a term is unknown, or its figure is none.
+    """
+    if text == "auto":
+        return "auto"
+    entries: dict[str, Any] = {
+        "coulomb": False,
+        "viscous": False,
+        "third": "none",
+        "offset": False,
+        "asymmetric": False,
+        "stribeck": 0.0,
+        "presliding": 0.0,
+    }
+    for term in text.split(","):
+        name, _, figure = term.strip().partition("=")
+        if name in ("quadratic", "cubic") and not figure:
+            entries["third"] = name
+        elif name in _TERMS and not figure:
+            entries[name] = True
+        elif name in ("stribeck", "presliding"):
+            entries[name] = _positive(term, figure)
+        else:
+            raise InputError(
+                None,
+                f"{term.strip()!r} is no term of friction",
+                field="--friction",
+                remedy=f"use auto, or some of {', '.join(_TERMS)}, stribeck=SPEED (rad/s) and "
+                "presliding=DISPLACEMENT (rad), with commas between them",
+            )
+    return entries
+
+
+def _positive(term: str, figure: str) -> float:
+    try:
+        value = float(figure)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise InputError(
+            None,
+            f"{term.strip()!r} has no figure above zero",
+            field="--friction",
+            remedy="write for instance presliding=1e-4",
+        )
+    return value
+
+
+FIXED: Final = Options(estimator="wls", bandwidth=RIGID_BANDWIDTH, velocity="position", friction={})
+"""Nothing chosen by inner prediction: the cell's own friction law, weighted least squares."""

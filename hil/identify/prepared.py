@@ -13,9 +13,12 @@ from hil.progress import Reporter
 from identification.delay import DelayEstimate, estimate_delays
 from identification.delay_compensation import compensate
 from identification.errors import IdentificationError
-from identification.preprocessing import Preprocessing, Samples, prepare
+from identification.inner_prediction import Choice, Question, Settings, choose_settings
+from identification.model import RobotModel
+from identification.preprocessing import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
 from identification.repetition_noise import repetition_noise
 from identification.resampling import time_base
+from identification.shrinkage import Shrinkage
 from identification.torque_channel import find_torque_bandwidth
 
 from .currents import with_torques
@@ -24,6 +27,8 @@ from .sources import Source, Sources
 
 Array = NDArray[np.float64]
 
+# Repetitions of one motion that settings are chosen on.
+_REPETITIONS = 2
 # Where nobody asked for a delay, searching one may cost about a second: in so many samples.
 _DELAY_SAMPLES = 8000
 
@@ -45,6 +50,8 @@ class Prepared:
             them, in words.
         rows: time samples of `fitted`.
         notes: what was found and done, in sentences.
+        shrinkage: of the automatic estimator.
+        choices: what was chosen by inner prediction.
     """
 
     sources: Sources
@@ -57,6 +64,8 @@ class Prepared:
     masked: Mapping[str, NDArray[np.intp]]
     rows: int
     notes: tuple[str, ...]
+    shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
+    choices: tuple[Choice, ...] = ()
 
     @property
     def commanded(self) -> tuple[Array | None, ...]:
@@ -67,9 +76,9 @@ class Prepared:
 def prepare_sources(
     sources: Sources, options: Options, reporter: Reporter, *, look_for_delay: bool = True
 ) -> Prepared:
-    """Smooth every recording, after its time base, noise, low-pass and delay are settled.
+    """Smooth every recording, after its time base, noise, delay and settings are decided.
 
-    Only what is fitted is looked at to settle them.
+    Only what is fitted is looked at to decide them.
 
     Args:
         sources: the recordings.
@@ -86,7 +95,7 @@ def prepare_sources(
     notes = _time_bases(sources)
     sources, noise_note = _with_noise(sources)
     sources = with_torques(sources)
-    sources, preprocessing = _with_bandwidth(sources, _settings(sources, options), options)
+    sources, preprocessing = _stated(sources, options)
     delays = None
     if look_for_delay or options.delay == "auto":
         delays = _delays(sources, preprocessing, options, reporter)
@@ -94,6 +103,8 @@ def prepare_sources(
     assumed = np.full(sources.cell.model.n_joints, preprocessing.torque_delay)
     if delays is not None and options.delay == "auto":
         sources, preprocessing, assumed, delay_notes = _compensated(sources, preprocessing, delays)
+    sources, chosen, choices = _chosen(sources, preprocessing, options, reporter)
+    preprocessing = chosen.preprocessing
     # A verdict on smoothed torque would flatter: what is judged is the torque as recorded.
     judged = replace(preprocessing, smooth_torque=False)
     with reporter.task(
@@ -127,25 +138,39 @@ def prepare_sources(
         masked=masked,
         rows=rows,
         notes=(*notes, *noise_note, *delay_notes, *_left_out(sources, masked, rows)),
+        shrinkage=chosen.shrinkage,
+        choices=choices,
     )
 
 
-def samples_of(source: Source, sources: Sources, how: Preprocessing) -> Samples:
+def samples_of(
+    source: Source, sources: Sources, how: Preprocessing, model: RobotModel | None = None
+) -> Samples:
     """Samples of one of the sources, with the noise, the rows and the limits of all of them.
+
+    Args:
+        source: one of them.
+        sources: all.
+        how: to prepare it.
+        model: the robot, by default the cell's.
 
     Raises:
         RecordingError: the recording cannot be prepared.
     """
     cell = sources.cell
-    return prepare(
-        source.recording,
-        cell.model,
+    recording, start = source.context or (source.recording, 0)
+    whole = prepare(
+        recording,
+        model or cell.model,
         noise_variance=sources.noise_variance,
         torque_variance=sources.torque_variance,
         options=how,
         origin=source.origin,
         current_limit=current_limit(cell),
     )
+    if source.context is None:
+        return whole
+    return whole.between(start, start + source.recording.n_samples)
 
 
 def current_limit(cell: Cell) -> Array | None:
@@ -192,39 +217,87 @@ def _with_noise(sources: Sources) -> tuple[Sources, list[str]]:
     )
 
 
-def _settings(sources: Sources, options: Options) -> Preprocessing:
+def _stated(sources: Sources, options: Options) -> tuple[Sources, Preprocessing]:
+    """What is known or asked for before anything is chosen."""
     cell, delay = sources.cell, options.delay
     if not isinstance(delay, float):
         controller = cell.file.controller
         delay = controller.current_delay_cycles * cell.period if controller else 0.0
+    if options.friction != "auto":
+        cell = cell.with_friction(**options.friction)
     bandwidth = options.torque_bandwidth
-    return Preprocessing(
+    return replace(sources, cell=cell), Preprocessing(
         smoother=options.smoother,
+        rigid_bandwidth=RIGID_BANDWIDTH if options.bandwidth == "auto" else options.bandwidth,
+        velocity="position" if options.velocity == "auto" else options.velocity,
+        left_out=options.standstill,
         smooth_torque=options.method == "paper",
         torque_delay=delay,
         torque_bandwidth=bandwidth if isinstance(bandwidth, float) else None,
     )
 
 
-def _with_bandwidth(
-    sources: Sources, plain: Preprocessing, options: Options
-) -> tuple[Sources, Preprocessing]:
-    """Look for a low-pass in imported torques; a controller's own currents come through none."""
-    recording = sources.training[0].recording
-    if options.torque_bandwidth != "auto" or plain.smooth_torque:
-        return sources, plain
-    if recording.motor_current is not None:
-        return sources, plain
-    found = find_torque_bandwidth(
-        recording, sources.cell.model, noise_variance=sources.noise_variance, options=plain
-    )
-    if found is None:
-        return sources, plain
-    doubt = (
-        f"the recorded torque seems to have come through a low-pass of {found:.3g} Hz before it "
-        "was recorded (found on what was fitted); the model is filtered alike"
-    )
-    return sources.with_doubt(doubt), replace(plain, torque_bandwidth=found)
+def _questions(sources: Sources, options: Options) -> set[Question]:
+    """What inner prediction has to decide."""
+    recorded = [source.recording for source in sources.training]
+    asked: dict[Question, bool] = {
+        "bandwidth": options.bandwidth == "auto",
+        "velocity": options.velocity == "auto"
+        and options.smoother == "spline"
+        and all(one.velocity is not None for one in recorded),
+        "presliding": options.friction == "auto",
+        # A cell file with a drive train says which terms are wanted.
+        "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
+        # A controller's own currents come through no low-pass.
+        "low-pass": options.torque_bandwidth == "auto"
+        and options.method == "default"
+        and recorded[0].motor_current is None,
+        "estimator": options.estimator == "auto",
+    }
+    return {question for question, wanted in asked.items() if wanted}
+
+
+def _chosen(
+    sources: Sources, stated: Preprocessing, options: Options, reporter: Reporter
+) -> tuple[Sources, Settings, tuple[Choice, ...]]:
+    """Choose what is automatic, on the fitted part alone."""
+    start = Settings(sources.cell.model, stated)
+    questions = _questions(sources, options)
+    if not questions:
+        return sources, start, ()
+    read = _read_to_choose(sources)
+
+    def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+        return [samples_of(source, sources, how, model) for source in read]
+
+    def low_pass(model: RobotModel, how: Preprocessing) -> float | None:
+        return find_torque_bandwidth(
+            read[0].recording, model, noise_variance=sources.noise_variance, options=how
+        )
+
+    with reporter.task("choosing settings by inner prediction", 1) as task:
+        settings, choices = choose_settings(ready, start, questions, low_pass)
+        task.advance(1)
+    found = settings.preprocessing.torque_bandwidth
+    if "low-pass" in questions and found is not None:
+        sources = sources.with_doubt(
+            f"the recorded torque seems to have come through a low-pass of {found:.3g} Hz before "
+            "it was recorded (found on what was fitted); the model is filtered alike"
+        )
+    law = settings.model.friction.laws[0]
+    cell = sources.cell
+    if "presliding" in questions:
+        cell = cell.with_friction(presliding=law.presliding)
+    if "friction" in questions:
+        cell = cell.with_friction(third=law.third or "none", stribeck=law.stribeck or 0.0)
+    return replace(sources, cell=cell), settings, choices
+
+
+def _read_to_choose(sources: Sources) -> Sequence[Source]:
+    """Recordings that settings are chosen on: repetitions of one motion say the same again."""
+    if sources.same_motion:
+        return sources.training[:_REPETITIONS]
+    return sources.training
 
 
 def _delays(
@@ -273,7 +346,7 @@ def _compensated(
 
     def shifted(some: tuple[Source, ...]) -> tuple[Source, ...]:
         return tuple(
-            replace(source, recording=compensate(source.recording, found.applied))
+            replace(source, recording=compensate(source.recording, found.applied), context=None)
             for source in some
         )
 

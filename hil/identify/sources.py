@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,12 +40,24 @@ class Source:
         recording: joints in the order of the model.
         origin: time of the first set-point [s].
         merged: samples that had the time stamp of the one before, and were averaged with it.
+        context: the motion of a longer recording that this is a part of, and where it begins in
+            it, so that filters know what lies beyond its ends. Its torques are zero outside.
     """
 
     name: str
     recording: Recording
     origin: float
     merged: int = 0
+    context: tuple[Recording, int] | None = None
+
+    def changed(self, change: Callable[[Recording], Recording]) -> Source:
+        """The source with its recording, and the context of it, changed alike row by row."""
+        context = self.context
+        return replace(
+            self,
+            recording=change(self.recording),
+            context=None if context is None else (change(context[0]), context[1]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,20 +343,35 @@ def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Sour
         )
     whole = sources[0]
     cut = round(share * whole.recording.n_samples)
-    first = replace(
-        whole, name=f"{whole.name} (first part)", recording=whole.recording.between(0, cut)
-    )
-    time = float(whole.recording.time[min(cut, whole.recording.n_samples - 1)])
-    last = Source(
-        f"{whole.name} (last part)",
-        whole.recording.between(cut, whole.recording.n_samples),
-        time,
-    )
+    first = _part(whole, "first part", 0, cut)
+    last = _part(whole, "last part", cut, whole.recording.n_samples)
     doubt = (
         f"a temporal split: the first {share:.0%} of one recording were fitted, the rest of the "
         "same motion was predicted; other motions would be a harder test"
     )
     return [first], [last], doubt
+
+
+def _part(whole: Source, words: str, start: int, stop: int) -> Source:
+    recording = whole.recording
+    outside = np.ones(recording.n_samples, dtype=np.bool_)
+    outside[start:stop] = False
+
+    def silent(values: Array | None) -> Array | None:
+        return None if values is None else np.where(outside[:, None], 0.0, values)
+
+    context = replace(
+        recording,
+        torque=silent(recording.torque),
+        motor_current=silent(recording.motor_current),
+    )
+    return Source(
+        f"{whole.name} ({words})",
+        recording.between(start, stop),
+        float(recording.time[min(start, recording.n_samples - 1)]),
+        whole.merged,
+        (context, start),
+    )
 
 
 def position_noise(cell: Cell, rest: Recording) -> Array:

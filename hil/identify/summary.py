@@ -14,6 +14,7 @@ from hil.archive import foreign_json
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.results import (
+    ChoiceResult,
     CoverageResult,
     CriteriaResult,
     DelaysResult,
@@ -99,6 +100,15 @@ def summarise(
         validation=[] if sources.in_sample else _validation(sources, estimate, prepared.held_out),
         fitted=_fitted(model, pooled.values, prepared),
         delays=_delays(prepared),
+        choices=[
+            ChoiceResult(
+                name=choice.name,
+                candidates=[*choice.candidates],
+                errors=[error if np.isfinite(error) else None for error in choice.errors],
+                chosen=choice.chosen,
+            )
+            for choice in prepared.choices
+        ],
         coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
         verdict=VerdictResult(
             good=verdict.good,

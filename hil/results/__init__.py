@@ -7,6 +7,7 @@ from .exports import ExportResult
 from .judgement import FindingResult, JointJudgement, JudgementResult, ProfileResult
 from .results import (
     SCHEMA_VERSION,
+    ChoiceResult,
     CoverageResult,
     CriteriaResult,
     DelaysResult,
@@ -25,6 +26,7 @@ __all__ = [
     "BlindResult",
     "ConductResult",
     "ConsistencyResult",
+    "ChoiceResult",
     "CoverageResult",
     "CriteriaResult",
     "DelaysResult",

@@ -129,6 +129,17 @@ class DelaysResult(Frozen):
     """What the fit took it to be."""
 
 
+class ChoiceResult(Frozen):
+    """A setting that was chosen by predicting parts of what was fitted from the rest."""
+
+    name: str
+    candidates: list[str]
+    errors: list[float | None]
+    """||e|| / ||tau|| of the predictions, all joints and rows; null where there was none."""
+    chosen: int
+    """Index of the candidate that was used."""
+
+
 class CoverageResult(Frozen):
     """How many parameters lie within 2 and 3 standard deviations of the planted truth."""
 
@@ -235,6 +246,8 @@ class Results(Frozen):
     """In-sample errors, to stand beside those on unseen motion."""
     delays: DelaysResult | None = None
     """Null where they could not be looked for."""
+    choices: list[ChoiceResult] = Field(default_factory=list)
+    """Settings that were chosen automatically, in order."""
     coverage: CoverageResult | None
     verdict: VerdictResult
     essential: EssentialResult | None = None

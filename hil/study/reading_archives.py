@@ -6,14 +6,14 @@ Both methods are treated alike: the same smoothing, the same delay, the same wei
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.identify.options import Options
+from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import executed_rows, moving_rows
@@ -180,7 +180,7 @@ def _motion_rows(run: Samples) -> slice:
 def _prepared(reading: Reading) -> Prepared:
     """All archives as they are fitted; nothing is held out of what is asked for."""
     paths = [*reading.archives, *reading.standstill]
-    options = Options(in_sample=True)
+    options = replace(FIXED, in_sample=True)
     sources = gather_sources(paths, options.split, in_sample=True)
     return prepare_sources(sources, options, Silent(), look_for_delay=False)
 

@@ -1,0 +1,324 @@
+"""Settings of an identification, chosen by predicting parts of what is fitted from the rest.
+
+Each recording is cut into `FOLDS` stretches of time. Parameters are estimated from all stretches
+but one and predict the torque of that one: every row of it, at rest too. The score of a candidate
+is ``||e|| / ||tau||`` over all joints and stretches. What is held out of the fit is never read.
+
+Only the factors of the stretches are needed (:mod:`identification.phase_factor`), so the samples
+are read once for each candidate way of preparing them, and any number of estimators are compared
+on the same factors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.augmented_rows import augmented_rows
+from identification.errors import IdentificationError
+from identification.estimation import joint_weights, solve
+from identification.factor import Factor
+from identification.friction import FrictionLaw, law_words
+from identification.model import RobotModel
+from identification.preprocessing import Preprocessing, Samples, VelocitySource
+from identification.shrinkage import Shrinkage, consistent_centre, shrunk_values
+
+Array = NDArray[np.float64]
+Question = Literal["bandwidth", "velocity", "presliding", "friction", "low-pass", "estimator"]
+
+FOLDS: Final = 5
+# What a rigid model leaves out (elasticity of gears, the clock of a logger, the servo) begins at
+# some 10 Hz on most arms: the first candidate, which others have to beat.
+BANDWIDTHS: Final = (10.0, 5.0, 7.0, 14.0, 20.0, 40.0)  # Hz
+# A jump (zero) is no candidate: at rest its sign is that of the noise.
+PRESLIDING: Final = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3)  # rad or m
+STRENGTHS: Final = (0.0, 1e-3, 1e-2, 0.1, 1.0, math.inf)
+PRIOR_WEIGHTS: Final = (0.01, 0.1, 1.0, 10.0)
+USUAL_PRESLIDING: Final = 1e-4
+# Beyond Coulomb and viscous friction; one of them alone, for they look alike.
+FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
+    {"third": None, "stribeck": None},
+    {"third": "quadratic", "stribeck": None},
+    {"third": "cubic", "stribeck": None},
+    {"third": None, "stribeck": 0.1},
+)
+# A candidate replaces the simpler one before it only if it predicts better by this share; a
+# low-pass of the torque, which can stand in for much else, by more.
+WORTHWHILE: Final = 0.01
+LOW_PASS_WORTHWHILE: Final = 0.05
+# Rows beyond this rate add nothing to a comparison of bandwidths of 40 Hz and less.
+_RATE: Final = 250.0  # Hz
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is chosen.
+
+    Attributes:
+        model: the robot, with its friction.
+        preprocessing: of recordings into samples.
+        shrinkage: of the estimate.
+    """
+
+    model: RobotModel
+    preprocessing: Preprocessing
+    shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
+
+    def describe(self) -> tuple[str, ...]:
+        """The settings in words, part by part."""
+        how, width = self.preprocessing, self.preprocessing.torque_bandwidth
+        return (
+            f"{how.rigid_bandwidth:g} Hz",
+            "measured velocity" if how.velocity == "measured" else "velocity from positions",
+            *law_words(self.model.friction.laws[0]),
+            "no low-pass" if width is None else f"low-pass of {width:.3g} Hz",
+            self.shrinkage.describe(),
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One question that was decided by inner prediction.
+
+    Attributes:
+        name: what was chosen.
+        candidates: in words.
+        errors: ``||e|| / ||tau||`` of each candidate.
+        chosen: index of the one that was taken.
+    """
+
+    name: str
+    candidates: tuple[str, ...]
+    errors: tuple[float, ...]
+    chosen: int
+
+
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """Factors of each stretch: of the rows that count in a fit, and of all rows.
+
+    Attributes:
+        fitted: FOLDS factors.
+        predicted: FOLDS factors.
+    """
+
+    fitted: tuple[Factor, ...]
+    predicted: tuple[Factor, ...]
+
+    @classmethod
+    def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> Folds:
+        """Reduce recordings, each cut into `FOLDS` stretches of equal length."""
+        fitted = [Factor.zero(model) for _ in range(FOLDS)]
+        predicted = [Factor.zero(model) for _ in range(FOLDS)]
+        places = [np.append(columns, model.n_parameters) for columns in model.plan.columns]
+        for samples in recordings:
+            usable, m = samples.usable, len(samples.torque)
+            edges = np.linspace(0, m, FOLDS + 1).round().astype(int)
+            for part, rows in augmented_rows(model, replace(samples, usable=usable | True)):
+                for k in range(FOLDS):
+                    start, stop = max(edges[k], part.start), min(edges[k + 1], part.stop)
+                    if start >= stop:
+                        continue
+                    counts = usable[start:stop]
+                    for joint, (block, place) in enumerate(zip(rows, places, strict=True)):
+                        own = block[:, start - part.start : stop - part.start]
+                        used = own if counts[:, joint].all() else own[:, counts[:, joint]]
+                        index = np.ix_(place, place)
+                        predicted[k].gram[joint][index] += own @ own.T
+                        fitted[k].gram[joint][index] += used @ used.T
+                    predicted[k].samples[:] += stop - start
+                    fitted[k].samples[:] += np.count_nonzero(counts, axis=0)
+        return cls(tuple(fitted), tuple(predicted))
+
+    def without(self, k: int) -> Factor:
+        """What is fitted to predict stretch k."""
+        others = [factor for index, factor in enumerate(self.fitted) if index != k]
+        return sum(others[1:], others[0])
+
+    def error(self, estimate: Callable[[int, Factor], Array]) -> float:
+        """``||e|| / ||tau||`` of predictions by ``estimate(k, factor without stretch k)``."""
+        squares = 0.0
+        for k, target in enumerate(self.predicted):
+            augmented = np.append(-estimate(k, self.without(k)), 1.0)
+            squares += float(np.einsum("i,jik,k->", augmented, target.gram, augmented))
+        torque = sum(float(target.gram[:, -1, -1].sum()) for target in self.predicted)
+        return math.sqrt(max(squares, 0.0) / torque) if torque > 0.0 else math.nan
+
+
+Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
+"""What is fitted, prepared for a model, and nothing else."""
+
+LowPass = Callable[[RobotModel, Preprocessing], float | None]
+"""Bandwidth [Hz] of a low-pass that the torque may have come through, None for none."""
+
+
+def choose_settings(
+    ready: Ready,
+    start: Settings,
+    questions: Collection[Question],
+    low_pass: LowPass,
+) -> tuple[Settings, tuple[Choice, ...]]:
+    """Choose settings one question after the other, each with what was chosen before it.
+
+    Args:
+        ready: prepares what is fitted.
+        start: what is not asked for stays as it is here.
+        questions: what is chosen.
+        low_pass: looked for where "low-pass" is among them.
+
+    Returns:
+        The settings, and how they were chosen.
+    """
+    trial = _Trial(ready)
+    now = start
+    if "bandwidth" in questions:
+        now = _with(now, rigid_bandwidth=BANDWIDTHS[0])
+    if "presliding" in questions:
+        now = replace(now, model=now.model.with_friction(presliding=USUAL_PRESLIDING))
+    choices: list[Choice] = []
+    if "estimator" in questions:
+        quick = [Shrinkage(strength) for strength in STRENGTHS]
+        now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
+    if not {"bandwidth", "velocity"}.isdisjoint(questions):
+        found = trial.decide("bandwidth and velocity", _motions(now, questions))
+        now, choices = found.settings, [*choices, found.choice]
+    reversal = trial.decide("presliding displacement", _presliding(now, questions))
+    if "low-pass" in questions:
+        width = low_pass(reversal.settings.model, now.preprocessing)
+        if width is not None:
+            filtered = _with(now, torque_bandwidth=width)
+            behind = trial.decide("presliding displacement", _presliding(filtered, questions))
+            pair = [reversal.settings, behind.settings]
+            filters = trial.decide("low-pass of the torque", pair, LOW_PASS_WORTHWHILE)
+            reversal = (reversal, behind)[filters.choice.chosen]
+            choices.append(filters.choice)
+    now, choices = reversal.settings, [*choices, reversal.choice]
+    if "friction" in questions:
+        found = trial.decide("friction at speed", _friction_terms(now))
+        now, choices = found.settings, [*choices, found.choice]
+    if "estimator" in questions:
+        trial.renew_centres()
+        found = trial.decide("estimator", [replace(now, shrinkage=one) for one in _shrinkages()])
+        now, choices = found.settings, [*choices, found.choice]
+    return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
+
+
+class _Decision(NamedTuple):
+    settings: Settings
+    choice: Choice
+
+
+class _Trial:
+    """Scores of settings, on factors that are made once."""
+
+    def __init__(self, ready: Ready) -> None:
+        self._ready = ready
+        self._folds: dict[tuple[tuple[FrictionLaw, ...], Preprocessing], Folds] = {}
+        self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
+
+    def decide(
+        self, name: str, candidates: Sequence[Settings], share: float = WORTHWHILE
+    ) -> _Decision:
+        """Take the first candidate, or the best one if it predicts better by that share."""
+        errors = [self.error(one) for one in candidates]
+        best = int(np.nanargmin(errors)) if np.any(np.isfinite(errors)) else 0
+        chosen = best if errors[best] < (1.0 - share) * errors[0] else 0
+        words = _differences(candidates)
+        return _Decision(candidates[chosen], Choice(name, words, tuple(errors), chosen))
+
+    def error(self, settings: Settings) -> float:
+        """``||e|| / ||tau||``, infinite where some stretch cannot be predicted."""
+        shrinkage, folds = settings.shrinkage, self._reduced(settings)
+
+        def estimate(k: int, factor: Factor) -> Array:
+            weights = joint_weights(factor)
+            if shrinkage.strength == 0.0:
+                return solve(factor.weighted(weights)).values
+            key = settings.model.parameter_names, shrinkage.prior_weight, k
+            if key not in self._centres:
+                self._centres[key] = consistent_centre(
+                    settings.model, factor, weights, shrinkage.prior_weight
+                )
+            return shrunk_values(factor.weighted(weights), self._centres[key], shrinkage.strength)
+
+        try:
+            return folds.error(estimate)
+        except IdentificationError:
+            return math.inf
+
+    def renew_centres(self) -> None:
+        """Find consistent solutions anew, with the settings that are asked for next."""
+        self._centres.clear()
+
+    def _reduced(self, settings: Settings) -> Folds:
+        key = settings.model.friction.laws, settings.preprocessing
+        if key not in self._folds:
+            samples = self._ready(settings.model, settings.preprocessing)
+            self._folds[key] = Folds.of(settings.model, map(_thinned, samples))
+        return self._folds[key]
+
+
+def _thinned(samples: Samples) -> Samples:
+    """One row in so many, as far as what is compared has no more to say."""
+    usual = float(np.median(np.diff(samples.motion.time)))
+    every = max(1, round(1.0 / (_RATE * usual)))
+    if every == 1 or samples.torque_bandwidth is not None:
+        return samples
+    some = slice(None, None, every)
+    return replace(
+        samples,
+        motion=samples.motion.rows(some),
+        torque=samples.torque[some],
+        usable=samples.usable[some],
+        segments=(slice(0, len(samples.torque[some])),),
+        mask=None,
+    )
+
+
+def _motions(now: Settings, questions: Collection[Question]) -> list[Settings]:
+    widths = BANDWIDTHS if "bandwidth" in questions else (now.preprocessing.rigid_bandwidth,)
+    sources: list[VelocitySource] = [now.preprocessing.velocity]
+    if "velocity" in questions:
+        sources = ["position", "measured"]
+    return [
+        _with(now, velocity=source, rigid_bandwidth=width) for source in sources for width in widths
+    ]
+
+
+def _presliding(now: Settings, questions: Collection[Question]) -> list[Settings]:
+    if "presliding" not in questions:
+        return [now]
+    # In the middle of what gears do, so that others have to earn their place.
+    others = [one for one in PRESLIDING if one != USUAL_PRESLIDING]
+    return [
+        replace(now, model=now.model.with_friction(presliding=distance))
+        for distance in (USUAL_PRESLIDING, *others)
+    ]
+
+
+def _friction_terms(now: Settings) -> list[Settings]:
+    return [replace(now, model=now.model.with_friction(**terms)) for terms in FRICTION_TERMS]
+
+
+def _shrinkages() -> list[Shrinkage]:
+    some = [strength for strength in STRENGTHS if strength > 0.0]
+    return [Shrinkage(), *(Shrinkage(strength, w) for w in PRIOR_WEIGHTS for strength in some)]
+
+
+def _with(settings: Settings, **changes: Any) -> Settings:
+    return replace(settings, preprocessing=replace(settings.preprocessing, **changes))
+
+
+def _differences(candidates: Sequence[Settings]) -> tuple[str, ...]:
+    """Each candidate in words, by what differs between them."""
+    parts = [one.describe() for one in candidates]
+    differ = [len(set(column)) > 1 for column in zip(*parts, strict=True)]
+    return tuple(
+        ", ".join(word for word, apart in zip(words, differ, strict=True) if apart)
+        for words in parts
+    )
