@@ -203,7 +203,9 @@ def choose_settings(
         now, choices = found.settings, [*choices, found.choice]
     if "estimator" in questions:
         trial.renew_centres()
-        found = trial.decide("estimator", [replace(now, shrinkage=one) for one in _shrinkages()])
+        weights = PRIOR_WEIGHTS if now.shrinkage.strength > 0.0 else (now.shrinkage.prior_weight,)
+        candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
+        found = trial.decide("estimator", candidates)
         now, choices = found.settings, [*choices, found.choice]
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
 
@@ -218,6 +220,7 @@ class _Trial:
 
     def __init__(self, ready: Ready) -> None:
         self._ready = ready
+        self._samples: dict[Preprocessing, list[Samples]] = {}
         self._folds: dict[tuple[tuple[FrictionLaw, ...], Preprocessing], Folds] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
 
@@ -258,8 +261,13 @@ class _Trial:
     def _reduced(self, settings: Settings) -> Folds:
         key = settings.model.friction.laws, settings.preprocessing
         if key not in self._folds:
-            samples = self._ready(settings.model, settings.preprocessing)
-            self._folds[key] = Folds.of(settings.model, map(_thinned, samples))
+            if settings.preprocessing not in self._samples:
+                samples = self._ready(settings.model, settings.preprocessing)
+                self._samples[settings.preprocessing] = [*samples]
+            samples = self._samples[settings.preprocessing]
+            self._folds[key] = Folds.of(
+                settings.model, (_thinned(one.directed(settings.model)) for one in samples)
+            )
         return self._folds[key]
 
 
@@ -305,9 +313,9 @@ def _friction_terms(now: Settings) -> list[Settings]:
     return [replace(now, model=now.model.with_friction(**terms)) for terms in FRICTION_TERMS]
 
 
-def _shrinkages() -> list[Shrinkage]:
+def _shrinkages(prior_weights: Sequence[float]) -> list[Shrinkage]:
     some = [strength for strength in STRENGTHS if strength > 0.0]
-    return [Shrinkage(), *(Shrinkage(strength, w) for w in PRIOR_WEIGHTS for strength in some)]
+    return [Shrinkage(), *(Shrinkage(strength, w) for w in prior_weights for strength in some)]
 
 
 def _with(settings: Settings, **changes: Any) -> Settings:

@@ -61,10 +61,13 @@ class RowMask:
     Attributes:
         reasons: by reason in words, the rows it excludes (m, n); a row may have several.
         shape: (m, n).
+        moving: rows (m, n) without any reason against them in which the joint moves, away from
+            its reversals: what a model of sliding friction is judged on.
     """
 
     reasons: Mapping[str, Rows]
     shape: tuple[int, int]
+    moving: Rows
 
     @property
     def usable(self) -> Rows:
@@ -78,7 +81,7 @@ class RowMask:
         """The mask of some of the rows."""
         reasons = {reason: rows[part] for reason, rows in self.reasons.items()}
         length = len(range(*part.indices(self.shape[0])))
-        return RowMask(MappingProxyType(reasons), (length, self.shape[1]))
+        return RowMask(MappingProxyType(reasons), (length, self.shape[1]), self.moving[part])
 
     @property
     def counts(self) -> dict[str, NDArray[np.intp]]:
@@ -154,14 +157,15 @@ def mask_rows(
     torn = torn_rows(recording, min(LONGEST_END, END_PERIODS / slowest), delay)
     if torque_bandwidth is not None:
         torn |= torn_rows(recording, min(LONGEST_END, END_PERIODS / float(torque_bandwidth.min())))
+    reversal = near_any_reversal(model, motion, reversal_periods / bandwidth)
     reasons = {TORN: np.broadcast_to(torn[:, None], shape)}
     if left_out == "rests":
         reasons[REST] = long_halts(motion.time, standing)
     elif left_out == "slow":
-        reasons[STANDSTILL] = standing
-        reasons[REVERSAL] = near_any_reversal(model, motion, reversal_periods / bandwidth)
+        reasons |= {STANDSTILL: standing, REVERSAL: reversal}
     reasons[SATURATED] = saturated
-    return RowMask(MappingProxyType(reasons), (shape[0], shape[1]))
+    moving = ~(reasons[TORN] | saturated | standing | reversal)
+    return RowMask(MappingProxyType(reasons), (shape[0], shape[1]), moving)
 
 
 def long_halts(time: Array, standing: Rows) -> Rows:

@@ -129,6 +129,17 @@ class Samples:
             whole=None if self.torque_bandwidth is None else (self, part),
         )
 
+    def moving(self) -> Samples:
+        """Return samples of which only rows count in which the joint moves."""
+        return self if self.mask is None else replace(self, usable=self.mask.moving)
+
+    def directed(self, model: RobotModel) -> Samples:
+        """Return samples whose dry friction has the direction that a model's law gives it."""
+        if not any(law.presliding > 0.0 for law in model.friction.laws):
+            return replace(self, motion=self.motion._replace(direction=None))
+        direction = model.friction.direction(self.motion.position, self.motion.velocity)
+        return replace(self, motion=self.motion._replace(direction=direction))
+
     def as_measured(self, joint: int, columns: Array) -> Array:
         """Columns (m, c) of a joint's row as the torque channel would have recorded them."""
         if self.torque_bandwidth is None:
@@ -227,10 +238,6 @@ def prepare(
     if recording.torque is None:
         raise RecordingError("torque", "the recording has no joint torque to fit")
     motion, bandwidth = _motion(recording, noise_variance, options)
-    presliding = [law.presliding > 0.0 for law in model.friction.laws]
-    if any(presliding):
-        direction = model.friction.direction(motion.position, motion.velocity)
-        motion = motion._replace(direction=direction)
     segments = tuple(recording.segments())
     torque, torque_bandwidth = recording.torque, None
     if options.torque_bandwidth is not None:
@@ -239,6 +246,7 @@ def prepare(
         if torque_bandwidth is None:
             torque_bandwidth = _noise_bandwidth(recording, torque_variance, segments)
         torque = _low_passed(recording.time, torque, torque_bandwidth, segments)
+    presliding = all(law.presliding > 0.0 for law in model.friction.laws)
     mask = mask_rows(
         recording,
         model,
@@ -248,7 +256,7 @@ def prepare(
         current_limit=current_limit,
         torque_bandwidth=torque_bandwidth,
         delay=options.torque_delay,
-        left_out=options.left_out or ("rests" if all(presliding) else "slow"),
+        left_out=options.left_out or ("rests" if presliding else "slow"),
         reversal_periods=options.reversal_periods,
     )
     samples = Samples(
@@ -260,7 +268,7 @@ def prepare(
         position_bandwidth=bandwidth,
         torque_bandwidth=torque_bandwidth,
         mask=mask,
-    )
+    ).directed(model)
     return samples if model.payload is None else _unloaded(samples, model)
 
 

@@ -27,8 +27,8 @@ from .sources import Source, Sources
 
 Array = NDArray[np.float64]
 
-# Repetitions of one motion that settings are chosen on.
-_REPETITIONS = 2
+# Repetitions of one motion that settings are chosen on: more say the same again.
+_REPETITIONS = 1
 # Where nobody asked for a delay, searching one may cost about a second: in so many samples.
 _DELAY_SAMPLES = 8000
 
@@ -126,6 +126,7 @@ def prepare_sources(
         training = tuple(samples_of(source, sources, judged) for source in sources.training)
     if sources.in_sample:
         held_out = training
+    training, held_out = (tuple(one.moving() for one in some) for some in (training, held_out))
     masked, rows = _masked(fitted), sum(len(one.torque) for one in fitted)
     return Prepared(
         sources=sources,
