@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,22 +24,28 @@ from identification.errors import IdentificationError
 from identification.estimation import joint_weights, solve
 from identification.factor import Factor
 from identification.friction import FrictionLaw, law_words
+from identification.masks import LeftOut
 from identification.model import RobotModel
 from identification.preprocessing import Preprocessing, Samples, VelocitySource
 from identification.shrinkage import Shrinkage, consistent_centre, shrunk_values
 
 Array = NDArray[np.float64]
-Question = Literal["bandwidth", "velocity", "presliding", "friction", "low-pass", "estimator"]
+Question = Literal[
+    "bandwidth", "velocity", "presliding", "rows", "friction", "low-pass", "estimator"
+]
 
 FOLDS: Final = 5
 # What a rigid model leaves out (elasticity of gears, the clock of a logger, the servo) begins at
 # some 10 Hz on most arms: the first candidate, which others have to beat.
 BANDWIDTHS: Final = (10.0, 5.0, 7.0, 14.0, 20.0, 40.0)  # Hz
-# A jump (zero) is no candidate: at rest its sign is that of the noise.
-PRESLIDING: Final = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3)  # rad or m
+# In the middle of what gears do first. A jump (zero) is no candidate: at rest its sign is that of
+# the noise.
+PRESLIDING: Final = (1e-4, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
+# Rows near a reversal say how dry friction turns round, but not so well as sliding ones what it is:
+# where they do not help, intervals are honest only without them.
+LEFT_OUT: Final[tuple[LeftOut, ...]] = ("slow", "rests")
 STRENGTHS: Final = (0.0, 1e-3, 1e-2, 0.1, 1.0, math.inf)
 PRIOR_WEIGHTS: Final = (0.01, 0.1, 1.0, 10.0)
-USUAL_PRESLIDING: Final = 1e-4
 # Beyond Coulomb and viscous friction; one of them alone, for they look alike.
 FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": None, "stribeck": None},
@@ -51,8 +57,10 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
 # low-pass of the torque, which can stand in for much else, by more.
 WORTHWHILE: Final = 0.01
 LOW_PASS_WORTHWHILE: Final = 0.05
+TERM_WORTHWHILE: Final = 0.02
 # Rows beyond this rate add nothing to a comparison of bandwidths of 40 Hz and less.
 _RATE: Final = 250.0  # Hz
+_MOST_SWEEPS: Final = 4
 
 
 @dataclass(frozen=True)
@@ -69,6 +77,11 @@ class Settings:
     preprocessing: Preprocessing
     shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
 
+    @property
+    def key(self) -> tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage]:
+        """What tells settings of one robot apart."""
+        return self.model.friction.laws, self.preprocessing, self.shrinkage
+
     def describe(self) -> tuple[str, ...]:
         """The settings in words, part by part."""
         how, width = self.preprocessing, self.preprocessing.torque_bandwidth
@@ -76,6 +89,9 @@ class Settings:
             f"{how.rigid_bandwidth:g} Hz",
             "measured velocity" if how.velocity == "measured" else "velocity from positions",
             *law_words(self.model.friction.laws[0]),
+            {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
+                how.left_out or "", "by the friction law"
+            ),
             "no low-pass" if width is None else f"low-pass of {width:.3g} Hz",
             self.shrinkage.describe(),
         )
@@ -178,28 +194,25 @@ def choose_settings(
     now = start
     if "bandwidth" in questions:
         now = _with(now, rigid_bandwidth=BANDWIDTHS[0])
+    if "rows" in questions:
+        now = _with(now, left_out=LEFT_OUT[0])
     if "presliding" in questions:
-        now = replace(now, model=now.model.with_friction(presliding=USUAL_PRESLIDING))
+        now = replace(now, model=now.model.with_friction(presliding=PRESLIDING[0]))
     choices: list[Choice] = []
     if "estimator" in questions:
         quick = [Shrinkage(strength) for strength in STRENGTHS]
         now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
-    if not {"bandwidth", "velocity"}.isdisjoint(questions):
-        found = trial.decide("bandwidth and velocity", _motions(now, questions))
-        now, choices = found.settings, [*choices, found.choice]
-    reversal = trial.decide("presliding displacement", _presliding(now, questions))
+    now, choices = _sweep(trial, now, questions)
     if "low-pass" in questions:
-        width = low_pass(reversal.settings.model, now.preprocessing)
+        width = low_pass(now.model, now.preprocessing)
         if width is not None:
-            filtered = _with(now, torque_bandwidth=width)
-            behind = trial.decide("presliding displacement", _presliding(filtered, questions))
-            pair = [reversal.settings, behind.settings]
-            filters = trial.decide("low-pass of the torque", pair, LOW_PASS_WORTHWHILE)
-            reversal = (reversal, behind)[filters.choice.chosen]
-            choices.append(filters.choice)
-    now, choices = reversal.settings, [*choices, reversal.choice]
+            filtered, behind = _sweep(trial, _with(now, torque_bandwidth=width), questions)
+            found = trial.decide("low-pass of the torque", [now, filtered], LOW_PASS_WORTHWHILE)
+            if found.choice.chosen:
+                now, choices = filtered, behind
+            choices = [*choices, found.choice]
     if "friction" in questions:
-        found = trial.decide("friction at speed", _friction_terms(now))
+        found = trial.decide("friction at speed", _friction_terms(now), TERM_WORTHWHILE)
         now, choices = found.settings, [*choices, found.choice]
     if "estimator" in questions:
         trial.renew_centres()
@@ -222,6 +235,7 @@ class _Trial:
         self._ready = ready
         self._samples: dict[Preprocessing, list[Samples]] = {}
         self._folds: dict[tuple[tuple[FrictionLaw, ...], Preprocessing], Folds] = {}
+        self._errors: dict[tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage], float] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
 
     def decide(
@@ -236,6 +250,11 @@ class _Trial:
 
     def error(self, settings: Settings) -> float:
         """``||e|| / ||tau||``, infinite where some stretch cannot be predicted."""
+        if settings.key not in self._errors:
+            self._errors[settings.key] = self._predicted(settings)
+        return self._errors[settings.key]
+
+    def _predicted(self, settings: Settings) -> float:
         shrinkage, folds = settings.shrinkage, self._reduced(settings)
 
         def estimate(k: int, factor: Factor) -> Array:
@@ -257,6 +276,7 @@ class _Trial:
     def renew_centres(self) -> None:
         """Find consistent solutions anew, with the settings that are asked for next."""
         self._centres.clear()
+        self._errors.clear()
 
     def _reduced(self, settings: Settings) -> Folds:
         key = settings.model.friction.laws, settings.preprocessing
@@ -288,25 +308,47 @@ def _thinned(samples: Samples) -> Samples:
     )
 
 
-def _motions(now: Settings, questions: Collection[Question]) -> list[Settings]:
-    widths = BANDWIDTHS if "bandwidth" in questions else (now.preprocessing.rigid_bandwidth,)
-    sources: list[VelocitySource] = [now.preprocessing.velocity]
-    if "velocity" in questions:
-        sources = ["position", "measured"]
+def _sweep(
+    trial: _Trial, now: Settings, questions: Collection[Question]
+) -> tuple[Settings, list[Choice]]:
+    """Decide what depends on one another in turn, until nothing changes."""
+    asked = [(name, vary) for question, name, vary in _SWEPT if question in questions]
+    choices: list[Choice] = []
+    for _ in range(_MOST_SWEEPS):
+        before = now
+        choices = []
+        for name, vary in asked:
+            found = trial.decide(name, vary(now))
+            now, choices = found.settings, [*choices, found.choice]
+        if now.key == before.key:
+            break
+    return now, choices
+
+
+def _bandwidths(now: Settings) -> list[Settings]:
+    return [_with(now, rigid_bandwidth=width) for width in BANDWIDTHS]
+
+
+def _velocities(now: Settings) -> list[Settings]:
+    return [_with(now, velocity=source) for source in get_args(VelocitySource)]
+
+
+def _rows(now: Settings) -> list[Settings]:
+    return [_with(now, left_out=rows) for rows in LEFT_OUT]
+
+
+def _presliding(now: Settings) -> list[Settings]:
     return [
-        _with(now, velocity=source, rigid_bandwidth=width) for source in sources for width in widths
+        replace(now, model=now.model.with_friction(presliding=distance)) for distance in PRESLIDING
     ]
 
 
-def _presliding(now: Settings, questions: Collection[Question]) -> list[Settings]:
-    if "presliding" not in questions:
-        return [now]
-    # In the middle of what gears do, so that others have to earn their place.
-    others = [one for one in PRESLIDING if one != USUAL_PRESLIDING]
-    return [
-        replace(now, model=now.model.with_friction(presliding=distance))
-        for distance in (USUAL_PRESLIDING, *others)
-    ]
+_SWEPT: Final[tuple[tuple[Question, str, Callable[[Settings], list[Settings]]], ...]] = (
+    ("bandwidth", "bandwidth of the motion", _bandwidths),
+    ("velocity", "velocity", _velocities),
+    ("presliding", "presliding displacement", _presliding),
+    ("rows", "rows that are left out", _rows),
+)
 
 
 def _friction_terms(now: Settings) -> list[Settings]:

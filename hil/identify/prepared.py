@@ -247,6 +247,7 @@ def _questions(sources: Sources, options: Options) -> set[Question]:
         and options.smoother == "spline"
         and all(one.velocity is not None for one in recorded),
         "presliding": options.friction == "auto",
+        "rows": options.standstill is None,
         # A cell file with a drive train says which terms are wanted.
         "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
         # A controller's own currents come through no low-pass.
