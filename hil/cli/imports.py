@@ -135,6 +135,14 @@ def rosbag2(
             help="What the effort field holds: torque (N·m), motor_current (A) or ignore."
         ),
     ] = "torque",
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="RECORDED=URDF",
+            help="A joint that the bag calls by another name than the URDF; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
     locked: Locked = None,
     lock_others: LockOthers = False,
     held: Held = None,
@@ -159,6 +167,7 @@ def rosbag2(
             None, f"{effort!r} is unknown", field="--effort", remedy=f"use {', '.join(kinds)}"
         )
     _require_one_robot(urdf, cell, dh)
+    names = _names(rename or [])
     path = import_rosbag2(
         source,
         output,
@@ -170,10 +179,11 @@ def rosbag2(
             gravity,
             _law(friction, standstill),
             _positions(locked or []),
-            recorded_joints(source, topic) if lock_others else None,
+            recorded_joints(source, topic, names) if lock_others else None,
         ),
         topic=topic,
         effort=kinds[effort],
+        joint_names=names,
         held_joints=held or (),
         use=_use(kind),
     )
@@ -343,6 +353,19 @@ def _positions(locked: list[str]) -> dict[str, float]:
                 remedy="give rad or m, as in --locked joint_7=0.3",
             ) from error
     return positions
+
+
+def _names(renamed: list[str]) -> dict[str, str]:
+    """Name in the URDF by name in the bag."""
+    names = {}
+    for text in renamed:
+        recorded, _, name = text.partition("=")
+        if not (recorded and name):
+            raise InputError(
+                None, f"{text!r} is no pair", field="--rename", remedy="give RECORDED=URDF"
+            )
+        names[recorded] = name
+    return names
 
 
 def _law(terms: str, standstill: float) -> FrictionLaw:

@@ -237,7 +237,8 @@ def _held(
             path,
             f"none of its joints {', '.join(names)} was recorded",
             field="--lock-others",
-            remedy=f"recorded are {', '.join(recorded)}: use the names of the URDF",
+            remedy=f"recorded are {', '.join(recorded)}; use the names of the URDF (joints in the "
+            "map of a log, --rename RECORDED=URDF of a bag)",
         )
     limits = urdf_limits(urdf)
     others = {

@@ -82,12 +82,17 @@ def import_rosbag2(
     )
 
 
-def recorded_joints(source: str | PathLike[str], topic: str | None = None) -> tuple[str, ...]:
+def recorded_joints(
+    source: str | PathLike[str],
+    topic: str | None = None,
+    joint_names: Mapping[str, str] | None = None,
+) -> tuple[str, ...]:
     """The joints of a bag: those of the first message with most of them.
 
     Args:
         source: as for `import_rosbag2`.
         topic: likewise.
+        joint_names: likewise; the names returned are those in the URDF.
 
     Raises:
         SourceError: no bag, no such topic, or no message.
@@ -98,7 +103,7 @@ def recorded_joints(source: str | PathLike[str], topic: str | None = None) -> tu
             found = max(found, tuple(_decoded(data, files[0], number).name), key=len)
     if not found:
         raise SourceError(files[0], "has no message with joints", field="joints")
-    return found
+    return tuple((joint_names or {}).get(name, name) for name in found)
 
 
 @contextmanager
@@ -230,7 +235,8 @@ class _States:
                 self.source,
                 f"none of the joints {', '.join(self.joints)} was recorded; {recorded}",
                 field="joints",
-                remedy="give the URDF of this robot, or one with the recorded names",
+                remedy="give the URDF of this robot, or say which joint is which: --rename "
+                "RECORDED=URDF",
             )
         position = self._column("position")
         if position is None:

@@ -161,6 +161,18 @@ class TestRobotOfAnImport:
         assert "locked, rad or m: shoulder at 0" in result.output
         assert open_archive(place / "o.mcap").joint_names == ("elbow",)
 
+    def test_joints_of_a_bag_can_have_other_names(self, place: Path) -> None:
+        messages = [state(10**7 * k, [0.1 * k], names=["j2"]) for k in range(9)]
+        bag(place / "other.db3", {"/js": (STATE, messages)})
+        arguments = ["import", "rosbag2", str(place / "other.db3"), "-o", str(place / "o.mcap")]
+        arguments += ["--urdf", str(URDF), "--lock-others"]
+        refused = CliRunner().invoke(app, arguments)
+        assert "recorded are j2" in str(refused.exception)
+        assert "--rename RECORDED=URDF" in str(refused.exception)
+        assert "--rename" in str(CliRunner().invoke(app, [*arguments, "--rename", "j2"]).exception)
+        assert CliRunner().invoke(app, [*arguments, "--rename", "j2=elbow"]).exit_code == 0
+        assert open_archive(place / "o.mcap").joint_names == ("elbow",)
+
     def test_a_map_without_names_cannot_say_which_are_others(self, place: Path) -> None:
         text = (place / "map.toml").read_text()
         (place / "map.toml").write_text(text.replace('joints = ["elbow"]\n', ""))

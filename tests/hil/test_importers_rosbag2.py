@@ -218,6 +218,7 @@ class TestImport:
         messages = [state(5, [0.01], names=["finger"]), *states(2)]
         file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
         assert recorded_joints(file) == ("ankle", "hip")
+        assert recorded_joints(file, joint_names={"hip": "h"}) == ("ankle", "h")
         empty = bag(tmp_path / "e.db3", {"/js": (STATE, [])})
         with pytest.raises(SourceError, match="has no message with joints"):
             recorded_joints(empty)
