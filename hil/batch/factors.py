@@ -244,7 +244,7 @@ def design_effect(estimate: Estimate, phase: PhaseFactor, weighting: Weighting) 
 
 
 def _doubts(archive: Archive, cell: Cell, source: Source) -> tuple[str, ...]:
-    doubts = [*known_doubts(cell, archive), *Findings.of(archive.metadata).doubts]
+    doubts = [*known_doubts(cell, archive), *Findings.of(archive.metadata).warnings]
     if source.merged:
         doubts.append(
             f"{source.merged} samples had the time stamp of the one before and were averaged "

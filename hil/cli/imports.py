@@ -11,10 +11,22 @@ import typer
 
 from hil.archive import open_archive
 from hil.errors import InputError
-from hil.importers import ColumnMap, Findings, Robot, Use, import_log, import_rosbag2
+from hil.importers import (
+    STANDARD_GRAVITY,
+    ColumnMap,
+    Findings,
+    Robot,
+    Use,
+    convention_of,
+    import_log,
+    import_rosbag2,
+    recorded_joints,
+)
 from hil.lines import say
 from hil.printable import printable
 from identification import FrictionLaw
+
+FRICTION = "coulomb,viscous,offset"
 
 app = typer.Typer(
     help="Turn other people's recordings into archives that `hil identify` reads.",
@@ -30,11 +42,39 @@ CellFile = Annotated[
     Path | None,
     typer.Option(help="A cell file instead of --urdf and --friction.", show_default=False),
 ]
+Dh = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="TABLE",
+        help="In place of --urdf, a CSV table of DH parameters, where nothing else is known of the "
+        "robot: joint, type, a, alpha, d, theta_offset (m, rad; or a_mm, alpha_deg, …), a row per "
+        "joint. Needs --convention.",
+        show_default=False,
+    ),
+]
+DhConvention = Annotated[
+    str | None,
+    typer.Option(
+        help="Of --dh: standard (a row is Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or modified "
+        "(Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
+        show_default=False,
+    ),
+]
+Gravity = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(
+        metavar="X Y Z",
+        help="Gravity in the robot's base frame, m/s², for an arm on a wall, a ceiling or a slope: "
+        "0 0 9.81 for one that hangs upside down; 0 0 0 if the torques are without gravity "
+        "already. As of an upright arm, or as the cell says, if left out.",
+        show_default=False,
+    ),
+]
 Friction = Annotated[
     str,
     typer.Option(
-        help="Friction terms, comma separated: coulomb, viscous, quadratic (sgn(v) v²) or cubic "
-        "(v³), offset. A cell file can say more."
+        help="Friction terms, comma separated: coulomb, viscous, offset, quadratic (sgn(v) v²) or "
+        "cubic (v³). A cell file can say more."
     ),
 ]
 Standstill = Annotated[
@@ -48,6 +88,15 @@ Locked = Annotated[
         help="A joint of the URDF that was not recorded, NAME or NAME=POSITION (rad or m), held "
         "there (at 0); may be repeated.",
         show_default=False,
+    ),
+]
+LockOthers = Annotated[
+    bool,
+    typer.Option(
+        "--lock-others",
+        help="Lock every joint of the URDF that was not recorded, at 0 or at the middle of a "
+        "range without 0; the command says which. A log names those that were recorded in `joints` "
+        "of its map.",
     ),
 ]
 Held = Annotated[
@@ -72,7 +121,10 @@ def rosbag2(
     output: Output,
     urdf: Urdf = None,
     cell: CellFile = None,
-    friction: Friction = "coulomb,viscous,quadratic,offset",
+    dh: Dh = None,
+    convention: DhConvention = None,
+    gravity: Gravity = None,
+    friction: Friction = FRICTION,
     standstill: Standstill = 0.01,
     topic: Annotated[
         str | None, typer.Option(help="Topic of the joint states, if there is more than one.")
@@ -83,7 +135,16 @@ def rosbag2(
             help="What the effort field holds: torque (N·m), motor_current (A) or ignore."
         ),
     ] = "torque",
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="RECORDED=URDF",
+            help="A joint that the bag calls by another name than the URDF; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
     locked: Locked = None,
+    lock_others: LockOthers = False,
     held: Held = None,
     kind: Kind = "excitation",
     json: Json = False,
@@ -91,7 +152,10 @@ def rosbag2(
     """Import sensor_msgs/JointState from a rosbag2, or from any MCAP file; joints go by name.
 
     A bag's folder, its .db3 or .mcap file, compressed or not. Messages of other types in an MCAP
-    file are imported by `hil import log` with a column map.
+    file are imported by `hil import log` with a column map. Of a URDF with more joints than were
+    recorded, --locked or --lock-others leaves those out of the model.
+
+    **Example:** `hil import rosbag2 bag --urdf arm.urdf --lock-others --gravity 0 0 9.81 -o a.mcap`
     """
     kinds: dict[str, Literal["torque", "motor_current", "ignore"]] = {
         "torque": "torque",
@@ -102,12 +166,24 @@ def rosbag2(
         raise InputError(
             None, f"{effort!r} is unknown", field="--effort", remedy=f"use {', '.join(kinds)}"
         )
+    _require_one_robot(urdf, cell, dh)
+    names = _names(rename or [])
     path = import_rosbag2(
         source,
         output,
-        robot=_robot(urdf, cell, friction, standstill, locked),
+        robot=_robot(
+            urdf,
+            cell,
+            dh,
+            convention,
+            gravity,
+            _law(friction, standstill),
+            _positions(locked or []),
+            recorded_joints(source, topic, names) if lock_others else None,
+        ),
         topic=topic,
         effort=kinds[effort],
+        joint_names=names,
         held_joints=held or (),
         use=_use(kind),
     )
@@ -127,9 +203,13 @@ def log(
     ],
     urdf: Urdf = None,
     cell: CellFile = None,
-    friction: Friction = "coulomb,viscous,quadratic,offset",
+    dh: Dh = None,
+    convention: DhConvention = None,
+    gravity: Gravity = None,
+    friction: Friction = FRICTION,
     standstill: Standstill = 0.01,
     locked: Locked = None,
+    lock_others: LockOthers = False,
     held: Held = None,
     kind: Kind = "excitation",
     uncoupled: Annotated[
@@ -144,13 +224,36 @@ def log(
 ) -> None:
     """Import a log of numbers: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
 
-    A column map names its columns or arrays, their units and sides: `docs/archive-format.md`.
+    A column map names its columns or arrays, their units and sides: `docs/archive-format.md`. It
+    also says where a quantity has a file of its own, or one per joint; the recording may then be a
+    folder. What looks like a slip of the map is said in warnings: two readings, and their errors.
+
+    **Example:** `hil import log log.csv --map map.toml --urdf arm.urdf -o log.mcap`, with
+    `map.toml` of `[time] column = "t"`, `[position] columns = "q{}"`, `[torque] columns = "tau{}"`
     """
+    _require_one_robot(urdf, cell, dh)
+    found = ColumnMap.load(columns)
+    if lock_others and found.joints is None:
+        raise InputError(
+            columns,
+            "does not say which joints were recorded",
+            field="joints",
+            remedy="--lock-others needs joints = [...], the URDF's joint of each column",
+        )
     path = import_log(
         source,
         output,
-        robot=_robot(urdf, cell, friction, standstill, locked),
-        columns=ColumnMap.load(columns),
+        robot=_robot(
+            urdf,
+            cell,
+            dh,
+            convention,
+            gravity,
+            _law(friction, standstill),
+            _positions(locked or []),
+            found.joints if lock_others else None,
+        ),
+        columns=found,
         held_joints=held or (),
         use=_use(kind),
         coupled=not uncoupled,
@@ -169,13 +272,13 @@ def _tell(path: Path, *, json: bool) -> None:
     """What was read, as the archive keeps it."""
     found = Findings.of(open_archive(path).metadata)
     if json:
-        told = {"archive": str(path), "found": found.lines, "doubts": found.doubts}
-        typer.echo(json_format.dumps(told))
+        summary = {"archive": str(path), "found": found.lines, "warnings": found.warnings}
+        typer.echo(json_format.dumps(summary))
         return
     for line in found.lines:
         say(line)
-    for doubt in found.doubts:
-        typer.secho(printable(f"doubtful: {doubt}"), fg=typer.colors.YELLOW)
+    for warning in found.warnings:
+        typer.secho(printable(f"warning: {warning}"), fg=typer.colors.YELLOW)
     say(f"wrote {path}")
 
 
@@ -192,25 +295,47 @@ def _use(kind: str) -> Use:
     return kinds[kind]
 
 
-def _robot(
-    urdf: Path | None, cell: Path | None, friction: str, standstill: float, locked: list[str] | None
-) -> Robot:
-    if urdf is not None and cell is not None:
+def _require_one_robot(urdf: Path | None, cell: Path | None, dh: Path | None) -> None:
+    given = [name for name, path in (("--urdf", urdf), ("--cell", cell), ("--dh", dh)) if path]
+    if len(given) != 1:
         raise InputError(
             None,
-            "a cell file names its own URDF",
-            field="--urdf",
-            remedy="leave out one of --urdf and --cell",
+            "both describe the robot" if given else "whose recording is it?",
+            field=" and ".join(given) or "--urdf",
+            remedy="leave out one of them (a cell file names its own URDF)"
+            if given
+            else "give --urdf, --cell or --dh",
         )
-    if urdf is None and cell is None:
+
+
+def _robot(
+    urdf: Path | None,
+    cell: Path | None,
+    dh: Path | None,
+    convention: str | None,
+    gravity: tuple[float, float, float] | None,
+    law: FrictionLaw,
+    locked: dict[str, float],
+    recorded: tuple[str, ...] | None,
+) -> Robot:
+    if gravity is not None and not all(math.isfinite(one) for one in gravity):
         raise InputError(
-            None, "whose recording is it?", field="--urdf", remedy="give --urdf or --cell"
+            None, f"{gravity} is no vector", field="--gravity", remedy="give m/s², as in 0 0 -9.81"
         )
-    positions = _positions(locked or [])
     if cell is not None:
-        return Robot.from_cell(cell, locked=positions)
+        return Robot.from_cell(cell, gravity=gravity, locked=locked, recorded=recorded)
+    down = STANDARD_GRAVITY if gravity is None else gravity
+    if dh is not None:
+        return Robot.from_dh(
+            dh,
+            convention_of(convention),
+            friction=law,
+            gravity=down,
+            locked=locked,
+            recorded=recorded,
+        )
     assert urdf is not None
-    return Robot.from_urdf(urdf, friction=_law(friction, standstill), locked=positions)
+    return Robot.from_urdf(urdf, friction=law, gravity=down, locked=locked, recorded=recorded)
 
 
 def _positions(locked: list[str]) -> dict[str, float]:
@@ -228,6 +353,19 @@ def _positions(locked: list[str]) -> dict[str, float]:
                 remedy="give rad or m, as in --locked joint_7=0.3",
             ) from error
     return positions
+
+
+def _names(renamed: list[str]) -> dict[str, str]:
+    """Name in the URDF by name in the bag."""
+    names = {}
+    for text in renamed:
+        recorded, _, name = text.partition("=")
+        if not (recorded and name):
+            raise InputError(
+                None, f"{text!r} is no pair", field="--rename", remedy="give RECORDED=URDF"
+            )
+        names[recorded] = name
+    return names
 
 
 def _law(terms: str, standstill: float) -> FrictionLaw:

@@ -11,8 +11,17 @@ import typer
 from hil.campaign import stop_on_interrupt
 from hil.errors import InputError
 from hil.files import write_atomically
+from hil.importers import convention_of
 from hil.lines import say
-from hil.new import Known, cell_of_urdf, from_archive, from_init, read_init
+from hil.new import (
+    Known,
+    NewCell,
+    cell_of_dh,
+    cell_of_urdf,
+    from_archive,
+    from_init,
+    read_init,
+)
 from hil.whole_number import port_number
 
 PORT = 1000
@@ -20,7 +29,25 @@ PORT = 1000
 
 
 def new(
-    urdf: Annotated[Path, typer.Option(help="The arm's URDF.", show_default=False)],
+    urdf: Annotated[Path | None, typer.Option(help="The arm's URDF.", show_default=False)] = None,
+    dh: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="TABLE",
+            help="In place of --urdf, a CSV table of DH parameters: "
+            "joint, type, a, alpha, d, theta_offset (m, rad; or a_mm, alpha_deg, …), a row per "
+            "joint. A URDF of this geometry is written beside the cell file. Needs --convention.",
+            show_default=False,
+        ),
+    ] = None,
+    convention: Annotated[
+        str | None,
+        typer.Option(
+            help="Of --dh: standard (a row is Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or "
+            "modified (Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
+            show_default=False,
+        ),
+    ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="The cell file to write.")] = Path(
         "cell.toml"
     ),
@@ -67,18 +94,20 @@ def new(
     the controller's Open program starts, answers safely (nothing can move), and reads the init
     packet: start this command first, then that program. With --from-archive the same comes from
     an archive. Everything else is yours to fill in: a file with a "?" in it is refused, with a
-    list of all that is missing and where each figure is found.
+    list of all that is missing and where each figure is found. An arm of which only the
+    Denavit-Hartenberg parameters are known begins with --dh in place of --urdf.
 
-    **Example:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`
+    **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`,
+    `hil new --dh table.csv --convention modified -o cell.toml`
     """
     if from_controller is not None and from_archive_file is not None:
         raise InputError(
             None, "controller and archive at once", remedy="give one of the two --from options"
         )
     _require_free(output, force=force)
-    made = cell_of_urdf(urdf, _positions(fix or []))
+    made = _described(urdf, dh, convention, _positions(fix or []))
     if made.urdf is not None:
-        _require_free(made.urdf_beside(output), force=force, own=urdf)
+        _require_free(made.urdf_beside(output), force=force, own=made.urdf_path)
     known = made.known
     if from_controller is not None:
         known |= _asked(from_controller, bind, len(made.joint_names), arm, wait, quiet=json)
@@ -109,6 +138,22 @@ def new(
     if unknown:
         say(f'still unknown, marked "?": {", ".join(unknown)}')
         say(f"fill them in, then `hil doctor {output}`; whatever is missing is named again")
+
+
+def _described(
+    urdf: Path | None, dh: Path | None, convention: str | None, fixed: dict[str, float]
+) -> NewCell:
+    """What the URDF or the DH parameters say."""
+    if urdf is not None and dh is None:
+        return cell_of_urdf(urdf, fixed)
+    if dh is not None and urdf is None:
+        return cell_of_dh(dh, convention_of(convention), fixed)
+    raise InputError(
+        None,
+        "both describe the arm" if urdf else "which arm is it?",
+        field="--urdf and --dh" if urdf else "--urdf",
+        remedy="leave out one of them" if urdf else "give --urdf or --dh",
+    )
 
 
 def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool) -> Known:

@@ -153,7 +153,7 @@ def gather_sources(
     doubts += [
         f"{archive.path.name}: {doubt}"
         for archive in archives
-        for doubt in Findings.of(archive.metadata).doubts
+        for doubt in Findings.of(archive.metadata).warnings
     ]
     doubts += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
     same_motion = len({archive.attachments.get("plan.json") for archive in fitted}) == 1

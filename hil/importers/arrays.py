@@ -9,7 +9,7 @@ import resource
 import threading
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
+from scipy.io.matlab import varmats_from_mat
 
 from hil.errors import SourceError
 from hil.importers.column_map import Column
@@ -41,6 +42,9 @@ _NUMBERS: Final = "fiubmM"
 _MATLAB_NUMBERS: Final = {"double", "single", "logical"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
+_MATLAB_NESTED: Final = ("struct", "cell", "object")
+_MOST_FIELDS: Final = 10_000  # of all structs of a file
+_MOST_LISTED: Final = 30
 _ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
 _COMMENT: Final = re.compile(r"[%#].*")
 # Of the process that reads a .mat: the largest array, what it is packed in and its copy.
@@ -155,11 +159,27 @@ class ArrayFile:
             return self._array(self._only())
         if name is not None and name in self.stored:
             return self._array(name)
-        shapes = ", ".join(f"{key} {value.shape}" for key, value in self.stored.items())
-        problem = (
-            "which of its arrays is not said" if name is None else f"there is no array {name!r}"
-        )
-        raise SourceError(self.path, problem, field=field, remedy=f"its arrays are {shapes}")
+        problem, there = self._absent(name)
+        shapes = [f"{key} {self.stored[key].shape}" for key in there]
+        if len(shapes) > _MOST_LISTED:
+            shapes[_MOST_LISTED:] = [f"{len(shapes) - _MOST_LISTED} more"]
+        remedy = f"its arrays are {', '.join(shapes)}"
+        raise SourceError(self.path, problem, field=field, remedy=remedy)
+
+    def _absent(self, name: str | None) -> tuple[str, list[str]]:
+        """What is wrong with a name, and the arrays that could have been meant."""
+        if name is None:
+            return "which of its arrays is not said", list(self.stored)
+        if inside := self._fields(name):
+            return f"{name!r} is a struct, no array", inside
+        for end in range(len(name) - 1, 0, -1):
+            if name[end] in ".(" and (inside := self._fields(name[:end])):
+                return f"there is no array {name[end:].lstrip('.')!r} in {name[:end]!r}", inside
+        return f"there is no array {name!r}", list(self.stored)
+
+    def _fields(self, name: str) -> list[str]:
+        """The arrays within a struct or a cell array."""
+        return [key for key in self.stored if key.startswith((f"{name}.", f"{name}("))]
 
     def _array(self, name: str) -> NDArray[Any]:
         if name not in self._loaded:
@@ -246,11 +266,61 @@ def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
 
 
 def _mat(path: Path) -> dict[str, Stored]:
+    listed = [one for one in _elsewhere(_variables, str(path)) if not one[0].startswith("__")]
+    nested = [name for name, _, kind in listed if kind in _MATLAB_NESTED]
     return {
         name: Stored(shape, partial(_matlab_variable, path, name))
-        for name, shape, kind in _elsewhere(whosmat, str(path))
-        if kind in _MATLAB_NUMBERS and not name.startswith("__")
-    }
+        for name, shape, kind in listed
+        if kind in _MATLAB_NUMBERS
+    } | _in_memory(_elsewhere(_struct_fields, str(path), nested) if nested else {})
+
+
+def _variables(path: str) -> list[tuple[str, tuple[int, ...], str]]:
+    """Name, shape and class of the variables, without those that only MATLAB can read.
+
+    Of these (tables, strings, time series) a file says no shape, and scipy lists none of its
+    variables.
+    """
+    try:
+        return list(whosmat(path))
+    except TypeError:
+        found = []
+        with Path(path).open("rb") as file:
+            for _, alone in varmats_from_mat(file):
+                with suppress(TypeError):
+                    found += whosmat(alone)
+        return found
+
+
+def _struct_fields(path: str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Every array of numbers within structs, by its path as MATLAB writes it: ``log.joint(2).q``.
+
+    Elements of cell arrays have round brackets as well: braces are for the joint's number.
+    """
+    found: dict[str, NDArray[Any]] = {}
+
+    def walk(value: object, place: str) -> None:
+        if not isinstance(value, np.ndarray):
+            return
+        if value.dtype.kind in _NUMBERS:
+            found[place] = np.squeeze(value) if value.ndim > 2 else value
+            if len(found) > _MOST_FIELDS:
+                raise ValueError(f"its structs have more than {_MOST_FIELDS} fields with numbers")
+        elif value.dtype.names or value.dtype.kind == "O":
+            one_struct = value.dtype.names and value.size == 1
+            for number, element in enumerate(value.ravel(order="F"), 1):
+                at = place if one_struct else f"{place}({number})"
+                if not value.dtype.names:
+                    walk(element, at)
+                for name in value.dtype.names or ():
+                    walk(element[name], f"{at}.{name}")
+
+    variables = loadmat(path, variable_names=names)
+    for name in names:
+        walk(variables[name], name)
+    if sum(array.size for array in found.values()) > MOST_NUMBERS:
+        raise ValueError("its structs are too large to be read at once")
+    return found
 
 
 def _matlab_variable(path: Path, name: str) -> NDArray[Any]:

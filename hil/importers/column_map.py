@@ -55,6 +55,9 @@ class Quantity(_Table):
             columns, one per joint.
         array: in files of arrays, the matrix that `columns` are columns of.
         file: the file, relative to the log that is imported; None for that log itself.
+        files: one file per joint instead, as a list or as one name with ``{}`` in the place of the
+            joint's number. `columns` is then the one column or array wanted of each; None where a
+            file holds nothing else.
         joints_along: whether the joints of a whole matrix lie along its ``columns`` or ``rows``;
             None: time lies along the longer side.
         unit: a unit of the quantity; None for the SI one.
@@ -66,6 +69,7 @@ class Quantity(_Table):
     columns: Annotated[tuple[Column, ...], Field(min_length=1)] | str | None = None
     array: str | None = None
     file: str | None = None
+    files: Annotated[tuple[str, ...], Field(min_length=1)] | str | None = None
     joints_along: Literal["columns", "rows"] | None = None
     unit: str | None = None
     offset: FiniteFloat | Vector = 0.0
@@ -79,7 +83,8 @@ class TimeColumn(_Table):
     Attributes:
         column: by name or index from 0; in files of arrays the name of an array.
         array: in files of arrays, the matrix that `column` is a column of.
-        file: the file, relative to the log that is imported; None for that of the positions.
+        file: the file, relative to the log that is imported; None for that of the positions. Where
+            these have one per joint, the times of all of them have to be the same.
         unit: of the numbers.
     """
 
@@ -125,6 +130,7 @@ class Format(_Table):
         skip_rows: lines before the header, or before the data.
         header: whether a line of column names comes first.
         transposed: whether the channels lie along the lines of the file instead of its columns.
+        skip_empty: leave out empty lines between the rows, which are refused otherwise.
         missing: what a row with a number missing or not finite is: ``refuse`` the log, or ``drop``
             the row from all quantities.
     """
@@ -134,6 +140,7 @@ class Format(_Table):
     skip_rows: Annotated[int, Field(ge=0)] = 0
     header: bool | None = None
     transposed: bool = False
+    skip_empty: bool = False
     missing: Literal["refuse", "drop"] = "refuse"
 
 
@@ -172,6 +179,13 @@ class ColumnMap(_Table):
                 )
             if quantity.side == "motor" and name != "motor_current" and not self.drive.geared:
                 raise ValueError(f"{name} is of the motor side, so drive.gear_ratio is needed")
+            if quantity.files is not None and (quantity.file or quantity.joints_along):
+                raise ValueError(f"{name} has files, so it has neither file nor joints_along")
+            if isinstance(quantity.files, str) and "{}" not in quantity.files:
+                raise ValueError(
+                    f"{name}.files has no place for the joint's number; write {{}} there, as in "
+                    '"q_{}.txt"'
+                )
             if 0.0 in np.atleast_1d(quantity.scale):
                 raise ValueError(
                     f"{name}.scale holds a 0, which leaves nothing of what was measured"
@@ -217,6 +231,7 @@ _MUST_BE = {
     "joints": "must be a list of names",
     "columns": "must be a name, or a list of names or of indices from 0",
     "column": "must be a name or an index from 0",
+    "files": 'must be a name with {} for the joint, as in "q_{}.txt", or a list of names',
     "offset": _ONE_OR_EACH,
     "scale": _ONE_OR_EACH,
     "gear_ratio": _PER_JOINT,

@@ -1,4 +1,9 @@
-"""What a recording looks like, so that a slip in its units is seen before anything is fitted."""
+"""What a recording looks like, so that a slip in its units is seen before anything is fitted.
+
+Where two readings of a recording are possible (another unit, another order of joints), both are
+given with their errors: how far a velocity misses the slope of its position, and in how many rows
+a position is outside the limits of the URDF.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +11,12 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from hil.archive import Samples, foreign_json
 from identification.resampling import time_base
@@ -23,6 +29,8 @@ METADATA: Final = "findings"
 
 SLOWEST: Final = 20.0  # Hz; nothing of a robot's dynamics is left below
 FASTEST: Final = 20_000.0  # Hz
+# Hz, below which no motion can be seen: 5 kHz in ms, read as s, are 5 Hz.
+_NO_MOTION: Final = 10.0
 _TOLERANCE: Final = 0.05  # rad or m that calibration and overshoot may take beyond a limit
 _HARDLY: Final = 0.1  # rad or m of travel, less than which excites nothing
 # Between the velocity and the slope of the position: filters take a few per cent.
@@ -33,16 +41,37 @@ _NOTHING_TO_FIT: Final = (
 )
 _TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
 _NO_LIMIT: Final = 1e4  # what some URDFs write for "none"
-_FACTORS: Final = {
-    180.0 / np.pi: "degrees read as radians",
-    np.pi / 180.0: "radians read as degrees",
-    30.0 / np.pi: "revolutions per minute read as radians per second",
-    1.0 / (2.0 * np.pi): "revolutions read as radians",
-    2.0 * np.pi: "radians read as revolutions",
-    1e3: "milliseconds (or mrad, mm) read as the whole unit",
-    1e-3: "the whole unit read as milliseconds (or mrad, mm)",
-    -1.0: "a sign",
-}
+_DEGREE: Final = math.pi / 180.0
+
+
+class _Slip(NamedTuple):
+    """What makes velocities a factor too large, in words."""
+
+    velocity: str
+    position: str = ""
+    time: str = ""
+
+
+_SLIPS: Final = {
+    1.0 / _DEGREE: _Slip("velocities in deg/s read as rad/s", "positions in rad read as deg"),
+    _DEGREE: _Slip("velocities in rad/s read as deg/s", "positions in deg read as rad"),
+    30.0 / math.pi: _Slip("velocities in rpm read as rad/s"),
+    math.pi / 30.0: _Slip("velocities in rad/s read as rpm"),
+    6.0: _Slip("velocities in deg/s read as rpm"),
+    1.0 / 6.0: _Slip("velocities in rpm read as deg/s"),
+    2.0 * math.pi: _Slip("velocities in rad/s read as rev/s", "positions in rev read as rad"),
+    0.5 / math.pi: _Slip("velocities in rev/s read as rad/s", "positions in rad read as rev"),
+    1e3: _Slip(
+        "velocities in mm/s read as m/s", "positions in m (rad) read as mm (mrad)",
+        "a time in ms read as s",
+    ),
+    1e-3: _Slip(
+        "velocities in m/s read as mm/s", "positions in mm (mrad) read as m (rad)",
+        "a time in s read as ms",
+    ),
+    -1.0: _Slip("the sign of the velocities", "the sign of the positions"),
+}  # fmt: skip
+"""By how many times too large the velocities then are."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +80,15 @@ class Findings:
 
     Attributes:
         lines: the time base, and the range of each joint.
-        doubts: what looks like a slip of the column map, in sentences.
+        warnings: what looks like a slip of the column map, in sentences.
     """
 
     lines: tuple[str, ...]
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     def text(self) -> str:
         """As an entry of an archive's metadata."""
-        return json.dumps({"lines": self.lines, "doubts": self.doubts})
+        return json.dumps({"lines": self.lines, "warnings": self.warnings})
 
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> Findings:
@@ -68,10 +97,12 @@ class Findings:
             return cls((), ())
         stored = foreign_json.loads(metadata[METADATA])
         entries = stored if isinstance(stored, dict) else {}
-        lines, doubts = (_sentences(entries.get(key)) for key in ("lines", "doubts"))
-        if lines is None or doubts is None:
+        earlier = entries.get("doubts")  # their name before
+        lines = _sentences(entries.get("lines"))
+        warnings = _sentences(entries.get("warnings", earlier))
+        if lines is None or warnings is None:
             return cls((), ("what its import found cannot be read",))
-        return cls(lines, doubts)
+        return cls(lines, warnings)
 
 
 def _sentences(stored: object) -> tuple[str, ...] | None:
@@ -91,29 +122,82 @@ class Limits:
     revolute: bool = True
 
 
-def examine(samples: Samples, joint_names: Sequence[str], urdf: str) -> Findings:
-    """Look at samples on the joint side, in SI units, columns in the order of the names."""
+class ClockFault(NamedTuple):
+    """Why a time base is that of no motion, and what would help."""
+
+    problem: str
+    remedy: str
+
+
+def clock_fault(stamp: NDArray[np.int64]) -> ClockFault | None:
+    """What forbids to use stamps (m,) [ns]; None where nothing does, or there is but one."""
+    steps = np.diff(stamp)
+    if not steps.size:
+        return None
+    backward = np.flatnonzero(steps < 0)
+    if backward.size:
+        first = int(backward[0]) + 1
+        return ClockFault(
+            f"sample {first} is {-1e-9 * steps[first - 1]:.3g} s older than the one before it "
+            f"({backward.size} such steps)",
+            "cut the recording where its clock runs backwards, or name another time column",
+        )
+    if not steps.any():
+        return ClockFault(
+            f"all {len(stamp)} samples have the same time",
+            "name the column of the time, or give sample_rate in its place",
+        )
+    rate = 1e9 / float(np.median(steps[steps > 0]))
+    if rate >= _NO_MOTION:
+        return None
+    return ClockFault(
+        f"there would be {rate:.2g} samples a second, in which no motion can be seen",
+        f"check its unit ([time] unit, or sample_rate in Hz): milliseconds read as seconds would "
+        f"make it {1e3 * rate:.4g} samples a second; at least {SLOWEST:g} are needed",
+    )
+
+
+def examine(
+    samples: Samples,
+    joint_names: Sequence[str],
+    urdf: str,
+    *,
+    locked: Mapping[str, float] | None = None,
+) -> Findings:
+    """Look at samples on the joint side, in SI units, columns in the order of the names.
+
+    Args:
+        samples: of the recording.
+        joint_names: the joints.
+        urdf: their description.
+        locked: positions [rad or m] of joints that are none of the model, by name.
+    """
     time = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9)
     limits = [urdf_limits(urdf).get(name, Limits()) for name in joint_names]
-    if len(time) < 2 or not np.any(np.diff(time) > 0.0):
-        return Findings((f"{len(time)} samples",), ("the clock stands still",))
+    held = [f"{name} at {position:.4g}" for name, position in (locked or {}).items()]
+    lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
+    if len(time) < 2:
+        return Findings((f"{len(time)} samples", *lines), ())
     base = time_base(time)
-    lines = [f"time: {'; '.join(base.describe())}"]
-    doubts = []
+    lines = [f"time: {'; '.join(base.describe())}", *lines]
+    warnings = []
     if not SLOWEST <= base.rate <= FASTEST:
-        doubts.append(
+        warnings.append(
             f"{base.rate:.3g} samples a second is unusual: is the unit of the time right?"
         )
-    if base.backward:
-        doubts.append(f"the clock falls back {base.backward} times; cut the log where it does")
-    for joint, name in enumerate(joint_names):
-        position = samples.position[:, joint]
-        lines.append(_range(name, position, limits[joint]))
-        doubts += _outside(name, position, limits[joint])
-    doubts += _motionless(samples.position)
-    doubts += _speeds(time, samples, joint_names, limits)
-    doubts += _torques(samples, joint_names, limits)
-    return Findings(tuple(lines), tuple(doubts))
+    lines += [
+        _range(name, samples.position[:, joint], limits[joint])
+        for joint, name in enumerate(joint_names)
+    ]
+    warnings += _beyond_limits(samples.position, joint_names, limits)
+    warnings += _motionless(samples.position, limits)
+    warnings += _speeds(time, samples.position, joint_names, limits)
+    if samples.velocity is not None:
+        warnings += _velocities(
+            time, base.rate, samples.position, samples.velocity, joint_names, limits
+        )
+    warnings += _torques(samples, joint_names, limits)
+    return Findings(tuple(lines), tuple(warnings))
 
 
 def urdf_limits(urdf: str) -> dict[str, Limits]:
@@ -161,56 +245,84 @@ def _range(name: str, position: Array, limits: Limits) -> str:
     return text
 
 
-def _outside(name: str, position: Array, limits: Limits) -> list[str]:
-    low, high = float(position.min()), float(position.max())
-    lower, upper = limits.lower - _TOLERANCE, limits.upper + _TOLERANCE
-    if lower <= low and high <= upper:
+def _outside(position: Array, limits: Sequence[Limits]) -> float:
+    """Share of the rows (m, n) in which a joint is outside its limits [%]."""
+    lower = np.array([one.lower for one in limits]) - _TOLERANCE
+    upper = np.array([one.upper for one in limits]) + _TOLERANCE
+    return 100.0 * float(np.mean(((position < lower) | (position > upper)).any(axis=1)))
+
+
+def _beyond_limits(position: Array, names: Sequence[str], limits: Sequence[Limits]) -> list[str]:
+    """Positions outside the limits, and whether another unit or order has none."""
+    fits = _fits(position, limits)
+    beyond = [joint for joint in range(len(names)) if not fits[joint, joint]]
+    if not beyond:
         return []
-    slip = "check its unit, sign and zero in the column map"
-    far = max(abs(low), abs(high)) > 3.0 * max(abs(limits.lower), abs(limits.upper))
-    factor = 180.0 / np.pi
-    if limits.revolute and far and lower <= low / factor and high / factor <= upper:
-        slip = 'it looks like degrees read as radians: write unit = "deg"'
-    return [f"{name} leaves the limits of the URDF, {low:.3g} .. {high:.3g}: {slip}"]
+    ranges = ", ".join(
+        f"{names[j]}: {position[:, j].min():.3g} .. {position[:, j].max():.3g}" for j in beyond
+    )
+    text = (
+        f"as mapped, {_outside(position, limits):.3g} % of the rows leave the limits of the URDF "
+        f"({ranges})"
+    )
+    turning = np.array([one.revolute for one in limits])
+    far = any(
+        np.abs(position[:, j]).max() > 3.0 * max(abs(limits[j].lower), abs(limits[j].upper))
+        for j in beyond
+    )
+    check = "check unit, sign and zero in the column map"
+    if far and np.diag(_fits(np.where(turning, position * _DEGREE, position), limits)).all():
+        return [f'{text}; as degrees read as radians, none would: write unit = "deg"']
+    columns = linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
+    if fits[np.arange(len(names)), columns].all():
+        order = ", ".join(names[int(j)] for j in np.argsort(columns))
+        return [
+            f"{text}; with the columns those of {order}, none would: is that the order of the "
+            f"joints? Otherwise {check}"
+        ]
+    return [f"{text}: {check}"]
 
 
-def _motionless(position: Array) -> list[str]:
+def _fits(position: Array, limits: Sequence[Limits]) -> NDArray[np.bool_]:
+    """Whether each column of the positions lies in the limits of each joint (joints, columns)."""
+    low, high = position.min(axis=0), position.max(axis=0)
+    return np.array(
+        [(one.lower - _TOLERANCE <= low) & (high <= one.upper + _TOLERANCE) for one in limits]
+    )
+
+
+def _motionless(position: Array, limits: Sequence[Limits]) -> list[str]:
     travel = float(np.ptp(position, axis=0).max())
     if travel >= _HARDLY:
         return []
+    text = f"no joint moves further than {travel:.2g} rad or m"
+    larger = position / _DEGREE
+    if travel / _DEGREE < _HARDLY:
+        return [f"{text}: if one did, the unit of the positions is wrong"]
     return [
-        f"no joint moves further than {travel:.2g} rad or m: if it did, the unit of "
-        "the positions is wrong"
+        f"{text}; were they radians read as degrees, the joints would move up to "
+        f"{travel / _DEGREE:.2g} rad, and {_outside(larger, limits):.3g} % of the rows leave the "
+        "limits of the URDF: is the unit of the positions right?"
     ]
 
 
 def _speeds(
-    time: Array, samples: Samples, names: Sequence[str], limits: Sequence[Limits]
+    time: Array, position: Array, names: Sequence[str], limits: Sequence[Limits]
 ) -> list[str]:
-    """Whether the velocity is the slope of the position, and whether a robot could move so."""
-    doubts = []
-    for joint, name in enumerate(names):
-        position = samples.position[:, joint]
-        usual = _usual_speed(time, position)
-        if usual > _TOO_FAST * limits[joint].velocity:
-            doubts.append(
-                f"{name} would move at {usual:.3g} rad/s (or m/s), its limit in the URDF is "
-                f"{limits[joint].velocity:.3g}: is the unit of the time or of the position right?"
-            )
-        if samples.velocity is None or np.ptp(position) < _HARDLY:
-            continue
-        factor, correlation = _against_position(time, position, samples.velocity[:, joint])
-        if correlation < _FOLLOWS:
-            doubts.append(
-                f"the velocity of {name} does not follow its position (correlation "
-                f"{correlation:.2f}): are the joints in the same order?"
-            )
-        elif abs(factor - 1.0) > _ALIKE:
-            doubts.append(
-                f"the velocity of {name} is {factor:.4g} times the slope of its position"
-                f"{_named(factor)}"
-            )
-    return doubts
+    """Whether a robot could move so."""
+    usual = [_usual_speed(time, column) for column in position.T]
+    ratio = [speed / one.velocity for speed, one in zip(usual, limits, strict=True)]
+    worst = int(np.argmax(ratio))
+    if ratio[worst] <= _TOO_FAST:
+        return []
+    others = sum(one > _TOO_FAST for one in ratio) - 1
+    return [
+        f"{names[worst]}{f' (and {others} more)' if others else ''} would move at "
+        f"{usual[worst]:.3g} rad/s (or m/s), its limit in the URDF is "
+        f"{limits[worst].velocity:.3g}; with degrees read as radians it would be "
+        f"{usual[worst] * _DEGREE:.3g}, with seconds read as milliseconds "
+        f"{usual[worst] * 1e-3:.3g}: is the unit of the position or of the time right?"
+    ]
 
 
 def _usual_speed(time: Array, position: Array) -> float:
@@ -223,37 +335,104 @@ def _usual_speed(time: Array, position: Array) -> float:
     return float(np.quantile(speed, 0.9))
 
 
-def _against_position(time: Array, position: Array, velocity: Array) -> tuple[float, float]:
-    """How many times too large a velocity is, and the correlation (without sign) that says so.
+def _velocities(
+    time: Array,
+    rate: float,
+    position: Array,
+    velocity: Array,
+    names: Sequence[str],
+    limits: Sequence[Limits],
+) -> list[str]:
+    """Whether the velocities are the slopes of the positions: in this order, in these units."""
+    moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _HARDLY]
+    if not moving:
+        return []
+    factor, correlation = _against_position(time, position[:, moving], velocity[:, moving])
+    itself = np.diag(correlation)
+    columns = linear_sum_assignment(-correlation)[1]
+    best = correlation[np.arange(len(moving)), columns]
+    if itself.min() < _FOLLOWS <= best.min():
+        theirs = list(names)
+        for joint, column in zip(moving, columns, strict=True):
+            theirs[moving[column]] = names[joint]
+        return [
+            "the velocities are in another order than the positions: as mapped they miss their "
+            f"slopes by {_missed(itself):.0f} %, as those of {', '.join(theirs)} by "
+            f"{_missed(best):.0f} %: name the columns of both in the same order"
+        ]
+    follow = dict(zip(moving, itself, strict=True))
+    factors = dict(zip(moving, factor, strict=True))
+    warnings = [
+        f"the velocity of {names[joint]} does not follow its position (correlation "
+        f"{follow[joint]:.2f}): are the joints in the same order?"
+        for joint in moving
+        if follow[joint] < _FOLLOWS
+    ]
+    off: dict[float, list[int]] = {}
+    for joint in moving:
+        if follow[joint] >= _FOLLOWS and abs(factors[joint] - 1.0) > _ALIKE:
+            off.setdefault(_nearest_slip(factors[joint]), []).append(joint)
+    for slip, joints in off.items():
+        subject = "every joint" if joints == moving else ", ".join(names[j] for j in joints)
+        text = (
+            f"the velocity of {subject} is {float(np.median([factors[j] for j in joints])):.4g} "
+            "times the slope of the position"
+        )
+        if slip not in _SLIPS:
+            warnings.append(f"{text}: check units and gears")
+            continue
+        changed = position.copy()
+        changed[:, joints] *= slip
+        words = _SLIPS[slip]
+        readings = [
+            f"{words.velocity} (with {_outside(position, limits):.3g} % of the rows outside the "
+            "limits of the URDF)"
+        ]
+        if words.position:
+            readings.append(f"{words.position} (with {_outside(changed, limits):.3g} %)")
+        if words.time and joints == moving:
+            readings.append(f"{words.time} (with {slip * rate:.3g} samples a second)")
+        warnings.append(f"{text}: {', or '.join(readings)}?")
+    return warnings
 
-    The integral is compared, not the slope: noise matters less.
+
+def _nearest_slip(factor: float) -> float:
+    """The slip that makes about this factor; the factor itself where none does."""
+    known = min(_SLIPS, key=lambda slip: abs(factor / slip - 1.0))
+    return known if abs(factor / known - 1.0) < _ALIKE else factor
+
+
+def _missed(correlation: Array) -> float:
+    """How far velocities miss slopes with which they have these correlations, at best scale [%]."""
+    return 100.0 * float(np.sqrt(np.mean(1.0 - np.minimum(correlation, 1.0) ** 2)))
+
+
+def _against_position(time: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
+    """How many times too large each velocity is (n,), and the correlations without sign (n, n).
+
+    Rows are positions, columns velocities. The integral is compared, not the slope: noise matters
+    less.
     """
-    steps = np.diff(time)
-    usual = np.median(steps)
-    # Over a gap nothing is known of the velocity.
-    moved = np.where(steps <= 5.0 * usual, 0.5 * (velocity[1:] + velocity[:-1]) * steps, 0.0)
-    gone = np.where(steps <= 5.0 * usual, np.diff(position), 0.0)
-    travelled, there = np.cumsum(moved), np.cumsum(gone)
-    travelled, there = travelled - travelled.mean(), there - there.mean()
-    squares = float(there @ there), float(travelled @ travelled)
-    if min(squares) == 0.0:
-        return 0.0, 0.0
-    product = float(travelled @ there)
-    return product / squares[0], abs(product) / float(np.sqrt(squares[0] * squares[1]))
-
-
-def _named(factor: float) -> str:
-    for known, words in _FACTORS.items():
-        if abs(factor / known - 1.0) < _ALIKE:
-            return f": {words}?"
-    return ": check units and gears"
+    steps = np.diff(time)[:, None]
+    known = steps <= 5.0 * np.median(steps)  # over a gap nothing is known of the velocity
+    moved = np.where(known, 0.5 * (velocity[1:] + velocity[:-1]) * steps, 0.0).cumsum(axis=0)
+    gone = np.where(known, np.diff(position, axis=0), 0.0).cumsum(axis=0)
+    moved, gone = moved - moved.mean(axis=0), gone - gone.mean(axis=0)
+    product = gone.T @ moved
+    squares = np.sum(gone * gone, axis=0), np.sum(moved * moved, axis=0)
+    sizes = np.sqrt(np.outer(*squares))
+    correlation = np.divide(np.abs(product), sizes, out=np.zeros_like(sizes), where=sizes > 0.0)
+    factor = np.divide(
+        np.diag(product), squares[0], out=np.zeros(len(sizes)), where=squares[0] > 0.0
+    )
+    return factor, correlation
 
 
 def _torques(samples: Samples, names: Sequence[str], limits: Sequence[Limits]) -> list[str]:
     if samples.torque is None:
         return [] if samples.motor_current is not None else [_NOTHING_TO_FIT]
     largest = np.abs(samples.torque).max(axis=0)
-    doubts = [
+    warnings = [
         f"the torque of {name} reaches {largest[j]:.3g}, its limit in the URDF is "
         f"{limits[j].effort:.3g} N·m (or N): is its unit right, and its side (motor or joint)?"
         for j, name in enumerate(names)
@@ -261,5 +440,5 @@ def _torques(samples: Samples, names: Sequence[str], limits: Sequence[Limits]) -
     ]
     for j, name in enumerate(names):
         if largest[j] == 0.0:
-            doubts.append(f"the torque of {name} is zero throughout")
-    return doubts
+            warnings.append(f"the torque of {name} is zero throughout")
+    return warnings

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from decimal import Decimal
 from os import PathLike
 from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,12 @@ from hil.errors import SourceError
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.column_map import TIMES, UNITS, Column, ColumnMap, Quantity
 from hil.importers.output import Use, write_imported
-from hil.importers.robot import Robot
+from hil.importers.robot import NOT_RECORDED, Robot
 from hil.importers.table import Table
 
 Array = NDArray[np.float64]
 
+_MORE: Final = 64  # columns or files beyond the joints that are looked for
 _LATEST = 2**31 * 10**9  # ns, what a stamp of an archive can hold
 
 
@@ -37,8 +39,9 @@ def import_log(
     """Turn a log into an archive of kind ``imported``.
 
     Args:
-        source: the log; with quantities in several files, the one the others lie beside. Files
-            that end in .npz, .npy, .mat or .m hold arrays, all others text.
+        source: the log; with quantities in several files, the one the others lie beside, or the
+            folder they lie in. Files that end in .npz, .npy, .mat or .m hold arrays, all others
+            text.
         output: the archive to write.
         robot: whose joints these are. Where the map couples joints, its model gets the inertias
             and the friction of the coupled motors, unless its cell says otherwise.
@@ -81,6 +84,7 @@ def import_log(
         held_joints=held_joints,
         period=None if columns.sample_rate is None else 1.0 / columns.sample_rate,
         use=use,
+        clock=log.clock,
     )
 
 
@@ -96,6 +100,7 @@ class _Log:
 
     def __init__(self, path: Path, columns: ColumnMap, robot: Robot) -> None:
         self.path = path
+        self._folder = path if path.is_dir() else path.parent
         self._map = columns
         self._files: dict[Path, Table | ArrayFile] = {}
         self.joints = columns.joints or robot.joint_names
@@ -122,29 +127,55 @@ class _Log:
         """The samples' stamps [ns], and what was taken off to make them storable."""
         if self._map.sample_rate is not None:
             return np.rint(np.arange(count) * (1e9 / self._map.sample_rate)).astype(np.int64), 0
-        time = self._map.time
-        assert time is not None
-        file = self._file(time.file or self._map.position.file)
-        if isinstance(file, Table):
-            times = file.times(time.column, TIMES[time.unit])
-        elif isinstance(time.column, int) and time.array is None:
-            times = _nanoseconds(file.matrix(None, "time").ravel(), TIMES[time.unit], file.path)
-        else:
-            column = file.column(time.column, "time", time.array)
-            times = _nanoseconds(column, TIMES[time.unit], file.path)
+        first, *others = self._clocks()
+        times = self._times(first)
+        for other in others:
+            if self._times(other) != times:
+                raise SourceError(
+                    other.path,
+                    f"has other times than {first.path.name}",
+                    field="time",
+                    remedy="name the file of the times that hold for all joints: [time] file",
+                )
         origin = 0 if min(times) >= 0 and max(times) < _LATEST else min(times)
         if max(times) - origin >= _LATEST:
             raise SourceError(
-                file.path,
+                first.path,
                 f"spans {Decimal(max(times) - min(times)).scaleb(-9):.3g} s",
                 field="time",
                 remedy="give the unit of its time: s, ms, us or ns",
             )
         return np.array([one - origin for one in times], np.int64), origin
 
+    @property
+    def clock(self) -> Path:
+        """The file that the times come from, or else the log."""
+        return self.path if self._map.time is None else self._clocks()[0].path
+
+    def _clocks(self) -> list[Table | ArrayFile]:
+        """The files with times."""
+        time, position = self._map.time, self._map.position
+        assert time is not None
+        if time.file is None and position.files is not None:
+            return self._file_per_joint(position.files, "position.files")
+        return [self._file(time.file or position.file, "time.file")]
+
+    def _times(self, file: Table | ArrayFile) -> list[int]:
+        """The times in a file [ns]."""
+        time = self._map.time
+        assert time is not None
+        if isinstance(file, Table):
+            return file.times(time.column, TIMES[time.unit])
+        if isinstance(time.column, int) and time.array is None:
+            return _nanoseconds(file.matrix(None, "time").ravel(), TIMES[time.unit], file.path)
+        column = file.column(time.column, "time", time.array)
+        return _nanoseconds(column, TIMES[time.unit], file.path)
+
     def _numbers(self, name: str, quantity: Quantity) -> Array:
         """The numbers of a quantity as in the file, (m, k)."""
-        file, field = self._file(quantity.file), f"{name}.columns"
+        if quantity.files is not None:
+            return self._joint_by_joint(name, quantity, quantity.files)
+        file, field = self._file(quantity.file, f"{name}.file"), f"{name}.columns"
         columns = quantity.columns
         if columns is None or (
             isinstance(columns, str) and "{}" not in columns and isinstance(file, ArrayFile)
@@ -159,7 +190,15 @@ class _Log:
                     field=field,
                     remedy='write {} there, as in "q{}"',
                 )
-            some = self._numbered(columns, file, field)
+            known = file.names if isinstance(file, Table) else tuple(file.stored)
+            if not known:
+                raise SourceError(
+                    file.path,
+                    f"its columns have no names like {columns!r}",
+                    field=field,
+                    remedy="count them from 0: columns = [1, 2, ...]",
+                )
+            some: list[Column] = [*self._numbered(columns, known, "columns", field)]
         else:
             self._check_length(columns, field)
             some = list(columns)
@@ -167,28 +206,83 @@ class _Log:
             return np.asarray(file.matrix(quantity.array, field)[_indices(some, file, field)].T)
         return file.numbers(some, field, quantity.array)
 
-    def _numbered(self, pattern: str, file: Table | ArrayFile, field: str) -> list[Column]:
-        """Column names from a pattern, counted from 1, or from 0 where the file does.
+    def _joint_by_joint(self, name: str, quantity: Quantity, names: str | Sequence[str]) -> Array:
+        """The numbers of a quantity that has a file per joint, (m, k)."""
+        files, columns = self._file_per_joint(names, f"{name}.files"), quantity.columns
+        field = f"{name}.columns"
+        if isinstance(columns, tuple) and len(columns) == 1:
+            columns *= len(files)
+        elif isinstance(columns, str):
+            columns = tuple(columns.replace("{}", str(k)) for k in range(1, len(files) + 1))
+        elif columns is not None:
+            self._check_length(columns, field)
+        found = []
+        for joint, file in enumerate(files):
+            if columns is not None:
+                found.append(file.numbers([columns[joint]], field, quantity.array)[:, 0])
+                continue
+            matrix = file.matrix(quantity.array, field)
+            if 1 not in matrix.shape:
+                raise SourceError(
+                    file.path,
+                    f"has the shape {matrix.shape}, where one column is wanted",
+                    field=field,
+                    remedy="say which one of each file, by name or by index from 0: columns = [1]",
+                )
+            found.append(matrix.ravel())
+        lengths = [len(one) for one in found]
+        if len(set(lengths)) > 1:
+            listing = ", ".join(f"{f.path.name} {m}" for f, m in zip(files, lengths, strict=True))
+            raise SourceError(
+                self.path,
+                f"the files differ in length: {listing}",
+                field=f"{name}.files",
+                remedy="cut them alike",
+            )
+        return np.column_stack(found)
+
+    def _file_per_joint(self, names: str | Sequence[str], field: str) -> list[Table | ArrayFile]:
+        if isinstance(names, str):
+            numbers = range(len(self.joints) + _MORE)
+            possible = [names.replace("{}", str(number)) for number in numbers]
+            found = [name for name in possible if (self._folder / name).is_file()]
+            names = self._numbered(names, found, "files", field)
+        self._check_length(names, field)
+        return [self._file(name, field) for name in names]
+
+    def _numbered(
+        self, pattern: str, known: Collection[str], what: Literal["columns", "files"], field: str
+    ) -> list[str]:
+        """Names of columns or files from a pattern, counted from 1, or from 0 where those are.
 
         Raises:
-            SourceError: a joint has no such column; names the joint.
+            SourceError: a joint has none, the joint is named; or there are more than joints.
         """
         count = len(self.joints)
-        known = file.names if isinstance(file, Table) else ()
-        names = [pattern.replace("{}", str(joint)) for joint in range(count + 1)]
-        from_zero = names[0] in known and names[count] not in known
-        found: list[Column] = [*(names[:count] if from_zero else names[1:])]
-        missing = [name for name in found if known and name not in known]
+        names = [pattern.replace("{}", str(number)) for number in range(count + _MORE)]
+        first = 0 if names[0] in known and names[count] not in known else 1
+        found = names[first : first + count]
+        missing = [name for name in found if name not in known]
         if missing:
             joint = found.index(missing[0])
             raise SourceError(
                 self.path,
-                f"there is no column {missing[0]!r} for {self.joints[joint]}, joint {joint + 1} of"
-                f" {count}",
+                f"there is no {what[:-1]} {missing[0]!r} for {self.joints[joint]}, joint "
+                f"{joint + 1} of {count}",
                 field=field,
-                remedy="lock joints that were not recorded (--locked NAME), name the joints of the"
-                " log in joints, or its columns, or skip lines before their names ([format]"
-                f" skip_rows); its columns are {', '.join(known)}",
+                remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or list its {what}"
+                + ", or skip lines before their names ([format] skip_rows)" * (what == "columns")
+                + (f"; its {what} are {', '.join(known)}" if known else ""),
+            )
+        present = [name for name in names if name in known]
+        if len(present) > count:
+            raise SourceError(
+                self.path,
+                f"{len(present)} {what} are called {pattern!r} ({present[0]} to {present[-1]}), "
+                f"and there are {count} joints: {', '.join(self.joints)}",
+                field=field,
+                remedy=f"say which: the URDF's joint of each in joints (a joint that the URDF does "
+                f"not have is left out), or a list of {count} {what}",
             )
         return found
 
@@ -211,13 +305,20 @@ class _Log:
                 f"{name} has the shape {matrix.shape}, joints along its {along}, and there are "
                 f"{count} joints: {', '.join(self.joints)}",
                 field=name,
-                remedy="lock joints that were not recorded (--locked NAME), name the joints of the"
-                " log in joints, or give the columns of the joints",
+                remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or give the columns "
+                "of the joints",
             )
         return upright
 
-    def _file(self, name: str | None) -> Table | ArrayFile:
-        path = self.path if name is None else self.path.parent / name
+    def _file(self, name: str | None, field: str) -> Table | ArrayFile:
+        if name is None and self.path.is_dir():
+            raise SourceError(
+                self.path,
+                "is a folder",
+                field=field,
+                remedy='name a file in it: file = "q.txt", or one per joint: files = "q_{}.txt"',
+            )
+        path = self.path if name is None else self._folder / name
         if path not in self._files:
             arrays = path.suffix.lower() in READERS
             self._files[path] = (
@@ -234,11 +335,7 @@ class _Log:
                 f"the map names the joints {', '.join(self.joints)}",
                 field="joints",
                 remedy=f"the robot's joints are {', '.join(robot.joint_names)}"
-                + (
-                    "; lock those that were not recorded (--locked NAME)"
-                    if missing
-                    else ", each named once"
-                ),
+                + (f"; {NOT_RECORDED}" if missing else ", each named once"),
             )
         return [self.joints.index(name) for name in robot.joint_names]
 

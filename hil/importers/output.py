@@ -13,7 +13,7 @@ import numpy as np
 
 from hil.archive import Samples, write_samples
 from hil.errors import SourceError
-from hil.importers.findings import METADATA, examine
+from hil.importers.findings import METADATA, clock_fault, examine
 from hil.importers.robot import Robot
 
 Use = Literal["excitation", "validation", "standstill"]
@@ -32,6 +32,7 @@ def write_imported(
     held_joints: Sequence[str] = (),
     period: float | None = None,
     use: Use = "excitation",
+    clock: Path | None = None,
 ) -> Path:
     """Write the samples of a recording, joints in the order of the robot's, as an archive.
 
@@ -46,12 +47,16 @@ def write_imported(
         held_joints: joints known to have been held still.
         period: step [s] of a recording at a fixed rate.
         use: what identification may do with them: fit, only predict, or take the noise from.
+        clock: the file that the stamps come from; None for the first.
 
     Raises:
-        SourceError: no sample, or a value that is not finite, or beyond 1e12.
+        SourceError: no sample, a value that is not finite or beyond 1e12, or a clock that stands
+            still, runs backwards or steps too seldom for a motion.
         ArchiveWriteError: the archive cannot be written.
     """
     _check(samples, source[0], robot.joint_names)
+    if (fault := clock_fault(samples.stamp)) is not None:
+        raise SourceError(clock or source[0], fault.problem, field="time", remedy=fault.remedy)
     unknown = [name for name in held_joints if name not in robot.joint_names]
     if unknown:
         raise SourceError(
@@ -66,7 +71,7 @@ def write_imported(
         "source_sha256": json.dumps([_digest(path) for path in source]),
         "held_joints": json.dumps(list(held_joints)),
         "use": use,
-        METADATA: examine(samples, robot.joint_names, robot.urdf).text(),
+        METADATA: examine(samples, robot.joint_names, robot.urdf, locked=robot.locked).text(),
     }
     return write_samples(
         output,

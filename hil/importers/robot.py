@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +14,20 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.errors import SourceError
+from hil.importers.dh import Convention, urdf_of_dh
+from hil.importers.findings import Limits, urdf_limits
 from hil.reading import remedy_of, text_of
 from identification import FrictionLaw
 from identification.errors import ModelError
 from identification.kinematics import pinocchio_model
 from planner.toml_value import toml_value
 
-STANDARD_GRAVITY = (0.0, 0.0, -9.81)
+STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
+IMPORTED_LAW: Final = FrictionLaw(third=None, offset=True)
+"""Friction of a robot that is imported without a law of its own. A term in v² or v³ that the motion
+does not need makes the prediction of a faster one worse."""
+NOT_RECORDED: Final = "lock joints that were not recorded (--locked NAME, or all: --lock-others)"
+"""What the commands advise where the robot has more joints than the recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +38,13 @@ class Robot:
         cell: text of a cell file; the robot's table is all that identification needs of it.
         urdf: text of the robot description.
         joint_names: its joints that move and are not locked, in the order of the model.
+        locked: position [rad or m] of those that are, by name.
     """
 
     cell: str
     urdf: str
     joint_names: tuple[str, ...]
+    locked: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_urdf(
@@ -45,16 +55,19 @@ class Robot:
         gravity: Sequence[float] = STANDARD_GRAVITY,
         rotor_inertia: bool = True,
         locked: Mapping[str, float] | None = None,
+        recorded: Collection[str] | None = None,
     ) -> Robot:
         """Describe a robot by its URDF and the settings of its model.
 
         Args:
             path: the URDF file.
-            friction: friction law of every joint, None for the default one.
+            friction: friction law of every joint, None for `IMPORTED_LAW`.
             gravity: in the base frame [m/s²].
             rotor_inertia: give every joint a rotor inertia.
             locked: position [rad or m] of joints that are none of the model, such as those of a
                 gripper that was not recorded.
+            recorded: the joints that were; all others are locked at zero, or at the middle of
+                their range where zero is outside. None: none but those in `locked`.
 
         Raises:
             InputError: the file cannot be read, is no usable URDF, or has no such joint.
@@ -66,28 +79,87 @@ class Robot:
             why = error.strerror if isinstance(error, OSError) else error
             remedy = remedy_of(error, "name a URDF file")
             raise SourceError(path, f"cannot be read ({why})", remedy=remedy) from error
+        return cls._modelled(path, urdf, friction, gravity, rotor_inertia, locked, recorded)
+
+    @classmethod
+    def from_dh(
+        cls,
+        path: str | PathLike[str],
+        convention: Convention,
+        *,
+        friction: FrictionLaw | None = None,
+        gravity: Sequence[float] = STANDARD_GRAVITY,
+        rotor_inertia: bool = True,
+        locked: Mapping[str, float] | None = None,
+        recorded: Collection[str] | None = None,
+    ) -> Robot:
+        """Describe a robot by a table of Denavit-Hartenberg parameters alone: it has no masses.
+
+        Args:
+            path: of the table, see :func:`hil.importers.dh.urdf_of_dh`.
+            convention: of its rows.
+            friction: these and all others as for `from_urdf`.
+            gravity: in the frame before the first joint.
+            rotor_inertia: see there.
+            locked: see there.
+            recorded: see there.
+
+        Raises:
+            InputError: the file cannot be read, or is no such table.
+        """
+        path, urdf = Path(path), urdf_of_dh(path, convention)
+        return cls._modelled(path, urdf, friction, gravity, rotor_inertia, locked, recorded)
+
+    @classmethod
+    def _modelled(
+        cls,
+        path: Path,
+        urdf: str,
+        friction: FrictionLaw | None,
+        gravity: Sequence[float],
+        rotor_inertia: bool,
+        locked: Mapping[str, float] | None,
+        recorded: Collection[str] | None,
+    ) -> Robot:
+        """The robot of a description that was read from `path`."""
         try:
             pinocchio_model(urdf)
         except ModelError as error:  # told of this file, and not of a cell that nobody wrote
             raise SourceError(path, str(error), remedy="name a URDF file") from error
-        law = friction or FrictionLaw()
-        text = _cell_text(path.stem, law, gravity, rotor_inertia, locked or {})
+        held = _held(urdf, locked or {}, recorded, path)
+        law = friction or IMPORTED_LAW
+        text = _cell_text(path.stem, law, gravity, rotor_inertia, held)
         return cls._checked(text, urdf, path)
 
     @classmethod
     def from_cell(
-        cls, path: str | PathLike[str], *, locked: Mapping[str, float] | None = None
+        cls,
+        path: str | PathLike[str],
+        *,
+        gravity: Sequence[float] | None = None,
+        locked: Mapping[str, float] | None = None,
+        recorded: Collection[str] | None = None,
     ) -> Robot:
-        """Describe a robot by a cell file; see `from_urdf` for `locked`.
+        """Describe a robot by a cell file; see `from_urdf` for `locked` and `recorded`.
+
+        Args:
+            path: the cell file.
+            gravity: in the base frame [m/s²]; None for that of the cell.
+            locked: besides those that the cell locks.
+            recorded: see there.
 
         Raises:
             InputError: the cell file or its URDF cannot be used, or has no such joint.
         """
-        cell = Cell.load(Path(path))
-        if not locked:
-            return cls(cell.text, cell.urdf, cell.joint_names)
-        text = _with_robot_entry(cell.text, "locked", {**cell.file.robot.locked, **locked})
-        return cls._checked(text, cell.urdf, Path(path))
+        path = Path(path)
+        cell = Cell.load(path)
+        text = cell.text
+        held = _held(cell.urdf, {**cell.file.robot.locked, **(locked or {})}, recorded, path)
+        if held != cell.file.robot.locked:
+            text = _with_robot_entry(text, "locked", _inline(held))
+        if gravity is not None:
+            text = _with_robot_entry(text, "gravity", _vector(gravity))
+        return cls._checked(text, cell.urdf, path)
 
     def with_coupling(self, motor_from_joint: NDArray[np.float64]) -> Robot:
         """This robot with motors that turn with several joints, unless it says so itself.
@@ -107,7 +179,8 @@ class Robot:
 
     @classmethod
     def _checked(cls, text: str, urdf: str, path: Path) -> Robot:
-        return cls(text, urdf, Cell.from_texts(text, urdf, path).joint_names)
+        cell = Cell.from_texts(text, urdf, path)
+        return cls(text, urdf, cell.joint_names, cell.file.robot.locked)
 
     def attachments(self) -> dict[str, bytes]:
         """The texts as files of an archive."""
@@ -138,7 +211,7 @@ def _cell_text(
         'urdf = "robot.urdf"',
         "",
         "[robot]",
-        f"gravity = {toml_value([float(g) for g in gravity])}",
+        f"gravity = {_vector(gravity)}",
         f"rotor_inertia = {toml_value(rotor_inertia)}",
         *([f"locked = {_inline(locked)}"] if locked else []),
         "",
@@ -146,6 +219,42 @@ def _cell_text(
         *(f"{key} = {toml_value(value)}" for key, value in law.items()),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _held(
+    urdf: str, locked: Mapping[str, float], recorded: Collection[str] | None, path: Path
+) -> dict[str, float]:
+    """Positions of joints that are none of the model: those given, and all that were not recorded.
+
+    Raises:
+        SourceError: none of the robot's joints was recorded.
+    """
+    if recorded is None:
+        return dict(locked)
+    names = tuple(pinocchio_model(urdf).names)[1:]
+    if not set(names) & set(recorded):
+        raise SourceError(
+            path,
+            f"none of its joints {', '.join(names)} was recorded",
+            field="--lock-others",
+            remedy=f"recorded are {', '.join(recorded)}; use the names of the URDF (joints in the "
+            "map of a log, --rename RECORDED=URDF of a bag)",
+        )
+    limits = urdf_limits(urdf)
+    others = {
+        name: _rest_position(limits.get(name, Limits())) for name in names if name not in recorded
+    }
+    return {**others, **locked}
+
+
+def _rest_position(limits: Limits) -> float:
+    """Zero, or the middle of a range that zero is outside of."""
+    inside = limits.lower <= 0.0 <= limits.upper
+    return 0.0 if inside else 0.5 * (limits.lower + limits.upper)
+
+
+def _vector(values: Sequence[float]) -> str:
+    return toml_value([float(value) for value in values])
 
 
 def _inline(table: Mapping[str, float]) -> str:
@@ -157,8 +266,8 @@ def _writable(name: str) -> str:
     return name.encode("utf-8", "replace").decode("utf-8")
 
 
-def _with_robot_entry(text: str, key: str, table: Mapping[str, float]) -> str:
+def _with_robot_entry(text: str, key: str, value: str) -> str:
     try:
-        return replaced_value(text, "robot", key, _inline(table))
+        return replaced_value(text, "robot", key, value)
     except ValueError:
-        return f"{text}\n[robot]\n{key} = {_inline(table)}\n"
+        return f"{text}\n[robot]\n{key} = {value}\n"

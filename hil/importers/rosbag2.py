@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -11,13 +14,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from hil.archive import Samples
 from hil.errors import SourceError
 from hil.importers import bags
 from hil.importers.mcap_messages import JOINT_STATES, Topic
 from hil.importers.output import Use, write_imported
-from hil.importers.robot import Robot
+from hil.importers.robot import NOT_RECORDED, Robot
 
 Array = NDArray[np.float64]
 Effort = Literal["torque", "motor_current", "ignore"]
@@ -62,15 +66,9 @@ def import_rosbag2(
     """
     files = bags.bag_files(Path(source))
     states = _States(files[0], robot.joint_names, joint_names or {})
-    with bags.unpacked(files) as plain:
-        known = [bags.topics(file) for file in plain]
-        topic = _choose(
-            {name: t for topics in known for name, t in topics.items()}, files[0], topic
-        )
-        for file, topics in zip(plain, known, strict=True):
-            if topic in topics:  # a part of a split bag may lack it
-                for stamp, data in bags.messages(file, topic):
-                    states.add(stamp, data)
+    with _messages(files, topic) as (topic, messages):
+        for stamp, data in messages:
+            states.add(stamp, data)
     samples = states.samples(effort)
     metadata = {"importer": "rosbag2", "topic": str(topic), "effort": effort, "clock": states.clock}
     return write_imported(
@@ -82,6 +80,69 @@ def import_rosbag2(
         held_joints=held_joints,
         use=use,
     )
+
+
+def recorded_joints(
+    source: str | PathLike[str],
+    topic: str | None = None,
+    joint_names: Mapping[str, str] | None = None,
+) -> tuple[str, ...]:
+    """The joints of a bag: those of the first message with most of them.
+
+    Args:
+        source: as for `import_rosbag2`.
+        topic: likewise.
+        joint_names: likewise; the names returned are those in the URDF.
+
+    Raises:
+        SourceError: no bag, no such topic, or no message.
+    """
+    files, found = bags.bag_files(Path(source)), ()
+    with _messages(files, topic) as (_, messages):
+        for number, (_, data) in enumerate(messages):
+            found = max(found, tuple(_decoded(data, files[0], number).name), key=len)
+    if not found:
+        raise SourceError(files[0], "has no message with joints", field="joints")
+    return tuple((joint_names or {}).get(name, name) for name in found)
+
+
+@contextmanager
+def _messages(
+    files: list[Path], topic: str | None
+) -> Iterator[tuple[str, Iterator[tuple[int, bytes]]]]:
+    """The topic of the joint states, and time of receipt [ns] and data of its messages."""
+    with bags.unpacked(files) as plain:
+        known = [bags.topics(file) for file in plain]
+        chosen = _choose(
+            {name: t for topics in known for name, t in topics.items()}, files[0], topic
+        )
+        yield (
+            chosen,
+            chain.from_iterable(
+                bags.messages(file, chosen)
+                for file, topics in zip(plain, known, strict=True)
+                if chosen in topics  # a part of a split bag may lack it
+            ),
+        )
+
+
+@cache
+def _typestore() -> Typestore:
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _decoded(data: bytes, file: Path, number: int) -> Any:
+    """A joint state.
+
+    Raises:
+        SourceError: it is none.
+    """
+    try:
+        return _typestore().deserialize_cdr(data, JOINT_STATE)
+    except Exception as error:  # rosbags does not list what it raises for other bytes
+        raise SourceError(
+            file, f"message {number} cannot be decoded ({error or type(error).__name__})"
+        ) from error
 
 
 def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
@@ -137,7 +198,6 @@ class _States:
     )
 
     def __post_init__(self) -> None:
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
         self._orders: dict[tuple[str, ...], list[int]] = {}
         self._seen: list[str] = []
 
@@ -148,14 +208,7 @@ class _States:
 
     def add(self, bag_stamp: int, data: bytes) -> None:
         """Take a message in, unless it has none of the joints."""
-        try:
-            message: Any = self._store.deserialize_cdr(data, JOINT_STATE)
-        except Exception as error:  # rosbags does not list what it raises for other bytes
-            raise SourceError(
-                self.source,
-                f"message {len(self.bag_stamps)} cannot be decoded "
-                f"({error or type(error).__name__})",
-            ) from error
+        message = _decoded(data, self.source, len(self.bag_stamps))
         order = self._order(tuple(message.name))
         if not order:
             return
@@ -182,7 +235,8 @@ class _States:
                 self.source,
                 f"none of the joints {', '.join(self.joints)} was recorded; {recorded}",
                 field="joints",
-                remedy="give the URDF of this robot, or one with the recorded names",
+                remedy="give the URDF of this robot, or say which joint is which: --rename "
+                "RECORDED=URDF",
             )
         position = self._column("position")
         if position is None:
@@ -198,9 +252,12 @@ class _States:
         )
 
     def _column(self, name: str) -> Array | None:
-        """A quantity that all messages have; None when none has it."""
+        """A quantity that all messages have; None when none has it, or NaN alone.
+
+        NaN is what ros2_control publishes for an interface that the hardware does not have.
+        """
         rows = self.rows[name]
-        if not rows:
+        if not rows or all(np.isnan(row).all() for row in rows):
             return None
         if len(rows) != len(self.bag_stamps):
             raise SourceError(
@@ -222,7 +279,7 @@ class _States:
                     self.source,
                     f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}",
                     field="joints",
-                    remedy="give a URDF with the recorded names, or hold the others with --fixed",
+                    remedy=f"give a URDF with the recorded names, or {NOT_RECORDED}",
                 )
             self._orders[names] = [] if missing else [ours.index(joint) for joint in self.joints]
         return self._orders[names]

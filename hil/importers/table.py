@@ -75,7 +75,7 @@ class Table:
             for number, line in enumerate(text.splitlines(), 1)
             if number > form.skip_rows and not line.lstrip().startswith(_COMMENTS)
         ]
-        kept = _inside(kept, path)
+        kept = _between(kept, path, form)
         delimiter, decimal = _written([line for _, line in kept[:_PROBED]], form)
         if form.transposed:
             kept = _transposed(kept, delimiter, path)
@@ -206,11 +206,13 @@ class Table:
         return values
 
 
-def _inside(kept: list[tuple[int, str]], path: Path) -> list[tuple[int, str]]:
-    """Without empty lines before and after the numbers; one between them would shift a channel."""
+def _between(kept: list[tuple[int, str]], path: Path, form: Format) -> list[tuple[int, str]]:
+    """Without empty lines before and after the numbers; one between them may be a lost row."""
     filled = [place for place, (_, line) in enumerate(kept) if line.strip()]
     if not filled:
         raise SourceError(path, "has no row of numbers")
+    if form.skip_empty:
+        return [kept[place] for place in filled]
     kept = kept[filled[0] : filled[-1] + 1]
     header = next((place for place, (_, line) in enumerate(kept[1:], 1) if line.strip()), 1)
     kept = kept[:1] + kept[header:]
@@ -219,7 +221,8 @@ def _inside(kept: list[tuple[int, str]], path: Path) -> list[tuple[int, str]]:
         raise SourceError(
             path,
             f"line {empty} is empty",
-            remedy="take it out, or cut the log there; skip lines of a header: [format] skip_rows",
+            remedy="take it out, or cut the log there; where empty lines mean nothing, leave them "
+            "out: [format] skip_empty = true; skip lines of a header: [format] skip_rows",
         )
     return kept
 

@@ -1,7 +1,15 @@
 """A commented cell file for a new arm, from its URDF and what its controller or an archive says."""
 
-from .cell_text import NewCell, cell_of_urdf
+from .cell_text import NewCell, cell_of_dh, cell_of_urdf
 from .controller import read_init
 from .known import Known, from_archive, from_init
 
-__all__ = ["Known", "NewCell", "cell_of_urdf", "from_archive", "from_init", "read_init"]
+__all__ = [
+    "Known",
+    "NewCell",
+    "cell_of_dh",
+    "cell_of_urdf",
+    "from_archive",
+    "from_init",
+    "read_init",
+]

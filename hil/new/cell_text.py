@@ -16,6 +16,7 @@ from drivers.drive_train import WRIST_AXES
 from hil.cell.unknown import UNKNOWN, WHERE
 from hil.cell.urdf import urdf_limits
 from hil.errors import InputError
+from hil.importers import Convention, urdf_of_dh
 from hil.reading import remedy_of, text_of
 from identification.errors import ModelError
 from identification.kinematics import Chain, chain_from_urdf
@@ -48,7 +49,7 @@ class NewCell:
         name: of the cell.
         joint_names: those that move, in the order of all lists.
         urdf: its text, None where the file that was named is used as it is.
-        urdf_path: of the URDF that was read.
+        urdf_path: of the URDF (or the table of DH parameters) that was read.
         collision: the collision shapes' mesh paths; None where the URDF has no shapes at all.
         known: what is known of it.
     """
@@ -76,6 +77,23 @@ class NewCell:
         return beside
 
 
+def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -> NewCell:
+    """What a table of DH parameters alone says of a cell: geometry; its URDF has to be written.
+
+    Args:
+        path: of the table.
+        convention: of its rows.
+        fixed: as for `cell_of_urdf`.
+
+    Raises:
+        InputError: it cannot be read, is no such table, or has no such joint.
+    """
+    text = urdf_of_dh(path, convention)
+    note = "the URDF has the geometry alone, as DH parameters give it: no masses, no limits"
+    made = _cell_of(path, text, fixed)
+    return replace(made, urdf=made.urdf or text, known=Known(notes=(note,)) | made.known)
+
+
 def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
     """What a URDF alone says of a cell.
 
@@ -96,6 +114,11 @@ def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
         why = error.strerror if isinstance(error, OSError) else error
         remedy = remedy_of(error, "name a URDF")
         raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error
+    return _cell_of(path, text, fixed)
+
+
+def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
+    """What the URDF that was read from `path` says of a cell."""
     chain = _chain(path, text)
     unknown = sorted(set(fixed) - set(chain.joint_names))
     if unknown:

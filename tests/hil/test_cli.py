@@ -127,7 +127,7 @@ def test_a_log_with_a_column_map_becomes_an_archive(tmp_path: Path) -> None:
     [
         (["identify", "nothing.mcap"], "nothing.mcap"),
         (["identify", str(CELL_PATH)], "cell.toml"),
-        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf or --cell"),
+        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf, --cell or --dh"),
         (["import", "rosbag2", "x.db3", "-o", "y.mcap", "--urdf", str(URDF_PATH)], "x.db3"),
         (
             ["import", "csv", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from hil.archive import Samples, open_archive
 from hil.cli import app
-from hil.importers import Findings
-from hil.importers.findings import examine
+from hil.errors import SourceError
+from hil.importers import ColumnMap, Findings, Robot, import_log
+from hil.importers.findings import METADATA, clock_fault, examine
 from tests.hil.simulated_logs import Simulated, simulate
+
+DEGREES = 57.29578
 
 
 @pytest.fixture(scope="module")
@@ -22,59 +25,171 @@ def arm() -> Simulated:
     return simulate("ur5_robot.urdf", np.arange(0.0, 20.0, 0.01))
 
 
-def doubts(
+@pytest.fixture(scope="module")
+def panda() -> Simulated:
+    """An arm whose joints have ranges of their own."""
+    fingers = ("panda_finger_joint1", "panda_finger_joint2")
+    return simulate("panda.urdf", np.arange(0.0, 20.0, 0.01), locked=fingers)
+
+
+def warnings(
     arm: Simulated, *, position=1.0, velocity=1.0, torque=1.0, clock=1.0, order=None
 ) -> list[str]:
     stamp = np.rint(arm.time * clock * 1e9).astype(np.int64)
-    joints = range(6) if order is None else order
+    joints = range(len(arm.joint_names)) if order is None else order
     samples = Samples(
         stamp,
         arm.position * position,
         velocity=arm.velocity[:, list(joints)] * velocity,
         torque=arm.torque * torque,
     )
-    return list(examine(samples, arm.joint_names, arm.urdf.read_text()).doubts)
+    return list(examine(samples, arm.joint_names, arm.urdf.read_text()).warnings)
 
 
-def test_a_log_without_a_slip_raises_no_doubt(arm: Simulated) -> None:
-    assert doubts(arm) == []
+class TestSlips:
+    def test_a_log_without_one_has_no_warning(self, arm: Simulated, panda: Simulated) -> None:
+        assert warnings(arm) == []
+        assert warnings(panda) == []
 
-
-@pytest.mark.parametrize(
-    ("slip", "sentence"),
-    [
-        ({"position": 57.29578}, "degrees read as radians"),
-        ({"position": 1 / 57.29578}, "no joint moves further than"),
-        ({"velocity": 57.29578}, "57.3 times the slope of its position: degrees read as radians"),
-        ({"velocity": 9.5493}, "revolutions per minute read as radians per second"),
-        ({"velocity": -1.0}, "-1 times the slope of its position: a sign?"),
-        ({"velocity": 0.0}, "does not follow its position"),
-        ({"order": (1, 0, 2, 3, 4, 5)}, "does not follow its position.*in the same order"),
-        ({"torque": 1000.0}, "its limit in the URDF is 150 N·m.*is its unit right"),
-        ({"torque": 0.0}, "is zero throughout"),
-        ({"clock": 1e3}, "0.1 samples a second is unusual"),
-        ({"clock": 1e-3}, "1e\\+05 samples a second is unusual"),
-    ],
-)
-def test_a_slip_is_named(arm: Simulated, slip: dict[str, float], sentence: str) -> None:
-    found = doubts(arm, **slip)  # type: ignore[arg-type]
-    assert any(re.search(sentence, doubt) for doubt in found), found
-
-
-def test_the_command_says_what_it_read_and_the_archive_keeps_it(
-    arm: Simulated, tmp_path: Path
-) -> None:
-    np.savez(tmp_path / "log.npz", q=np.degrees(arm.position), t=arm.time)
-    (tmp_path / "map.toml").write_text(
-        '[time]\ncolumn = "t"\n[position]\ncolumns = "q"\n'  # the unit is missing
+    @pytest.mark.parametrize(
+        ("slip", "sentence"),
+        [
+            ({"position": DEGREES}, "degrees read as radians"),
+            ({"position": 1 / DEGREES}, "no joint moves further than"),
+            ({"velocity": 0.0}, "does not follow its position"),
+            ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): is its unit right"),
+            ({"torque": 0.0}, "is zero throughout"),
+            ({"clock": 1e3}, "0.1 samples a second is unusual"),
+            ({"clock": 1e-3}, "1e+05 samples a second is unusual"),
+        ],
     )
-    arguments = ["import", "npz", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
-    arguments += ["--map", str(tmp_path / "map.toml"), "--urdf", str(arm.urdf)]
-    result = CliRunner().invoke(app, [*arguments, "--kind", "validation"])
-    assert result.exit_code == 0
-    assert "2000 samples in 19.99 s, 100 Hz" in result.stdout
-    assert 'write unit = "deg"' in result.stdout
-    metadata = open_archive(tmp_path / "log.mcap").metadata
-    assert metadata["use"] == "validation"
-    assert any("deg" in doubt for doubt in Findings.of(metadata).doubts)
-    assert json.loads(metadata["source"]) == ["log.npz"]
+    def test_is_named(self, arm: Simulated, slip: dict[str, float], sentence: str) -> None:
+        found = warnings(arm, **slip)
+        assert any(sentence in warning for warning in found), found
+
+    @pytest.mark.parametrize(
+        ("factor", "velocity", "position"),
+        [
+            (DEGREES, "velocities in deg/s read as rad/s", "positions in rad read as deg"),
+            (1 / DEGREES, "velocities in rad/s read as deg/s", "positions in deg read as rad"),
+            (9.5493, "velocities in rpm read as rad/s", None),
+            (-1.0, "the sign of the velocities", "the sign of the positions"),
+        ],
+    )
+    def test_units_of_velocity_have_two_readings_with_errors(
+        self, panda: Simulated, factor: float, velocity: str, position: str | None
+    ) -> None:
+        """Either the velocity's unit is wrong or the position's: the limits know the second."""
+        (sentence,) = warnings(panda, velocity=factor)
+        assert f"of every joint is {factor:.3g}"[:20] in sentence
+        assert f"{velocity} (with 0 % of the rows outside the limits" in sentence
+        assert (position is None) == (", or " not in sentence)
+        if position is not None:
+            share = float(sentence.split(f"{position} (with ")[1].split(" %")[0])
+            assert share > 50.0 or factor == pytest.approx(1 / DEGREES)
+
+    def test_a_scale_that_no_unit_explains_is_said_per_joint(self, arm: Simulated) -> None:
+        found = warnings(arm, velocity=np.array([1.0, 3.0, 1.0, 1.0, 1.0, 1.0]))
+        assert [one for one in found if "check units and gears" in one] == found
+        assert "shoulder_lift_joint is 3" in found[0]
+
+    def test_degrees_have_two_readings_with_errors(self, panda: Simulated) -> None:
+        (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
+        assert sentence.startswith("as mapped, 100 % of the rows leave the limits of the URDF")
+        assert 'as degrees read as radians, none would: write unit = "deg"' in sentence
+        assert all("degrees" in other for other in others)
+
+
+class TestOrder:
+    def test_velocities_in_another_order_are_told_with_the_order(self, arm: Simulated) -> None:
+        names = list(arm.joint_names)
+        (sentence,) = warnings(arm, order=(1, 2, 0, 3, 4, 5))
+        right = [names[1], names[2], names[0], *names[3:]]
+        assert f"as those of {', '.join(right)} by 0 %" in sentence
+        assert "as mapped they miss their slopes by" in sentence
+
+    def test_positions_that_fit_other_limits_are_told_with_an_order(self, panda: Simulated) -> None:
+        """Joint 4 of this arm bends one way only, joint 6 the other way."""
+        names = list(panda.joint_names)
+        order = [0, 1, 2, 5, 4, 3, 6]
+        samples = Samples(np.rint(panda.time * 1e9).astype(np.int64), panda.position[:, order])
+        found = examine(samples, names, panda.urdf.read_text()).warnings
+        assert "% of the rows leave the limits of the URDF" in found[0]
+        assert f"those of {', '.join(names[j] for j in order)}, none would" in found[0]
+
+    def test_a_zero_that_is_off_is_no_order(self, panda: Simulated) -> None:
+        position = panda.position.copy()
+        position[:, 3] += 20.0
+        samples = Samples(np.rint(panda.time * 1e9).astype(np.int64), position)
+        found = examine(samples, panda.joint_names, panda.urdf.read_text()).warnings
+        assert "check unit, sign and zero in the column map" in found[0]
+        assert "order" not in found[0]
+
+
+class TestClock:
+    """A recording whose clock cannot be that of a motion is refused by file and field."""
+
+    def stamps(self, *seconds: float) -> NDArray[np.int64]:
+        return np.rint(np.array(seconds) * 1e9).astype(np.int64)
+
+    @pytest.mark.parametrize("rate", [10.0, 125.0, 1000.0, 50_000.0])
+    def test_usual_rates_pass(self, rate: float) -> None:
+        assert clock_fault(self.stamps(*(np.arange(50) / rate))) is None
+
+    def test_milliseconds_read_as_seconds_are_refused(self) -> None:
+        fault = clock_fault(self.stamps(*range(0, 1000, 10)))
+        assert fault is not None
+        assert fault.problem.startswith("there would be 0.1 samples a second")
+        assert "milliseconds read as seconds would make it 100 samples a second" in fault.remedy
+
+    def test_a_clock_that_runs_backwards_is_refused_by_its_sample(self) -> None:
+        fault = clock_fault(self.stamps(0.0, 0.01, 0.02, 0.005, 0.015))
+        assert fault is not None
+        assert fault.problem == "sample 3 is 0.015 s older than the one before it (1 such steps)"
+
+    def test_a_clock_that_stands_still_is_refused(self) -> None:
+        fault = clock_fault(self.stamps(3.0, 3.0, 3.0))
+        assert fault is not None
+        assert fault.problem == "all 3 samples have the same time"
+
+    def test_single_stamps_and_repeats_pass(self) -> None:
+        assert clock_fault(self.stamps(3.0)) is None
+        assert clock_fault(self.stamps(0.0, 0.01, 0.01, 0.02)) is None
+
+    def test_the_file_with_the_times_is_named(self, arm: Simulated, tmp_path: Path) -> None:
+        np.savetxt(tmp_path / "q.txt", arm.position)
+        np.savetxt(tmp_path / "t.txt", 1e3 * arm.time)
+        columns = ColumnMap.model_validate(
+            {"time": {"column": 0, "file": "t.txt"}, "position": {"file": "q.txt"}}
+        )
+        with pytest.raises(SourceError, match=r"t\.txt: time: there would be 0\.1 samples"):
+            import_log(
+                tmp_path, tmp_path / "a.mcap", robot=Robot.from_urdf(arm.urdf), columns=columns
+            )
+        assert not (tmp_path / "a.mcap").exists()
+
+
+class TestCommand:
+    def test_it_says_what_it_read_and_the_archive_keeps_it(
+        self, arm: Simulated, tmp_path: Path
+    ) -> None:
+        np.savez(tmp_path / "log.npz", q=np.degrees(arm.position), t=arm.time)
+        (tmp_path / "map.toml").write_text(
+            '[time]\ncolumn = "t"\n[position]\ncolumns = "q"\n'  # the unit is missing
+        )
+        arguments = ["import", "npz", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
+        arguments += ["--map", str(tmp_path / "map.toml"), "--urdf", str(arm.urdf)]
+        result = CliRunner().invoke(app, [*arguments, "--kind", "validation"])
+        assert result.exit_code == 0
+        assert "2000 samples in 19.99 s, 100 Hz" in result.stdout
+        assert "warning: as mapped" in result.stdout
+        assert 'write unit = "deg"' in result.stdout
+        metadata = open_archive(tmp_path / "log.mcap").metadata
+        assert metadata["use"] == "validation"
+        assert any("deg" in warning for warning in Findings.of(metadata).warnings)
+        assert json.loads(metadata["source"]) == ["log.npz"]
+
+    def test_an_earlier_archive_gives_its_warnings_too(self) -> None:
+        """They had another name in its metadata."""
+        stored = json.dumps({"lines": ["a"], "doubts": ["b"]})
+        assert Findings.of({METADATA: stored}) == Findings(("a",), ("b",))

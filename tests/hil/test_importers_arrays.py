@@ -6,6 +6,7 @@ import io
 import os
 import resource
 import signal
+import struct
 import tomllib
 import zipfile
 from pathlib import Path
@@ -167,6 +168,94 @@ def stored(kind: str) -> bytes:
     return file.getvalue()
 
 
+def opaque(name: str) -> bytes:
+    """A variable of a .mat that only MATLAB can read, as it saves tables and strings."""
+    flags = struct.pack("<IIII", 6, 8, 17, 0)  # an array of UINT32: the class of opaque objects
+    text = struct.pack("<II", 1, len(name)) + name.encode().ljust(8, b"\0")
+    return struct.pack("<II", 14, len(flags) + len(text)) + flags + text
+
+
+LOG = {
+    "t": TIME,
+    "note": "a string",
+    "joint": {"q": Q, "tau": TAU.T, "more": {"q": -Q}},
+    "each": np.array([{"q": column} for column in Q.T], object),
+}
+
+
+class TestStructs:
+    """A path such as `log.joint.q` reaches a field of a struct."""
+
+    @pytest.mark.parametrize("packed", [False, True])
+    @pytest.mark.parametrize(
+        ("columns", "expected"),
+        [("log.joint.q", Q), ("log.joint.more.q", -Q), ("log.joint.tau", TAU)],
+    )
+    def test_a_field_is_reached_by_its_path(self, tmp_path, robot, columns, expected, packed):
+        savemat(tmp_path / "a.mat", {"log": LOG, "k": 3.0}, do_compression=packed)
+        entries = {"sample_rate": None, "time": {"column": "log.t"}}
+        found = read(tmp_path / "a.mat", robot, position={"columns": columns}, **entries)
+        assert np.array_equal(found["position"], expected)
+        assert (found["stamp"] / 1e9) == pytest.approx(TIME)
+
+    @pytest.mark.parametrize("name", ["log.each({}).q", "cells({})", "one({}).q"])
+    def test_elements_count_from_one_as_in_matlab(self, tmp_path, robot, name):
+        records = np.zeros((1, 3), [("q", object)])
+        cells = np.empty(3, object)
+        for joint in range(3):
+            records[0, joint]["q"] = cells[joint] = Q[:, joint]
+        savemat(tmp_path / "a.mat", {"log": LOG, "cells": cells, "one": records})
+        found = read(tmp_path / "a.mat", robot, position={"columns": name})
+        assert np.array_equal(found["position"], Q)
+
+    def test_columns_of_a_field_by_index(self, tmp_path, robot):
+        savemat(tmp_path / "a.mat", {"log": {"all": np.column_stack([TIME, Q])}})
+        position = {"array": "log.all", "columns": (1, 2, 3)}
+        assert np.array_equal(read(tmp_path / "a.mat", robot, position=position)["position"], Q)
+
+    def test_dimensions_of_one_element_do_not_count(self, tmp_path, robot):
+        """Simulink logs (1, joints, samples)."""
+        savemat(tmp_path / "a.mat", {"log": {"signals": {"values": Q.T[None]}}})
+        found = read(tmp_path / "a.mat", robot, position={"columns": "log.signals.values"})
+        assert np.array_equal(found["position"], Q)
+
+    @pytest.mark.parametrize(
+        ("path", "sentence"),
+        [
+            ("log.joint.x", r"no array 'x' in 'log.joint'; its arrays are log.joint.q \(40, 3\)"),
+            ("log.joint", r"'log.joint' is a struct, no array; its arrays are log.joint.q"),
+            ("log.joint.q.x", r"no array 'q.x' in 'log.joint'; its arrays are log.joint.q"),
+            ("log.note", r"no array 'note' in 'log'; its arrays are log.t \(1, 40\), log.joint.q"),
+            ("other.q", r"there is no array 'other.q'; its arrays are k \(1, 1\), log.t"),
+        ],
+    )
+    def test_a_field_that_is_missing_is_named_with_those_there(
+        self, tmp_path, robot, path, sentence
+    ):
+        savemat(tmp_path / "a.mat", {"log": LOG, "k": 3.0})
+        with pytest.raises(SourceError, match=r"a\.mat: position.columns: .*" + sentence):
+            read(tmp_path / "a.mat", robot, position={"columns": path})
+
+    @pytest.mark.parametrize("position", ["q", "log.joint.q"])
+    def test_variables_that_only_matlab_reads_are_passed_over(self, tmp_path, robot, position):
+        """scipy lists nothing of a file with one."""
+        savemat(tmp_path / "a.mat", {"log": LOG, "q": Q})
+        with (tmp_path / "a.mat").open("ab") as file:
+            file.write(opaque("table"))
+        found = read(tmp_path / "a.mat", robot, position={"columns": position})
+        assert np.array_equal(found["position"], Q)
+
+    def test_no_more_fields_are_read_than_anybody_logs(self, tmp_path, robot, monkeypatch):
+        monkeypatch.setattr(array_files, "_MOST_FIELDS", 2)
+        savemat(tmp_path / "a.mat", {"log": LOG})
+        with pytest.raises(ValueError, match="more than 2 fields"):
+            array_files._struct_fields(str(tmp_path / "a.mat"), ["log"])
+        monkeypatch.setattr(array_files, "_MOST_FIELDS", 100)
+        monkeypatch.setattr(array_files, "MOST_NUMBERS", 100)
+        with pytest.raises(ValueError, match="too large"):
+            array_files._struct_fields(str(tmp_path / "a.mat"), ["log"])
+
+
 class TestDamageAndMalice:
     @pytest.mark.parametrize("kind", ["npz", "npy", "mat", "compressed mat"])
     def test_a_damaged_file_is_read_or_refused_with_one_sentence(self, tmp_path, kind):
@@ -306,8 +395,15 @@ class TestTextMatrices:
     def test_an_empty_line_between_numbers_is_named(self, tmp_path, robot):
         lines = [" ".join(map(repr, row)) for row in Q.tolist()]
         (tmp_path / "q.txt").write_text("\n".join([*lines[:9], "", *lines[9:]]))
-        with pytest.raises(SourceError, match="line 10 is empty; take it out"):
+        with pytest.raises(SourceError, match=r"line 10 is empty; .*\[format\] skip_empty = true"):
             read(tmp_path / "q.txt", robot)
+
+    @pytest.mark.parametrize("header", [[], ["q1 q2 q3"], ["q1 q2 q3", ""]])
+    def test_empty_lines_are_left_out_on_demand(self, tmp_path, robot, header):
+        lines = [" ".join(map(repr, row)) + "\n" for row in Q.tolist()]
+        (tmp_path / "q.txt").write_text("\n".join(["", *header, *lines, " ", ""]))
+        found = read(tmp_path / "q.txt", robot, format={"skip_empty": True})
+        assert np.array_equal(found["position"], Q)
 
     @pytest.mark.parametrize("hole", ["nan", "", "NULL", "-"])
     def test_rows_with_holes_are_left_out_on_demand(self, tmp_path, robot, hole):
@@ -338,7 +434,7 @@ def test_joints_of_the_log_that_the_robot_has_not_are_left_out(tmp_path, robot):
 
 def test_a_joint_that_was_not_recorded_has_to_be_locked(tmp_path, robot):
     np.savez(tmp_path / "a.npz", q=Q[:, :2])
-    with pytest.raises(SourceError, match="lock those that were not recorded"):
+    with pytest.raises(SourceError, match="--locked NAME, or all: --lock-others"):
         read(tmp_path / "a.npz", robot, joints=JOINTS[:2], position={"columns": "q"})
     path = tmp_path / "two.urdf"
     path.write_text(robot.urdf)

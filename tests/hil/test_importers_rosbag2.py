@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import InputError, SourceError
-from hil.importers import Robot, import_rosbag2
+from hil.importers import Robot, import_rosbag2, recorded_joints
 from hil.recordings import open_recording
 from identification import FrictionLaw
 from identification.recording import RecordingError
@@ -94,12 +94,51 @@ class TestRobot:
         assert set(cell.model.friction.laws) == {FrictionLaw(third=None, offset=True)}
         assert cell.joint_names == robot.joint_names == ("hip", "ankle")
 
+    def test_without_a_law_it_has_offset_coulomb_and_viscous_friction(self, tmp_path):
+        """A term in v² makes the prediction of other motions worse on average."""
+        (tmp_path / "two.urdf").write_text(URDF)
+        robot = Robot.from_urdf(tmp_path / "two.urdf")
+        cell = Cell.from_texts(robot.cell, robot.urdf, Path("cell.toml"))
+        assert set(cell.model.friction.laws) == {FrictionLaw(third=None, offset=True)}
+
     def test_gravity_and_rotor_inertia_are_kept(self, tmp_path):
         (tmp_path / "two.urdf").write_text(URDF)
         robot = Robot.from_urdf(tmp_path / "two.urdf", gravity=(0, 9.81, 0), rotor_inertia=False)
         model = Cell.from_texts(robot.cell, robot.urdf, Path("cell.toml")).model
         assert model.gravity.tolist() == [0, 9.81, 0]
         assert not model.rotor_inertia
+
+    def test_gravity_replaces_that_of_a_cell(self, tmp_path, robot):
+        (tmp_path / "robot.urdf").write_text(robot.urdf)
+        (tmp_path / "cell.toml").write_text(robot.cell)
+        turned = Robot.from_cell(tmp_path / "cell.toml", gravity=(0, 0, 1.62))
+        model = Cell.from_texts(turned.cell, turned.urdf, Path("cell.toml")).model
+        assert model.gravity.tolist() == [0, 0, 1.62]
+
+    def test_joints_that_were_not_recorded_are_locked(self, tmp_path):
+        """At zero, or in the middle of a range without it; what is locked by name stays there."""
+        more = "".join(
+            f"<link name='{name}'/><joint name='{name}' type='{kind}'><parent link='lower'/>"
+            f"<child link='{name}'/><axis xyz='0 0 1'/>"
+            f"<limit lower='{low}' upper='{high}' effort='1' velocity='1'/></joint>"
+            for name, kind, low, high in [
+                ("turns", "revolute", -1, 2), ("slides", "prismatic", 0.1, 0.3),
+                ("bends", "revolute", -3, -1), ("rolls", "continuous", 0, 0),
+            ]
+        )  # fmt: skip
+        path = tmp_path / "more.urdf"
+        path.write_text(URDF.replace("</robot>", more + "</robot>"))
+        robot = Robot.from_urdf(path, locked={"turns": 0.5}, recorded=["hip", "ankle", "unknown"])
+        assert robot.joint_names == ("hip", "ankle")
+        assert robot.locked == {
+            "turns": 0.5, "slides": pytest.approx(0.2), "bends": -2.0, "rolls": 0.0
+        }  # fmt: skip
+        (tmp_path / "robot.urdf").write_text(robot.urdf)
+        (tmp_path / "cell.toml").write_text(robot.cell)
+        less = Robot.from_cell(tmp_path / "cell.toml", recorded=["hip"])
+        assert less.locked == {**robot.locked, "ankle": 0.0}
+        with pytest.raises(InputError, match=r"none of its joints hip.* recorded are a, b"):
+            Robot.from_urdf(path, recorded=["a", "b"])
 
     def test_a_transmission_of_the_same_name_does_not_hide_a_fixed_joint(self, tmp_path):
         again = '<transmission name="t"><joint name="ankle"/></transmission></robot>'
@@ -160,6 +199,29 @@ class TestImport:
         path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot)
         assert set(open_archive(path).columns) == {"stamp", "position"}
         assert open_recording(path).torque is None
+
+    def test_velocity_reaches_the_archive(self, tmp_path, robot):
+        messages = [state(8_000_000 * i, [1, 2], velocity=[0.5, -i]) for i in range(3)]
+        file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
+        path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot)
+        assert open_archive(path).columns["velocity"].tolist() == [[-i, 0.5] for i in range(3)]
+
+    def test_nan_throughout_is_no_quantity(self, tmp_path, robot):
+        """ros2_control publishes it for what the hardware does not measure."""
+        nothing = [np.nan, np.nan]
+        messages = [state(8_000_000 * i, [1, i], velocity=nothing) for i in range(3)]
+        file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
+        path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot)
+        assert set(open_archive(path).columns) == {"stamp", "position"}
+
+    def test_recorded_joints_are_those_of_the_fullest_message(self, tmp_path):
+        messages = [state(5, [0.01], names=["finger"]), *states(2)]
+        file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
+        assert recorded_joints(file) == ("ankle", "hip")
+        assert recorded_joints(file, joint_names={"hip": "h"}) == ("ankle", "h")
+        empty = bag(tmp_path / "e.db3", {"/js": (STATE, [])})
+        with pytest.raises(SourceError, match="has no message with joints"):
+            recorded_joints(empty)
 
     def test_effort_can_be_declared_a_motor_current(self, tmp_path, robot):
         file = bag(tmp_path / "b.db3", {"/js": (STATE, states())})
@@ -244,11 +306,18 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("messages", "sentence"),
         [
-            ([state(1, [1.0], names=["hip"])], "ankle was not recorded; recorded are hip"),
+            (
+                [state(1, [1.0], names=["hip"])],
+                "ankle was not recorded; recorded are hip.*--lock-others",
+            ),
             ([state(1, [1.0], names=["x"])], "none of the joints hip, ankle .* recorded are x"),
             ([state(1, [1.0])], "position: message 0 has 1 values for 2 joints"),
             ([*states(2), state(9, [1, 2])], "effort: only 2 of 3 messages have it"),
             ([*states(2), state(9, [np.nan, 2], effort=[1, 1])], "ankle is nan in sample"),
+            (
+                [state(9 * 10**9, [1, 2]), (10**10, state(1, [1, 3])[1])],
+                "time: sample 1 is 9 s older than",
+            ),
             ([(3, b"\x00\x01\x00\x00rubbish")], "message 0 cannot be decoded"),
         ],
     )

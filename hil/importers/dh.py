@@ -1,0 +1,213 @@
+"""Robots of which only the Denavit-Hartenberg parameters are known: a URDF of geometry alone."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Final, Literal, get_args
+from xml.sax.saxutils import quoteattr
+
+from hil.errors import InputError
+from hil.reading import remedy_of, text_of
+
+Convention = Literal["standard", "modified"]
+CONVENTIONS: Final[tuple[Convention, ...]] = get_args(Convention)
+
+_NAMES: Final = ("joint", "type", "a", "alpha", "d", "theta_offset")
+_UNITS: Final[Mapping[str, Mapping[str, float]]] = {
+    "a": {"a": 1.0, "a_mm": 1e-3},
+    "d": {"d": 1.0, "d_mm": 1e-3},
+    "alpha": {"alpha": 1.0, "alpha_deg": math.pi / 180.0},
+    "theta_offset": {"theta_offset": 1.0, "theta_offset_deg": math.pi / 180.0},
+}
+_TYPES: Final = {"revolute": "continuous", "prismatic": "prismatic"}
+_LARGEST: Final = {"a": 20.0, "d": 20.0, "alpha": 2.0 * math.pi, "theta_offset": 2.0 * math.pi}
+"""m and rad; what is larger is in mm or degrees."""
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A joint and its link, in m and rad."""
+
+    joint: str
+    type: str
+    a: float
+    alpha: float
+    d: float
+    theta_offset: float
+
+
+def urdf_of_dh(path: str | PathLike[str], convention: Convention) -> str:
+    r"""The URDF of a table of Denavit-Hartenberg parameters: geometry, no masses, no limits.
+
+    The table is text with commas or semicolons, a header and a row per joint, base to flange:
+    ``joint,type,a,alpha,d,theta_offset``. `type` is revolute or prismatic. Lengths are in m,
+    angles in rad; columns called ``a_mm``, ``d_mm``, ``alpha_deg``, ``theta_offset_deg`` are in mm
+    and degrees. With the angle :math:`\theta = q + \theta_0` of a revolute joint (the length
+    :math:`d + q` of a prismatic one) a row is the transform
+
+    - standard: :math:`R_z(\theta)\, T_z(d)\, T_x(a)\, R_x(\alpha)`, joint k turns about the z axis
+      of frame k-1;
+    - modified (Craig): :math:`R_x(\alpha)\, T_x(a)\, R_z(\theta)\, T_z(d)`, joint k turns about the
+      z axis of frame k.
+
+    Link k is called ``link_k``, the base ``base_link``, the last frame ``flange``.
+
+    Args:
+        path: of the table.
+        convention: of its rows.
+
+    Raises:
+        InputError: it cannot be read, or a row says what no joint can be; names the line.
+    """
+    path = Path(path)
+    rows = _rows(path)
+    parts = [f"<robot name={quoteattr(path.stem or 'robot')}>", _link("base_link")]
+    parent = "base_link"
+    # Between two joints: what stands behind one joint (standard) or before the next (modified).
+    for number, row in enumerate(rows, 1):
+        if convention == "modified":
+            before = f"before_{number}"
+            parts += _fixed(parent, before, (row.a, 0.0, 0.0), row.alpha)
+            parent = before
+        lift = row.d if convention == "modified" else 0.0
+        parts += _moving(row, parent, f"link_{number}", lift)
+        parent = f"link_{number}"
+        if convention == "standard":
+            end = "flange" if number == len(rows) else f"end_{number}"
+            parts += _fixed(parent, end, (row.a, 0.0, row.d), row.alpha)
+            parent = end
+    if convention == "modified":
+        parts += _fixed(parent, "flange", (0.0, 0.0, 0.0), 0.0)
+    return "\n".join(['<?xml version="1.0"?>', *parts, "</robot>"]) + "\n"
+
+
+def convention_of(text: str | None) -> Convention:
+    """A convention by its name, which has to be given: the figures of a table do not show it.
+
+    Raises:
+        InputError: there is no such convention.
+    """
+    for known in CONVENTIONS:
+        if text == known:
+            return known
+    raise InputError(
+        None,
+        "is not given" if text is None else f"{text!r} is unknown",
+        field="--convention",
+        remedy="--dh needs standard (the frame of a row is at the far end of its link) or "
+        "modified (Craig: at the near end)",
+    )
+
+
+def _link(name: str) -> str:
+    return f"<link name={quoteattr(name)}/>"
+
+
+def _fixed(
+    parent: str, child: str, place: tuple[float, float, float], roll: float
+) -> tuple[str, str]:
+    """A link that is fixed to another one, moved and then turned about x."""
+    xyz = " ".join(map(repr, place))
+    joint = (
+        f'<joint name="fixed_{child}" type="fixed"><parent link="{parent}"/>'
+        f'<child link="{child}"/><origin xyz="{xyz}" rpy="{roll!r} 0 0"/></joint>'
+    )
+    return _link(child), joint
+
+
+def _moving(row: _Row, parent: str, child: str, lift: float) -> tuple[str, str]:
+    """A link that turns about, or slides along, the z axis of another one."""
+    limit = (
+        "" if row.type == "continuous" else '<limit lower="0" upper="0" effort="0" velocity="0"/>'
+    )
+    joint = (
+        f'<joint name={quoteattr(row.joint)} type="{row.type}"><parent link="{parent}"/>'
+        f'<child link="{child}"/><origin xyz="0 0 {lift!r}" rpy="0 0 {row.theta_offset!r}"/>'
+        f'<axis xyz="0 0 1"/>{limit}</joint>'
+    )
+    return _link(child), joint
+
+
+def _rows(path: Path) -> list[_Row]:
+    try:
+        lines = text_of(path).removeprefix("\ufeff").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        remedy = remedy_of(error, "name a table of DH parameters")
+        raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error
+    filled = [
+        (number, line)
+        for number, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if len(filled) < 2:
+        raise InputError(path, "has no row of a joint", remedy=f"write {','.join(_NAMES)} and rows")
+    header = filled[0][1]
+    delimiter = ";" if ";" in header else ","
+    columns = _columns(path, _cells(header, delimiter))
+    rows = [_row(path, number, _cells(line, delimiter), columns) for number, line in filled[1:]]
+    names = [row.joint for row in rows]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(path, f"has two joints {twice!r}", field="joint", remedy="rename one")
+    return rows
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
+
+
+def _columns(path: Path, header: list[str]) -> dict[str, tuple[int, float]]:
+    """Place and unit of each quantity."""
+    columns = {}
+    for name in _NAMES:
+        spellings = _UNITS.get(name, {name: 1.0})
+        found = [spelling for spelling in spellings if spelling in header]
+        if len(found) != 1:
+            raise InputError(
+                path,
+                f"has {'no column' if not found else 'columns'} {' and '.join(found or [name])}",
+                field="header",
+                remedy=f"its columns are {','.join(_NAMES)}; lengths in m (a_mm, d_mm: in mm), "
+                "angles in rad (alpha_deg, theta_offset_deg: in degrees)",
+            )
+        columns[name] = header.index(found[0]), spellings[found[0]]
+    return columns
+
+
+def _row(path: Path, number: int, cells: list[str], columns: dict[str, tuple[int, float]]) -> _Row:
+    texts = {name: cells[k] if k < len(cells) else "" for name, (k, _) in columns.items()}
+    kind = texts["type"].lower()
+    if kind not in _TYPES:
+        raise InputError(
+            path,
+            f"line {number} has the type {texts['type']!r}",
+            field="type",
+            remedy=f"write {' or '.join(_TYPES)}",
+        )
+    if not texts["joint"]:
+        raise InputError(path, f"line {number} has no name", field="joint", remedy="write one")
+    values = {name: _number(path, number, name, texts[name], columns[name][1]) for name in _UNITS}
+    return _Row(texts["joint"], _TYPES[kind], **values)
+
+
+def _number(path: Path, line: int, name: str, text: str, unit: float) -> float:
+    try:
+        value = float(text) * unit
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _LARGEST[name]:
+        other = next(spelling for spelling, u in _UNITS[name].items() if u != 1.0)
+        largest = f"{_LARGEST[name]:.3g} {'m' if name in 'ad' else 'rad'}"
+        raise InputError(
+            path,
+            f"line {line} has {repr(text) if text else 'nothing'}",
+            field=name,
+            remedy=f"write a number of at most {largest}, or call the column {other}",
+        )
+    return value
