@@ -31,10 +31,8 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"
 
 import argparse
-import importlib.metadata
 import json
 import tempfile
-import tomllib
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,7 +40,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
+from benchmarks.published import FITTED_SHARE, Published
 from hil.recordings import open_recording
 from identification.consistent import consistent_estimate
 from identification.coupling import Coupling
@@ -63,8 +61,6 @@ from identification.torque_channel import find_torque_bandwidth
 from identification.validation import prediction_error
 from planner.arrays import Array
 
-CONFIGURATIONS: Final = Path(__file__).parent / "recordings"
-FITTED_SHARE: Final = 0.7
 LAWS: Final = {
     "linear_friction": FrictionLaw(third=None, offset=True),
     "quadratic_friction": FrictionLaw(third="quadratic", offset=True),
@@ -222,19 +218,16 @@ def essential_table(
 
 
 def load_case(folder: Path) -> Case:
-    """The recording of a folder, imported as its configuration says."""
-    file = CONFIGURATIONS / f"{folder.name}.toml"
-    if not file.is_file():
-        known = ", ".join(sorted(path.stem for path in CONFIGURATIONS.glob("*.toml")))
-        raise SystemExit(f"nothing is known about {folder.name}; known are {known}")
-    configuration = tomllib.loads(file.read_text(encoding="utf-8"))
-    bandwidth = configuration.get("smooth_bandwidth")
-    urdf = _urdf(configuration, folder)
-    recording, matrix = _recording(configuration, folder, urdf)
+    """The first recording of a folder, imported as its configuration says, and its coupling."""
+    published = Published.named(folder.name)
+    with tempfile.TemporaryDirectory() as scratch:
+        archive = Path(scratch) / "imported.mcap"
+        recording = open_recording(published.imported(next(iter(published.logs)), folder, archive))
+    bandwidth = published.smooth_bandwidth
     return Case(
         recording,
-        urdf.read_text(encoding="utf-8"),
-        matrix,
+        published.urdf_text(folder),
+        _coupled_motors(recording),
         Preprocessing(smooth_torque=bandwidth is not None, torque_bandwidth=bandwidth),
     )
 
@@ -267,40 +260,13 @@ def main() -> None:
     print(json.dumps(result))
 
 
-def _urdf(configuration: dict[str, Any], folder: Path) -> Path:
-    """Return the URDF: beside the recording, or in an installed package."""
-    package = configuration.get("urdf_package")
-    if package is None:
-        return folder / str(configuration["urdf"])
-    for file in importlib.metadata.files(package) or ():
-        if file.name == configuration["urdf"]:
-            return Path(str(file.locate()))
-    raise SystemExit(f"{configuration['urdf']} is not in the package {package}; is it installed?")
-
-
-def _recording(
-    configuration: dict[str, Any], folder: Path, urdf: Path
-) -> tuple[Recording, Array | None]:
-    """Import into an archive and read that, as `hil import` and `hil identify` do.
-
-    Returns:
-        The recording, and the motors' angles per joint angle where axes are coupled.
-    """
-    robot = Robot.from_urdf(urdf)
-    with tempfile.TemporaryDirectory() as scratch:
-        archive = Path(scratch) / "imported.mcap"
-        if "bag" in configuration:
-            import_rosbag2(folder / configuration["bag"], archive, robot=robot)
-            return open_recording(archive), None
-        columns = ColumnMap.model_validate(configuration["map"])
-        import_log(folder / configuration["log"], archive, robot=robot, columns=columns)
-        drive = columns.drive
-        if not drive.coupling or drive.gear_ratio is None:
-            return open_recording(archive), None
-        matrix = np.diag(np.array(drive.gear_ratio))
-        for motor, joint, ratio in drive.coupling:
-            matrix[motor - 1, joint - 1] = ratio
-        return open_recording(archive), matrix
+def _coupled_motors(recording: Recording) -> Array | None:
+    """The motors' angles per joint angle (n, n) where axes are coupled, else None."""
+    stored = recording.provenance.get("motor_from_joint")
+    if stored is None:
+        return None
+    matrix = np.array(json.loads(stored))
+    return matrix if np.any(matrix != np.diag(np.diag(matrix))) else None
 
 
 def _plain(model: RobotModel, split: Split) -> float:

@@ -282,6 +282,7 @@ def _validation(
             relative_error=error.relative.tolist(),
             overall_relative_error=error.overall,
             all_rows_relative_error=all_rows.overall,
+            all_rows_joint_errors=all_rows.relative.tolist(),
         )
         for source, error, all_rows in zip(sources.held_out, errors, everywhere, strict=True)
     ]
@@ -294,13 +295,15 @@ def _fitted(model: RobotModel, values: Array, prepared: Prepared) -> FittedResul
         return over_all(prediction_error(model, values, samples, all_rows=all_rows))
 
     moving = error(prepared.training, all_rows=False)
+    everywhere = error(prepared.training, all_rows=True)
     smoothed = (
         error(prepared.fitted, all_rows=True) if prepared.preprocessing.smooth_torque else None
     )
     return FittedResult(
         relative_error=moving.relative.tolist(),
         overall_relative_error=moving.overall,
-        all_rows_relative_error=error(prepared.training, all_rows=True).overall,
+        all_rows_relative_error=everywhere.overall,
+        all_rows_joint_errors=everywhere.relative.tolist(),
         smoothed_relative_error=None if smoothed is None else smoothed.relative.tolist(),
         smoothed_overall_relative_error=None if smoothed is None else smoothed.overall,
     )

@@ -90,6 +90,8 @@ class ValidationResult(Frozen):
     """||e|| / ||tau|| over all joints, rows in which the joint moves."""
     all_rows_relative_error: float
     """The same over every row, standstill and the first and last rows included."""
+    all_rows_joint_errors: list[float] = Field(default_factory=list)
+    """The same of each joint; empty in a file that was written before there were any."""
 
 
 class FittedResult(Frozen):
@@ -100,6 +102,8 @@ class FittedResult(Frozen):
     overall_relative_error: float
     all_rows_relative_error: float
     """The same over every row, standstill and the first and last rows included."""
+    all_rows_joint_errors: list[float] = Field(default_factory=list)
+    """The same of each joint; empty in a file that was written before there were any."""
     smoothed_relative_error: list[float] | None = None
     """Every row, of the torque as it was fitted, where that was smoothed; null where not."""
     smoothed_overall_relative_error: float | None = None

@@ -1,0 +1,387 @@
+"""Identification by default settings beside a plain fit, on real recordings and on spoilt ones.
+
+Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--degraded] [--json]``, where
+FOLDER holds the folders of recordings that `benchmarks/recordings` describes.
+
+Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
+torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
+identify` does, by default settings; *plain* is `benchmarks.plain_fit` on the same rows. A ratio
+below 1 is won.
+
+With ``--degraded``, the first held-out split of each robot and of the simulated cell is done again
+with copies of the logs, each with one fault (`benchmarks.degradations`): the error beside that of
+the copy without a fault, and what the verdict calls wrong or
+suspicious only with the fault. *Right* is a verdict that
+names the fault, or leaves it out where it is harmless, and blames nothing else.
+"""
+
+# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from benchmarks import plain_fit
+from benchmarks.degradations import CAUSES, DEGRADATIONS, EXPECTED, FITTED_ONLY, HARMLESS
+from benchmarks.joint_log import JointLog
+from benchmarks.published import FITTED_SHARE, Published, Split, known
+from benchmarks.study_recordings import (
+    Kept,
+    excitation_path,
+    record_excitation,
+    record_validation,
+    study_cell,
+    study_plan,
+    validation_paths,
+)
+from hil.errors import HilError
+from hil.identify import Options, identify_archives
+from hil.importers import Robot
+from hil.progress import Silent
+from hil.results import FindingResult, Results
+from identification.errors import IdentificationError
+
+DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
+SIMULATED: Final = "simulated"
+_RATED_PAYLOAD: Final = 16.0  # kg, of the NS 16
+
+
+@dataclass(frozen=True)
+class Row:
+    """One split of one recording: errors of both, over all joints and by joint, and their times.
+
+    Attributes:
+        ratio: of hil's error to the plain one.
+        seconds: that each took, by name.
+    """
+
+    data: str
+    split: str
+    hil: float
+    plain: float
+    ratio: float
+    hil_joints: list[float]
+    plain_joints: list[float]
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True)
+class DegradedRow:
+    """One fault of one recording.
+
+    Attributes:
+        hil: held-out error with the fault; None where the recording was refused.
+        undegraded: without it.
+        named: checks that the verdict calls wrong or suspicious; of those that it calls so without
+            the fault as well only what is expected.
+        words: what it says of them, or why the recording was refused.
+        expected: checks of which any is right.
+        right: whether the fault was named, or left out where harmless, and nothing else blamed.
+    """
+
+    data: str
+    case: str
+    hil: float | None
+    undegraded: float
+    ratio: float | None
+    named: list[str]
+    words: list[str]
+    expected: list[str]
+    right: bool
+
+
+class Parts(NamedTuple):
+    """The rows that are fitted, and those that are predicted."""
+
+    fitted: JointLog
+    predicted: JointLog
+
+
+class Identified(NamedTuple):
+    """Error over all joints and every row, and by joint; and all results."""
+
+    error: float
+    joints: list[float]
+    results: Results
+
+
+def cut(split: Split, logs: Mapping[str, JointLog]) -> Parts:
+    """The parts of a split, of logs by name."""
+    whole = logs[split.fitted]
+    if split.predicted is not None:
+        return Parts(whole, logs[split.predicted])
+    share = round(FITTED_SHARE * whole.n_rows)
+    if split.part == "first":
+        return Parts(whole.rows(slice(0, share)), whole.rows(slice(share, None)))
+    if split.part == "last":
+        rest = whole.n_rows - share
+        return Parts(whole.rows(slice(rest, None)), whole.rows(slice(0, rest)))
+    return Parts(whole, whole)
+
+
+def identified(
+    fitted: Path, predicted: Sequence[Path] = (), *, in_sample: bool = False
+) -> Identified:
+    """Identify from an archive as `hil identify` does, by default settings."""
+    options = Options(split=FITTED_SHARE, in_sample=in_sample)
+    results = identify_archives([fitted], Silent(), options, predict=predicted).results
+    one = results.fitted if in_sample else results.validation[0]
+    assert one is not None
+    return Identified(one.all_rows_relative_error, one.all_rows_joint_errors, results)
+
+
+def identified_split(split: Split, archives: Mapping[str, Path], parts: Parts) -> Identified:
+    """Identify what a split asks for, from whole archives where the options can say it."""
+    fitted = archives[split.fitted]
+    if split.predicted is not None:
+        return identified(fitted, [archives[split.predicted]])
+    if split.part == "last":
+        return identified_parts(parts, fitted.parent)
+    return identified(fitted, in_sample=split.in_sample)
+
+
+def identified_parts(parts: Parts, folder: Path) -> Identified:
+    """Import both parts from files of their own, and identify one to predict the other."""
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        fitted = parts.fitted.imported(Path(scratch) / "fitted.mcap")
+        predicted = parts.predicted.imported(Path(scratch) / "predicted.mcap")
+        return identified(fitted, [predicted])
+
+
+def plain_errors(parts: Parts) -> tuple[float, list[float]]:
+    """Errors of the plain fit over all joints, and by joint."""
+    fitted = plain_fit.fit(parts.fitted.pinocchio_model(), parts.fitted.measured)
+    torque, predicted = parts.predicted.torque, fitted.predicted_torque(parts.predicted.measured)
+    joints = [
+        plain_fit.relative_error(torque[:, joint], predicted[:, joint])
+        for joint in range(torque.shape[1])
+    ]
+    return plain_fit.relative_error(torque, predicted), joints
+
+
+def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str, JointLog]) -> Row:
+    """Both errors on one split of logs, which the archives hold."""
+    parts = cut(split, logs)
+    start = time.perf_counter()
+    ours = identified_split(split, archives, parts)
+    middle = time.perf_counter()
+    plain, plain_joints = plain_errors(parts)
+    return Row(
+        data=name,
+        split=str(split),
+        hil=ours.error,
+        plain=plain,
+        ratio=ours.error / plain,
+        hil_joints=ours.joints,
+        plain_joints=plain_joints,
+        seconds={"hil": middle - start, "plain": time.perf_counter() - middle},
+    )
+
+
+def rows_of(name: str, data: Path) -> Iterator[Row]:
+    """Every split of a configuration, by its name, in the folder of all recordings."""
+    published = Published.named(name)
+    with tempfile.TemporaryDirectory() as scratch:
+        archives = import_all(published, data / (published.folder or name), Path(scratch))
+        logs = {log: JointLog.read(path, published.rated_payload) for log, path in archives.items()}
+        for split in published.splits:
+            yield row(name, split, archives, logs)
+
+
+def import_all(published: Published, data: Path, folder: Path) -> dict[str, Path]:
+    """Archives of all logs of a robot, by their names.
+
+    Raises:
+        SystemExit: the folder of its recordings is not there.
+    """
+    if not data.is_dir():
+        raise SystemExit(f"there are no recordings in {data}: name the folder of all with --data")
+    return {log: published.imported(log, data, folder / f"{log}.mcap") for log in published.logs}
+
+
+def degraded_rows(name: str, split: Split, logs: Mapping[str, JointLog]) -> Iterator[DegradedRow]:
+    """One split with each fault in turn."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        whole = identified_parts(cut(split, logs), folder)
+        for case, degrade in DEGRADATIONS.items():
+            if case in FITTED_ONLY:
+                parts = cut(split, logs)
+                parts = parts._replace(fitted=degrade(parts.fitted))
+            else:
+                parts = cut(split, {log: degrade(values) for log, values in logs.items()})
+            found: Identified | str
+            try:
+                found = identified_parts(parts, folder)
+            except (HilError, IdentificationError) as error:
+                found = f"refused: {error}"
+            yield degraded_row(name, case, whole, found)
+
+
+def degraded_row(name: str, case: str, whole: Identified, found: Identified | str) -> DegradedRow:
+    """What became of a fault, beside the identification without it; words where it was refused."""
+    expected = EXPECTED[case].checks
+    error, ratio, named, words = None, None, list[str](), list[str]()
+    if isinstance(found, str):
+        words = [found]
+    else:
+        before = {one.check for one in suspicious(whole.results)} - expected
+        findings = [one for one in suspicious(found.results) if one.check not in before]
+        error, ratio = found.error, found.error / whole.error
+        named = list(dict.fromkeys(one.check for one in findings))
+        words = [f"{one.check}: {one.words}" for one in findings]
+    return DegradedRow(
+        data=name,
+        case=case,
+        hil=error,
+        undegraded=whole.error,
+        ratio=ratio,
+        named=named,
+        words=words,
+        expected=sorted(expected),
+        right=ratio is not None and is_right(case, ratio, named),
+    )
+
+
+def suspicious(results: Results) -> list[FindingResult]:
+    """Findings that are neither good nor mere information."""
+    assert results.judgement is not None
+    return [one for one in results.judgement.findings if one.level not in ("good", "information")]
+
+
+def is_right(case: str, ratio: float, named: Collection[str]) -> bool:
+    """Whether a verdict explains a fault.
+
+    Args:
+        case: name of the fault.
+        ratio: of the held-out errors with and without it.
+        named: checks that the verdict calls wrong or suspicious, see `DegradedRow`.
+    """
+    expected, blamed = EXPECTED[case], CAUSES.intersection(named)
+    if blamed - expected.checks:
+        return False
+    return bool(blamed) or (expected.silence and ratio <= HARMLESS)
+
+
+def split_logs(name: str, data: Path) -> tuple[Split, dict[str, JointLog]]:
+    """The first held-out split of a robot, and its logs."""
+    if name == SIMULATED:
+        return simulated_logs()
+    published = Published.named(name)
+    split = next(split for split in published.splits if not split.in_sample)
+    with tempfile.TemporaryDirectory() as scratch:
+        archives = import_all(published, data / (published.folder or name), Path(scratch))
+        logs = {log: JointLog.read(path, published.rated_payload) for log, path in archives.items()}
+    return split, {log: logs[log] for log in (split.fitted, split.predicted) if log is not None}
+
+
+def simulated_logs() -> tuple[Split, dict[str, JointLog]]:
+    """Excitation and first validation motion of the simulated cell, without unmodelled effects."""
+    cell = study_cell()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        plan = study_plan(folder, cell)
+        record_excitation(folder, cell, plan, 0, "clean")
+        record_validation(folder, cell, plan, "clean")
+        paths = {
+            "excitation": excitation_path(folder, 0, "clean"),
+            "validation": validation_paths(folder, cell, "clean")[0],
+        }
+        recordings = {name: Kept.load(path).recording for name, path in paths.items()}
+    robot = Robot(cell.text, cell.urdf, cell.joint_names)
+    logs = {}
+    for name, one in recordings.items():
+        assert one.torque is not None
+        logs[name] = JointLog(robot, one.time, one.position, None, one.torque, _RATED_PAYLOAD)
+    return Split(fitted="excitation", predicted="validation"), logs
+
+
+def summary(rows: Sequence[Row], degraded: Sequence[DegradedRow]) -> dict[str, Any]:
+    """What the line of JSON holds."""
+    ratios = np.array([one.ratio for one in rows])
+    found: dict[str, Any] = {"rows": [asdict(one) for one in rows]}
+    if rows:
+        found |= {
+            "worst_ratio": float(ratios.max()),
+            "mean_ratio": float(np.exp(np.log(ratios).mean())),
+        }
+    if degraded:
+        found |= {
+            "degraded": [asdict(one) for one in degraded],
+            "right": sum(one.right for one in degraded),
+        }
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, and print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of recordings")
+    parser.add_argument(
+        "--only", action="append", choices=[*known(), SIMULATED], help="may be repeated"
+    )
+    parser.add_argument("--degraded", action="store_true", help="spoilt copies as well")
+    parser.add_argument("--json", action="store_true", help="end with a line of JSON")
+    options = parser.parse_args(arguments)
+    wanted = options.only or [*known(), SIMULATED]
+    rows: list[Row] = []
+    degraded: list[DegradedRow] = []
+    print(_HEADING)
+    for name in wanted:
+        for one in () if name == SIMULATED else rows_of(name, options.data):
+            rows.append(one)
+            print(_line(one), flush=True)
+    found = summary(rows, ())
+    if rows:
+        print(f"worst ratio {found['worst_ratio']:.3f}, geometric mean {found['mean_ratio']:.3f}")
+    if options.degraded:
+        print(_DEGRADED_HEADING)
+        for name in wanted:
+            for spoilt in degraded_rows(name, *split_logs(name, options.data)):
+                degraded.append(spoilt)
+                print(_degraded_lines(spoilt), flush=True)
+        print(f"right in {sum(one.right for one in degraded)} of {len(degraded)}")
+    if options.json:
+        print(json.dumps(summary(rows, degraded)))
+
+
+_HEADING: Final = (
+    f"{'recording':11} {'split':30} {'hil':>7} {'plain':>7} {'ratio':>6} {'hil':>6} {'plain':>7}"
+    "  by joint: hil/plain [%]"
+)
+_DEGRADED_HEADING: Final = f"\n{'recording':11} {'fault':19} {'hil':>7} {'ratio':>6} right  named"
+
+
+def _line(row: Row) -> str:
+    joints = " ".join(
+        f"{100 * ours:.3g}/{100 * plain:.3g}"
+        for ours, plain in zip(row.hil_joints, row.plain_joints, strict=True)
+    )
+    return (
+        f"{row.data:11} {row.split:30} {row.hil:7.2%} {row.plain:7.2%} {row.ratio:6.3f}"
+        f" {row.seconds['hil']:4.0f} s {row.seconds['plain']:5.1f} s  {joints}"
+    )
+
+
+def _degraded_lines(row: DegradedRow) -> str:
+    error = f"{'-':>7} {'-':>6}" if row.hil is None else f"{row.hil:7.2%} {row.ratio:6.3f}"
+    first = f"{row.data:11} {row.case:19} {error} {'yes' if row.right else 'no':5}  "
+    return "\n".join([first + ", ".join(row.named), *(f"{'':15}{words}" for words in row.words)])
+
+
+if __name__ == "__main__":
+    main()

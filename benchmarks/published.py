@@ -1,0 +1,136 @@
+"""Published recordings: what they are, how they are imported, and what is predicted of them.
+
+Each file of `benchmarks/recordings` describes one robot: its URDF, its logs, the column map or the
+names that the importers need, and which part of its logs predicts which.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+import tempfile
+import tomllib
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict
+
+from hil.cli import imports
+from planner.toml_value import toml_value
+
+CONFIGURATIONS: Final = Path(__file__).parent / "recordings"
+FITTED_SHARE: Final = 0.7
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Split(_Table):
+    """What is fitted and what is predicted.
+
+    Attributes:
+        fitted: name of a log.
+        predicted: of another; None where a part of the same log is.
+        part: of that log what is fitted: its first or last 70 %, and the rest predicted, or all of
+            it, and predicted as well.
+    """
+
+    fitted: str
+    predicted: str | None = None
+    part: Literal["first", "last", "all"] = "all"
+
+    @property
+    def in_sample(self) -> bool:
+        """Whether the very rows are predicted that were fitted."""
+        return self.predicted is None and self.part == "all"
+
+    def __str__(self) -> str:
+        if self.predicted is not None:
+            return f"{self.fitted} to {self.predicted}"
+        words = {"first": "first 70 % to last 30 %", "last": "last 70 % to first 30 %"}
+        return f"{self.fitted}: {words.get(self.part, 'in sample')}"
+
+
+class Published(_Table):
+    """One robot and its logs.
+
+    Attributes:
+        folder: below that of all recordings; None: as the file of this configuration is named.
+        urdf: name of the file, beside the logs or in a package.
+        urdf_package: the installed package that has the URDF.
+        logs: file of each log, by a short name; those that end in .db3 are bags.
+        rated_payload: of the robot [kg].
+        splits: what is fitted and predicted.
+        map: of the columns, of logs that are no bags.
+        joint_names: name in a bag by name in the URDF, where they differ.
+        locked: position of joints that were not recorded [rad or m].
+        smooth_bandwidth: see `benchmarks.real_data` [Hz].
+    """
+
+    folder: str | None = None
+    urdf: str
+    urdf_package: str | None = None
+    logs: dict[str, str]
+    rated_payload: float
+    splits: tuple[Split, ...]
+    map: dict[str, Any] = {}
+    joint_names: dict[str, str] = {}
+    locked: dict[str, float] = {}
+    smooth_bandwidth: float | None = None
+
+    @classmethod
+    def named(cls, name: str) -> Self:
+        """The configuration of this name.
+
+        Raises:
+            SystemExit: there is none.
+        """
+        if name not in known():
+            raise SystemExit(f"nothing is known about {name}; known are {', '.join(known())}")
+        text = (CONFIGURATIONS / f"{name}.toml").read_text(encoding="utf-8")
+        return cls.model_validate(tomllib.loads(text))
+
+    def urdf_text(self, folder: Path) -> str:
+        """The URDF, beside the logs or in an installed package, with the bag's names of joints.
+
+        Raises:
+            SystemExit: the package is not installed, or has no such file.
+        """
+        path = folder / self.urdf if self.urdf_package is None else self._packaged()
+        text = path.read_text(encoding="utf-8")
+        for ours, theirs in self.joint_names.items():
+            text = text.replace(f'"{ours}"', f'"{theirs}"')
+        return text
+
+    def _packaged(self) -> Path:
+        try:
+            files = importlib.metadata.files(str(self.urdf_package)) or ()
+        except importlib.metadata.PackageNotFoundError:
+            files = ()
+        for file in files:
+            if file.name == self.urdf:
+                return Path(str(file.locate()))
+        raise SystemExit(f"{self.urdf} is not in the package {self.urdf_package}; is it installed?")
+
+    def imported(self, log: str, folder: Path, output: Path) -> Path:
+        """Import one of the logs in a folder into an archive, by `hil import` and its defaults."""
+        source = folder / self.logs[log]
+        locked = [f"{name}={position}" for name, position in self.locked.items()]
+        with tempfile.TemporaryDirectory() as scratch, redirect_stdout(io.StringIO()):
+            urdf = Path(scratch) / self.urdf
+            urdf.write_text(self.urdf_text(folder), encoding="utf-8")
+            if source.suffix == ".db3":
+                imports.rosbag2(source, output, urdf=urdf, locked=locked)
+            else:
+                columns = Path(scratch) / "map.toml"
+                lines = [f"{key} = {toml_value(value)}\n" for key, value in self.map.items()]
+                columns.write_text("".join(lines), encoding="utf-8")
+                imports.log(source, output, columns=columns, urdf=urdf, locked=locked)
+        return output
+
+
+def known() -> list[str]:
+    """Names of the configurations."""
+    return sorted(path.stem for path in CONFIGURATIONS.glob("*.toml"))
