@@ -47,14 +47,24 @@ def find_torque_bandwidth(
         options: the other settings.
     """
     assert recording.torque is not None
-    unfiltered = _log_residuals(recording, model, noise_variance, options)
+    # One set of rows for all: the ends that the narrowest filter knows badly do not count.
+    narrowest = replace(options, torque_bandwidth=LOWEST_BANDWIDTH)
+    samples = prepare(recording, model, noise_variance=noise_variance, options=narrowest)
+
+    def log_residuals(bandwidth: float | None) -> Array:
+        """Log of the residual's standard deviation per joint (n,) that moves."""
+        each = None if bandwidth is None else np.full(model.n_joints, bandwidth)
+        factor = replace(samples, torque_bandwidth=each).factor(model)
+        noise = estimate(model, factor).noise_std
+        return np.asarray(np.log(noise[np.isfinite(noise)]))
+
+    unfiltered = log_residuals(None)
     white = difference_variance(recording.time, recording.torque)
     if np.any(np.sqrt(white) > _NOISELESS * np.exp(unfiltered)):
         return None
 
     def misfit(log_bandwidth: float) -> float:
-        filtered = replace(options, torque_bandwidth=float(np.exp(log_bandwidth)))
-        return float(np.mean(_log_residuals(recording, model, noise_variance, filtered)))
+        return float(np.mean(log_residuals(float(np.exp(log_bandwidth)))))
 
     highest = 0.25 / float(np.median(np.diff(recording.time)))
     grid = np.linspace(np.log(LOWEST_BANDWIDTH), np.log(highest), _COARSE)
@@ -67,12 +77,3 @@ def find_torque_bandwidth(
     if fine.fun > float(np.mean(unfiltered)) + np.log(1.0 - _WORTHWHILE):
         return None
     return float(np.exp(fine.x))
-
-
-def _log_residuals(
-    recording: Recording, model: RobotModel, noise_variance: Array | None, options: Preprocessing
-) -> Array:
-    """Log of the residual's standard deviation per joint (n,) that moves."""
-    samples = prepare(recording, model, noise_variance=noise_variance, options=options)
-    noise = estimate(model, samples.factor(model)).noise_std
-    return np.asarray(np.log(noise[np.isfinite(noise)]))

@@ -15,7 +15,7 @@ def rows(urdf: str, samples: Samples) -> Array:
     """Rows (m, n, 14 n): pinocchio's regressor, then rotors, Coulomb, viscous and offset."""
     robot = pin.buildModelFromXML(urdf)
     data = robot.createData()
-    q, qd, qdd = samples.motion[1:]
+    q, qd, qdd = samples.motion[1:4]
     m, n = q.shape
     table = np.zeros((m, n, 14 * n))
     for k in range(m):

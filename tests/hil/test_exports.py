@@ -107,7 +107,7 @@ def test_urdf_rotors_and_friction_together_give_the_torque_of_the_model(
     model, consistent = any_arm.cell.model, any_arm.consistency.consistent
     motion = a_motion(model.n_joints, seed=5)
     every = slice(None, None, 40)
-    q, qd, qdd = (array[every] for array in motion[1:])
+    q, qd, qdd = (array[every] for array in motion[1:4])
     moving = np.all(np.abs(qd) > 0.02, axis=1)
     q, qd, qdd = q[moving], qd[moving], qdd[moving]
     parameters = json.loads((tmp_path / "parameters.json").read_text())

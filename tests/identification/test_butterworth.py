@@ -172,7 +172,7 @@ def test_rows_beside_ends_and_gaps_do_not_count_and_say_why(
     for edge in (0, 4000, len(EVEN)):
         assert not samples.usable[max(0, edge - reach) : edge + reach].any()
     exact = motion(EVEN)
-    for smoothed, true in zip(samples.motion[1:], exact, strict=True):
+    for smoothed, true in zip(samples.motion[1:4], exact, strict=True):
         error = (smoothed - true)[samples.usable.all(axis=1)]
         assert np.sqrt(np.mean(error**2)) < 5e-3 * np.std(true)
     assert samples.mask is not None

@@ -55,7 +55,7 @@ def test_the_servos_torque_is_what_the_model_needs(extra: dict[str, object]) -> 
     moved = simulated_motion(model, truth, SERVO, (plan := command())).motion
     applied = SERVO.position * (plan.position - moved.position)
     applied += SERVO.velocity * (plan.velocity - moved.velocity)
-    needed = model.torque(truth, *moved[1:]) + model.load_torque(*moved[1:])
+    needed = model.torque(truth, *moved[1:]) + model.load_torque(*moved[1:4])
     rows = model.moving(moved.velocity)
     error = np.where(rows, needed - applied, 0.0)
     assert np.all(np.linalg.norm(error, axis=0) < 0.04 * np.linalg.norm(needed * rows, axis=0))

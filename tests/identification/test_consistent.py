@@ -263,7 +263,7 @@ def test_one_chunk_or_many_are_the_same(two_link: RobotModel) -> None:
 def test_a_joint_that_never_moved_keeps_its_nominal_link() -> None:
     model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None), gravity=(0, 0, 0))
     motion = a_motion(model, 10)
-    for array in motion[1:]:
+    for array in motion[1:4]:
         array[:, 1] = 0.0
     values = np.concatenate([model.base.grouping @ model.nominal, [4.0, 2.0, 1.5, 0.8]])
     torque = measured(model, motion, values, 0.01, 10)

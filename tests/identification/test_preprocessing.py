@@ -72,7 +72,7 @@ def test_smoothed_motion_is_the_true_motion_where_rows_count(
 ) -> None:
     recording = a_recording(model, truth)
     samples = prepare(recording, model, noise_variance=QUANTISATION)
-    for smoothed, exact in zip(samples.motion[1:], motion(recording.time), strict=True):
+    for smoothed, exact in zip(samples.motion[1:4], motion(recording.time), strict=True):
         error = (smoothed - exact)[samples.usable.all(axis=1)]
         assert np.sqrt(np.mean(error**2)) < 2e-3 * np.std(exact)
 

@@ -103,7 +103,7 @@ def executed(
     current = np.linalg.solve(real.motor_from_joint.T, torque.T).T / np.array(real.constant)
     current += CURRENT_NOISE * np.random.default_rng(seed).standard_normal(current.shape)
     seen = np.linalg.solve(believed.motor_from_joint, real.motor_from_joint).T
-    motion = Motion(motion.time, *(part @ seen for part in motion[1:]))
+    motion = Motion(motion.time, *(part @ seen for part in motion[1:4]))
     return Samples(
         motion=motion,
         torque=(current * np.array(believed.constant)) @ believed.motor_from_joint,
@@ -235,7 +235,7 @@ def test_a_load_on_unseen_motion_only_is_named_and_weighed(model: RobotModel, ma
     carrying = RobotModel.from_urdf(urdf_text(), payload=Payload(mass, (0.0, 0.09, 0.12)))
 
     def load(motion: Motion, _: Array) -> Array:
-        return carrying.load_torque(*motion[1:])
+        return carrying.load_torque(*motion[1:4])
 
     verdict, evidence = campaign(model, unseen_disturbance=load)
     assert not verdict.good
