@@ -84,7 +84,9 @@ def executed(
 ) -> Samples:
     """The plan, followed within 2 %, seen through noisy encoders and a 40 Hz smoother."""
     rng = np.random.default_rng(seed)
-    true = Motion(TIME, *(a + b for a, b in zip(PLAN[1:], sines(13 + seed, 0.02)[1:], strict=True)))
+    true = Motion(
+        TIME, *(a + b for a, b in zip(PLAN[1:4], sines(13 + seed, 0.02)[1:4], strict=True))
+    )
     torque = model.torque(truth, *true[1:]) + noise * coloured(rng, correlation)
     seen = true
     if position_noise:

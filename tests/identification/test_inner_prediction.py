@@ -1,0 +1,96 @@
+"""Settings are chosen by predicting parts of what is fitted from the rest of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identification.inner_prediction import Choice, Question, Settings, choose_settings
+from identification.model import RobotModel
+from identification.preprocessing import Preprocessing, Samples, prepare
+from identification.recording import Recording
+from tests.identification.two_link import MODEL, a_motion, truth
+
+CUT = 1400  # of 2000 rows: what is fitted
+
+
+def a_recording(model: RobotModel = MODEL, values: np.ndarray | None = None) -> Recording:
+    """A motion of the planted arm with noise on torque and position."""
+    motion = a_motion()
+    direction = model.friction.direction(motion.position, motion.velocity)
+    rng = np.random.default_rng(5)
+    torque = model.torque(truth() if values is None else values, *motion[1:4], direction)
+    return Recording(
+        motion.time,
+        motion.position + 1e-6 * rng.standard_normal(motion.position.shape),
+        MODEL.joint_names,
+        torque + 0.05 * rng.standard_normal(torque.shape),
+    )
+
+
+def chosen(
+    recording: Recording, questions: set[Question], *, leaks: bool = False
+) -> tuple[Settings, tuple[Choice, ...]]:
+    """Settings chosen on the rows before CUT; on all of them where those behind it leak."""
+
+    def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+        samples = prepare(recording, model, options=how)
+        return [samples if leaks else samples.between(0, CUT)]
+
+    return choose_settings(ready, Settings(MODEL, Preprocessing()), questions, lambda *_: None)
+
+
+class TestChosenSettings:
+    @pytest.mark.parametrize("distance", [1e-4, 1e-3])
+    def test_the_planted_presliding_is_found(self, distance: float) -> None:
+        recording = a_recording(MODEL.with_friction(presliding=distance))
+        settings, _ = chosen(recording, {"presliding", "bandwidth"})
+        assert settings.model.friction.laws[0].presliding == distance
+
+    def test_the_planted_friction_term_is_found(self) -> None:
+        cubic = MODEL.with_friction(third="cubic")
+        settings, _ = chosen(a_recording(cubic, np.append(truth(), [0.5, 0.3])), {"friction"})
+        assert settings.model.friction.laws[0].third == "cubic"
+
+    def test_a_term_that_is_not_there_is_not_claimed(self) -> None:
+        settings, _ = chosen(a_recording(), {"friction"})
+        assert settings.model.friction.laws[0].third is None
+
+    def test_least_squares_stays_where_it_predicts_as_well(self) -> None:
+        settings, choices = chosen(a_recording(), {"estimator"})
+        assert settings.shrinkage.strength == 0.0
+        assert choices[-1].candidates[choices[-1].chosen] == "least squares"
+
+    def test_what_is_not_asked_stays(self) -> None:
+        start = Settings(MODEL, Preprocessing(rigid_bandwidth=33.0))
+        settings, choices = choose_settings(lambda *_: [], start, set(), lambda *_: 1.0)
+        assert settings == start
+        assert not choices
+
+
+class TestHeldOutRows:
+    """The torque of rows that are held out has no part in any choice."""
+
+    QUESTIONS = frozenset[Question]({"bandwidth", "presliding", "rows", "friction", "estimator"})
+
+    @staticmethod
+    def spoiled(recording: Recording) -> Recording:
+        assert recording.torque is not None
+        torque = recording.torque.copy()
+        torque[CUT:] += 40.0 * np.sign(np.sin(7.0 * recording.time[CUT:, None]))
+        return replace(recording, torque=torque)
+
+    def errors(self, recording: Recording, *, leaks: bool) -> list[tuple[float, ...]]:
+        return [one.errors for one in chosen(recording, set(self.QUESTIONS), leaks=leaks)[1]]
+
+    def test_spoiling_them_changes_nothing(self) -> None:
+        recording = a_recording()
+        sound = self.errors(recording, leaks=False)
+        assert sound == self.errors(self.spoiled(recording), leaks=False)
+
+    def test_a_leak_would_be_noticed(self) -> None:
+        recording = a_recording()
+        sound = self.errors(recording, leaks=True)
+        assert sound != self.errors(self.spoiled(recording), leaks=True)
