@@ -5,7 +5,11 @@ from identification.consistent import Consistency, ConsistentEstimate, consisten
 from identification.coupling import Coupling
 from identification.covariance import with_block_covariance
 from identification.delay import DelayEstimate, estimate_delays
-from identification.delay_compensation import compensate
+from identification.delay_compensation import (
+    compensate,
+    delay_sensitivity,
+    with_delay_uncertainty,
+)
 from identification.endogeneity import EndogeneityTest, endogeneity_test
 from identification.errors import IdentificationError, ModelError, ShapeError
 from identification.essential import Elimination, eliminate
@@ -68,6 +72,8 @@ __all__ = [
     "find_torque_bandwidth",
     "DelayEstimate",
     "estimate_delays",
+    "delay_sensitivity",
+    "with_delay_uncertainty",
     "compensate",
     "Gains",
     "identify_gains",

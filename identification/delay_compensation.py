@@ -1,4 +1,4 @@
-"""Torque and current brought back to the time of the positions they belong to."""
+"""Torque read at the time of its position, and what an uncertain delay does to an estimate."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
+from identification.estimation import Estimate, solve, total
+from identification.model import RobotModel
+from identification.preprocessing import Samples
 from identification.recording import Recording
 
 Array = NDArray[np.float64]
@@ -48,7 +51,10 @@ def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recordi
         keep[segment] = kept
         gap[segment.start + int(np.argmax(kept))] = True
         for array in moved.values():
-            array[segment] = _read_later(inside, array[segment], shift)
+            for joint in np.flatnonzero(shift):
+                array[segment, joint] = read_at(
+                    inside, array[segment, joint], inside + shift[joint]
+                )
     if not keep.any():
         raise IdentificationError("every stretch of the recording is shorter than the delay")
     commanded = recording.commanded_position
@@ -64,12 +70,66 @@ def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recordi
     )
 
 
-def _read_later(time: Array, values: Array, shift: Array) -> Array:
-    """Values (m, n) of one stretch, each channel read its own shift (n,) later."""
+def read_at(time: Array, values: Array, at: Array) -> Array:
+    """Values (m, ...) of one stretch at other times (k,), those of its ends beyond them."""
     # Local: where Coulomb friction jumps, a global spline would ring.
     source = scipy.interpolate.CubicHermiteSpline(time, values, np.gradient(values, time, axis=0))
-    later = values.copy()
-    for joint in np.flatnonzero(shift):
-        at = np.clip(time + shift[joint], time[0], time[-1])
-        later[:, joint] = source(at)[:, joint]
-    return later
+    return np.asarray(source(np.clip(at, time[0], time[-1])))
+
+
+def payload_torque(model: RobotModel, samples: Samples) -> Array:
+    """Torque of the known payload (m, n), as the torque channel would have recorded it."""
+    load = model.load_torque(*samples.motion[1:4])
+    for joint in range(model.n_joints if model.payload is not None else 0):
+        load[:, joint] = samples.as_measured(joint, load[:, joint : joint + 1])[:, 0]
+    return load
+
+
+def predicted_rate(samples: Samples, torque: Array) -> Array:
+    """Time derivative of predicted torques (m, ...), zero in stretches too short for one."""
+    rate = np.zeros_like(torque)
+    for segment in samples.segments:
+        if segment.stop - segment.start > 1:
+            rate[segment] = np.gradient(torque[segment], samples.motion.time[segment], axis=0)
+    return rate
+
+
+def delay_sensitivity(
+    model: RobotModel, recordings: Sequence[Samples], weights: Array, values: Array
+) -> Array:
+    """Change of the estimated parameters per second of delay taken for the torque (p,).
+
+    A later delay compares the torque with earlier motion, which is another torque by its rate of
+    change; the parameters move by the fit of that rate.
+
+    Args:
+        model: the robot.
+        recordings: what was fitted.
+        weights: per joint (n,).
+        values: the estimate (p,).
+
+    Raises:
+        ShapeError: `values` are not (p,).
+    """
+    rates = []
+    for one in recordings:
+        torque = one.predicted_torque(model, values) + payload_torque(model, one)
+        rates.append(replace(one, torque=predicted_rate(one, torque)))
+    return solve(total([one.factor(model) for one in rates]).weighted(weights)).values
+
+
+def with_delay_uncertainty(estimate: Estimate, sensitivity: Array, variance: float) -> Estimate:
+    """Return the estimate with the uncertainty of the delay in its covariance.
+
+    Args:
+        estimate: made with one delay taken for certain.
+        sensitivity: of the parameters to that delay (p,), see :func:`delay_sensitivity`.
+        variance: of the delay [s²].
+
+    Raises:
+        ShapeError: not one sensitivity per parameter.
+    """
+    if sensitivity.shape != estimate.values.shape:
+        raise ShapeError("sensitivity", sensitivity.shape, str(estimate.values.shape))
+    known = np.where(np.isfinite(np.diag(estimate.covariance)), sensitivity, 0.0)
+    return replace(estimate, covariance=estimate.covariance + variance * np.outer(known, known))

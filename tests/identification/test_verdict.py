@@ -438,13 +438,15 @@ def test_what_sound_models_reach_is_no_doubt_and_nothing_is_not_told() -> None:
 def test_a_delay_that_stands_comes_before_torque_constants() -> None:
     late = DelayEstimate(
         joint_names=AXES,
-        delays=np.full(2, 0.003),
-        std=np.full(2, 1e-4),
-        cycle=0.001,
         common=0.003,
         common_std=1e-4,
-        reasons=(None, None),
+        deviations=np.zeros(2),
+        deviation_std=np.zeros(2),
+        assumed=0.0,
+        cycle=0.001,
         interval_factor=2.0,
+        reason=None,
+        significant=True,
     )
     verdict = judge(
         AXES, evidence_with(**slowly_off(0.1, 0.1), surroundings=Surroundings(delays=late))

@@ -1,0 +1,179 @@
+"""A simulated arm written without the project's code: pinocchio, numpy and scipy only.
+
+Trajectories, friction, noise and delay are its own; of the project it reads the NS 16's URDF file
+only, so that an error of the project's model, smoothing or sampling has no counterpart here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Noise = Literal["white", "coloured"]
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedArm:
+    """A rigid arm of n joints with rotors and dry and viscous friction.
+
+    Attributes:
+        urdf: its description.
+        model: pinocchio's, with rotor inertias as armature.
+        locked: joints of the description that do not belong to the arm, and where they are held.
+        speed: largest joint speeds (n,) [rad/s].
+        centre: posture about which it moves (n,) [rad].
+        room: largest excursion from there (n,) [rad].
+        coulomb, viscous: friction (n,) [N·m, N·m·s/rad].
+    """
+
+    urdf: str
+    model: pin.Model
+    locked: dict[str, float]
+    speed: Array
+    centre: Array
+    room: Array
+    coulomb: Array
+    viscous: Array
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(self.model.names[1:])
+
+    def torque(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """Joint torque (m, n) [N·m]."""
+        data = self.model.createData()
+        rigid = np.array([pin.rnea(self.model, data, *row) for row in zip(q, qd, qdd, strict=True)])
+        return rigid + self.coulomb * np.tanh(qd / 1e-3) + self.viscous * qd
+
+
+def ns16() -> SimulatedArm:
+    """A COMAU NS 16: its wrist has more friction than inertia."""
+    urdf = (ROOT / "sim_fixtures" / "ns16" / "ns16.urdf").read_text(encoding="utf-8")
+    model = pin.buildModelFromXML(urdf)
+    model.armature = np.array([7.6, 24.6, 10.5, 0.25, 0.30, 0.12])
+    return SimulatedArm(
+        urdf=urdf,
+        model=model,
+        locked={},
+        speed=np.array([2.7, 2.7, 2.9, 6.2, 6.1, 9.5]),
+        centre=np.array([0.0, -1.2, 2.0, 0.0, 1.0, 0.0]),
+        room=np.array([1.5, 0.7, 0.9, 2.0, 0.9, 2.5]),
+        coulomb=np.array([68.0, 108.0, 50.0, 9.2, 8.9, 5.1]),
+        viscous=np.array([41.0, 63.0, 39.0, 3.3, 16.4, 8.9]),
+    )
+
+
+def panda() -> SimulatedArm:
+    """A Franka Emika Panda without its fingers; skips where its description is not installed."""
+    try:
+        package = distribution("example-robot-data")
+    except PackageNotFoundError:
+        pytest.skip("the example-robot-data package is not installed")
+    path = "cmeel.prefix/share/example-robot-data/robots/panda_description/urdf/panda.urdf"
+    urdf = Path(str(package.locate_file(path))).read_text(encoding="utf-8")
+    whole = pin.buildModelFromXML(urdf)
+    fingers = ("panda_finger_joint1", "panda_finger_joint2")
+    held = [whole.getJointId(name) for name in fingers]
+    model = pin.buildReducedModel(whole, held, pin.neutral(whole))
+    model.armature = np.array([0.6, 0.6, 0.5, 0.5, 0.2, 0.2, 0.2])
+    return SimulatedArm(
+        urdf=urdf,
+        model=model,
+        locked=dict.fromkeys(fingers, 0.0),
+        speed=np.array([2.17, 2.17, 2.17, 2.17, 2.6, 2.6, 2.6]),
+        centre=np.array([0.0, 0.0, 0.0, -1.6, 0.0, 1.8, 0.0]),
+        room=np.array([1.5, 1.2, 1.5, 1.2, 1.5, 1.4, 1.5]),
+        coulomb=np.array([0.8, 0.9, 0.7, 0.8, 0.6, 0.4, 0.5]),
+        viscous=np.array([1.2, 1.4, 1.0, 1.1, 0.6, 0.5, 0.4]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Sines:
+    """Joint motion as sums of sines about a posture."""
+
+    centre: Array
+    size: Array  # (k, n)
+    rate: Array  # (k, n), rad/s
+    phase: Array  # (k, n)
+
+    def __call__(self, time: Array) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration (m, n)."""
+        angle = self.rate * time[:, None, None] + self.phase
+        wave = self.size * np.sin(angle)
+        slope = (self.size * self.rate * np.cos(angle)).sum(axis=1)
+        return self.centre + wave.sum(axis=1), slope, -(wave * self.rate**2).sum(axis=1)
+
+
+def motion(arm: SimulatedArm, seed: int, pace: float) -> Sines:
+    """Five sines a joint between 0.1 and 1 Hz at pace 1, at up to 60 % of the largest speeds."""
+    rng = np.random.default_rng([seed, 1])
+    shape = (5, len(arm.centre))
+    rate = 2.0 * np.pi * rng.uniform(0.1, 1.0, shape)
+    size = rng.standard_normal(shape) / rate
+    found = Sines(arm.centre, size, rate, rng.uniform(0.0, 2.0 * np.pi, shape))
+    q, qd, _ = found(np.arange(0.0, 60.0, 0.01))
+    fastest = np.abs(qd).max(axis=0) / (0.6 * arm.speed)
+    farthest = np.abs(q - arm.centre).max(axis=0) / arm.room
+    return Sines(arm.centre, size / np.maximum(fastest, farthest), pace * rate, found.phase)
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """What a logger would have written: time (m,), position and torque (m, n)."""
+
+    time: Array
+    position: Array
+    torque: Array
+
+
+def record(
+    arm: SimulatedArm,
+    seed: int,
+    *,
+    delay: float = 0.0,
+    pace: float = 1.0,
+    noise: Noise = "white",
+    level: float = 0.014,
+    duration: float = 20.0,
+    rate: float = 250.0,
+    moves: Sines | None = None,
+) -> Log:
+    """A recording whose torque is logged a delay [s] after the position it belongs to.
+
+    Args:
+        arm: what moves.
+        seed: of motion and noise.
+        delay: of the torque of every joint [s].
+        pace: of the motion, see :func:`motion`.
+        noise: of the torque, white or a white and an autoregressive part of 50 ms, equally large.
+        level: of the noise, of the rms torque about its mean.
+        duration: [s].
+        rate: samples per second [Hz].
+        moves: the motion, by default the seed's.
+    """
+    moves = motion(arm, seed, pace) if moves is None else moves
+    rng = np.random.default_rng([seed, 2])
+    time = np.arange(round(duration * rate)) / rate
+    torque = arm.torque(*moves(time - delay))
+    draw = rng.standard_normal(torque.shape)
+    if noise == "coloured":
+        keep = np.exp(-1.0 / (0.05 * rate))
+        slow = scipy.signal.lfilter(
+            [np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(torque.shape), axis=0
+        )
+        draw = np.sqrt(0.5) * (draw + slow)
+    torque += level * torque.std(axis=0) * draw
+    position = moves(time)[0] + 1e-5 * rng.standard_normal(torque.shape)
+    return Log(time, position, torque)
