@@ -6,9 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hil.campaign.conduct import conduct_of
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
@@ -20,9 +17,7 @@ from identification.consistency_check import ConsistencyCheck
 from identification.essential_choice import EssentialChoice
 from identification.evidence import gather
 from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples
 from identification.repetitions import RepeatedEstimate
-from identification.validation import for_figure
 from identification.verdict import Verdict, judge
 
 from .consistency import consistency_doubts, consistency_of, consistency_reasons
@@ -31,14 +26,10 @@ from .estimating import Estimation, estimate_with
 from .judging import judgement_result
 from .options import Options
 from .prepared import Prepared, prepare_sources
-from .sources import Sources, gather_sources
-from .summary import moving_rows, summarise
+from .series import report_series
+from .sources import gather_sources
+from .summary import summarise
 from .surroundings import nominal_of, surroundings_of
-
-Array = NDArray[np.float64]
-
-FIGURE_SAMPLES = 4000
-"""Rows of a time series that a figure is drawn from, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,30 +182,5 @@ def _judged(
         consistency=consistency,
         verdict=verdict,
         results=results.model_copy(update={"judgement": judgement}),
-        series=_series(sources, result, prepared.training[0], prepared.held_out[0]),
+        series=report_series(prepared, result),
     )
-
-
-def _series(
-    sources: Sources, estimate: RepeatedEstimate, excitation: Samples, example: Samples
-) -> ReportSeries:
-    model = sources.cell.model
-    motion = excitation.motion
-    shown = _thinned(moving_rows(excitation))
-    time = example.motion.time
-    predicted = example.predicted_torque(model, estimate.pooled.values)
-    drawn = _thinned(moving_rows(example))
-    return ReportSeries(
-        excitation_time=motion.time[shown] - excitation.origin,
-        excitation_position=motion.position[shown],
-        excitation_velocity=motion.velocity[shown],
-        example_archive=sources.held_out[0].name,
-        example_time=time[drawn] - example.origin,
-        example_measured=for_figure(time, example.torque)[drawn],
-        example_predicted=for_figure(time, predicted)[drawn],
-    )
-
-
-def _thinned(rows: slice) -> slice:
-    """Rows of the motion for a figure: at rest no model of sliding friction is right."""
-    return slice(rows.start, rows.stop, max(1, (rows.stop - rows.start) // FIGURE_SAMPLES))

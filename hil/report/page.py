@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from hil.report import (
+    choices,
     conduct,
     consistency,
     essential,
@@ -44,6 +47,7 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
     labels = [parameters.short_label(p) for p in results.parameters]
     base, friction = parameters.table_rows(results)
     routes = parameters.routes(results)
+    drawn = validation.drawn_errors(results)
     return {
         "numbering": Numbering(),
         "results": results,
@@ -51,7 +55,9 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "facts": overview.facts(results),
         "estimation_facts": estimation.facts(results),
         "criteria": overview.criteria(results),
+        "questions": choices.questions(results),
         "overall": validation.overall(results),
+        "error_rows": validation.error_rows(results),
         "joint_errors": validation.joint_errors(results) if results.validation else [],
         "run_tables": validation.run_tables(results) if len(results.validation) > 1 else [],
         "base_rows": base,
@@ -65,11 +71,15 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "excitation_panels": figures.excitation_panels(series, results.joint_names),
+        "has_reversals": bool(np.isfinite(series.reversal_travel).any()),
         "deviation_panels": figures.deviation_panels(results),
         "uncertainty_panels": figures.uncertainty_panels(results, routes),
         "correlation": figures.correlation_matrix(results),
         "box_panels": figures.error_boxes(results),
-        "torque_panels": figures.torque_panels(series, results.joint_names),
+        "torque_panels": figures.torque_panels(series, drawn),
+        "split_panels": figures.split_panels(series, drawn),
+        "spectrum_panels": figures.spectrum_panels(series, drawn),
+        "curve_panels": figures.friction_curve_panels(series, drawn),
         **verdict.verdict_context(results),
         **essential.context(results),
         **consistency.context(results),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -24,9 +24,53 @@ class SeriesError(ValueError):
         self.field, self.shape, self.expected = field, shape, expected
 
 
+_SHAPES: Final = {
+    "excitation_time": "m",
+    "excitation_position": "mn",
+    "excitation_velocity": "mn",
+    "example_time": "k",
+    "example_measured": "kn",
+    "example_predicted": "kn",
+}
+_OPTIONAL: Final = {
+    "excitation_fitted": "mn",
+    "example_counted": "kn",
+    "example_inertia": "kn",
+    "example_coriolis": "kn",
+    "example_gravity": "kn",
+    "example_friction": "kn",
+    "friction_speed": "cn",
+    "friction_torque": "cn",
+    "law_speed": "sn",
+    "law_torque": "sn",
+    "reversal_travel": "rn",
+    "reversal_torque": "rn",
+    "spectrum_frequency": "f",
+    "spectrum_torque": "fn",
+    "spectrum_residual": "fn",
+    "motion_bandwidth": "n",
+}
+# The field whose length each letter is; n is the number of joints.
+_LENGTHS: Final = {
+    "m": "excitation_time",
+    "k": "example_time",
+    "c": "friction_speed",
+    "s": "law_speed",
+    "r": "reversal_travel",
+    "f": "spectrum_frequency",
+}
+
+
+def _nothing() -> Array:
+    return np.empty((0, 0))
+
+
 @dataclass(frozen=True, eq=False)
 class ReportSeries:
-    """Motion of the excitation, and one validation run in time.
+    """Motion of the excitation, one validation run in time, and what friction and residual are.
+
+    Torques are in N·m, of joints that slide in N; likewise rad is m. The series after the
+    predicted torque may be empty: figures that need them are then left out.
 
     Attributes:
         excitation_time: (m,) [s].
@@ -36,6 +80,22 @@ class ReportSeries:
         example_time: (k,) [s]; k = 0 where no validation run exists.
         example_measured: (k, n) [N·m], already low-passed for display.
         example_predicted: (k, n) [N·m], low-passed alike.
+        excitation_fitted: (m, n), 1 where the row was fitted and 0 where not.
+        example_counted: (k, n), 1 where the row counts in the error of the verdict, else 0.
+        example_inertia: (k, n) part of the predicted torque; the four parts add up to it.
+        example_coriolis: (k, n), centrifugal torque included.
+        example_gravity: (k, n).
+        example_friction: (k, n), offsets included.
+        friction_speed: (c, n) [rad/s] of fitted rows; NaN where there are fewer.
+        friction_torque: (c, n) measured torque less what is predicted without friction.
+        law_speed: (s, n) [rad/s] along the friction law.
+        law_torque: (s, n) of a joint that slides.
+        reversal_travel: (r, n) displacement since a reversal [rad]; NaN where friction jumps.
+        reversal_torque: (r, n) of a joint that creeps forwards after it has gone backwards.
+        spectrum_frequency: (f,) [Hz] of the example.
+        spectrum_torque: (f, n) [N·m/√Hz], of the measured torque, every row.
+        spectrum_residual: (f, n) of measured less predicted torque.
+        motion_bandwidth: (n,) [Hz] of the smoothed positions of the example; NaN where unknown.
 
     Raises:
         SeriesError: the shapes do not belong together.
@@ -48,23 +108,36 @@ class ReportSeries:
     example_time: Array
     example_measured: Array
     example_predicted: Array
+    excitation_fitted: Array = field(default_factory=_nothing)
+    example_counted: Array = field(default_factory=_nothing)
+    example_inertia: Array = field(default_factory=_nothing)
+    example_coriolis: Array = field(default_factory=_nothing)
+    example_gravity: Array = field(default_factory=_nothing)
+    example_friction: Array = field(default_factory=_nothing)
+    friction_speed: Array = field(default_factory=_nothing)
+    friction_torque: Array = field(default_factory=_nothing)
+    law_speed: Array = field(default_factory=_nothing)
+    law_torque: Array = field(default_factory=_nothing)
+    reversal_travel: Array = field(default_factory=_nothing)
+    reversal_torque: Array = field(default_factory=_nothing)
+    spectrum_frequency: Array = field(default_factory=_nothing)
+    spectrum_torque: Array = field(default_factory=_nothing)
+    spectrum_residual: Array = field(default_factory=_nothing)
+    motion_bandwidth: Array = field(default_factory=_nothing)
 
     def __post_init__(self) -> None:
         position = self.excitation_position
-        n = position.shape[1] if position.ndim == 2 else 0
-        m, k = self.excitation_time.size, self.example_time.size
-        expected = {
-            "excitation_time": (m,),
-            "excitation_position": (m, n),
-            "excitation_velocity": (m, n),
-            "example_time": (k,),
-            "example_measured": (k, n),
-            "example_predicted": (k, n),
-        }
-        for field, shape in expected.items():
-            found = getattr(self, field)
+        sizes = {"n": position.shape[1] if position.ndim == 2 else 0}
+        for letter, name in _LENGTHS.items():
+            values = getattr(self, name)
+            sizes[letter] = values.shape[0] if values.ndim else 0
+        for name, letters in (_SHAPES | _OPTIONAL).items():
+            found = getattr(self, name)
+            if name in _OPTIONAL and found.size == 0:
+                continue
+            shape = tuple(sizes[letter] for letter in letters)
             if found.shape != shape or found.dtype != np.float64 or not _drawable(found):
-                raise SeriesError(field, found.shape, shape)
+                raise SeriesError(name, found.shape, shape)
 
     @property
     def n_joints(self) -> int:

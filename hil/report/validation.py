@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.report import numbers
-from hil.results import Results, ValidationResult
+from hil.results import FittedResult, Results, ValidationResult
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,24 @@ class JointError:
     relative_median: str
     relative_worst: str
     fit_std: str
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """Torque error over all joints on some motion, in per cent, as text."""
+
+    motion: str
+    counted: str
+    every_row: str
+
+
+@dataclass(frozen=True)
+class TorqueError:
+    """Error of one joint on the motion that is drawn: what stands beside its figures."""
+
+    joint: str
+    unit: str
+    words: str
 
 
 @dataclass(frozen=True)
@@ -69,6 +87,72 @@ def joint_errors(results: Results) -> list[JointError]:
     return found
 
 
+def error_rows(results: Results) -> list[ErrorRow]:
+    """Errors of the verdict and those of every row: on unseen motion, and on what was fitted."""
+    runs, fitted, found = results.validation, results.fitted, []
+    if runs:
+        both = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
+        many = len(runs) > 1
+        title = f"unseen, median of {len(runs)} runs" if many else "unseen"
+        found.append(_error_row(title, *np.median(both, axis=0).tolist()))
+        if many:
+            found.append(_error_row("unseen, worst run", *both.max(axis=0).tolist()))
+    if fitted is not None:
+        found.append(
+            _error_row(
+                "fitted" if runs else "fitted (in-sample: nothing was held out)",
+                fitted.overall_relative_error,
+                fitted.all_rows_relative_error,
+            )
+        )
+        smoothed = fitted.smoothed_overall_relative_error
+        if smoothed is not None:
+            found.append(_error_row("fitted, torque smoothed as it was fitted", None, smoothed))
+    return found
+
+
+def _error_row(motion: str, counted: float | None, every_row: float) -> ErrorRow:
+    return ErrorRow(motion, numbers.percent(counted), numbers.percent(every_row))
+
+
+def every_row_errors(results: Results) -> list[str]:
+    """Error of each joint over every row, in per cent; empty where no file says it.
+
+    The median of the runs on unseen motion, or the error on what was fitted.
+    """
+    if results.validation:
+        known = [run.all_rows_joint_errors for run in results.validation]
+    else:
+        known = [] if results.fitted is None else [results.fitted.all_rows_joint_errors]
+    if not known or not all(known):
+        return []
+    return [numbers.percent(value) for value in np.median(np.array(known), axis=0).tolist()]
+
+
+def drawn_errors(results: Results) -> list[TorqueError]:
+    """Errors of each joint on the motion that is drawn: the first run, or what was fitted."""
+    judgement = results.judgement
+    units = [joint.unit for joint in judgement.joints] if judgement else []
+    drawn: ValidationResult | FittedResult | None = None
+    if results.validation:
+        drawn = results.validation[0]
+    elif len(results.repetitions) == 1:
+        drawn = results.fitted
+    return [
+        TorqueError(name, units[j] if units else "N·m", _drawn_words(drawn, j))
+        for j, name in enumerate(results.joint_names)
+    ]
+
+
+def _drawn_words(drawn: ValidationResult | FittedResult | None, joint: int) -> str:
+    if drawn is None:
+        return ""
+    words = f"error {numbers.percent(drawn.relative_error[joint])} %"
+    if drawn.all_rows_joint_errors:
+        words += f", every row {numbers.percent(drawn.all_rows_joint_errors[joint])} %"
+    return words
+
+
 def run_tables(results: Results) -> list[RunTable]:
     """Mean |e|, RMS, signed mean and relative error of each run, per joint."""
     runs = results.validation
@@ -77,6 +161,7 @@ def run_tables(results: Results) -> list[RunTable]:
         RunTable("RMS error", "N·m", _rows(runs, lambda r: r.rms_error), False),
         RunTable("Signed mean error", "N·m", _signed_rows(runs), False),
         RunTable("Relative error", "%", _relative_rows(runs), True),
+        *_every_row_table(runs),
     ]
 
 
@@ -112,6 +197,20 @@ def _relative_rows(runs: Sequence[ValidationResult]) -> list[list[str]]:
     ]
 
 
+def _every_row_table(runs: Sequence[ValidationResult]) -> list[RunTable]:
+    if not all(run.all_rows_joint_errors for run in runs):
+        return []
+    rows = [
+        [
+            run.archive,
+            *(numbers.percent(v) for v in run.all_rows_joint_errors),
+            numbers.percent(run.all_rows_relative_error),
+        ]
+        for run in runs
+    ]
+    return [RunTable("Relative error over every row", "%", rows, True)]
+
+
 def _head(run: ValidationResult) -> list[str]:
     return [run.archive, numbers.fixed(run.duration, 1)]
 
@@ -125,6 +224,7 @@ class Overall:
     median: str
     worst: str
     worst_archive: str
+    every_row: str
 
 
 def overall(results: Results) -> Overall | None:
@@ -140,4 +240,5 @@ def overall(results: Results) -> Overall | None:
         median=numbers.percent(float(np.median(errors))),
         worst=numbers.percent(errors[worst]),
         worst_archive=runs[worst].archive,
+        every_row=numbers.percent(float(np.median([run.all_rows_relative_error for run in runs]))),
     )

@@ -13,6 +13,7 @@ from hil.report.figures.residuals import (
     position_panels,
     speed_panels,
 )
+from hil.report.validation import every_row_errors
 from hil.results import JointJudgement, JudgementResult, Results
 
 _ORDER = ("wrong", "doubtful", "information", "good")
@@ -25,6 +26,7 @@ class JointRow:
     joint: str
     rms: str
     relative: str
+    every_row: str
     fitted: str
     explained: str
     limit: str
@@ -37,9 +39,16 @@ def verdict_context(results: Results) -> dict[str, Any]:
     judgement = results.judgement
     if judgement is None:
         return {"judgement": None}
+    every_row = every_row_errors(results)
     return {
         "judgement": judgement,
-        "judged_joints": [_row(joint) for joint in judgement.joints],
+        "judged_joints": [
+            _row(joint, every)
+            for joint, every in zip(
+                judgement.joints, every_row or [""] * len(judgement.joints), strict=True
+            )
+        ],
+        "has_every_row": bool(every_row),
         "has_fitted": not judgement.in_sample and _any(judgement.joints, "fitted_relative"),
         "has_limit": _any(judgement.joints, "share_of_limit"),
         "has_nominal": _any(judgement.joints, "nominal_relative"),
@@ -62,11 +71,12 @@ def _sorted(judgement: JudgementResult) -> list[Any]:
     return sorted(judgement.findings, key=lambda finding: _ORDER.index(finding.level))
 
 
-def _row(joint: JointJudgement) -> JointRow:
+def _row(joint: JointJudgement, every_row: str) -> JointRow:
     return JointRow(
         joint=joint.joint,
         rms=f"{numbers.significant(joint.rms)} {joint.unit}",
         relative=numbers.percent(joint.relative),
+        every_row=every_row,
         fitted=numbers.percent(joint.fitted_relative),
         explained=_explained(joint.explained),
         limit=numbers.percent(joint.share_of_limit),

@@ -369,7 +369,7 @@ def test_a_reader_who_cannot_see_is_told_what_each_figure_shows(page: Page, html
     assert all(len(a["aria-label"] or "") > 30 for a in figures)
     assert sum(tag == "h1" for tag, _ in page.tags) == 1
     assert sum(tag == "caption" for tag, _ in page.tags) == len(page.tables)
-    for kind, count in (("Figure", 6), ("Table", 9)):
+    for kind, count in (("Figure", 6), ("Table", 10)):
         found = re.findall(rf"<b>{kind} (\d+)\.</b>", html)
         assert found == [str(k) for k in range(1, count + 1)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Literal
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -71,6 +72,15 @@ def headed(axes: Axes, text: str) -> None:
 def footed(axes: Axes, text: str) -> None:
     """`text` below the axes."""
     axes.set_xlabel(text, fontsize=TEXT_SIZE, color=MUTED, labelpad=3.0)
+
+
+def dots(axes: Axes, x: Array, y: Array, color: str, size: float = 2.2) -> None:
+    """Small dots at (c,) points as one path, a tenth of what c marks would take of the page."""
+    gap = np.full(x.shape, np.nan)
+    # A line without length, with round ends, is a dot.
+    rows = [np.column_stack([v, v, gap]).ravel() for v in (x, y)]
+    with mpl.rc_context({"path.simplify": False}):
+        axes.plot(*rows, color=color, linewidth=size, solid_capstyle="round")
 
 
 def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:

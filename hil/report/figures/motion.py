@@ -1,8 +1,9 @@
-"""What happens in time: the identification trajectory, and torque measured against predicted."""
+"""What happens in time: the identification trajectory, torque measured, predicted and split."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,17 +11,21 @@ from numpy.typing import NDArray
 
 from hil.report import numbers
 from hil.report.figures.canvas import blank, footed, headed, place, ruled, thinned
-from hil.report.figures.palette import FIRST, INK, MUTED, SECOND, WIDE
+from hil.report.figures.palette import BAND, FIRST, INK, MUTED, ROUTES, SECOND, WIDE
 from hil.report.figures.svg import Panel, drawing, to_panel
 from hil.report.figures.traces import Plot, Trace, traces_text
 from hil.report.series import ReportSeries
+from hil.report.validation import TorqueError
 
 Array = NDArray[np.float64]
 
 _WIDTH, _LEFT, _RIGHT = 370.0, 46.0, 10.0
 _SECONDS = "time [s]"
 _INNER = _WIDTH - _LEFT - _RIGHT
-_POINTS = 1200  # of a planned motion, which is smooth
+_POINTS = 1200  # of lines that are smooth
+
+Stretches = Sequence[tuple[float, float]]
+"""Begin and end [s]."""
 
 
 def excitation_panels(series: ReportSeries, joint_names: Sequence[str]) -> list[Panel]:
@@ -28,92 +33,194 @@ def excitation_panels(series: ReportSeries, joint_names: Sequence[str]) -> list[
     time = _from_zero(series.excitation_time)
     return [
         _excitation(
-            j, name, time, series.excitation_position[:, j], series.excitation_velocity[:, j]
+            j,
+            name,
+            time,
+            series.excitation_position[:, j],
+            series.excitation_velocity[:, j],
+            _left_out(time, series.excitation_fitted, j),
         )
         for j, name in enumerate(joint_names)
     ]
 
 
-def _excitation(j: int, name: str, time: Array, position: Array, velocity: Array) -> Panel:
+def _excitation(
+    j: int, name: str, time: Array, position: Array, velocity: Array, shaded: Stretches
+) -> Panel:
     low, high = float(np.min(position)), float(np.max(position))
     fastest = float(np.max(np.abs(velocity)))
-    degrees = f"{np.degrees(low):.0f}° to {np.degrees(high):.0f}°".replace("-", "−")
+    ends = (numbers.fixed(float(np.degrees(end)), 0) for end in (low, high))
+    degrees = "{}° to {}°".format(*ends).replace("-", "−")
     note = f"{degrees}, up to {np.degrees(fastest):.0f} °/s"
     alt = (
         f"{name}: position between {numbers.significant(low)} and {numbers.significant(high)} rad,"
         f" speed up to {numbers.significant(fastest)} rad/s, over {_length(time)} s."
     )
     plots = (
-        Plot((_LEFT, 20.0, _INNER, 78.0), "position [rad]", [Trace(position, FIRST, 1.5, "q")]),
-        Plot((_LEFT, 122.0, _INNER, 78.0), "velocity [rad/s]", [Trace(velocity, SECOND, 1.5, "v")]),
+        Plot(
+            (_LEFT, 20.0, _INNER, 78.0),
+            "position [rad]",
+            [Trace(position, FIRST, 1.5, "q")],
+            shaded=shaded,
+        ),
+        Plot(
+            (_LEFT, 122.0, _INNER, 78.0),
+            "velocity [rad/s]",
+            [Trace(velocity, SECOND, 1.5, "v")],
+            shaded=shaded,
+        ),
     )
     traces = traces_text(time, plots, points=_POINTS)
     return _panel(240.0, time, plots, key=f"x{j}", title=name, note=note, alt=alt, traces=traces)
 
 
-def torque_panels(series: ReportSeries, joint_names: Sequence[str]) -> list[Panel]:
+def torque_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Panel]:
     """Measured and predicted torque of each joint, and their difference (the paper's Fig. 4)."""
     if series.example_time.size == 0:
         return []
     time = _from_zero(series.example_time)
     return [
-        _torque(j, name, time, series.example_measured[:, j], series.example_predicted[:, j])
-        for j, name in enumerate(joint_names)
+        _torque(
+            j,
+            error,
+            time,
+            series.example_measured[:, j],
+            series.example_predicted[:, j],
+            _left_out(time, series.example_counted, j),
+        )
+        for j, error in enumerate(errors)
     ]
 
 
-def _torque(j: int, name: str, time: Array, measured: Array, predicted: Array) -> Panel:
+def _torque(
+    j: int, told: TorqueError, time: Array, measured: Array, predicted: Array, shaded: Stretches
+) -> Panel:
     error = measured - predicted
-    rms = numbers.significant(float(np.sqrt(np.mean(error**2))))
-    size = numbers.significant(float(np.sqrt(np.mean(measured**2))))
-    note = f"RMS error {rms} of {size} N·m"
-    alt = f"{name}: measured and predicted torque over {_length(time)} s; {note}."
+    alt = f"{told.joint}: measured and predicted torque over {_length(time)} s; {told.words}."
     plots = (
         Plot(
             (_LEFT, 20.0, _INNER, 128.0),
-            "torque [N·m]",
+            f"torque [{told.unit}]",
             [Trace(measured, WIDE, 4.0, "measured"), Trace(predicted, INK, 1.1, "predicted")],
+            shaded=shaded,
         ),
         Plot(
             (_LEFT, 172.0, _INNER, 50.0),
-            "measured − predicted [N·m]",
+            f"measured − predicted [{told.unit}]",
             [Trace(error, SECOND, 0.9, "difference")],
+            shaded=shaded,
         ),
     )
     traces = traces_text(time, plots)
-    return _panel(262.0, time, plots, key=f"t{j}", title=name, note=note, alt=alt, traces=traces)
+    return _panel(
+        262.0,
+        time,
+        plots,
+        key=f"t{j}",
+        title=told.joint,
+        note=told.words,
+        alt=alt,
+        traces=traces,
+    )
 
 
-def _panel(height: float, time: Array, plots: tuple[Plot, Plot], **words: str) -> Panel:
-    """Two plots over the same time, one above the other."""
+PARTS: Final = (
+    ("gravity", ROUTES[0], 1.6),
+    ("inertia", FIRST, 1.2),
+    ("coriolis", ROUTES[3], 1.2),
+    ("friction", SECOND, 1.2),
+)
+"""Parts of a predicted torque with their colours and widths, the lowest line first."""
+
+
+def split_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Panel]:
+    """Predicted torque of each joint taken apart, and the measured one behind it."""
+    if series.example_time.size == 0 or series.example_gravity.size == 0:
+        return []
+    time = _from_zero(series.example_time)
+    parts = {name: getattr(series, f"example_{name}") for name, _, _ in PARTS}
+    return [
+        _split(
+            j,
+            one,
+            time,
+            series.example_measured[:, j],
+            {name: part[:, j] for name, part in parts.items()},
+            _left_out(time, series.example_counted, j),
+        )
+        for j, one in enumerate(errors)
+    ]
+
+
+def _split(
+    j: int,
+    told: TorqueError,
+    time: Array,
+    measured: Array,
+    parts: dict[str, Array],
+    shaded: Stretches,
+) -> Panel:
+    sizes = {name: float(np.sqrt(np.mean(part**2))) for name, part in parts.items()}
+    words = ", ".join(f"{name} {numbers.significant(size, 2)}" for name, size in sizes.items())
+    alt = f"{told.joint}: parts of the predicted torque; RMS of {words} {told.unit}."
+    largest = max(sizes, key=lambda name: sizes[name])
+    note = f"largest: {largest}, RMS {numbers.significant(sizes[largest])} {told.unit}"
+    lines = [Trace(parts[name], colour, width, name) for name, colour, width in PARTS]
+    plot = Plot(
+        (_LEFT, 20.0, _INNER, 140.0),
+        f"torque [{told.unit}]",
+        [Trace(measured, WIDE, 4.0, "measured"), *lines],
+        shaded=shaded,
+    )
+    traces = traces_text(time, [plot], points=_POINTS)
+    return _panel(
+        200.0, time, (plot,), key=f"g{j}", title=told.joint, note=note, alt=alt, traces=traces
+    )
+
+
+def _panel(height: float, time: Array, plots: Sequence[Plot], **words: str) -> Panel:
+    """Plots over the same time, one above the other."""
     with drawing():
         figure = blank(_WIDTH, height)
-        upper, lower = (place(figure, *plot.box) for plot in plots)
-        for axes, plot in zip((upper, lower), plots, strict=True):
+        all_axes = [place(figure, *plot.box) for plot in plots]
+        for axes, plot in zip(all_axes, plots, strict=True):
+            for stretch in plot.shaded:
+                axes.axvspan(*stretch, color=BAND, linewidth=0.0, zorder=0.5)
             for trace in plot.traces:
                 _line(axes, time, trace.values, trace.colour, trace.width)
             headed(axes, plot.heading)
-        if (
-            float(np.min(plots[1].traces[0].values))
-            < 0.0
-            < float(np.max(plots[1].traces[0].values))
-        ):
-            lower.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1.5)
-        _time_axes(upper, lower, time)
+            _zero_line(axes, plot)
+        _time_axes(all_axes, time)
         return to_panel(figure, **words)
+
+
+def _zero_line(axes: Axes, plot: Plot) -> None:
+    lowest = min(float(np.min(trace.values)) for trace in plot.traces)
+    highest = max(float(np.max(trace.values)) for trace in plot.traces)
+    if lowest < 0.0 < highest:
+        axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1.5)
 
 
 def _line(axes: Axes, time: Array, values: Array, color: str, width: float) -> None:
     axes.plot(*thinned(time, values), color=color, linewidth=width, solid_joinstyle="round")
 
 
-def _time_axes(upper: Axes, lower: Axes, time: Array) -> None:
-    ruled(upper, "both", x_ticks=6)
-    ruled(lower, "both", x_ticks=6, y_ticks=3)
-    for axes in (upper, lower):
+def _time_axes(all_axes: Sequence[Axes], time: Array) -> None:
+    for k, axes in enumerate(all_axes):
+        ruled(axes, "both", x_ticks=6, y_ticks=3 if k else 4)
         axes.set_xlim(0.0, max(float(time[-1]), 1e-9))
-    upper.tick_params(labelbottom=False)
-    footed(lower, _SECONDS)
+        axes.tick_params(labelbottom=axes is all_axes[-1])
+    footed(all_axes[-1], _SECONDS)
+
+
+def _left_out(time: Array, counted: Array, joint: int) -> Stretches:
+    """Stretches of time (m,) in which rows (m, n) of a joint are zero, to midway to the next."""
+    if counted.size == 0:
+        return ()
+    out = np.concatenate([[False], counted[:, joint] < 0.5, [False]])
+    edges = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
+    changes = edges[np.flatnonzero(np.diff(out.astype(np.int8)))].tolist()
+    return tuple(zip(changes[::2], changes[1::2], strict=True))
 
 
 def _from_zero(time: Array) -> Array:

@@ -52,12 +52,14 @@ class Plot:
         heading: what stands above: the quantity and its unit.
         traces: its lines, the lowest first.
         limits: values at which dashed lines are drawn.
+        shaded: stretches of time [s] that are shaded, from the first instant on.
     """
 
     box: tuple[float, float, float, float]
     heading: str
     traces: Sequence[Trace]
     limits: Sequence[float] = ()
+    shaded: Sequence[tuple[float, float]] = ()
 
 
 def traces_text(time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS) -> str:
@@ -98,6 +100,7 @@ def even_traces_text(
                 "box": plot.box,
                 "heading": plot.heading,
                 "limits": [float(f"{limit:.7g}") for limit in plot.limits],
+                "shaded": [[round(start, 4), round(stop, 4)] for start, stop in plot.shaded],
                 "lines": [_line(one.values, one) for one in plot.traces],
             }
             for plot in plots

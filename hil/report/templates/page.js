@@ -158,6 +158,11 @@
     function upright(t, kind) {
       element("path", { d: "M" + x(t) + " " + top + "v" + tall, "class": kind }, group);
     }
+    plot.shaded.forEach(function (stretch) {
+      var from = Math.max(stretch[0], view.from), to = Math.min(stretch[1], view.to);
+      if (to > from) element("rect", { x: x(from), y: top, width: x(to) - x(from), height: tall,
+        "class": "zoom-shade" }, group);
+    });
     ticks(view.from + begin, view.to + begin, 6).forEach(function (tick) {
       upright(tick.at - begin, "zoom-grid");
       if (isLast) element("text", { x: x(tick.at - begin), y: top + tall + 14, "text-anchor": "middle",

@@ -1,0 +1,52 @@
+"""Spectra of torques by Welch's method, as few points as a logarithmic figure shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_STRETCH: Final = 4.0  # s; lines a quarter of a hertz apart
+_FEWEST: Final = 32  # samples
+_BINS: Final = 120
+
+
+class Spectrum(NamedTuple):
+    """Amplitude spectral density.
+
+    Attributes:
+        frequency: (f,) [Hz], above zero and evenly spread on a logarithmic axis.
+        density: (f, c) [unit of the signals per √Hz].
+    """
+
+    frequency: Array
+    density: Array
+
+
+def spectrum(time: Array, signals: Array, segments: Sequence[slice]) -> Spectrum:
+    """Return the spectrum of signals (m, c) in the longest segment of time (m,) [s].
+
+    Uneven samples are interpolated at their median interval; f is 0 where there are too few.
+    """
+    longest = max(segments, key=lambda one: int(one.stop - one.start), default=slice(0, 0))
+    time, signals = time[longest], signals[longest]
+    if time.size < _FEWEST:
+        return Spectrum(np.empty(0), np.empty((0, signals.shape[1])))
+    interval = float(np.median(np.diff(time)))
+    even = np.arange(time[0], time[-1], interval)
+    resampled = np.column_stack([np.interp(even, time, column) for column in signals.T])
+    length = min(len(even), max(_FEWEST, round(_STRETCH / interval)))
+    frequency, power = scipy.signal.welch(resampled, fs=1.0 / interval, nperseg=length, axis=0)
+    # The mean is no part of it, and its line has what detrending left.
+    frequency, power = frequency[1:], power[1:]
+    edges = np.geomspace(frequency[0], frequency[-1], _BINS + 1)
+    bins = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, _BINS - 1)
+    starts = np.flatnonzero(np.diff(bins, prepend=-1))
+    counts = np.diff(starts, append=len(bins))
+    mean_power = np.add.reduceat(power, starts, axis=0) / counts[:, None]
+    return Spectrum(np.add.reduceat(frequency, starts) / counts, np.sqrt(mean_power))
