@@ -6,6 +6,13 @@ from identification.coupling import Coupling
 from identification.covariance import with_block_covariance
 from identification.delay import DelayEstimate, estimate_delays
 from identification.delay_compensation import compensate
+from identification.elements import (
+    Anchors,
+    ExtensionSpring,
+    GasCylinder,
+    JointElements,
+    TorsionSpring,
+)
 from identification.endogeneity import EndogeneityTest, endogeneity_test
 from identification.errors import IdentificationError, ModelError, ShapeError
 from identification.essential import Elimination, eliminate
@@ -47,14 +54,19 @@ from identification.verdict import Thresholds, Verdict, judge
 
 __all__ = [
     # model
+    "Anchors",
     "BaseParameters",
     "Coupling",
+    "ExtensionSpring",
     "FrictionLaw",
+    "GasCylinder",
+    "JointElements",
     "JointFriction",
     "Motion",
     "Payload",
     "Regressor",
     "RobotModel",
+    "TorsionSpring",
     # recordings and their preparation
     "Recording",
     "TimeBase",
