@@ -25,8 +25,8 @@ from identification.errors import ModelError
 from identification.excitation.searches.digest import digest
 from identification.friction import FrictionLaw
 from identification.parameter_text import parameters_dict
-from identification.preprocessing import Samples
 from tests.identification import two_link
+from tests.identification.robots import one_joint
 
 Array = NDArray[np.float64]
 
@@ -187,13 +187,20 @@ class TestElementModel:
         assert not load[:, 1].any()
         assert known.has_load and not two_link.MODEL.has_load
 
+    def test_one_of_the_form_of_another_is_refused(self) -> None:
+        with pytest.raises(ElementError, match=r"spring_1b .* same form"):
+            with_elements(SPRING, SPRING)
+
     def test_one_of_the_form_of_a_weight_is_refused(self) -> None:
-        """A spring without free length balances a weight, and has its column."""
-        weight = RobotModel.from_urdf(two_link.URDF).nominal
-        assert weight.any()
-        twice = [SPRING, replace(SPRING, rest=0.3)]
-        with pytest.raises(ElementError, match="spring_1b .* same form"):
-            with_elements(*twice)
+        """A spring of no free length turns a pendulum as its weight does."""
+        pendulum = one_joint("revolute", axis="1 0 0")
+        spring = ExtensionSpring(
+            "strange", Anchors(0.8, 0.2, 0.4), free_length=0.0, preload=0.0, identified=True
+        )
+        with pytest.raises(ElementError, match="such as a weight"):
+            RobotModel.from_urdf(pendulum, elements=[spring])
+        longer = replace(spring, free_length=0.3)
+        assert RobotModel.from_urdf(pendulum, elements=[longer]).n_parameters > 0
 
     def test_the_digest_of_a_search_knows_their_figures(self) -> None:
         one = with_elements(replace(SPRING, identified=False))
@@ -201,25 +208,25 @@ class TestElementModel:
         assert len({digest(model) for model in (two_link.MODEL, one, other)}) == 3
 
 
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return with_elements(SPRING, GAS)
+
+
+@pytest.fixture(scope="module")
+def values() -> Array:
+    return np.concatenate([two_link.truth(), [-35.0, 0.8]])
+
+
+@pytest.fixture(scope="module")
+def factor(model: RobotModel, values: Array) -> Factor:
+    motion = two_link.a_motion()
+    noise = two_link.gaussian(np.random.default_rng(3), motion)
+    torque = model.torque(values, *motion[1:]) + noise
+    return Factor.from_samples(model, motion, torque, model.moving(motion.velocity))
+
+
 class TestIdentifiedElements:
-    @pytest.fixture(scope="class")
-    def model(self) -> RobotModel:
-        return with_elements(SPRING, GAS)
-
-    @pytest.fixture(scope="class")
-    def values(self) -> Array:
-        return np.concatenate([two_link.truth(), [-35.0, 0.8]])
-
-    @pytest.fixture(scope="class")
-    def factor(self, model: RobotModel, values: Array) -> Factor:
-        motion = two_link.a_motion()
-        noise = two_link.gaussian(np.random.default_rng(3), motion)
-        samples: Samples = replace(
-            two_link.recording(noise, motion),
-            torque=model.torque(values, *motion[1:]) + noise,
-        )
-        return Factor.from_samples(model, samples)
-
     def test_least_squares_finds_them(
         self, model: RobotModel, values: Array, factor: Factor
     ) -> None:
