@@ -1,6 +1,6 @@
-"""What a cell states of a recording and archives of one arm may differ in: delay, payload, springs.
+"""What a cell states of a recording and archives of one arm may differ in: delay and payload.
 
-They are known and taken off, so the parameters of an arm stay comparable; but archives of which
+Both are known and taken off, so the parameters of an arm stay comparable; but archives of which
 they are different are not of one campaign.
 """
 
@@ -9,14 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from hil.cell import Cell
-from hil.cell.schema import ElementTable, PayloadTable
+from hil.cell.schema import PayloadTable
 
 
 def setup_of(cell: Cell) -> str:
-    """Delay, payload, springs and balancers of a cell in words, with every digit; "" for none."""
-    robot = cell.file.robot
-    parts = (_lag(stated_delay(cell)), _load(robot.payload), *map(_element, robot.elements))
-    return ", ".join(filter(None, parts))
+    """Delay of the torque and payload of a cell in words, with every digit; "" for neither."""
+    return ", ".join(filter(None, (_lag(stated_delay(cell)), _load(cell.file.robot.payload))))
 
 
 def stated_delay(cell: Cell) -> float:
@@ -35,13 +33,6 @@ def _load(payload: PayloadTable | None) -> str:
     frame = f" in {payload.frame}" if payload.frame else ""
     words = f"carries {payload.mass:.12g} kg at {_row(payload.centre)} m{frame}"
     return words + (f", {_row(payload.inertia)} kg·m²" if any(payload.inertia) else "")
-
-
-def _element(table: ElementTable) -> str:
-    figures = table.model_dump(exclude_none=True, exclude={"kind", "joint", "identified"})
-    state = "identified" if table.identified else "known"
-    given = ", ".join(f"{name} {value:.12g}" for name, value in figures.items())
-    return f"{state} {table.kind} on {table.joint} ({given})"
 
 
 def _row(figures: Iterable[float]) -> str:
