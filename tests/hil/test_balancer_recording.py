@@ -27,7 +27,7 @@ FILES = {
 
 @pytest.mark.slow
 class TestBalancer:
-    def test_a_known_one_is_as_good_as_one_taken_off(
+    def test_a_known_one_predicts_another_motion(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """At most 14.0 % of the unseen motion's torque, over all joints and every row."""

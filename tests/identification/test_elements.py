@@ -106,7 +106,7 @@ class TestElementTorque:
         np.testing.assert_allclose(both.columns(POSITIONS) @ [900.0, 60.0], whole)
         np.testing.assert_allclose(one.columns(POSITIONS)[:, 0] * 900 + one.known(POSITIONS), whole)
 
-    def test_a_published_balancer_is_the_torque_taken_off(self) -> None:
+    def test_a_published_balancer_is_the_torque_subtracted(self) -> None:
         """A recording with and one without its balancer differ by the formula, to rounding."""
         if not KR300.is_dir():
             pytest.skip(f"there is no recording {KR300}")
