@@ -10,6 +10,13 @@ from identification.delay_compensation import (
     delay_sensitivity,
     with_delay_uncertainty,
 )
+from identification.elements import (
+    Anchors,
+    ExtensionSpring,
+    GasCylinder,
+    JointElements,
+    TorsionSpring,
+)
 from identification.endogeneity import EndogeneityTest, endogeneity_test
 from identification.errors import IdentificationError, ModelError, ShapeError
 from identification.essential import Elimination, eliminate
@@ -51,14 +58,19 @@ from identification.verdict import Thresholds, Verdict, judge
 
 __all__ = [
     # model
+    "Anchors",
     "BaseParameters",
     "Coupling",
+    "ExtensionSpring",
     "FrictionLaw",
+    "GasCylinder",
+    "JointElements",
     "JointFriction",
     "Motion",
     "Payload",
     "Regressor",
     "RobotModel",
+    "TorsionSpring",
     # recordings and their preparation
     "Recording",
     "TimeBase",

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.elements import JointElements
 from identification.errors import IdentificationError, ShapeError
 from identification.friction import SYMBOLS
 from identification.instrument_motion import Instruments
@@ -81,7 +82,8 @@ def simulated_motion(
     ahead = np.zeros(command.position.shape)
     if servo.feedforward:
         ahead = model.torque(values, *command[1:]) + model.load_torque(*command[1:4])
-    q, qd = _run(arm, coupled, friction, servo, command, ahead)
+    elements = _Elements.of(model, values)
+    q, qd = _run(arm, coupled, friction, elements, servo, command, ahead)
     qdd = np.gradient(qd, command.time, axis=0)
     return Instruments(
         Motion(command.time, q, qd, qdd),
@@ -95,6 +97,7 @@ def _run(
     arm: pin.Model,
     coupled: Array,
     friction: _Friction,
+    elements: _Elements,
     servo: JointServo,
     command: Motion,
     ahead: Array,
@@ -116,6 +119,7 @@ def _run(
             wanted = _between(command.position, k, share)
             speed = _between(command.velocity, k, share)
             torque = _between(ahead, k, share) - friction.torque(qd)
+            torque -= elements.torque(q)
             torque += servo.position * (wanted - q - h * qd) + servo.velocity * (speed - qd)
             mass = pin.crba(arm, data, q)
             torque -= pin.nonLinearEffects(arm, data, q, qd)
@@ -163,7 +167,7 @@ class _Friction:
         laws = friction.laws + tuple(friction.laws[motor] for motor in friction.motors)
         places = {motor: model.n_joints + k for k, motor in enumerate(friction.motors)}
         coefficients = {symbol: np.zeros(len(speeds)) for symbol in SYMBOLS}
-        for term, value in zip(friction.terms, values[model.base.rank :], strict=True):
+        for term, value in zip(friction.terms, values[model.friction_part], strict=True):
             place = places[term.owner] if term.motor else term.owner
             coefficients[term.symbol][place] = value
         return cls(
@@ -194,6 +198,26 @@ class _Friction:
         sticking = (size < self.standstill) * (c["f0"] + c["fs"]) / self.standstill
         slope = np.maximum(c["f1"] + c["fd"] * np.sign(v) + third + sticking, 0.0)
         return np.asarray((self.speeds.T * slope) @ self.speeds)
+
+
+@dataclass(frozen=True, eq=False)
+class _Elements:
+    """Springs and balancers with the values (e,) of those that are identified."""
+
+    elements: JointElements
+    values: Array
+
+    @classmethod
+    def of(cls, model: RobotModel, values: Array) -> _Elements:
+        """Take their parameters out of all (p,)."""
+        return cls(model.elements, values[model.element_part])
+
+    def torque(self, q: Array) -> Array:
+        """Torque (n,) that the drives hold at a position (n,)."""
+        if not self.elements.elements:
+            return np.zeros(len(q))
+        row = q[None]
+        return np.asarray((self.elements.torque(self.values, row) + self.elements.known(row))[0])
 
 
 def _arm(model: RobotModel, values: Array) -> tuple[pin.Model, Array]:

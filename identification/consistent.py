@@ -64,10 +64,10 @@ class ConsistentEstimate:
         standard_names: (s,).
         standard: standard parameters (s,), every pseudo-inertia positive definite, no rotor
             inertia negative. Where the data leave a choice they are close to the nominal ones.
-        friction: coefficients (p - b,), the last of the model's parameters.
-        estimate: base parameters and friction (p,) that follow from them. Its covariance is the
-            one of the unconstrained estimate: an inequality that holds has no covariance of its
-            own, and one that binds makes the true spread smaller.
+        friction: coefficients (k,), see `RobotModel.friction_part`.
+        estimate: the parameters (p,) that follow from them, with springs and balancers. Its
+            covariance is the one of the unconstrained estimate: an inequality that holds has no
+            covariance of its own, and one that binds makes the true spread smaller.
         unconstrained: the estimate without inequalities, as it was given.
         margin: smallest eigenvalue of each link's pseudo-inertia (n,), SI units, positive.
         excess: weighted squared torque error above the unconstrained minimum, in units in which
@@ -138,7 +138,7 @@ def consistent_estimate(
     root = square_root(equations)
     program = Program.of(model, root, options)
     solution, status = solve_program(program, options, equations.n)
-    standard, friction = program.physical(solution)
+    standard, others = program.physical(solution)
     found = margin(link_parameters(model, standard))
     if not np.all(found > 0.0):
         worst = model.joint_names[int(np.argmin(found))]
@@ -147,13 +147,13 @@ def consistent_estimate(
             f" has the eigenvalue {found.min():.3g}",
             status=status,
         )
-    values = np.concatenate([model.base.grouping @ standard, friction])
+    values = np.concatenate([model.base.grouping @ standard, others])
     rms, relative = _errors(factor, values)
     free_rms, free_relative = _errors(factor, unconstrained.values)
     return ConsistentEstimate(
         standard_names=model.standard_names,
         standard=standard,
-        friction=friction,
+        friction=values[model.friction_part],
         estimate=replace(
             unconstrained,
             values=values,

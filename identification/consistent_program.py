@@ -114,12 +114,12 @@ class Program:
     """The semidefinite program in variables u for which the reference is of size one.
 
     Per link ten entries of the pseudo-inertia in axes in which the reference's is the unit
-    matrix; then rotors and coupling inertias; then friction.
+    matrix; then rotors and coupling inertias; then friction, springs and balancers.
 
     Attributes:
         bodies: reference of each link.
         to_standard: physical standard parameters from u (s, v).
-        to_friction: physical friction from u (k, v).
+        to_others: parameters of physical friction, springs and balancers from u (k, v).
         rows: R and z in u.
         cones: pseudo-inertias, and the rotors' inertia matrix where joints are coupled.
         centre: what squares of the variables behind the links are counted from (v - 10 n,).
@@ -129,7 +129,7 @@ class Program:
 
     bodies: ReferenceBodies
     to_standard: Array
-    to_friction: Array
+    to_others: Array
     rows: SquareRoot
     cones: tuple[Cone, ...]
     centre: Array
@@ -152,7 +152,7 @@ class Program:
         others = np.concatenate([layout.rotors, layout.couplings])
         s, k = layout.size, model.n_parameters - b
         v = s + k
-        to_standard, to_friction = np.zeros((s, v)), np.zeros((k, v))
+        to_standard, to_others = np.zeros((s, v)), np.zeros((k, v))
         for link, (places, frame) in enumerate(zip(layout.links, bodies.frames, strict=True)):
             entries = np.einsum("ab,kbc,dc->kad", frame, _SYMMETRIC, frame)
             span = slice(_N_LINK * link, _N_LINK * (link + 1))
@@ -161,9 +161,11 @@ class Program:
         unit = _rotor_units(model, root, nominal)
         to_standard[others, rotors] = unit
         rest = np.arange(s, v)
-        directions = np.vstack([np.zeros((b, k)), taken.combine])
-        to_friction[:, rest] = taken.combine * _whole_torque_units(root, directions)
-        mapping = np.vstack([model.base.grouping @ to_standard, to_friction])
+        combine = np.eye(k)  # springs and balancers are free
+        combine[: len(taken.combine), : len(taken.combine)] = taken.combine
+        directions = np.vstack([np.zeros((b, k)), combine])
+        to_others[:, rest] = combine * _whole_torque_units(root, directions)
+        mapping = np.vstack([model.base.grouping @ to_standard, to_others])
         coupled = _coupled_rotors(model, _N_LINK * n)
         alone = rotors[: len(layout.rotors)]
         if coupled is not None:
@@ -172,11 +174,11 @@ class Program:
         return cls(
             bodies=bodies,
             to_standard=to_standard,
-            to_friction=to_friction,
+            to_others=to_others,
             rows=SquareRoot(root.R @ mapping, root.z),
             cones=(Cone(links, _SYMMETRIC),) + (() if coupled is None else (coupled,)),
             centre=np.concatenate([nominal[others] / unit, np.zeros(k)]),
-            not_negative=np.concatenate([alone, rest[taken.not_negative]]),
+            not_negative=np.concatenate([alone, rest[: len(taken.combine)][taken.not_negative]]),
             masses=to_standard[layout.links[:, -1]],
         )
 
@@ -196,7 +198,7 @@ class Program:
         return u
 
     def physical(self, u: Array) -> tuple[Array, Array]:
-        """Return standard parameters (s,) and friction (k,).
+        """Return standard parameters (s,) and those of friction, springs and balancers (k,).
 
         A solver holds inequalities to its tolerance. What is left beyond them is taken back.
         """
@@ -210,7 +212,7 @@ class Program:
             below = -np.linalg.eigvalsh(cone.matrices(u))[:, :1]
             lift = np.where(below < _TOLERANCE, np.maximum(below, 0.0), 0.0)
             u[cone.places] += lift * np.einsum("kaa->k", cone.entries)
-        return self.to_standard @ u, self.to_friction @ u
+        return self.to_standard @ u, self.to_others @ u
 
 
 def _symmetric_basis() -> Array:

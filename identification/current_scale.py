@@ -104,6 +104,7 @@ def _columns(model: RobotModel, motion: Motion, turns: Array) -> tuple[Array, ND
     """Per motor [nominal torque, acceleration, sign, speed, 1] (m, n, 5), and rows that count."""
     values = np.zeros(model.n_parameters)
     values[: model.base.rank] = model.base.grouping @ model.nominal
+    values[model.element_part] = model.elements.nominal
     torque = model.torque(values, *motion[1:]) + model.load_torque(*motion[1:4])
     speed, acceleration = motion.velocity @ turns.T, motion.acceleration @ turns.T
     motors = np.linalg.solve(turns.T, torque.T).T

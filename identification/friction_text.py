@@ -64,7 +64,7 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
     """Return the friction law and its coefficients (k,) as plain text, a line per joint.
 
     Raises:
-        ShapeError: `coefficients` is not (k,), as in the last `model.parameter_names`.
+        ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
     friction = model.friction
     table, motors = friction.table(coefficients), friction.motor_table(coefficients)
@@ -107,7 +107,7 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     the sign is made linear, for simulations that must not jump at zero speed.
 
     Raises:
-        ShapeError: `coefficients` is not (k,), as in the last `model.parameter_names`.
+        ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
     friction, n = model.friction, model.n_joints
     table = friction.table(coefficients)

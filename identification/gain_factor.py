@@ -118,9 +118,11 @@ class GainFactor:
 
 
 def _load(model: RobotModel, payload: Payload | None, samples: Samples) -> Array:
+    """Known torque (m, n): of what was carried, of springs and balancers."""
+    known = model.elements.known(samples.motion.position)
     if payload is None:
-        return np.zeros_like(samples.motion.position)
-    return Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
+        return known
+    return known + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
 
 
 def _block_edges(time: Array) -> NDArray[np.intp]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from identification.base_parameters import TOLERANCE, BaseParameters, select_base, share_left
 from identification.coupling import Coupling
+from identification.elements import Element, ElementError, JointElements
 from identification.errors import ModelError, ShapeError
 from identification.friction import OFFSET, FrictionLaw
 from identification.joint_friction import JointFriction
@@ -38,7 +39,8 @@ class RobotModel:
     Build it with :meth:`from_urdf`. Joints are numbered from 1 in parameter names; inertial
     parameters are about the joint frame's origin, in its axes, ``mc`` is mass times centre of
     mass, ``I`` the inertia tensor, ``I3m`` the rotor of joint 3 seen from the link side, ``I45``
-    the coupling inertia of joints 4 and 5. A payload is known: its torque is no part of W pi.
+    the coupling inertia of joints 4 and 5. A payload is known: its torque is no part of W pi, nor
+    is that of springs and balancers of which the figures are given.
 
     Attributes:
         chain: geometry and nominal inertia as read from the URDF.
@@ -46,12 +48,14 @@ class RobotModel:
         layout: where the s standard parameters stand.
         friction: of every joint, and of coupled motors.
         base: the b base parameters and their grouping.
-        parameter_names: the p parameters: base, then friction (all f0, all f1, ...).
+        parameter_names: the p parameters: base, then friction (all f0, all f1, ...), then those
+            of springs and balancers.
         units: unit of each parameter, shape (p,).
         plan: how the regressor is made.
         locked: position [rad or m] of joints of the description that are held.
         coupling: motors that turn with several joints; None where each joint has its own.
         payload: what the arm carries; None for nothing.
+        elements: springs and balancers.
     """
 
     chain: Chain
@@ -65,6 +69,7 @@ class RobotModel:
     locked: Mapping[str, float] = field(default_factory=dict)
     coupling: Coupling | None = None
     payload: Payload | None = None
+    elements: JointElements = field(default_factory=JointElements)
     _load: Load | None = field(default=None, repr=False)
 
     @classmethod
@@ -79,6 +84,7 @@ class RobotModel:
         locked: Mapping[str, float] = _NOT_LOCKED,
         coupling: Coupling | None = None,
         payload: Payload | None = None,
+        elements: Sequence[Element] = (),
     ) -> RobotModel:
         """Build the model from URDF text.
 
@@ -91,11 +97,12 @@ class RobotModel:
             locked: joints held at a position [rad or m], by name: no joints of the model.
             coupling: motors that turn with several joints, joints in the model's order.
             payload: a body of known mass that the arm carries.
+            elements: springs and balancers.
 
         Raises:
             ModelError: the text is no open chain of revolute and prismatic joints, gravity is
                 not a finite vector, a name is of no joint, the coupling is of another number of
-                joints, or a friction offset cannot be told from a weight.
+                joints, or the torque of an offset or an element is that of other parameters.
         """
         chain = chain_from_urdf(urdf, locked)
         down = np.array(gravity, dtype=np.float64)
@@ -110,19 +117,21 @@ class RobotModel:
         pairs = coupling.pairs if coupling is not None and coupling.inertia else ()
         layout = StandardLayout(revolute, rotor_inertia, pairs if rotor_inertia else ())
         all_friction = JointFriction(laws, revolute, coupling)
-        base = _base_parameters(chain, down, layout, all_friction)
+        beside = JointElements.of(elements, chain.joint_names, revolute)
+        base = _base_parameters(chain, down, layout, all_friction, beside)
         return cls(
             chain=chain,
             gravity=down,
             layout=layout,
             friction=all_friction,
             base=base,
-            parameter_names=base.names + all_friction.names,
-            units=tuple(layout.units[k] for k in base.kept) + all_friction.units,
-            plan=_plan(chain, down, layout, base.kept, all_friction),
+            parameter_names=base.names + all_friction.names + beside.names,
+            units=tuple(layout.units[k] for k in base.kept) + all_friction.units + beside.units,
+            plan=_plan(chain, down, layout, base.kept, all_friction, beside),
             locked=dict(locked),
             coupling=coupling,
             payload=payload,
+            elements=beside,
             _load=None if payload is None else Load(chain, down, payload),
         )
 
@@ -137,9 +146,13 @@ class RobotModel:
         return replace(
             self,
             friction=friction,
-            parameter_names=self.base.names + friction.names,
-            units=tuple(self.layout.units[k] for k in self.base.kept) + friction.units,
-            plan=_plan(self.chain, self.gravity, self.layout, self.base.kept, friction),
+            parameter_names=self.base.names + friction.names + self.elements.names,
+            units=tuple(self.layout.units[k] for k in self.base.kept)
+            + friction.units
+            + self.elements.units,
+            plan=_plan(
+                self.chain, self.gravity, self.layout, self.base.kept, friction, self.elements
+            ),
         )
 
     @property
@@ -155,8 +168,19 @@ class RobotModel:
     @property
     def friction_columns(self) -> NDArray[np.bool_]:
         """Which of the p parameters are friction (p,): all coefficients but offsets."""
-        inertial = np.zeros(self.base.rank, dtype=np.bool_)
-        return np.concatenate([inertial, self.friction.dissipating])
+        columns = np.zeros(self.n_parameters, dtype=np.bool_)
+        columns[self.friction_part] = self.friction.dissipating
+        return columns
+
+    @property
+    def friction_part(self) -> slice:
+        """Where the k friction coefficients stand among the p parameters."""
+        return slice(self.base.rank, self.base.rank + len(self.friction.terms))
+
+    @property
+    def element_part(self) -> slice:
+        """Where the e parameters of springs and balancers stand among the p parameters."""
+        return slice(self.friction_part.stop, self.n_parameters)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -204,7 +228,7 @@ class RobotModel:
     ) -> Array:
         """Return the joint torques [N·m, N] for parameter values (p,), shape (m, n).
 
-        Without that of a payload: see :meth:`load_torque`; `direction` as in :meth:`regressor`.
+        Without what is known: see :meth:`load_torque`; `direction` as in :meth:`regressor`.
 
         Raises:
             ShapeError: an array does not have the shape it should have.
@@ -220,16 +244,22 @@ class RobotModel:
                 torque[part, joint] = weights[joint] @ block
         return torque
 
+    @property
+    def has_load(self) -> bool:
+        """Whether a payload or an element has a known torque."""
+        return self._load is not None or bool(self.elements.elements)
+
     def load_torque(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """Return the torque [N·m, N] that moving the known payload takes (m, n), zero without one.
+        """Return the known torque [N·m, N] of payload, springs and balancers (m, n).
+
+        Zero without any; it is no part of W pi.
 
         Raises:
             ShapeError: an array does not have the shape it should have.
         """
-        if self._load is None:
-            (q,) = joint_arrays(self.n_joints, q=q)
-            return np.zeros(q.shape)
-        return self._load.torque(q, qd, qdd)
+        (q,) = joint_arrays(self.n_joints, q=q)
+        torque = self.elements.known(q)
+        return torque if self._load is None else torque + self._load.torque(q, qd, qdd)
 
     def moving(self, qd: Array) -> NDArray[np.bool_]:
         """Return where each joint's friction law can be fitted, shape (m, n).
@@ -259,14 +289,19 @@ def _plan(
     layout: StandardLayout,
     kept: NDArray[np.intp],
     friction: JointFriction | None,
+    elements: JointElements | None = None,
 ) -> RegressorPlan:
     links, rotors, couplings = layout.split(kept.tolist())
     pairs = [layout.pairs[k] for k in couplings]
-    return RegressorPlan(chain, gravity, links, rotors, friction, pairs)
+    return RegressorPlan(chain, gravity, links, rotors, friction, pairs, elements)
 
 
 def _base_parameters(
-    chain: Chain, gravity: Array, layout: StandardLayout, friction: JointFriction
+    chain: Chain,
+    gravity: Array,
+    layout: StandardLayout,
+    friction: JointFriction,
+    elements: JointElements,
 ) -> BaseParameters:
     everything = np.arange(layout.size, dtype=np.intp)
     random = np.random.default_rng(_SEED)
@@ -278,6 +313,7 @@ def _base_parameters(
     rows = plan.evaluate(q, qd, qdd).dense(layout.size).reshape(-1, layout.size)
     base = select_base(rows, layout.names, layout.units)
     _refuse_weight_as_offset(chain, friction, rows[:, base.kept])
+    _refuse_known_shape(chain, friction, elements, rows[:, base.kept], q)
     return base
 
 
@@ -296,3 +332,26 @@ def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Arr
                 "(asymmetric friction has one) or the rotor inertias",
                 joint=name,
             )
+
+
+def _refuse_known_shape(
+    chain: Chain, friction: JointFriction, elements: JointElements, columns: Array, q: Array
+) -> None:
+    """Refuse an element whose column the others contain, such as a weight's or an offset's."""
+    m, n = q.shape
+    offsets = [j for j, law in enumerate(friction.laws) if OFFSET in law.symbols]
+    columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])
+    for element, joint, place in elements.identified():
+        own = element.columns(q[:, joint])
+        for k, name in enumerate(elements.names[place]):
+            torque = np.zeros((m, n))
+            torque[:, joint] = own[:, k]
+            column = torque.reshape(-1, 1)
+            if share_left(column, columns)[0] <= TOLERANCE:
+                raise ElementError(
+                    f"the torque of {name} on joint {element.joint!r} has the same form as that of"
+                    " other parameters, such as a weight, and cannot be separated from it; give its"
+                    " figures, with identified = false",
+                    joint=chain.joint_names[joint],
+                )
+            columns = np.column_stack([columns, column])

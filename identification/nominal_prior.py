@@ -30,32 +30,32 @@ def nominal_prior(
     The mass of a link is believed to `share` of itself, its first moments and its inertia to
     `share` of the largest among them, so that a zero in the CAD is no certainty. A link whose
     first moments are all zero gets those of its radius of gyration, one without inertia the
-    largest on the arm. A URDF says nothing about rotor inertia and friction: of these nothing is
-    believed unless they are known. The belief is in the standard parameters; that in their base
-    groups, and how they correlate, follows.
+    largest on the arm. A URDF says nothing about rotor inertia, friction and springs: of these
+    nothing is believed unless they are known. The belief is in the standard parameters; that in
+    their base groups, and how they correlate, follows.
 
     Args:
         model: the robot.
         share: of the nominal value.
         known: mean and standard deviation by name, of standard parameters (replacing the
-            nominal) and friction coefficients: `{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}`.
+            nominal) and of all others: `{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}`.
 
     Raises:
         IdentificationError: the URDF has no inertia, a name is unknown, the share not positive.
     """
     if not share > 0.0:
         raise IdentificationError(f"the nominal parameters' uncertainty is {share}, not positive")
-    friction = model.parameter_names[model.base.rank :]
-    names = model.standard_names + friction
-    mean = np.concatenate([model.nominal, np.zeros(len(friction))])
-    std = np.concatenate([_nominal_std(model, share), np.full(len(friction), np.inf)])
+    others = model.parameter_names[model.base.rank :]  # friction, springs and balancers
+    names = model.standard_names + others
+    mean = np.concatenate([model.nominal, np.zeros(len(others))])
+    std = np.concatenate([_nominal_std(model, share), np.full(len(others), np.inf)])
     for name, (value, deviation) in (known or {}).items():
         if name not in names:
             raise IdentificationError(f"the model has no parameter {name!r} to be known")
         mean[names.index(name)], std[names.index(name)] = value, deviation
     combinations = np.zeros((model.n_parameters, len(names)))
     combinations[: model.base.rank, : len(model.standard_names)] = model.base.grouping
-    combinations[model.base.rank :, len(model.standard_names) :] = np.eye(len(friction))
+    combinations[model.base.rank :, len(model.standard_names) :] = np.eye(len(others))
     extra = f", {len(known)} given" if known else ""
     return GaussianPrior.of_combinations(
         combinations, mean, std, f"nominal parameters to {100.0 * share:g} %{extra}"

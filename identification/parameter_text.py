@@ -65,6 +65,7 @@ def parameters_dict(
         "joints": list(model.joint_names),
         "locked_joints": {name: float(position) for name, position in model.locked.items()},
         "payload": _payload(model),
+        "elements": _elements(model),
         "gravity": [float(x) for x in model.gravity],
         "convention": CONVENTION,
         "method": estimate.method,
@@ -73,7 +74,7 @@ def parameters_dict(
         "noise_std": _plain(estimate.noise_std),
         "samples": [int(count) for count in estimate.samples],
         "undetermined": list(estimate.undetermined),
-        "friction_law": friction_in_words(model, estimate.values[model.base.rank :]),
+        "friction_law": friction_in_words(model, estimate.values[model.friction_part]),
         "parameters": [
             {
                 "name": name,
@@ -172,8 +173,7 @@ def _harmless(text: str) -> str:
 
 def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, float, float]]:
     """Return name, expression, unit, value and standard deviation of each parameter."""
-    friction = estimate.names[model.base.rank :]
-    expressions = (*model.base.expressions(), *friction)
+    expressions = (*model.base.expressions(), *estimate.names[model.base.rank :])
     return list(
         zip(
             estimate.names,
@@ -210,6 +210,13 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
         "coupling_inertia": couplings,
         "rotor_matrix": _plain(model.layout.rotor_matrix(consistent.standard)),
         "motor_friction": {term.name: value for term, value in terms if term.motor},
+        "elements": dict(
+            zip(
+                model.elements.names,
+                consistent.estimate.values[model.element_part].tolist(),
+                strict=True,
+            )
+        ),
         "not_in_urdf": list(not_in_urdf(model)),
         "status": consistent.status,
         "relative_error": consistent.relative_error,
@@ -225,6 +232,21 @@ def _payload(model: RobotModel) -> dict[str, Any] | None:
         return None
     own = dataclasses.asdict(model.payload)
     return {**own, "centre": list(own["centre"]), "inertia": list(own["inertia"])}
+
+
+def _elements(model: RobotModel) -> list[dict[str, Any]]:
+    """Return the springs and balancers, and the parameters that belong to each."""
+    names: dict[int, tuple[str, ...]] = {}
+    for element, _, place in model.elements.identified():
+        names[id(element)] = model.elements.names[place]
+    return [
+        {
+            "law": type(element).__name__,
+            **dataclasses.asdict(element),
+            "parameters": list(names.get(id(element), ())),
+        }
+        for element in model.elements.elements
+    ]
 
 
 def _parts(

@@ -269,11 +269,11 @@ def prepare(
         torque_bandwidth=torque_bandwidth,
         mask=mask,
     ).directed(model)
-    return samples if model.payload is None else _unloaded(samples, model)
+    return _unloaded(samples, model) if model.has_load else samples
 
 
 def _unloaded(samples: Samples, model: RobotModel) -> Samples:
-    """These samples without the torque of the payload, whose parameters are known."""
+    """These samples without the torque of payload and elements that is known."""
     load = model.load_torque(*samples.motion[1:4])
     for joint in range(model.n_joints):
         load[:, joint] = samples.as_measured(joint, load[:, joint : joint + 1])[:, 0]

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.elements import Element, JointElements
 from identification.errors import ShapeError
 from identification.friction import FrictionLaw
 from identification.joint_friction import JointFriction
@@ -72,11 +73,12 @@ class RegressorPlan:
         rotors: joints whose rotor inertia has a column of its own.
         friction: of joints and coupled motors, None for none.
         couplings: pairs of joints whose coupling inertia has a column.
+        elements: springs and balancers, None for none.
 
     Attributes:
         columns: per joint j the parameter index of each column in its row, shape (c_j,).
             Parameters are numbered link by link (inertial, then rotor), then coupling inertias,
-            then friction.
+            then friction, then springs and balancers.
     """
 
     def __init__(
@@ -87,6 +89,7 @@ class RegressorPlan:
         rotors: Sequence[bool],
         friction: JointFriction | None,
         couplings: Sequence[tuple[int, int]] = (),
+        elements: JointElements | None = None,
     ) -> None:
         self.chain = chain
         self.gravity = gravity
@@ -94,8 +97,9 @@ class RegressorPlan:
         self.rotors = tuple(rotors)
         self.friction = friction
         self.couplings = tuple(couplings)
+        self.elements = tuple(elements.identified()) if elements is not None else ()
         # Order in the working array: columns of the links, then of the joint's drive: friction,
-        # motor friction, rotor, coupling inertias, response.
+        # motor friction, rotor, coupling inertias, elements, response.
         self.first_own = sum(len(kept) for kept in links)
         self.own = tuple(_OwnRows.of(self, joint) for joint in range(chain.n_joints))
         self.rows: tuple[Rows, ...]
@@ -180,6 +184,7 @@ class _OwnRows(NamedTuple):
     motors: dict[tuple[int, str], int]  # by coupled motor and symbol
     rotor: int | None
     couplings: dict[int, int]  # by the joint that it is coupled to
+    elements: slice  # those on it, one after the other
     response: int
 
     @classmethod
@@ -199,7 +204,10 @@ class _OwnRows(NamedTuple):
         row += plan.rotors[joint]
         others = [sum(pair) - joint for pair in plan.couplings if joint in pair]
         couplings = {other: row + k for k, other in enumerate(others)}
-        return cls(friction, motors, rotor, couplings, row + len(others))
+        row += len(others)
+        acting_here = [len(one.symbols) for one, owner, _ in plan.elements if owner == joint]
+        elements = slice(row, row + sum(acting_here))
+        return cls(friction, motors, rotor, couplings, elements, elements.stop)
 
 
 class _Workspace:
@@ -223,6 +231,7 @@ class _Workspace:
         self._primitives = np.empty((n, N_PRIMITIVES, size))
         self._friction = self._friction_parts()
         self._drives = self._drive_parts()
+        self._elements = self._element_parts(plan)
         self._contractions: list[_Contraction] = []
         first = 0
         for link, kept in enumerate(plan.links):
@@ -288,6 +297,16 @@ class _Workspace:
                 parts.append((acceleration[other], self.rows[joint, row]))
         return parts
 
+    def _element_parts(self, plan: RegressorPlan) -> list[tuple[Element, int, Array]]:
+        """Return springs and balancers, the joint of each, and the rows that they write."""
+        free = [own.elements.start for own in self._own]
+        parts = []
+        for element, joint, place in plan.elements:
+            first = free[joint]
+            free[joint] += place.stop - place.start
+            parts.append((element, joint, self.rows[joint, first : free[joint]]))
+        return parts
+
     def _write_motor_friction(self, friction: JointFriction) -> None:
         """Friction f(c qd) of a motor acts on the joints as c' f(c qd)."""
         directions = self._direction[friction.n_joints :]
@@ -332,6 +351,8 @@ class _Workspace:
             law.columns(velocity, turned, target)
         for source, target in self._drives:
             np.copyto(target, source)
+        for element, joint, target in self._elements:
+            target[:, : len(q)] = element.columns(q[:, joint]).T
         if self._joint_friction is not None and self._joint_friction.motors:
             self._write_motor_friction(self._joint_friction)
 
@@ -385,6 +406,7 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
     first_friction = offsets[-1] + len(plan.couplings)
     terms = plan.friction.terms if plan.friction is not None else ()
     places = {(t.motor, t.owner, t.symbol): first_friction + k for k, t in enumerate(terms)}
+    first_element = first_friction + len(terms)
     for joint, own in enumerate(plan.own):
         if plan.friction is not None:
             symbols = plan.friction.laws[joint].symbols
@@ -395,6 +417,9 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
         for other in own.couplings:
             pair = (min(joint, other), max(joint, other))
             columns[joint].append(offsets[-1] + plan.couplings.index(pair))
+        for _, owner, span in plan.elements:
+            if owner == joint:
+                columns[joint] += range(first_element + span.start, first_element + span.stop)
         rows[joint] += range(plan.first_own, own.response)
     return (
         tuple(_as_slice(r) for r in rows),

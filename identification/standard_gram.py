@@ -31,7 +31,8 @@ class StandardGram:
     """Sums over samples of products of [W0 | Wx | Wy | Wz | y], joint by joint.
 
     Attributes:
-        gram: (n, 4 s + 1, 4 s + 1) for s columns: standard parameters, then friction.
+        gram: (n, 4 s + 1, 4 s + 1) for s columns: standard parameters, friction, then
+            springs and balancers.
         rows: that were summed (n,).
     """
 
@@ -60,8 +61,8 @@ class StandardGram:
     def of(cls, model: RobotModel, recordings: Sequence[Samples]) -> StandardGram:
         """Sum over about a thousand usable rows of each recording."""
         plans = [_plan(model, gravity) for gravity in (np.zeros(3), *np.eye(3))]
-        columns = np.arange(model.layout.size + len(model.friction.names))
-        s, n = len(columns), model.n_joints
+        s = model.layout.size + len(model.friction.names) + len(model.elements.names)
+        n = model.n_joints
         gram, rows = np.zeros((n, 4 * s + 1, 4 * s + 1)), np.zeros(n)
         for samples in recordings:
             kept = slice(None, None, max(1, len(samples.torque) // _MOST_ROWS))
@@ -113,6 +114,7 @@ def _plan(model: RobotModel, gravity: Array) -> RegressorPlan:
         [model.rotor_inertia] * n,
         model.friction,
         model.layout.pairs,
+        model.elements,
     )
 
 

@@ -76,7 +76,7 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
         urdf: the text of the file that the model was made from.
         model: the robot.
         standard: all standard parameters (s,), as in `model.standard_names`.
-        friction: coefficients (k,) as in the last `model.parameter_names`; none leaves
+        friction: coefficients (k,), see `RobotModel.friction_part`; none leaves
             ``<dynamics>`` as it is, NaN leaves that figure.
 
     Raises:
@@ -116,6 +116,7 @@ def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
         "the friction offset": "fo" in symbols,
         "friction of coupled motors": bool(model.friction.motors),
         "the payload": model.payload is not None,
+        "springs and balancers": bool(model.elements.elements),
     }
     return tuple(words for words, there in absent.items() if there)
 

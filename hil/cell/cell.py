@@ -351,7 +351,8 @@ class Cell:
     ) -> Array:
         """Parameter vector (p,) of the URDF's inertias with these joint-side figures (n,).
 
-        Everything else, such as coupling inertias, an offset or a Stribeck term, is zero.
+        Springs and balancers have the figures of the file. Everything else, such as coupling
+        inertias, an offset or a Stribeck term, is zero.
         """
         model = self.model
         standard = model.nominal
@@ -362,7 +363,7 @@ class Cell:
             known[term.symbol][term.owner] if term.symbol in known and not term.motor else 0.0
             for term in model.friction.terms
         ]
-        return np.concatenate([model.base.grouping @ standard, friction])
+        return np.concatenate([model.base.grouping @ standard, friction, model.elements.nominal])
 
     def urdf_angles(self, controller_angles: Array) -> Array:
         """URDF angles (n,) from the teach pendant's, rad."""

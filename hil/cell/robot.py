@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.coupling import Coupling
+from identification.elements import (
+    Anchors,
+    Element,
+    ElementError,
+    ExtensionSpring,
+    GasCylinder,
+    JointElements,
+    TorsionSpring,
+)
 from identification.errors import ModelError
 from identification.friction import FrictionLaw
 from identification.kinematics import Chain, chain_from_urdf, pinocchio_model
@@ -17,7 +27,16 @@ from identification.model import RobotModel
 from identification.payload import Payload
 
 from .errors import CellError
-from .schema import CouplingTable, FrictionTable, PayloadTable, RobotTable
+from .schema import (
+    AnchoredTable,
+    CouplingTable,
+    ElementTable,
+    ExtensionSpringTable,
+    FrictionTable,
+    PayloadTable,
+    RobotTable,
+    TorsionSpringTable,
+)
 
 Array = NDArray[np.float64]
 
@@ -45,12 +64,16 @@ def robot_model(
     _known(path, "robot.friction.joints", robot.friction.joints, chain.joint_names)
     coupling = _coupling(path, robot.coupling, chain, drive_train)
     payload = _payload(path, robot.payload, chain)
+    elements = [_element(path, place, table, chain) for place, table in enumerate(robot.elements)]
     laws = {
         name: _law(path, f"robot.friction.joints.{name}", _override(robot.friction, name))
         for name in robot.friction.joints
     }
     common = _law(path, "robot.friction", robot.friction)
-    with _blamed(path, "cell.urdf", urdf_name, "correct the URDF or [robot]"):
+    with (
+        _blamed(path, "cell.urdf", urdf_name, "correct the URDF or [robot]"),
+        _blamed(path, "robot.elements", None, "correct that table", ElementError),
+    ):
         return RobotModel.from_urdf(
             urdf,
             gravity=tuple(robot.gravity),
@@ -60,6 +83,7 @@ def robot_model(
             locked=robot.locked,
             coupling=coupling,
             payload=payload,
+            elements=elements,
         )
 
 
@@ -124,6 +148,46 @@ def _payload(path: Path, table: PayloadTable | None, chain: Chain) -> Payload | 
         return payload
 
 
+def _element(path: Path, place: int, table: ElementTable, chain: Chain) -> Element:
+    field = f"robot.elements[{place}]"
+    _known(path, f"{field}.joint", {table.joint: table}, chain.joint_names)
+    with _blamed(path, field, table.kind, "correct that table"):
+        element = _built(table)
+        JointElements.of([element], chain.joint_names, tuple(map(bool, chain.revolute)))
+        return element
+
+
+def _built(table: ElementTable) -> Element:
+    """Raises ModelError."""
+    if isinstance(table, TorsionSpringTable):
+        rest = math.radians(table.rest_deg)
+        return TorsionSpring(table.joint, rest, table.stiffness, table.identified)
+    anchors = _anchors(table)
+    if isinstance(table, ExtensionSpringTable):
+        return ExtensionSpring(
+            table.joint,
+            anchors,
+            table.free_length,
+            stiffness=table.stiffness,
+            preload=table.preload,
+            identified=table.identified,
+        )
+    return GasCylinder(
+        table.joint,
+        anchors,
+        table.length,
+        table.area,
+        table.pressure,
+        table.volume,
+        pulls=table.kind == "hydraulic_balancer",
+        identified=table.identified,
+    )
+
+
+def _anchors(table: AnchoredTable) -> Anchors:
+    return Anchors(table.base_distance, table.link_distance, math.radians(table.angle_deg))
+
+
 def _known(path: Path, field: str, named: Mapping[str, object], joints: tuple[str, ...]) -> None:
     for name in named:
         if name not in joints:
@@ -137,8 +201,10 @@ def _known(path: Path, field: str, named: Mapping[str, object], joints: tuple[st
 
 
 @contextmanager
-def _blamed(path: Path, field: str, value: object, remedy: str) -> Iterator[None]:
+def _blamed(
+    path: Path, field: str, value: object, remedy: str, kind: type[ModelError] = ModelError
+) -> Iterator[None]:
     try:
         yield
-    except ModelError as error:
+    except kind as error:
         raise CellError(path, field, value, str(error), remedy) from error

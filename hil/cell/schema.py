@@ -7,7 +7,7 @@ the field's name. `[simulation]` is in `simulation_schema`.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field, model_validator
 
@@ -25,6 +25,8 @@ from .fields import (
 
 ArmAxis = tuple[Annotated[Whole, Field(ge=1, le=4)], Annotated[Whole, Field(ge=1, le=10)]]
 Factor = Annotated[Number, Field(gt=1, le=5)]
+
+ELEMENT_KINDS: Final = '"torsion_spring", "extension_spring", "gas_spring" or "hydraulic_balancer"'
 
 
 class CellTable(Table):
@@ -134,6 +136,83 @@ class CouplingTable(Table):
     )
 
 
+class JointElementTable(Table):
+    """What all entries of `[[robot.elements]]` have."""
+
+    joint: str = Field(description="name of the joint it acts on, one that turns")
+    identified: Choice = Field(
+        default=False, description="true (a parameter is estimated) or false (its figures hold)"
+    )
+
+
+class TorsionSpringTable(JointElementTable):
+    """An entry of `[[robot.elements]]`: a spring about the axis of a joint."""
+
+    kind: Literal["torsion_spring"] = Field(description=ELEMENT_KINDS)
+    rest_deg: Number = Field(description="URDF angle of the joint without torque, in degrees")
+    stiffness: NonNegative | None = Field(
+        default=None, description="its stiffness in N·m/rad; nothing if it is identified"
+    )
+
+
+class AnchoredTable(JointElementTable):
+    """An element between two anchors in the plane of a joint."""
+
+    base_distance: Positive = Field(
+        description="distance in m of the anchor on the base side from the joint's axis"
+    )
+    link_distance: Positive = Field(
+        description="distance in m of the anchor on the link side from the joint's axis"
+    )
+    angle_deg: Number = Field(
+        description="angle in degrees from the anchor on the base side to the other, about the "
+        "joint's axis, at URDF angle 0"
+    )
+
+
+class ExtensionSpringTable(AnchoredTable):
+    """An entry of `[[robot.elements]]`: a spring between two anchors."""
+
+    kind: Literal["extension_spring"] = Field(description=ELEMENT_KINDS)
+    free_length: NonNegative = Field(description="its length in m without load")
+    stiffness: NonNegative | None = Field(
+        default=None, description="its stiffness in N/m; nothing if it is identified"
+    )
+    preload: Number | None = Field(
+        default=None,
+        description="its tension in N at the free length; nothing for 0, or to identify that too",
+    )
+
+
+class GasTable(AnchoredTable):
+    """A cylinder in which gas is compressed."""
+
+    length: Positive = Field(
+        description="distance in m between the anchors at which pressure and volume are given"
+    )
+    area: Positive = Field(description="area in m² on which the gas acts")
+    pressure: Positive = Field(description="pressure in Pa over that outside, at `length`")
+    volume: Positive = Field(description="volume in m³ of the gas at `length`")
+
+
+class GasSpringTable(GasTable):
+    """An entry of `[[robot.elements]]`: a gas spring, which pushes its anchors apart."""
+
+    kind: Literal["gas_spring"] = Field(description=ELEMENT_KINDS)
+
+
+class HydraulicBalancerTable(GasTable):
+    """An entry of `[[robot.elements]]`: a balancer with gas, which pulls its anchors together."""
+
+    kind: Literal["hydraulic_balancer"] = Field(description=ELEMENT_KINDS)
+
+
+ElementTable = Annotated[
+    TorsionSpringTable | ExtensionSpringTable | GasSpringTable | HydraulicBalancerTable,
+    Field(discriminator="kind"),
+]
+
+
 class RobotTable(Table):
     """`[robot]`: how the rigid body model is built from the URDF."""
 
@@ -155,6 +234,10 @@ class RobotTable(Table):
     )
     coupling: CouplingTable | None = Field(
         default=None, description="a table of motors that turn with several joints"
+    )
+    elements: list[ElementTable] = Field(
+        default_factory=list,
+        description=f"tables [[robot.elements]], each with a kind: {ELEMENT_KINDS}",
     )
 
 

@@ -122,12 +122,12 @@ def _friction(
 ) -> dict[str, str | None]:
     """The friction law in words and as source: that of the URDF beside it, if there is one."""
     if consistent is None:
-        values, whose = estimate.values[model.base.rank :], "least squares"
+        values, whose = estimate.values[model.friction_part], "least squares"
     else:
         values, whose = consistent.friction, f"the physically consistent parameters of {URDF}"
     remarks = [f"friction of {whose}", *(f"{key}: {value}" for key, value in origin.items())]
     unknown = [
-        name for name in model.parameter_names[model.base.rank :] if name in estimate.undetermined
+        name for name in model.parameter_names[model.friction_part] if name in estimate.undetermined
     ]
     if unknown:
         remarks.insert(
@@ -146,7 +146,7 @@ def _urdf(
 ) -> str:
     """The user's URDF with the consistent parameters, and a comment that says so."""
     model = cell.model
-    names = model.parameter_names[model.base.rank :]
+    names = model.parameter_names[model.friction_part]
     # A joint that never moved keeps the friction that its URDF gives it.
     unknown = np.array([name in estimate.undetermined for name in names], dtype=np.bool_)
     friction = np.where(unknown, np.nan, consistent.friction)

@@ -75,9 +75,11 @@ def nominal_of(cell: Cell) -> Nominal | None:
     standard = model.nominal
     if not np.any(standard):
         return None
-    friction = np.zeros(model.n_parameters - model.base.rank)
+    values = np.zeros(model.n_parameters)
+    values[: model.base.rank] = model.base.grouping @ standard
+    values[model.element_part] = model.elements.nominal
     return Nominal(
-        np.concatenate([model.base.grouping @ standard, friction]),
+        values,
         "the URDF's inertias, without friction and rotors",
         False,
         NOMINAL_SHARE,

@@ -23,7 +23,7 @@ from hil.batch.tree import sum_tree
 from hil.batch.tree_sum import TreeSum
 from hil.batch.types import ArchiveRef, Broken, Settings
 from hil.cell import Cell
-from hil.cell.schema import PayloadTable, RobotTable
+from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
 from sim_fixtures.ns16 import CELL_PATH
 
 KEY = "0123456789abcdef"
@@ -113,6 +113,9 @@ def test_an_arm_is_its_links_friction_and_drives_and_not_its_payload_or_campaign
     assert arm_digest(loaded, b"drives") == own
     tilted = with_robot(cell, cell.file.robot.model_copy(update={"gravity": [0.0, 1.0, -9.8]}))
     assert arm_digest(tilted, b"drives") != own
+    spring = TorsionSpringTable(kind="torsion_spring", joint="joint_2", rest_deg=0.0, stiffness=9.0)
+    sprung = with_robot(cell, cell.file.robot.model_copy(update={"elements": [spring]}))
+    assert arm_digest(sprung, b"drives") != own
     assert arm_digest(replace(cell, urdf=cell.urdf + "\n"), b"drives") != own
     assert arm_digest(cell, b"other drives") != own
 

@@ -331,6 +331,50 @@ def test_a_payload_is_known_torque(folder: Path) -> None:
     assert np.abs(model.load_torque(still, still, still)).max() > 100.0
 
 
+SPRING = """[[robot.elements]]
+kind = "torsion_spring"
+joint = "joint_2"
+rest_deg = 5.0
+identified = true
+"""
+BALANCER = """[[robot.elements]]
+kind = "hydraulic_balancer"
+joint = "joint_2"
+base_distance = 0.8
+link_distance = 0.2
+angle_deg = 5.0
+length = 0.6
+area = 1.67e-3
+pressure = 16.3e6
+volume = 1e-3
+"""
+
+
+class TestElements:
+    def test_identified_ones_are_parameters(self, folder: Path) -> None:
+        path = folder / "cell.toml"
+        text = path.read_text("utf-8")
+        stiff = SPRING + "stiffness = 30.0\n"
+        path.write_text(f"{text}\n{stiff}\n{BALANCER}identified = true\n", "utf-8")
+        cell = Cell.load(path)
+        assert cell.model.parameter_names[-2:] == ("spring_2", "balancer_2")
+        np.testing.assert_array_equal(cell.nominal_values()[-2:], [30.0, 1.0])
+
+    def test_known_ones_are_known_torque(self, folder: Path) -> None:
+        """At a right angle between the anchors the lever is D k / l, the force p A."""
+        path = folder / "cell.toml"
+        bare = Cell.load(path)
+        path.write_text(f"{bare.text}\n{BALANCER}", "utf-8")
+        cell = Cell.load(path)
+        assert cell.model.parameter_names == bare.model.parameter_names
+        q = np.zeros((1, 6))
+        q[0, 1] = np.radians(85.0)
+        length = np.hypot(0.8, 0.2)
+        force = 1.67e-3 * 16.3e6 * 1e-3 / (1e-3 - (length - 0.6) * 1.67e-3)
+        torque = cell.model.load_torque(q, np.zeros_like(q), np.zeros_like(q))
+        np.testing.assert_allclose(torque[0, 1], 0.16 / length * force)
+
+
 ROBOT_FAULTS = {
     '[robot.friction.joints.joint_9]\nthird = "none"': ("robot.friction.joints", "joint_9"),
     '[robot.friction.joints.joint_5]\nthirds = "none"': ("robot.friction.joints.joint_5", "third"),
@@ -343,6 +387,14 @@ ROBOT_FAULTS = {
         "robot.payload", "link_6",
     ),
     "[robot.payload]\nmass = -1.0\ncentre = [0.0, 0.0, 0.0]": ("robot.payload.mass", "-1"),
+    SPRING.replace("torsion_", "leaf_"): ("robot.elements[0].kind = 'leaf_spring'", "torsion"),
+    SPRING.replace("kind", "sort"): ("robot.elements[0].kind: is missing", "torsion_spring"),
+    SPRING.replace("joint_2", "joint_9"): ("robot.elements[0].joint", "joint_6"),
+    SPRING.replace("rest_deg = 5.0", ""): ("robot.elements[0].rest_deg", "in degrees"),
+    SPRING + "free_length = 1.0": ("robot.elements[0].free_length", "known are", "rest_deg"),
+    SPRING.replace("true", "false"): ("robot.elements[0]", "neither a stiffness nor identified"),
+    SPRING + SPRING: ("robot.elements", "spring_2b", "same form", "give its figures"),
+    BALANCER.replace("volume = 1e-3", "volume = 1e-4"): ("robot.elements[0]", "the gas has", "m³"),
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from pydantic import BaseModel
@@ -23,10 +23,19 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "cell-file.md"
 def tables(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
     """Every table that a cell file may have, by its dotted name."""
     for name, info in model.model_fields.items():
-        for part in (info.annotation, *getattr(info.annotation, "__args__", ())):
-            if isinstance(part, type) and issubclass(part, BaseModel):
-                yield prefix + name, part
-                yield from tables(part, f"{prefix}{name}.")
+        for part in parts(info.annotation):
+            kind = part.model_fields.get("kind")
+            full = prefix + name + ("" if kind is None else f".{get_args(kind.annotation)[0]}")
+            yield full, part
+            yield from tables(part, f"{full}.")
+
+
+def parts(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models within an annotation, such as those of a list of several kinds."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from parts(part)
 
 
 def default_text(info: FieldInfo) -> str:
@@ -51,6 +60,8 @@ def documented() -> dict[str, dict[str, str]]:
     for line in DOCUMENT.read_text("utf-8").splitlines():
         if line.startswith("#"):
             here = re.findall(r"`\[+([a-z_.]+)\]+`", line)
+            if kinds := re.findall(r"`kind = \"([a-z_]+)\"`", line):
+                here = [f"{name}.{kind}" for name in here for kind in kinds]
             found |= {name: {} for name in here}
         row = re.fullmatch(r"\| `(\w+)` \| (.+?) \| (.+) \|", line)
         for name in here if row else ():

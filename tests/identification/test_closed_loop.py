@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from identification import FrictionLaw, Motion, RobotModel
 from identification.closed_loop import JointServo, simulated_motion
 from identification.coupling import Coupling
+from identification.elements import TorsionSpring
 from identification.payload import Payload
 
 Array = NDArray[np.float64]
 
 URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+SPRINGS = (TorsionSpring("elbow", 0.2, 40.0), TorsionSpring("elbow", -0.3, 25.0, identified=True))
 SERVO = JointServo(np.array([4000.0, 1500.0]), np.array([300.0, 60.0]))
 
 
@@ -39,8 +41,9 @@ def command() -> Motion:
         {"payload": Payload(3.0, (0.05, 0.0, 0.3))},
         {"friction": FrictionLaw(asymmetric=True, stribeck=0.5, standstill=0.05)},
         {"joint_friction": {"elbow": FrictionLaw(third="cubic", viscous=False, standstill=0.05)}},
+        {"elements": SPRINGS},
     ],
-    ids=["coupled motors", "payload", "six terms", "own laws"],
+    ids=["coupled motors", "payload", "six terms", "own laws", "springs"],
 )
 def test_the_servos_torque_is_what_the_model_needs(extra: dict[str, object]) -> None:
     settings = {"friction": FrictionLaw(third=None, standstill=0.05)} | extra
@@ -50,7 +53,7 @@ def test_the_servos_torque_is_what_the_model_needs(extra: dict[str, object]) -> 
     standard[model.layout.couplings] = 0.6
     sizes = {"f0": 4.0, "f1": 1.5, "fd": 0.3, "f2": 0.5, "fs": 1.0, "fo": 0.5}
     friction = np.array([sizes[term.symbol] for term in model.friction.terms])
-    truth = np.concatenate([model.base.grouping @ standard, friction])
+    truth = np.concatenate([model.base.grouping @ standard, friction, model.elements.nominal])
 
     moved = simulated_motion(model, truth, SERVO, (plan := command())).motion
     applied = SERVO.position * (plan.position - moved.position)

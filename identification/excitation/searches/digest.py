@@ -46,7 +46,8 @@ def _feed(summary: hashlib._Hash, value: object) -> None:
     if isinstance(value, RobotModel):
         # The rest of a model is computed from these, maybe with another last bit elsewhere.
         own = (value.chain, value.gravity, value.rotor_inertia, value.friction, value.payload)
-        _feed(summary, ("RobotModel", *own, value.parameter_names))
+        beside = (value.elements,) if value.elements.elements else ()
+        _feed(summary, ("RobotModel", *own, *beside, value.parameter_names))
     elif isinstance(value, np.ndarray | np.generic):
         array = np.asarray(value)
         if array.dtype.hasobject:

@@ -1,0 +1,395 @@
+r"""Springs and balancers that put a torque on a joint beside the rigid body.
+
+The torque of an element depends on the position q of its joint alone. As with a payload it is
+counted as what the *drive* has to hold against: for a spring under the tension F between an anchor
+on the base side and one on the link side, at the distance l, that is :math:`F\,dl/dq`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import ModelError
+
+Array = NDArray[np.float64]
+
+_SAME_DISTANCE: Final = 1e-6
+"""Share of the distances by which they have to differ: equal ones let the length become zero."""
+
+
+class ElementError(ModelError):
+    """An element whose parameters the others stand for already."""
+
+
+class Element(Protocol):
+    """A torque on one joint: c parameters that are identified, and a part that is known."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def joint(self) -> str:
+        """Name of the joint."""
+        ...
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """Names of the c identified parameters, without the number of the joint."""
+        ...
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Their units (c,)."""
+        ...
+
+    @property
+    def nominal(self) -> tuple[float, ...]:
+        """Their values (c,) as far as they are given, else zero."""
+        ...
+
+    def columns(self, q: Array) -> Array:
+        """Return the torque per unit of each identified parameter, at positions (m,): (m, c)."""
+        ...
+
+    def known(self, q: Array) -> Array:
+        """Return the part of the torque [N·m] that is known (m,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Two anchors in the plane of a joint, one on the base side and one on the link side.
+
+    Attributes:
+        base: distance of the anchor on the base side from the axis [m].
+        link: that of the anchor on the link side [m].
+        angle: between the two, seen from the axis, at joint angle zero [rad].
+
+    Raises:
+        ModelError: a distance is not positive, or both are the same.
+    """
+
+    base: float
+    link: float
+    angle: float
+
+    def __post_init__(self) -> None:
+        _require_positive("distance of an anchor from the axis", "m", self.base, self.link)
+        _require_finite("angle between the anchors", self.angle)
+        if abs(self.base - self.link) <= _SAME_DISTANCE * self.base:
+            raise ModelError(
+                f"both anchors are {self.base:g} m from the axis: they would meet at one angle;"
+                " give the measured distances"
+            )
+
+    @property
+    def shortest(self) -> float:
+        """Smallest distance between the anchors over a whole turn [m]."""
+        return abs(self.base - self.link)
+
+    @property
+    def longest(self) -> float:
+        """Largest distance between the anchors over a whole turn [m]."""
+        return self.base + self.link
+
+    def length(self, q: Array) -> Array:
+        """Return the distance l between the anchors [m] at positions (m,) [rad]."""
+        product = 2.0 * self.base * self.link
+        return np.sqrt(self.base**2 + self.link**2 - product * np.cos(q + self.angle))
+
+    def lever(self, q: Array) -> Array:
+        """Return dl/dq [m/rad] at positions (m,): the lever of a tension."""
+        moment = self.base * self.link * np.sin(q + self.angle)
+        return np.asarray(moment / self.length(q))
+
+
+@dataclass(frozen=True)
+class TorsionSpring:
+    """A spring about the axis; the drive holds ``stiffness (q - rest)``.
+
+    Attributes:
+        joint: name.
+        rest: position without torque [rad].
+        stiffness: [N·m/rad]; of an identified spring the nominal one, if it is known.
+        identified: whether the stiffness is a parameter.
+
+    Raises:
+        ModelError: a known spring has no stiffness, or a number is not finite.
+    """
+
+    joint: str
+    rest: float
+    stiffness: float | None = None
+    identified: bool = False
+
+    def __post_init__(self) -> None:
+        _require_finite("rest angle", self.rest)
+        _require_stiffness(self.stiffness, identified=self.identified)
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """``spring``, where it is identified."""
+        return ("spring",) if self.identified else ()
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of the stiffness, where it is identified."""
+        return ("N·m/rad",) if self.identified else ()
+
+    @property
+    def nominal(self) -> tuple[float, ...]:
+        """The stiffness, where it is identified."""
+        return (self.stiffness or 0.0,) if self.identified else ()
+
+    def columns(self, q: Array) -> Array:
+        """Return the deflection (m, 1) [rad], (m, 0) of a known spring."""
+        return (q - self.rest)[:, None] if self.identified else np.zeros((len(q), 0))
+
+    def known(self, q: Array) -> Array:
+        """Return the torque (m,) of a known spring [N·m]."""
+        if self.identified or self.stiffness is None:
+            return np.zeros(len(q))
+        return self.stiffness * (q - self.rest)
+
+
+@dataclass(frozen=True)
+class ExtensionSpring:
+    """A spring between two anchors, of tension ``stiffness (l - free_length) + preload``.
+
+    Attributes:
+        joint: name.
+        anchors: where it is fixed.
+        free_length: [m].
+        stiffness: [N/m]; of an identified spring the nominal one, if it is known.
+        preload: tension at the free length [N]; an identified spring without it gets a parameter
+            for it, a known spring none.
+        identified: whether the stiffness is a parameter.
+
+    Raises:
+        ModelError: a known spring has no stiffness, or a number is not finite.
+    """
+
+    joint: str
+    anchors: Anchors
+    free_length: float
+    stiffness: float | None = None
+    preload: float | None = None
+    identified: bool = False
+
+    def __post_init__(self) -> None:
+        _require_finite("free length or preload", self.free_length, self.preload or 0.0)
+        _require_stiffness(self.stiffness, identified=self.identified)
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """``spring``, and ``preload`` unless that is given."""
+        if not self.identified:
+            return ()
+        return ("spring", "preload") if self.preload is None else ("spring",)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of stiffness and preload."""
+        return ("N/m", "N")[: len(self.symbols)]
+
+    @property
+    def nominal(self) -> tuple[float, ...]:
+        """Stiffness and preload."""
+        return (self.stiffness or 0.0, 0.0)[: len(self.symbols)]
+
+    def columns(self, q: Array) -> Array:
+        """Return lever times extension [m²/rad], and the lever [m/rad] (m, c)."""
+        lever, extension = self.anchors.lever(q), self.anchors.length(q) - self.free_length
+        return np.column_stack([lever * extension, lever])[:, : len(self.symbols)]
+
+    def known(self, q: Array) -> Array:
+        """Return the torque (m,) of what is given: the preload, and a known stiffness [N·m]."""
+        stiffness = 0.0 if self.identified or self.stiffness is None else self.stiffness
+        tension = stiffness * (self.anchors.length(q) - self.free_length) + (self.preload or 0.0)
+        return np.asarray(self.anchors.lever(q) * tension)
+
+
+@dataclass(frozen=True)
+class GasCylinder:
+    """A piston against gas between two anchors, of constant temperature.
+
+    With the stroke s, by which the anchors compress the gas from the length at which pressure and
+    volume are given, the pressure is ``pressure volume / (volume - s area)``.
+
+    Attributes:
+        joint: name.
+        anchors: where it is fixed.
+        length: distance between the anchors at which pressure and volume are given [m].
+        area: of the piston, or of a gas spring's rod [m²].
+        pressure: over that outside [Pa].
+        volume: of the gas [m³].
+        pulls: whether it pulls the anchors together, its gas being compressed as they part
+            (hydraulic balancer), or pushes them apart (gas spring).
+        identified: whether a factor of its torque is a parameter.
+
+    Raises:
+        ModelError: a figure is not positive, or the gas has no volume left at some angle.
+    """
+
+    joint: str
+    anchors: Anchors
+    length: float
+    area: float
+    pressure: float
+    volume: float
+    pulls: bool = True
+    identified: bool = False
+
+    def __post_init__(self) -> None:
+        _require_positive("length", "m", self.length)
+        _require_positive("area", "m²", self.area)
+        _require_positive("pressure", "Pa", self.pressure)
+        _require_positive("volume", "m³", self.volume)
+        end = self.anchors.longest if self.pulls else self.anchors.shortest
+        left = float(self._volume_left(np.array(end)))
+        if not left > 0.0:
+            raise ModelError(
+                f"the gas has {left:.3g} m³ left where the anchors are {end:.3g} m apart; correct"
+                " volume, area, length or the distances of the anchors"
+            )
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """``balancer`` or ``gas_spring``, where it is identified."""
+        return (("balancer" if self.pulls else "gas_spring"),) if self.identified else ()
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """One, where it is identified: a factor has no unit."""
+        return ("1",) if self.identified else ()
+
+    @property
+    def nominal(self) -> tuple[float, ...]:
+        """The factor one, where it is identified."""
+        return (1.0,) if self.identified else ()
+
+    def columns(self, q: Array) -> Array:
+        """Return the torque of the stated law (m, 1) [N·m], (m, 0) where it is known."""
+        return self.torque(q)[:, None] if self.identified else np.zeros((len(q), 0))
+
+    def known(self, q: Array) -> Array:
+        """Return the torque (m,) [N·m] where it is known."""
+        return np.zeros(len(q)) if self.identified else self.torque(q)
+
+    def torque(self, q: Array) -> Array:
+        """Return the torque of the stated law (m,) [N·m]."""
+        left = self._volume_left(self.anchors.length(q))
+        force = self.area * self.pressure * self.volume / left
+        return np.asarray((1.0 if self.pulls else -1.0) * self.anchors.lever(q) * force)
+
+    def _volume_left(self, length: Array) -> Array:
+        """Volume of the gas [m³] at a distance between the anchors."""
+        stroke = length - self.length if self.pulls else self.length - length
+        return np.asarray(self.volume - stroke * self.area)
+
+
+@dataclass(frozen=True)
+class JointElements:
+    """All elements of an arm: e identified parameters, element by element.
+
+    Attributes:
+        elements: in the order of the parameters.
+        joints: which joint each acts on, from 0.
+    """
+
+    elements: tuple[Element, ...] = ()
+    joints: tuple[int, ...] = ()
+
+    @classmethod
+    def of(
+        cls, elements: Sequence[Element], joint_names: Sequence[str], revolute: Sequence[bool]
+    ) -> JointElements:
+        """Find the joints of elements.
+
+        Raises:
+            ModelError: there is no such joint, or it slides.
+        """
+        for element in elements:
+            if element.joint not in joint_names:
+                raise ModelError(
+                    f"there is no joint {element.joint!r} for an element to act on; there are"
+                    f" {', '.join(joint_names)}"
+                )
+            if not revolute[joint_names.index(element.joint)]:
+                raise ModelError(
+                    f"joint {element.joint!r} slides; springs and balancers are for joints that"
+                    " turn",
+                    joint=element.joint,
+                )
+        return cls(tuple(elements), tuple(joint_names.index(one.joint) for one in elements))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the e parameters: ``spring_2``, then ``spring_2b`` of another on that joint."""
+        found: Counter[str] = Counter()
+        names = []
+        for element, joint in zip(self.elements, self.joints, strict=True):
+            for symbol in element.symbols:
+                name = f"{symbol}_{joint + 1}"
+                names.append(name + ("" if not found[name] else chr(ord("a") + found[name])))
+                found[name] += 1
+        return tuple(names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the e parameters."""
+        return tuple(unit for element in self.elements for unit in element.units)
+
+    @property
+    def nominal(self) -> Array:
+        """Values of the e parameters as far as they are given, else zero."""
+        return np.array([value for one in self.elements for value in one.nominal], dtype=np.float64)
+
+    def identified(self) -> Iterator[tuple[Element, int, slice]]:
+        """Yield elements with parameters, the joint of each, and where its parameters stand."""
+        first = 0
+        for element, joint in zip(self.elements, self.joints, strict=True):
+            count = len(element.symbols)
+            if count:
+                yield element, joint, slice(first, first + count)
+            first += count
+
+    def torque(self, values: Array, q: Array) -> Array:
+        """Return the torque (m, n) [N·m] for e parameter values, without what is known."""
+        torque = np.zeros(q.shape)
+        for element, joint, place in self.identified():
+            torque[:, joint] += element.columns(q[:, joint]) @ values[place]
+        return torque
+
+    def known(self, q: Array) -> Array:
+        """Return the known part of the torque (m, n) [N·m] at positions (m, n)."""
+        torque = np.zeros(q.shape)
+        for element, joint in zip(self.elements, self.joints, strict=True):
+            torque[:, joint] += element.known(q[:, joint])
+        return torque
+
+
+def _require_positive(what: str, unit: str, *values: float) -> None:
+    for value in values:
+        if not (math.isfinite(value) and value > 0.0):
+            raise ModelError(f"the {what} is {value!r} {unit}; it must be finite and positive")
+
+
+def _require_finite(what: str, *values: float) -> None:
+    if not all(math.isfinite(value) for value in values):
+        raise ModelError(f"the {what} is not finite; give a number")
+
+
+def _require_stiffness(stiffness: float | None, *, identified: bool) -> None:
+    if stiffness is None and not identified:
+        raise ModelError(
+            "the spring has neither a stiffness nor identified = true; give one of the two"
+        )
+    _require_finite("stiffness", stiffness or 0.0)
