@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +14,7 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
 from identification.consistent import consistent_estimate
+from identification.delay_compensation import delay_sensitivity, with_delay_uncertainty
 from identification.endogeneity import EndogeneityTest
 from identification.estimation import Estimate, joint_weights, nothing_usable
 from identification.least_squares import Weighting, fit_least_squares
@@ -96,6 +97,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         prior = cad_prior(prepared.sources.cell)
         case = _Case(model, fitted, prior, instrumental, prepared.shrinkage)
         result, doubts = _ESTIMATORS[options.estimator](case)
+        result = _with_delay_uncertainty(case, result, prepared.delay_variance)
         task.advance(1, "prior")
         posterior = _posterior(case, result.phase)
         task.advance(1, "held-out motion")
@@ -111,6 +113,18 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         ),
         doubts=(*doubts, *_conditioning(result.pooled), *_bias(options.estimator, instrumental)),
     )
+
+
+def _with_delay_uncertainty(
+    case: _Case, result: RepeatedEstimate, variance: float
+) -> RepeatedEstimate:
+    """The result with what an uncertain delay of the torque adds to its intervals."""
+    if variance == 0.0:
+        return result
+    pooled = result.pooled
+    weights = np.where(np.isfinite(pooled.noise_std), pooled.noise_std, np.inf) ** -2.0
+    moved = delay_sensitivity(case.model, case.fitted, weights, pooled.values)
+    return replace(result, pooled=with_delay_uncertainty(pooled, moved, variance))
 
 
 def _require_usable(prepared: Prepared, model: RobotModel) -> None:

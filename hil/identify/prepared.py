@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 # Repetitions of one motion that settings are chosen on: more say the same again.
 _REPETITIONS = 1
-# Where nobody asked for a delay, searching one may cost about a second: in so many samples.
+# Where the delay is stated it is looked for all the same, to be reported: in so many samples.
 _DELAY_SAMPLES = 8000
 
 
@@ -50,6 +50,7 @@ class Prepared:
             them, in words.
         rows: time samples of `fitted`.
         notes: what was found and done, in sentences.
+        delay_variance: of the delay that was applied [s²]; zero where it is known.
         shrinkage: of the automatic estimator.
         choices: what was chosen by inner prediction.
     """
@@ -64,6 +65,7 @@ class Prepared:
     masked: Mapping[str, NDArray[np.intp]]
     rows: int
     notes: tuple[str, ...]
+    delay_variance: float = 0.0
     shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
     choices: tuple[Choice, ...] = ()
 
@@ -101,8 +103,11 @@ def prepare_sources(
         delays = _delays(sources, preprocessing, options, reporter)
     delay_notes: list[str] = []
     assumed = np.full(sources.cell.model.n_joints, preprocessing.torque_delay)
-    if delays is not None and options.delay == "auto":
-        sources, preprocessing, assumed, delay_notes = _compensated(sources, preprocessing, delays)
+    unknown = options.delay is None and sources.cell.file.controller is None
+    if delays is not None and (unknown or options.delay == "auto"):
+        sources, preprocessing, assumed, delay_notes = _compensated(
+            sources, preprocessing, delays, by_axis=options.delay == "auto"
+        )
     sources, chosen, choices = _chosen(sources, preprocessing, options, reporter)
     preprocessing = chosen.preprocessing
     # A verdict on smoothed torque would flatter: what is judged is the torque as recorded.
@@ -139,6 +144,7 @@ def prepare_sources(
         masked=masked,
         rows=rows,
         notes=(*notes, *noise_note, *delay_notes, *_left_out(sources, masked, rows)),
+        delay_variance=delays.variance if delays is not None and delay_notes else 0.0,
         shrinkage=chosen.shrinkage,
         choices=choices,
     )
@@ -331,20 +337,24 @@ def _delays(
 
 
 def _compensated(
-    sources: Sources, plain: Preprocessing, found: DelayEstimate
+    sources: Sources, plain: Preprocessing, found: DelayEstimate, *, by_axis: bool
 ) -> tuple[Sources, Preprocessing, Array, list[str]]:
-    """Sources without the delays that were found, the delay of each axis (n,), and words."""
+    """Sources without the delays that were found, the delay of each axis (n,), and words.
+
+    One delay of all axes moves the time at which the motion is read; delays axis by axis, where
+    somebody asked for them, move the torques.
+    """
     notes = [f"delay of the torque behind the position, {line}" for line in found.describe()]
     n = len(found.joint_names)
-    if found.determined.any() and found.agree:
-        notes.append(f"the torque of every axis was read {found.common * 1e3:.3g} ms later")
+    if not found.significant:
+        notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")
+        return sources, plain, found.applied, notes
+    if found.agree or not by_axis:
+        notes.append(f"a delay of {found.common * 1e3:.3g} ms of all axes was compensated")
         common = replace(plain, torque_delay=found.common)
         return sources, common, np.full(n, found.common), notes
+    notes.append("each axis was compensated by its own delay")
     none = replace(plain, torque_delay=0.0)
-    if not found.determined.any():
-        notes.append("no axis determines a delay: none was compensated")
-        return sources, none, np.zeros(n), notes
-    notes.append("each axis was compensated by its own delay, axes without one not at all")
 
     def shifted(some: tuple[Source, ...]) -> tuple[Source, ...]:
         return tuple(
