@@ -15,7 +15,7 @@ from identification.delay_compensation import compensate
 from identification.errors import IdentificationError
 from identification.preprocessing import Preprocessing, Samples, prepare
 from identification.repetition_noise import repetition_noise
-from identification.resampling import time_base
+from identification.signals.clock import time_base
 from identification.torque_channel import find_torque_bandwidth
 
 from .currents import with_torques

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples, foreign_json
-from identification.resampling import time_base
+from identification.signals.clock import time_base
 from identification.urdf_tree import urdf_tree
 
 Array = NDArray[np.float64]
