@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from identification.recording import GAP_STEPS, Recording, RecordingError
+from identification.resampling import each_channel
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -35,7 +36,7 @@ _MARGIN: Final = 3.0
 _OUTLIER: Final = 6.0
 _SHORTEST: Final = 32  # samples of a stretch; below it the stamps stand
 _BESIDE: Final = 4  # steps to either side that give the speed at one
-_SPEED_TIME: Final = 0.05  # s that the speed beside the residual is averaged over
+_SPEED_TIME: Final = 0.025  # s to either side that give the speed beside a residual
 # A step is counted from the positions where these know it to an eighth of a step of the clock.
 _CLEAR: Final = 8.0
 # Multiples of noise and resolution that a step must have to be no standstill.
@@ -218,12 +219,13 @@ class Clock:
         rows = ~self.repeated
         if rows.all() and self.decision == "as recorded":
             return recording
-        chosen: dict[str, Any] = {
-            name: getattr(recording, name)[rows]
-            for name in (*CHANNELS, "gap_before")
-            if getattr(recording, name, None) is not None
-        }
-        return replace(recording, time=self.time[rows], **chosen)
+        gap = recording.gap_before
+        return replace(
+            recording,
+            time=self.time[rows],
+            gap_before=None if gap is None else gap[rows],
+            **each_channel(recording, lambda values: values[rows]),
+        )
 
     def describe(self) -> list[str]:
         """What was decided and why, in sentences; none where the stamps are even."""
@@ -237,28 +239,28 @@ class Clock:
         if np.isnan(self.share):
             return lines
         figures = (
-            f"high-frequency residual of the positions {self.residuals[0]:.3g} times the least with"
-            f" the stamps, {self.residuals[1]:.3g} with even times; they follow"
-            f" {self.share:.2f} ± {self.share_deviation:.2g} of the stamps' scatter"
+            f"share of the scatter that the positions follow: {self.share:.2f} ±"
+            f" {self.share_deviation:.1g}; their high-frequency residual, in multiples of noise:"
+            f" {self.residuals[0]:.3g} with the stamps, {self.residuals[1]:.3g} with even times"
         )
         scatter = f"the time stamps scatter by {self.scatter:.1%} of a step"
-        if self.decision == "even":
-            missing = f", {self.missing} missing samples counted" if self.missing else ""
+        missing = f"{self.missing} missing samples were counted"
+        if self.decision == "even" and self.scatter == 0.0:
+            lines.append(f"the time stamps are even, the samples are not: {missing} ({figures})")
+        elif self.decision == "even":
             lines.append(
-                f"{scatter}, the samples do not: even times were used{missing} ({figures})"
+                f"{scatter} and the samples do not: even times were used"
+                + (f", {missing}" if self.missing else "")
+                + f" ({figures})"
             )
         elif self.certain:
-            lines.append(f"{scatter}, and so do the samples: the stamps were used ({figures})")
+            lines.append(f"{scatter} and so do the samples: the stamps were used ({figures})")
         else:
             lines.append(
-                f"{scatter}; whether the samples do cannot be decided from these positions: the"
-                f" stamps were used ({figures})"
+                f"{scatter}; the positions do not show whether the samples do: the stamps were"
+                f" used ({figures})"
             )
         return lines
-
-
-CHANNELS: Final = ("position", "velocity", "torque", "motor_current", "commanded_position")
-"""Names of a recording's columns per joint."""
 
 
 def true_times(recording: Recording) -> Clock:
@@ -270,23 +272,23 @@ def true_times(recording: Recording) -> Clock:
     even times, too. The share of that product in it, over all joints, is near one or near zero.
 
     Args:
-        recording: finite, in the order of its samples; stamps that repeat or fall back are legal.
+        recording: its samples in order; stamps that repeat or fall back are legal.
 
     Raises:
-        RecordingError: the clock stands still.
+        RecordingError: NaN or infinity, or the clock stands still.
     """
-    time = recording.time
-    base = time_base(time, recording.gap_before)
-    signals = recording.position
+    recording._check_finite()
+    time, signals = recording.time, recording.position
     velocity = getattr(recording, "velocity", None)
     if velocity is not None:
         signals = np.hstack([signals, velocity])
+    base = time_base(time, recording.gap_before)
     even, repeated = time.copy(), np.zeros(len(time), np.bool_)
     idle = repeated.copy()
-    pairs, scatters, missing, longer = [], [], 0, 0.0
+    evidence, scatter, missing, longer = [], [], 0, 0.0
     for part in recording.segments():
         even[part] += longer
-        repeated[part] = _repeated(signals[part])
+        repeated[part] = _repeated(time[part], signals[part])
         rows = part.start + np.flatnonzero(~repeated[part])
         if len(rows) < _SHORTEST:
             continue
@@ -297,36 +299,35 @@ def true_times(recording: Recording) -> Clock:
         if len(rows) < _SHORTEST:
             continue
         lost = int(number[-1]) + 1 - len(rows)
-        if base.uniform:  # a counter of rows, and no clock: what is missing takes longer
+        if base.uniform:  # a count of rows and no clock: with what is missing they took longer
             times = time[rows[0]] + base.step * number
             even[rows] = times + longer
             longer += base.step * lost
         else:
             even[rows] = times = _even_times(time[rows], number)
+        late = time[rows] - times
         missing += lost
-        scatters.append((time[rows] - times) / base.step)
-        pairs.append(_residuals(number, times, signals[rows], time[rows] - times, base.step))
-    scatter = np.concatenate([np.zeros(1), *scatters])
+        scatter.append(late / base.step)
+        evidence.append(_residuals(number, times, signals[rows], late, base.step))
+    scattered = np.concatenate([np.zeros(1), *scatter])
     share, deviation, residuals = np.nan, np.nan, (1.0, 1.0)
-    if pairs and np.abs(scatter).max() > UNIFORM:
-        share, deviation, residuals = _share(*map(np.concatenate, zip(*pairs, strict=True)))
+    if np.abs(scattered).max() > UNIFORM:
+        share, deviation, residuals = _share(*map(np.concatenate, zip(*evidence, strict=True)))
     # Nearer to one reading than to the other, and not half way between them.
-    certain = abs(share - 0.5) > max(_MARGIN * deviation, 0.25)
-    out = repeated | idle
-    use_even = bool(certain and share < 0.5 and np.all(np.diff(even[~out]) > 0.0))
-    if not use_even:
-        out = repeated
-        if base.largest_deviation <= UNIFORM:
-            share = np.nan
+    certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
+    is_even = certain and share < 0.5 and bool(np.all(np.diff(even[~(repeated | idle)]) > 0.0))
+    if not is_even and base.largest_deviation <= UNIFORM:
+        share = np.nan  # even stamps: nothing was to be decided
+    out = repeated | idle if is_even else repeated
     rows = np.flatnonzero(~out)
-    chosen = (even if use_even else time)[rows]
+    chosen = (even if is_even else time)[rows]
     return Clock(
         time=np.interp(np.arange(len(time)), rows, chosen) if out.any() else chosen,
         repeated=out,
-        decision="even" if use_even else "as recorded",
-        certain=bool(certain or np.isnan(share)),
+        decision="even" if is_even else "as recorded",
+        certain=bool(np.isnan(share) or is_even or (certain and share > 0.5)),
         step=base.step,
-        scatter=float(scatter.std()),
+        scatter=0.0 if base.uniform else float(scattered.std()),
         missing=missing,
         share=share,
         share_deviation=deviation,
@@ -337,33 +338,35 @@ def true_times(recording: Recording) -> Clock:
 def _numbers(time: Array, signals: Array, step: float) -> Array:
     """Number of each sample (m,) in an even clock, the first zero.
 
-    Where the motion of at least two signals at once says clearly how many steps passed, it is
-    counted from them, and elsewhere by the phase of the stamps.
+    Where the motion says clearly how many steps passed, and not by one signal alone, they are
+    counted from it, and elsewhere by the phase of the stamps.
     """
     phased = _steps_by_phase(time, step)
     moved, resolution = np.diff(signals, axis=0), _resolution(signals)[1:]
+    before, after = (_run(signals, side) for side in (-1, 1))
+    pace = np.add(*(np.abs(_run(signals, side)) for side in (-1, 1))) / (2 * _BESIDE)
     steps = phased
     for _ in range(2):  # speeds first by the stamps' count, then by the better one
-        number = np.concatenate([[0.0], np.cumsum(steps)])
-        each = _beside(signals) / np.maximum(_beside(number[:, None]), 0.5)
+        number = np.concatenate([[0.0], np.cumsum(steps)])[:, None]
+        passed = [np.maximum(_run(number, side), 0.5) for side in (-1, 1)]
+        each = (before + after) / (passed[0] + passed[1])
         noise = np.maximum(_level(moved - each * steps[:, None]), resolution)
         unit, way = each / noise, moved / noise
         clarity = (unit**2).sum(axis=1)
         counted = np.rint((unit * way).sum(axis=1) / np.maximum(clarity, 1.0))
-        size = np.abs(unit)
-        clear = (clarity > _CLEAR**2) & (np.count_nonzero(size > _MOVES, axis=1) > 1)
-        # A joint that jumped alone says nothing of the time.
-        alike = (np.abs(way - unit * counted[:, None]) < _OUTLIER + 0.25 * size).all(axis=1)
-        clear &= alike & (counted >= 0.0) & (counted <= GAP_STEPS)
+        alike = (np.abs(way - unit * counted[:, None]) < _OUTLIER + 0.5 * pace / noise).all(axis=1)
+        steady = _steady(before / passed[0] / noise, after / passed[1] / noise, 0.25)
+        clear = clarity - (unit**2).max(axis=1) > _CLEAR**2
+        clear &= alike & steady & (counted >= 0.0) & (counted <= GAP_STEPS)
         steps = np.where(clear, counted, phased)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _beside(values: Array) -> Array:
-    """Change of values (m, k) over the `_BESIDE` steps to either side of each step (m - 1, k)."""
-    at = np.arange(len(values) - 1)
-    before, after = np.maximum(at - _BESIDE, 0), np.minimum(at + 1 + _BESIDE, len(values) - 1)
-    return np.asarray(values[at] - values[before] + values[after] - values[at + 1])
+def _run(values: Array, side: int) -> Array:
+    """Change of values (m, k) over the `_BESIDE` steps before (-1) or after (1) each (m - 1, k)."""
+    at = np.arange(len(values) - 1) + (side > 0)
+    there = np.clip(at + side * _BESIDE, 0, len(values) - 1)
+    return np.asarray(side * (values[there] - values[at]))
 
 
 def _even_times(stamps: Array, number: Array) -> Array:
@@ -384,18 +387,24 @@ def _odd(wanted: float, samples: int) -> int:
     return (int(min(wanted, samples)) - 1) // 2 * 2 + 1
 
 
-def _repeated(signals: Array) -> Rows:
-    """Rows (m,) that repeat the one before them to the last bit while the arm moves through."""
-    new = np.concatenate([[True], (np.diff(signals, axis=0) != 0.0).any(axis=1)])
-    if new.all() or np.count_nonzero(new) < _SHORTEST:
-        return np.zeros(len(signals), dtype=np.bool_)
-    steps = np.diff(signals[new], axis=0)
-    noise = _level(_off_cubic(np.arange(len(steps) + 1.0), signals[new]))
-    least = _MOVES * np.maximum(noise, _resolution(signals)[new][1:-1])
-    through = np.sign(steps[1:]) == np.sign(steps[:-1])
-    through &= np.minimum(np.abs(steps[1:]), np.abs(steps[:-1])) > least
-    moving = np.concatenate([[False], through.any(axis=1), [False]])
-    return np.asarray(~new & moving[np.cumsum(new) - 1])
+def _repeated(time: Array, signals: Array) -> Rows:
+    """Rows (m,) that repeat the one before them, with its stamp or while the arm moves steadily."""
+    equal = np.concatenate([[False], (np.diff(signals, axis=0) == 0.0).all(axis=1)])
+    again = np.diff(time) == 0.0
+    samples = signals[~equal]
+    if equal.any() and len(samples) >= _SHORTEST:
+        noise = _level(_off_cubic(np.arange(len(samples), dtype=np.float64), samples))
+        noise = np.maximum(noise, _resolution(signals)[1:])
+        before, after = (_run(signals, side) / (_BESIDE * noise) for side in (-1, 1))
+        moving = (np.abs(before + after) > 2.0 * _MOVES).any(axis=1)
+        again |= moving & _steady(before, after, 0.5)
+    return np.asarray(equal & np.concatenate([[False], again]))
+
+
+def _steady(before: Array, after: Array, most: float) -> Rows:
+    """Where the square of speeds (m, k) changes by this share at most: no stop, no jump beside."""
+    change, mean = (after - before) ** 2, (after + before) ** 2 / 4.0
+    return np.asarray(change.sum(axis=1) < most * mean.sum(axis=1))
 
 
 def _resolution(signals: Array) -> Array:
@@ -422,12 +431,17 @@ def _residuals(
     number: Array, times: Array, signals: Array, late: Array, step: float
 ) -> tuple[Array, Array, Array]:
     """High-frequency residual of even signals, what right stamps make it, and its resolution."""
-    window = _odd(np.clip(_SPEED_TIME / step, 2 * _BESIDE + 1, _DRIFT), len(number))
+    half = round(float(np.clip(_SPEED_TIME / step, _DRIFT // 10, _DRIFT // 2)))
+    at = np.arange(len(number))
+    # From samples that the residual has no part in: their noise must not meet its own.
+    ahead = half // 2 + len(_CUBIC)
+    there, behind = np.minimum(at + ahead, at[-1]), np.maximum(at - ahead, 0)
 
-    def slope(values: Array) -> Array:
-        return np.asarray(scipy.signal.savgol_filter(values, window, 2, deriv=1, axis=0))
+    def change(values: Array) -> Array:
+        mean = scipy.ndimage.uniform_filter1d(values, half, axis=0, mode="nearest")
+        return np.asarray(mean[there] - mean[behind])
 
-    speed = slope(signals) / slope(times)[:, None]
+    speed = change(signals) / change(times - times[0])[:, None]
     late = _off_cubic(number, late[:, None])
     return _off_cubic(number, signals), speed[2:-2] * late, _resolution(signals)[2:-2]
 
