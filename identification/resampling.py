@@ -51,15 +51,14 @@ def without_repeats(recording: Recording) -> Recording:
         recording,
         time=recording.time[starts],
         gap_before=None if gap is None else np.logical_or.reduceat(gap, starts),
-        **each_channel(recording, mean),
+        **_changed(recording, mean),
     )
 
 
 def resample(recording: Recording, step: float | None = None) -> Recording:
     """Return the recording at uniform times within each stretch between gaps.
 
-    Positions and velocities come from the interpolating cubic spline, torques and currents from
-    monotone cubics,
+    Positions come from the interpolating cubic spline, torques and currents from monotone cubics,
     which do not overshoot where friction jumps, commands from straight lines, missing where one
     of the two samples beside them has none. Each stretch begins at its own first sample.
 
@@ -103,25 +102,27 @@ def _uniform(one: Recording, step: float) -> Recording:
     count = int(np.floor((time[-1] - time[0]) / step + 1e-6)) + 1
     at = time[0] + step * np.arange(count)
     inside = np.clip(at, time[0], time[-1])
-
-    def read(name: str, values: Array) -> Array:
-        if name in ("position", "velocity"):
-            return np.asarray(scipy.interpolate.make_interp_spline(time, values, k=3)(inside))
-        if name == "commanded_position":
-            return np.column_stack([np.interp(inside, time, column) for column in values.T])
-        return np.asarray(scipy.interpolate.PchipInterpolator(time, values)(inside))
-
-    changed: dict[str, Any] = {name: read(name, getattr(one, name)) for name in _present(one)}
+    changed: dict[str, Any] = {
+        "position": scipy.interpolate.make_interp_spline(time, one.position, k=3)(inside)
+    }
+    for name in ("torque", "motor_current"):
+        values = getattr(one, name)
+        if values is not None:
+            changed[name] = scipy.interpolate.PchipInterpolator(time, values)(inside)
+    if one.commanded_position is not None:
+        command = one.commanded_position
+        changed["commanded_position"] = np.column_stack(
+            [np.interp(inside, time, column) for column in command.T]
+        )
     return replace(one, time=at, gap_before=None, **changed)
 
 
-def each_channel(recording: Recording, change: Callable[[Array], Array]) -> dict[str, Any]:
-    """The columns per joint that a recording has, by name, each changed alike."""
-    return {name: change(getattr(recording, name)) for name in _present(recording)}
-
-
-_CHANNELS: Final = ("position", "velocity", "torque", "motor_current", "commanded_position")
+_CHANNELS: Final = ("position", "torque", "motor_current", "commanded_position")
 
 
 def _present(recording: Recording) -> tuple[str, ...]:
-    return tuple(name for name in _CHANNELS if getattr(recording, name, None) is not None)
+    return tuple(name for name in _CHANNELS if getattr(recording, name) is not None)
+
+
+def _changed(recording: Recording, change: Callable[[Array], Array]) -> dict[str, Any]:
+    return {name: change(getattr(recording, name)) for name in _present(recording)}

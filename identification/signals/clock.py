@@ -17,7 +17,6 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.recording import GAP_STEPS, Recording, RecordingError
-from identification.resampling import each_channel
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -224,7 +223,7 @@ class Clock:
             recording,
             time=self.time[rows],
             gap_before=None if gap is None else gap[rows],
-            **each_channel(recording, lambda values: values[rows]),
+            **recording._each_channel(lambda values: values[rows]),
         )
 
     def describe(self) -> list[str]:
