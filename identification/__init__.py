@@ -49,8 +49,9 @@ from identification.qr_factor import QRFactor
 from identification.recording import Recording, RecordingError
 from identification.regressor import Regressor
 from identification.repetitions import RepeatedEstimate, estimate_repetitions
-from identification.resampling import TimeBase, resample, time_base
+from identification.resampling import resample
 from identification.robust import RobustEstimate, robust_estimate
+from identification.signals.clock import Clock, TimeBase, time_base, true_times
 from identification.torque_channel import find_torque_bandwidth
 from identification.urdf_write import write_urdf
 from identification.validation import PredictionError, prediction_error
@@ -73,9 +74,11 @@ __all__ = [
     "TorsionSpring",
     # recordings and their preparation
     "Recording",
+    "Clock",
     "TimeBase",
     "resample",
     "time_base",
+    "true_times",
     "Preprocessing",
     "Samples",
     "prepare",

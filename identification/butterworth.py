@@ -23,7 +23,8 @@ from identification.errors import ShapeError
 from identification.motion import Motion
 from identification.noise import difference_variance
 from identification.recording import Recording, RecordingError
-from identification.resampling import resample, time_base
+from identification.resampling import resample
+from identification.signals.clock import time_base
 
 Array = NDArray[np.float64]
 

@@ -3,6 +3,10 @@
 A joint that moves at a speed of v changes it by at most its acceleration times the step of the
 clock; its position therefore steps by about what the steps beside it say. A step that departs from
 these and is not taken back is no motion.
+
+A wrong time stamp, a missing row and a repeated one make every joint depart at once, each by its
+speed times one error of the time. What the other joints have in common with a departure is the
+clock's, and is taken off before it is judged.
 """
 
 from __future__ import annotations
@@ -15,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.finding import Finding, listed
-from identification.recording import Recording
+from identification.recording import GAP_STEPS, Recording
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
 # Robust standard deviations that a step must depart by.
 _STANDS_OUT: Final = 15.0
@@ -28,6 +33,10 @@ _BEYOND_USUAL: Final = 3.0
 _FASTEST: Final = 150.0  # rad/s² or m/s²
 _BESIDE: Final = 4  # steps to either side
 _SHOWN: Final = 3
+# Standard deviations that other joints must move in a step to show that a row is missing.
+_SHOWS: Final = 5.0
+# Departures of whole steps of motion are sought to this share of one.
+_WHOLE: Final = 0.15
 
 
 @dataclass(frozen=True)
@@ -51,50 +60,78 @@ def position_jumps(recording: Recording, name: str = "the recording") -> list[Po
     """Lasting steps of the measured positions, in the order of time for each joint.
 
     Args:
-        recording: positions in its stretches without gaps.
+        recording: positions in its stretches without gaps, at the times that
+            :func:`identification.signals.clock.true_times` decided on.
         name: by which the jumps say where they are.
     """
-    found = []
-    for joint, joint_name in enumerate(recording.joint_names):
-        parts = [
-            (part.start, *_departures(recording.time[part], recording.position[part, joint]))
-            for part in recording.segments()
-            if part.stop - part.start > 2 * _BESIDE + 2
-        ]
-        if not parts:
-            continue
-        size = np.abs(np.concatenate([departure for _, departure, _ in parts]))
-        spread = 1.4826 * float(np.median(size))
-        usual = float(np.partition(size, -_USUAL)[-_USUAL]) if size.size > 10 * _USUAL else 0.0
-        for start, departure, steps in parts:
-            least = np.maximum(
-                max(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2
-            )
-            for k in np.flatnonzero(np.abs(departure) > least).tolist():
-                if not _lasts(departure, k):
-                    continue
-                at = start + k + 1
-                found.append(
-                    PositionJump(
-                        name,
-                        joint_name,
-                        float(recording.time[at] - recording.time[0]),
-                        float(departure[k]),
-                    )
-                )
-    return found
+    parts = [part for part in recording.segments() if part.stop - part.start > 2 * _BESIDE + 2]
+    if not parts:
+        return []
+    pieces = [_departures(recording.time[part], recording.position[part]) for part in parts]
+    departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
+    steps = np.concatenate([np.diff(recording.time[part]) for part in parts])[:, None]
+    after = np.concatenate([np.arange(part.start + 1, part.stop) for part in parts])
+    departure, shown = _without_clock(departure, speed, steps)
+    size = np.abs(departure)
+    spread = 1.4826 * np.median(size, axis=0)
+    usual = np.partition(size, -_USUAL, axis=0)[-_USUAL] if len(size) > 10 * _USUAL else 0.0
+    least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2)
+    suspect = (size - 0.5 * change > least) & (
+        shown | ~_whole_steps(departure, speed * steps, least)
+    )
+    return [
+        PositionJump(
+            name,
+            recording.joint_names[joint],
+            float(recording.time[after[k]] - recording.time[0]),
+            float(departure[k, joint]),
+        )
+        for joint, k in np.argwhere(suspect.T)
+        if _lasts(departure[:, joint], k)
+    ]
 
 
-def _departures(time: Array, position: Array) -> tuple[Array, Array]:
-    """By how much each step departs from the speed beside it (m - 1,), and the clock's steps."""
-    steps = np.diff(time)
-    speed = np.diff(position) / steps
-    padded = np.pad(speed, _BESIDE, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1)
-    before, after = windows[:, :_BESIDE], windows[:, _BESIDE + 1 :]
+def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
+    """By how much each step departs from the speed beside it (m - 1, n), and that speed.
+
+    Last what a change of speed from before it to after it explains: a stop is no jump.
+    """
+    steps = np.diff(time)[:, None]
+    speed = np.diff(position, axis=0) / steps
+    padded = np.pad(speed, ((_BESIDE, _BESIDE), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
+    before = np.median(windows[..., :_BESIDE], axis=-1)
+    after = np.median(windows[..., _BESIDE + 1 :], axis=-1)
     # The mean of both sides' medians follows a steady acceleration; one more jump beside is none.
-    usual = 0.5 * (np.median(before, axis=1) + np.median(after, axis=1))
-    return (speed - usual) * steps, steps
+    usual = 0.5 * (before + after)
+    return (speed - usual) * steps, usual, np.abs(after - before) * steps
+
+
+def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array, Rows]:
+    """Departures (m, n) without the error of the time that the other joints show.
+
+    Returns:
+        Whichever is less, with that error or without it; and where the others move fast enough
+        to show an error of one step (m, n).
+    """
+    # A joint at rest shows nothing: what does not depart is no measure of its noise.
+    size = np.abs(departure)
+    noise = np.array(
+        [1.4826 * np.median(some) if (some := d[d > 0.0]).size else np.inf for d in size.T]
+    )
+    way, rate = departure / noise, speed / noise
+    weight = (rate**2).sum(axis=1, keepdims=True) - rate**2
+    # The others' error of the time, drawn to zero by as much as one step is likely.
+    error = ((rate * way).sum(axis=1, keepdims=True) - rate * way) / (weight + steps**-2)
+    without = departure - speed * error
+    less = np.where(np.abs(without) < size, without, departure)
+    return less, weight * steps**2 > _SHOWS**2
+
+
+def _whole_steps(departure: Array, one: Array, least: Array) -> Rows:
+    """Where missing or repeated rows explain a departure (m, n) at the motion of `one` step."""
+    count = np.clip(np.rint(departure / np.where(one == 0.0, np.inf, one)), -1.0, GAP_STEPS)
+    return np.asarray(np.abs(departure - count * one) < np.maximum(least, _WHOLE * np.abs(one)))
 
 
 def _lasts(departure: Array, at: int) -> bool:

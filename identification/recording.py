@@ -116,7 +116,7 @@ class Recording:
             self,
             time=self.time[start:stop],
             gap_before=None if self.gap_before is None else self.gap_before[start:stop],
-            **self._each_channel(lambda array: array[start:stop]),
+            **self.each_channel(lambda array: array[start:stop]),
         )
 
     @property
@@ -159,7 +159,8 @@ class Recording:
         }
         return [(name, array) for name, array in channels.items() if array is not None]
 
-    def _each_channel(self, select: Callable[[Array], Array]) -> dict[str, Any]:
+    def each_channel(self, select: Callable[[Array], Array]) -> dict[str, Any]:
+        """Return every channel present, changed alike, by attribute name."""
         return {name: select(array) for name, array in self._channels()}
 
     def _check_joints(self, expected: tuple[str, ...]) -> None:

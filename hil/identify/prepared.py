@@ -17,8 +17,8 @@ from identification.inner_prediction import Choice, Question, Settings, choose_s
 from identification.model import RobotModel
 from identification.preprocessing import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
 from identification.repetition_noise import repetition_noise
-from identification.resampling import time_base
 from identification.shrinkage import Shrinkage
+from identification.signals.clock import time_base
 from identification.torque_channel import find_torque_bandwidth
 
 from .currents import with_torques
@@ -194,6 +194,7 @@ def _time_bases(sources: Sources) -> list[str]:
                 f"{source.name}: {source.merged} samples had the time stamp of the one before and "
                 "were averaged with it"
             )
+        notes += [f"{source.name}: {line}" for line in source.clock]
         base = time_base(source.recording.time, source.recording.gap_before)
         if not base.uniform or base.gaps:
             notes.append(f"{source.name}: {'; '.join(base.describe())}")

@@ -24,6 +24,7 @@ from hil.recordings import recording_of
 from identification.noise import standstill_variance
 from identification.recording import Recording, RecordingError
 from identification.resampling import without_repeats
+from identification.signals.clock import true_times
 
 Array = NDArray[np.float64]
 
@@ -40,6 +41,7 @@ class Source:
         recording: joints in the order of the model.
         origin: time of the first set-point [s].
         merged: samples that had the time stamp of the one before, and were averaged with it.
+        clock: what was decided about its time stamps, in sentences.
         context: the motion of a longer recording that this is a part of, and where it begins in
             it, so that filters know what lies beyond its ends. Its torques are zero outside.
     """
@@ -48,6 +50,7 @@ class Source:
     recording: Recording
     origin: float
     merged: int = 0
+    clock: tuple[str, ...] = ()
     context: tuple[Recording, int] | None = None
 
     def changed(self, change: Callable[[Recording], Recording]) -> Source:
@@ -312,7 +315,11 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
     merged = recording.n_samples - single.n_samples
-    return Source(archive.path.name, single, float(single.time[0]), merged)
+    words: tuple[str, ...] = ()
+    if archive.kind == "imported":  # a controller counts its own cycles
+        clock = true_times(single)
+        single, words = clock.apply(single), tuple(clock.describe())
+    return Source(archive.path.name, single, float(single.time[0]), merged, words)
 
 
 def useful_part(archive: Archive, recording: Recording) -> range | None:
@@ -370,6 +377,7 @@ def _part(whole: Source, words: str, start: int, stop: int) -> Source:
         recording.between(start, stop),
         float(recording.time[min(start, recording.n_samples - 1)]),
         whole.merged,
+        whole.clock,
         (context, start),
     )
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from hil.archive import Samples, foreign_json
-from identification.resampling import time_base
+from identification.signals.clock import time_base
 from identification.urdf_tree import urdf_tree
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from identification.preprocessing import Preprocessing, prepare
 from identification.recording import Recording, RecordingError
-from identification.resampling import time_base
+from identification.signals.clock import time_base
 from identification.validation import prediction_error
 from tests.identification.ur10_bag import ur10
 

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification.recording import Recording, RecordingError
-from identification.resampling import resample, time_base, without_repeats
+from identification.resampling import resample, without_repeats
+from identification.signals.clock import time_base
 
 Array = NDArray[np.float64]
 

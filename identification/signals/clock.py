@@ -1,0 +1,480 @@
+"""The clock of a recording: what its time stamps are, and when the samples were taken.
+
+A logger stamps a sample when it comes to it. The robot takes its samples by a clock of its own,
+mostly an even one, so that uneven stamps are either right or the logger's lateness. The positions
+decide: at a speed of v, a stamp wrong by e moves its sample off the smooth motion of every joint
+by v e at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final, Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from identification.recording import GAP_STEPS, Recording, RecordingError
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+# A filter that takes samples for uniform misplaces them by their jitter. One percent of a step
+# moves a sine of a tenth of the sampling rate by less than one percent of its amplitude.
+UNIFORM: Final = 0.01
+_LAG: Final = 7  # steps that the usual step is measured over
+# The phase of even samples in their stamps is the mean of so many; what is slower is drift.
+_PHASE: Final = 51
+_REFINEMENTS: Final = 3  # of the step, by the count of steps that it leads to
+_DRIFT: Final = 101
+# Standard deviations by which one reading of the stamps has to be nearer than the other.
+_MARGIN: Final = 3.0
+# A row's share of the evidence is limited: what is off by more under both readings is an outlier.
+_OUTLIER: Final = 6.0
+_SHORTEST: Final = 32  # samples of a stretch; below it the stamps stand
+_BESIDE: Final = 4  # steps to either side that give the speed at one
+_SPEED_TIME: Final = 0.025  # s to either side that give the speed beside a residual
+# A step is counted from the positions where these know it to an eighth of a step of the clock.
+_CLEAR: Final = 8.0
+# Multiples of noise and resolution that a step must have to be no standstill.
+_MOVES: Final = 3.0
+# Noise of the distance from the cubic where the samples are rounded: sqrt((1 + 17 / 18) / 12).
+_ROUNDING: Final = 0.4  # steps of the encoder
+_CUBIC: Final = np.array([-2, -1, 1, 2])  # samples beside
+
+
+@dataclass(frozen=True)
+class TimeBase:
+    """What the clock of a recording did.
+
+    Attributes:
+        samples: number of them.
+        duration: from the first to the last [s].
+        step: mean step of the clock; repeats, drops and gaps aside [s].
+        jitter: standard deviation of the steps that are no drop and no gap, in such steps.
+        largest_deviation: of one of them, in such steps.
+        repeated: samples with the time stamp of the one before.
+        backward: samples with an earlier time stamp than the one before.
+        dropped: samples that are missing where the clock steps by at most
+            `GAP_STEPS` usual steps.
+        gaps: longer steps, and gaps that were reported.
+    """
+
+    samples: int
+    duration: float
+    step: float
+    jitter: float
+    largest_deviation: float
+    repeated: int
+    backward: int
+    dropped: int
+    gaps: int
+
+    @property
+    def rate(self) -> float:
+        """Sampling rate [Hz]."""
+        return 1.0 / self.step
+
+    @property
+    def uniform(self) -> bool:
+        """Whether a filter may take each stretch between gaps for uniform as it is."""
+        even = self.largest_deviation <= UNIFORM
+        return even and self.repeated == self.backward == self.dropped == 0
+
+    def describe(self) -> list[str]:
+        """What there is to say about it, in words; the first line always."""
+        lines = [f"{self.samples} samples in {self.duration:.6g} s, {self.rate:.6g} Hz"]
+        if self.largest_deviation > UNIFORM:
+            lines.append(
+                f"uneven: steps scatter by {self.jitter:.1%} of the usual one, at most"
+                f" {self.largest_deviation:.0%}"
+            )
+        if self.repeated:
+            lines.append(f"{self.repeated} samples repeat the time stamp before them")
+        if self.backward:
+            lines.append(f"{self.backward} samples are older than the one before them")
+        if self.dropped:
+            lines.append(f"{self.dropped} samples are missing one by one")
+        if self.gaps:
+            lines.append(f"{self.gaps} gaps")
+        if not self.uniform:
+            lines.append("a filter that counts samples needs it resampled; the spline does not")
+        return lines
+
+
+def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeBase:
+    """Examine time stamps (m,) [s], legal or not.
+
+    Args:
+        time: as recorded; finite.
+        gap_before: (m,) True at a sample before which samples are known to be missing.
+
+    Raises:
+        RecordingError: fewer than two different times.
+    """
+    steps = np.diff(time)
+    forward = steps[steps > 0.0]
+    if forward.size == 0:
+        raise RecordingError("clock", f"the clock of all {len(time)} samples stands still")
+    reported = np.zeros(len(steps), dtype=np.bool_) if gap_before is None else gap_before[1:]
+    median = float(np.median(forward))
+    gap = reported | (steps > GAP_STEPS * median)
+    within = ~gap & (steps > 0.0)
+    step = _usual_step(time, steps[within], median)
+    missing = np.zeros(len(steps))
+    for _ in range(_REFINEMENTS):
+        passed = 0.0
+        for start, stop in pairwise([0, *(np.flatnonzero(gap) + 1).tolist(), len(time)]):
+            new = start + np.flatnonzero(np.diff(time[start:stop], prepend=np.nan) != 0.0)
+            counts = _steps_by_phase(time[new], step)
+            # After a stamp that was given twice a double step leaves nothing out.
+            missing[new[1:] - 1] = np.maximum(counts - np.diff(new), 0.0)
+            passed += float(counts.sum())
+        step = float(steps[~gap].sum()) / passed if passed else step
+    relative = steps[within & (missing == 0.0)] / step
+    return TimeBase(
+        samples=len(time),
+        duration=float(time[-1] - time[0]),
+        step=step,
+        jitter=float(relative.std()) if relative.size else 0.0,
+        largest_deviation=float(np.abs(relative - 1.0).max(initial=0.0)),
+        repeated=int(np.count_nonzero(steps == 0.0)),
+        backward=int(np.count_nonzero(steps < 0.0)),
+        dropped=int(missing.sum()),
+        gaps=int(np.count_nonzero(gap)),
+    )
+
+
+def _usual_step(time: Array, steps: Array, median: float) -> float:
+    """Step of the clock [s], to more digits than stamps that were rounded to a few.
+
+    The median over a few steps is known better than that of one step, and the mean of the steps
+    around it better still: as many are left out above it as below.
+    """
+    lag = min(_LAG, len(time) - 1)
+    usual = float(np.median(time[lag:] - time[:-lag])) / lag
+    if not 0.5 * median < usual < 2.0 * median:
+        return median
+    near = steps[np.abs(steps - usual) <= 0.5 * usual]
+    return float(near.mean()) if near.size else usual
+
+
+def _steps_by_phase(time: Array, step: float) -> Array:
+    """Steps of an even clock between stamps (m,) [s] that are off by less than half a step.
+
+    The stamps' mean phase in the clock does not move with one of them, nor with samples that are
+    missing; it follows a slow drift.
+
+    Returns:
+        Whole numbers of `step` (m - 1,), at least one.
+    """
+    turns = (time - time[0]) / step
+    phasor = scipy.ndimage.uniform_filter1d(
+        np.exp(2j * np.pi * turns).view(np.float64).reshape(-1, 2), _PHASE, axis=0, mode="nearest"
+    )
+    phase = np.unwrap(np.arctan2(phasor[:, 1], phasor[:, 0])) / (2.0 * np.pi)
+    ahead = np.rint(turns - phase) - np.arange(len(time))
+    # A stamp that is off by more than half a step is one alone; what is missing stays missing.
+    ahead = np.maximum.accumulate(scipy.ndimage.median_filter(ahead, 5, mode="nearest"))
+    return np.asarray(np.diff(ahead) + 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """When the samples of a recording were taken, m rows.
+
+    Attributes:
+        time: of the samples (m,) [s].
+        repeated: (m,) True where a row repeats the sample before it although the arm moves: the
+            logger had no new one, and the row says nothing of its time.
+        decision: which reading `time` is: the stamps as they are, or even steps that follow the
+            stamps' slow drift, with missing samples counted.
+        certain: whether the positions decide; else the stamps stand.
+        step: of the even samples [s].
+        scatter: standard deviation of the stamps about even times, in steps.
+        missing: samples that the even times leave out.
+        share: of the stamps' scatter that the positions follow: one if the stamps are right, zero
+            if the samples were even; NaN where there is nothing to decide.
+        share_deviation: its standard deviation.
+        residuals: high-frequency residual of the positions under the stamps and under even times,
+            root mean square in multiples of the lesser one of each joint.
+    """
+
+    time: Array
+    repeated: Rows
+    decision: Literal["as recorded", "even"]
+    certain: bool
+    step: float
+    scatter: float
+    missing: int
+    share: float
+    share_deviation: float
+    residuals: tuple[float, float]
+
+    def apply(self, recording: Recording) -> Recording:
+        """The recording at these times, without the repeated rows."""
+        rows = ~self.repeated
+        if rows.all() and self.decision == "as recorded":
+            return recording
+        gap = recording.gap_before
+        return replace(
+            recording,
+            time=self.time[rows],
+            gap_before=None if gap is None else gap[rows],
+            **recording.each_channel(lambda values: values[rows]),
+        )
+
+    def describe(self) -> list[str]:
+        """What was decided and why, in sentences; none where the stamps are even."""
+        lines = []
+        repeated = int(np.count_nonzero(self.repeated))
+        if repeated:
+            lines.append(
+                f"{repeated} rows repeat the sample before them while the arm moves and were left"
+                " out"
+            )
+        if np.isnan(self.share):
+            return lines
+        figures = (
+            f"share of the scatter that the positions follow: {self.share:.2f} ±"
+            f" {self.share_deviation:.1g}; their high-frequency residual, in multiples of noise:"
+            f" {self.residuals[0]:.3g} with the stamps, {self.residuals[1]:.3g} with even times"
+        )
+        scatter = f"the time stamps scatter by {self.scatter:.1%} of a step"
+        missing = f"{self.missing} missing samples were counted"
+        if self.decision == "even" and self.scatter == 0.0:
+            lines.append(f"the time stamps are even, the samples are not: {missing} ({figures})")
+        elif self.decision == "even":
+            lines.append(
+                f"{scatter} and the samples do not: even times were used"
+                + (f", {missing}" if self.missing else "")
+                + f" ({figures})"
+            )
+        elif self.certain:
+            lines.append(f"{scatter} and so do the samples: the stamps were used ({figures})")
+        else:
+            lines.append(
+                f"{scatter}; the positions do not show whether the samples do: the stamps were"
+                f" used ({figures})"
+            )
+        return lines
+
+
+def true_times(recording: Recording) -> Clock:
+    """Decide from the positions, and velocities where given, what the time stamps are worth.
+
+    Two readings are compared where they differ: the stamps, and even times that follow the
+    stamps' slow drift. Of an even reading, the distance of each sample from the cubic through
+    its neighbours is noise; if the stamps are right it holds the speed times their distance from
+    even times, too. The share of that product in it, over all joints, is near one or near zero.
+
+    Args:
+        recording: its samples in order; stamps that repeat or fall back are legal.
+
+    Raises:
+        RecordingError: NaN or infinity, or the clock stands still.
+    """
+    recording._check_finite()
+    time, signals = recording.time, recording.position
+    velocity = getattr(recording, "velocity", None)
+    if velocity is not None:
+        signals = np.hstack([signals, velocity])
+    base = time_base(time, recording.gap_before)
+    even, repeated = time.copy(), np.zeros(len(time), np.bool_)
+    idle = repeated.copy()
+    evidence, scatter, missing, longer = [], [], 0, 0.0
+    for part in recording.segments():
+        even[part] += longer
+        repeated[part] = _repeated(time[part], signals[part])
+        rows = part.start + np.flatnonzero(~repeated[part])
+        if len(rows) < _SHORTEST:
+            continue
+        number = _numbers(time[rows], signals[rows], base.step)
+        new = np.diff(number, prepend=-1.0) > 0.0
+        idle[rows[~new]] = True
+        rows, number = rows[new], number[new]
+        if len(rows) < _SHORTEST:
+            continue
+        lost = int(number[-1]) + 1 - len(rows)
+        if base.uniform:  # a count of rows and no clock: with what is missing they took longer
+            times = time[rows[0]] + base.step * number
+            even[rows] = times + longer
+            longer += base.step * lost
+        else:
+            even[rows] = times = _even_times(time[rows], number)
+        late = time[rows] - times
+        missing += lost
+        scatter.append(late / base.step)
+        evidence.append(_residuals(number, times, signals[rows], late, base.step))
+    scattered = np.concatenate([np.zeros(1), *scatter])
+    share, deviation, residuals = np.nan, np.nan, (1.0, 1.0)
+    if np.abs(scattered).max() > UNIFORM:
+        share, deviation, residuals = _share(*map(np.concatenate, zip(*evidence, strict=True)))
+    # Nearer to one reading than to the other, and not half way between them.
+    certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
+    is_even = certain and share < 0.5 and bool(np.all(np.diff(even[~(repeated | idle)]) > 0.0))
+    if not is_even and base.largest_deviation <= UNIFORM:
+        share = np.nan  # even stamps: nothing was to be decided
+    out = repeated | idle if is_even else repeated
+    rows = np.flatnonzero(~out)
+    chosen = (even if is_even else time)[rows]
+    return Clock(
+        time=np.interp(np.arange(len(time)), rows, chosen) if out.any() else chosen,
+        repeated=out,
+        decision="even" if is_even else "as recorded",
+        certain=bool(np.isnan(share) or is_even or (certain and share > 0.5)),
+        step=base.step,
+        scatter=0.0 if base.uniform else float(scattered.std()),
+        missing=missing,
+        share=share,
+        share_deviation=deviation,
+        residuals=residuals,
+    )
+
+
+def _numbers(time: Array, signals: Array, step: float) -> Array:
+    """Number of each sample (m,) in an even clock, the first zero.
+
+    Where the motion says clearly how many steps passed, and not by one signal alone, they are
+    counted from it, and elsewhere by the phase of the stamps.
+    """
+    phased = _steps_by_phase(time, step)
+    moved, resolution = np.diff(signals, axis=0), _resolution(signals)[1:]
+    before, after = (_run(signals, side) for side in (-1, 1))
+    pace = np.add(*(np.abs(_run(signals, side)) for side in (-1, 1))) / (2 * _BESIDE)
+    steps = phased
+    for _ in range(2):  # speeds first by the stamps' count, then by the better one
+        number = np.concatenate([[0.0], np.cumsum(steps)])[:, None]
+        passed = [np.maximum(_run(number, side), 0.5) for side in (-1, 1)]
+        each = (before + after) / (passed[0] + passed[1])
+        noise = np.maximum(_level(moved - each * steps[:, None]), resolution)
+        unit, way = each / noise, moved / noise
+        clarity = (unit**2).sum(axis=1)
+        counted = np.rint((unit * way).sum(axis=1) / np.maximum(clarity, 1.0))
+        alike = (np.abs(way - unit * counted[:, None]) < _OUTLIER + 0.5 * pace / noise).all(axis=1)
+        steady = _steady(before / passed[0] / noise, after / passed[1] / noise, 0.25)
+        clear = clarity - (unit**2).max(axis=1) > _CLEAR**2
+        clear &= alike & steady & (counted >= 0.0) & (counted <= GAP_STEPS)
+        steps = np.where(clear, counted, phased)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _run(values: Array, side: int) -> Array:
+    """Change of values (m, k) over the `_BESIDE` steps before (-1) or after (1) each (m - 1, k)."""
+    at = np.arange(len(values) - 1) + (side > 0)
+    there = np.clip(at + side * _BESIDE, 0, len(values) - 1)
+    return np.asarray(side * (values[there] - values[at]))
+
+
+def _even_times(stamps: Array, number: Array) -> Array:
+    """Even times (m,) [s] that follow the slow drift of the stamps (m,) [s]."""
+    line = np.polynomial.Polynomial.fit(number, stamps - stamps[0], 1)
+    off = stamps - stamps[0] - line(number)
+    # The median first: single stamps may be late by many steps.
+    drift = scipy.signal.savgol_filter(
+        scipy.ndimage.median_filter(off, _odd(_DRIFT / 3, len(off)), mode="nearest"),
+        _odd(_DRIFT, len(off)),
+        1,
+    )
+    return np.asarray(stamps[0] + line(number) + drift)
+
+
+def _odd(wanted: float, samples: int) -> int:
+    """The odd number of samples at or below both."""
+    return (int(min(wanted, samples)) - 1) // 2 * 2 + 1
+
+
+def _repeated(time: Array, signals: Array) -> Rows:
+    """Rows (m,) that repeat the one before them, with its stamp or while the arm moves steadily."""
+    equal = np.concatenate([[False], (np.diff(signals, axis=0) == 0.0).all(axis=1)])
+    again = np.diff(time) == 0.0
+    samples = signals[~equal]
+    if equal.any() and len(samples) >= _SHORTEST:
+        noise = _level(_off_cubic(np.arange(len(samples), dtype=np.float64), samples))
+        noise = np.maximum(noise, _resolution(signals)[1:])
+        before, after = (_run(signals, side) / (_BESIDE * noise) for side in (-1, 1))
+        moving = (np.abs(before + after) > 2.0 * _MOVES).any(axis=1)
+        again |= moving & _steady(before, after, 0.5)
+    return np.asarray(equal & np.concatenate([[False], again]))
+
+
+def _steady(before: Array, after: Array, most: float) -> Rows:
+    """Where the square of speeds (m, k) changes by this share at most: no stop, no jump beside."""
+    change, mean = (after - before) ** 2, (after + before) ** 2 / 4.0
+    return np.asarray(change.sum(axis=1) < most * mean.sum(axis=1))
+
+
+def _resolution(signals: Array) -> Array:
+    """Least change of speed nearby (m, k) that is not zero: an encoder's step, or less."""
+    change = np.abs(np.diff(signals, n=2, axis=0))
+    # A difference of decimal numbers is zero to some digits only.
+    change[change <= 1e-10 * np.abs(signals).max()] = np.inf
+    change = np.vstack([change[:1], change, change[-1:]])
+    return np.asarray(scipy.ndimage.minimum_filter1d(change, _DRIFT, axis=0))
+
+
+def _off_cubic(number: Array, values: Array) -> Array:
+    """Distance of samples (m, k) from the cubic through two to either side (m - 4, k)."""
+    at = np.arange(2, len(number) - 2)
+    beside = number[at[:, None] + _CUBIC] - number[at][:, None]
+    self = np.eye(len(_CUBIC), dtype=np.bool_)
+    above = np.where(self, 1.0, -beside[:, None, :])
+    below = np.where(self, 1.0, beside[:, :, None] - beside[:, None, :])
+    weights = np.prod(above / below, axis=2)
+    return np.asarray(values[2:-2] - np.einsum("ma,mak->mk", weights, values[at[:, None] + _CUBIC]))
+
+
+def _residuals(
+    number: Array, times: Array, signals: Array, late: Array, step: float
+) -> tuple[Array, Array, Array]:
+    """High-frequency residual of even signals, what right stamps make it, and its resolution."""
+    half = round(float(np.clip(_SPEED_TIME / step, _DRIFT // 10, _DRIFT // 2)))
+    at = np.arange(len(number))
+    # From samples that the residual has no part in: their noise must not meet its own.
+    ahead = half // 2 + len(_CUBIC)
+    there, behind = np.minimum(at + ahead, at[-1]), np.maximum(at - ahead, 0)
+
+    def change(values: Array) -> Array:
+        mean = scipy.ndimage.uniform_filter1d(values, half, axis=0, mode="nearest")
+        return np.asarray(mean[there] - mean[behind])
+
+    speed = change(signals) / change(times - times[0])[:, None]
+    late = _off_cubic(number, late[:, None])
+    return _off_cubic(number, signals), speed[2:-2] * late, _resolution(signals)[2:-2]
+
+
+def _share(
+    measured: Array, late: Array, resolution: Array
+) -> tuple[float, float, tuple[float, float]]:
+    """Share of `late` (m, k) in `measured`, its deviation, and the residual without and with it."""
+    level = np.minimum(_level(measured), _level(measured - late))
+    level = np.maximum(level, _ROUNDING * resolution)
+    measured, late = measured / level, late / level
+    inlier = np.minimum(np.abs(measured), np.abs(measured - late)) < _OUTLIER
+    measured, late = np.where(inlier, measured, 0.0), np.where(inlier, late, 0.0)
+    weight = float((late**2).sum())
+    if weight == 0.0:
+        return 0.5, np.inf, (1.0, 1.0)
+    share = float((measured * late).sum()) / weight
+    # Neighbours share samples, joints share the stamp: what is independent are stretches of rows.
+    score = ((measured - share * late) * late).sum(axis=1)
+    score = np.add.reduceat(score, np.arange(0, len(score), 2 * len(_CUBIC)))
+    deviation = float(np.sqrt(max(weight, (score**2).sum()))) / weight
+    squares = np.sum((measured - late) ** 2), np.sum(measured**2)
+    with_stamps, evenly = np.sqrt(np.array(squares) / np.count_nonzero(inlier))
+    return share, deviation, (float(with_stamps), float(evenly))
+
+
+def _level(values: Array) -> Array:
+    """Root mean square (k,) of what is not zero in each column, outliers limited; infinite without.
+
+    A joint at rest has no noise, and none of its rows is evidence.
+    """
+    levels = []
+    for column in np.abs(values).T:
+        some = column[column > 0.0]
+        most = _OUTLIER * 1.4826 * float(np.median(some)) if some.size else np.inf
+        levels.append(np.sqrt(np.mean(np.minimum(some, most) ** 2)) if some.size else np.inf)
+    return np.array(levels)
