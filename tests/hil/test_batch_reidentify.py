@@ -25,6 +25,7 @@ from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import InputError
 from hil.identify import Options, identify_campaign
+from hil.identify.options import FIXED
 from hil.identify.estimating import estimate_with
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
@@ -73,7 +74,7 @@ def same_bits(first: BatchResult, second: BatchResult) -> bool:
 def test_campaign_and_repetitions_are_those_of_hil_identify(
     campaign: Campaign, found: BatchResult
 ) -> None:
-    one = identify_campaign(campaign.folder.root, Silent()).estimate
+    one = identify_campaign(campaign.folder.root, Silent(), FIXED).estimate
     (level,) = found.campaigns
     np.testing.assert_allclose(level.values, one.pooled.values, **EXACT)
     np.testing.assert_allclose(level.covariance, one.pooled.covariance, rtol=1e-9, atol=1e-15)
@@ -91,7 +92,7 @@ def test_campaign_and_repetitions_are_those_of_hil_identify(
 def test_every_estimator_gives_what_it_gives_with_samples(
     name: BatchEstimator, campaign: Campaign, tmp_path: Path
 ) -> None:
-    prepared = prepare_sources(gather_sources(archives(campaign), 0.7), Options(), Silent())
+    prepared = prepare_sources(gather_sources(archives(campaign), 0.7), FIXED, Silent())
     one = estimate_with(prepared, Options(estimator=name), Silent()).result
     (level,) = batch(campaign.folder.root, plan=Plan(name, cache=tmp_path)).campaigns
     # The program of the consistent estimate stops at its own tolerance.
@@ -103,7 +104,7 @@ def test_every_estimator_gives_what_it_gives_with_samples(
 def test_the_error_on_unseen_motion_is_that_of_the_samples(
     campaign: Campaign, found: BatchResult
 ) -> None:
-    prepared = prepare_sources(gather_sources(archives(campaign), 0.7), Options(), Silent())
+    prepared = prepare_sources(gather_sources(archives(campaign), 0.7), FIXED, Silent())
     (level,) = found.campaigns
     model = prepared.sources.cell.model
     squares, rows = np.zeros(6), np.zeros(6)

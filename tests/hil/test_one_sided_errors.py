@@ -128,8 +128,13 @@ def test_friction_columns_of_the_wrong_sign_are_red(
     """The prediction stays as good, but friction that drives a joint is impossible."""
     columns = FrictionLaw.columns
 
-    def turned(law: FrictionLaw, velocity: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-        columns(law, velocity, out)
+    def turned(
+        law: FrictionLaw,
+        velocity: NDArray[np.float64],
+        direction: NDArray[np.float64],
+        out: NDArray[np.float64],
+    ) -> None:
+        columns(law, velocity, direction, out)
         out[0] *= -1.0
 
     monkeypatch.setattr(FrictionLaw, "columns", turned)
