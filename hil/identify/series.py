@@ -1,4 +1,4 @@
-"""Series that the figures of the report are drawn from: a few thousand rows, from all samples."""
+"""Series behind the figures of the report: a few thousand rows, from all samples."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .summary import moving_rows
 Array = NDArray[np.float64]
 
 FIGURE_SAMPLES: Final = 4000
-"""Rows of a time series that a figure is drawn from, at most."""
+"""Rows of a time series behind a figure, at most."""
 FRICTION_POINTS: Final = 600
 """Points per joint behind a friction curve."""
 _RECORDINGS: Final = 4  # of those that were fitted: more say the same again
@@ -34,7 +34,7 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
     sources, fitted, example = prepared.sources, prepared.fitted, prepared.held_out[0]
     model, values = sources.cell.model, estimate.pooled.values
     excitation, motion = fitted[0], fitted[0].motion
-    shown, drawn = _shown(prepared.training[0]), _shown(example)
+    shown, seen = _shown(prepared.training[0]), _shown(example)
     time = example.motion.time
     predicted = example.predicted_torque(model, values)
     parts = torque_parts(model, values, example)
@@ -56,15 +56,15 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
         excitation_position=motion.position[shown],
         excitation_velocity=motion.velocity[shown],
         example_archive=sources.held_out[0].name,
-        example_time=time[drawn] - example.origin,
-        example_measured=for_figure(time, example.torque)[drawn],
-        example_predicted=for_figure(time, predicted)[drawn],
+        example_time=time[seen] - example.origin,
+        example_measured=for_figure(time, example.torque)[seen],
+        example_predicted=for_figure(time, predicted)[seen],
         excitation_fitted=excitation.usable[shown].astype(np.float64),
-        example_counted=example.usable[drawn].astype(np.float64),
-        example_inertia=for_figure(time, parts.inertia)[drawn],
-        example_coriolis=for_figure(time, parts.coriolis)[drawn],
-        example_gravity=for_figure(time, parts.gravity)[drawn],
-        example_friction=for_figure(time, parts.friction)[drawn],
+        example_counted=example.usable[seen].astype(np.float64),
+        example_inertia=for_figure(time, parts.inertia)[seen],
+        example_coriolis=for_figure(time, parts.coriolis)[seen],
+        example_gravity=for_figure(time, parts.gravity)[seen],
+        example_friction=for_figure(time, parts.friction)[seen],
         friction_speed=speed,
         friction_torque=torque,
         law_speed=np.column_stack([curve.speed for curve in curves]),

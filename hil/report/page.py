@@ -47,7 +47,7 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
     labels = [parameters.short_label(p) for p in results.parameters]
     base, friction = parameters.table_rows(results)
     routes = parameters.routes(results)
-    drawn = validation.drawn_errors(results)
+    errors = validation.example_errors(results)
     return {
         "numbering": Numbering(),
         "results": results,
@@ -76,10 +76,10 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "uncertainty_panels": figures.uncertainty_panels(results, routes),
         "correlation": figures.correlation_matrix(results),
         "box_panels": figures.error_boxes(results),
-        "torque_panels": figures.torque_panels(series, drawn),
-        "split_panels": figures.split_panels(series, drawn),
-        "spectrum_panels": figures.spectrum_panels(series, drawn),
-        "curve_panels": figures.friction_curve_panels(series, drawn),
+        "torque_panels": figures.torque_panels(series, errors),
+        "split_panels": figures.split_panels(series, errors),
+        "spectrum_panels": figures.spectrum_panels(series, errors),
+        "curve_panels": figures.friction_curve_panels(series, errors),
         **verdict.verdict_context(results),
         **essential.context(results),
         **consistency.context(results),

@@ -37,7 +37,7 @@ class ErrorRow:
 
 @dataclass(frozen=True)
 class TorqueError:
-    """Error of one joint on the motion that is drawn: what stands beside its figures."""
+    """Error of one joint on the example of the figures, in words that stand beside them."""
 
     joint: str
     unit: str
@@ -129,27 +129,27 @@ def every_row_errors(results: Results) -> list[str]:
     return [numbers.percent(value) for value in np.median(np.array(known), axis=0).tolist()]
 
 
-def drawn_errors(results: Results) -> list[TorqueError]:
-    """Errors of each joint on the motion that is drawn: the first run, or what was fitted."""
+def example_errors(results: Results) -> list[TorqueError]:
+    """Errors of each joint on the example of the figures: the first run, or what was fitted."""
     judgement = results.judgement
     units = [joint.unit for joint in judgement.joints] if judgement else []
-    drawn: ValidationResult | FittedResult | None = None
+    example: ValidationResult | FittedResult | None = None
     if results.validation:
-        drawn = results.validation[0]
+        example = results.validation[0]
     elif len(results.repetitions) == 1:
-        drawn = results.fitted
+        example = results.fitted
     return [
-        TorqueError(name, units[j] if units else "N·m", _drawn_words(drawn, j))
+        TorqueError(name, units[j] if units else "N·m", _error_words(example, j))
         for j, name in enumerate(results.joint_names)
     ]
 
 
-def _drawn_words(drawn: ValidationResult | FittedResult | None, joint: int) -> str:
-    if drawn is None:
+def _error_words(example: ValidationResult | FittedResult | None, joint: int) -> str:
+    if example is None:
         return ""
-    words = f"error {numbers.percent(drawn.relative_error[joint])} %"
-    if drawn.all_rows_joint_errors:
-        words += f", every row {numbers.percent(drawn.all_rows_joint_errors[joint])} %"
+    words = f"error {numbers.percent(example.relative_error[joint])} %"
+    if example.all_rows_joint_errors:
+        words += f", every row {numbers.percent(example.all_rows_joint_errors[joint])} %"
     return words
 
 

@@ -93,20 +93,20 @@ def torque_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[P
 
 
 def _torque(
-    j: int, told: TorqueError, time: Array, measured: Array, predicted: Array, shaded: Stretches
+    j: int, joint: TorqueError, time: Array, measured: Array, predicted: Array, shaded: Stretches
 ) -> Panel:
     error = measured - predicted
-    alt = f"{told.joint}: measured and predicted torque over {_length(time)} s; {told.words}."
+    alt = f"{joint.joint}: measured and predicted torque over {_length(time)} s; {joint.words}."
     plots = (
         Plot(
             (_LEFT, 20.0, _INNER, 128.0),
-            f"torque [{told.unit}]",
+            f"torque [{joint.unit}]",
             [Trace(measured, WIDE, 4.0, "measured"), Trace(predicted, INK, 1.1, "predicted")],
             shaded=shaded,
         ),
         Plot(
             (_LEFT, 172.0, _INNER, 50.0),
-            f"measured − predicted [{told.unit}]",
+            f"measured − predicted [{joint.unit}]",
             [Trace(error, SECOND, 0.9, "difference")],
             shaded=shaded,
         ),
@@ -117,8 +117,8 @@ def _torque(
         time,
         plots,
         key=f"t{j}",
-        title=told.joint,
-        note=told.words,
+        title=joint.joint,
+        note=joint.words,
         alt=alt,
         traces=traces,
     )
@@ -154,7 +154,7 @@ def split_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Pa
 
 def _split(
     j: int,
-    told: TorqueError,
+    joint: TorqueError,
     time: Array,
     measured: Array,
     parts: dict[str, Array],
@@ -162,19 +162,19 @@ def _split(
 ) -> Panel:
     sizes = {name: float(np.sqrt(np.mean(part**2))) for name, part in parts.items()}
     words = ", ".join(f"{name} {numbers.significant(size, 2)}" for name, size in sizes.items())
-    alt = f"{told.joint}: parts of the predicted torque; RMS of {words} {told.unit}."
+    alt = f"{joint.joint}: parts of the predicted torque; RMS of {words} {joint.unit}."
     largest = max(sizes, key=lambda name: sizes[name])
-    note = f"largest: {largest}, RMS {numbers.significant(sizes[largest])} {told.unit}"
+    note = f"largest: {largest}, RMS {numbers.significant(sizes[largest])} {joint.unit}"
     lines = [Trace(parts[name], colour, width, name) for name, colour, width in PARTS]
     plot = Plot(
         (_LEFT, 20.0, _INNER, 140.0),
-        f"torque [{told.unit}]",
+        f"torque [{joint.unit}]",
         [Trace(measured, WIDE, 4.0, "measured"), *lines],
         shaded=shaded,
     )
     traces = traces_text(time, [plot], points=_POINTS)
     return _panel(
-        200.0, time, (plot,), key=f"g{j}", title=told.joint, note=note, alt=alt, traces=traces
+        200.0, time, (plot,), key=f"g{j}", title=joint.joint, note=note, alt=alt, traces=traces
     )
 
 
