@@ -136,16 +136,28 @@ class FrictionLaw:
         scaled = np.divide(velocity, self.standstill, out=out)
         return np.asarray(np.clip(scaled, -1.0, 1.0, out=out))
 
-    def direction(self, position: Array, velocity: Array) -> Array:
+    def direction(self, time: Array, position: Array, velocity: Array) -> Array:
         """Return the direction of dry friction (m,) along a motion: presliding state, or sign.
 
+        A reversal between two instants divides the step where the velocity, linear between them,
+        is zero.
+
         Args:
-            position: of the joint or motor at m instants [rad, m], in joint units.
+            time: of m instants [s].
+            position: of the joint or motor [rad, m], in joint units.
             velocity: likewise [rad/s, m/s].
         """
         if self.presliding == 0.0:
             return self.sign(velocity)
-        return presliding_state(position, self.presliding)
+        steps, before = np.diff(time), velocity[:-1]
+        share = before / np.where(before == velocity[1:], 1.0, before - velocity[1:])
+        turning = np.flatnonzero(before * velocity[1:] < 0.0)
+        turned = position[turning] + 0.5 * (before * steps * share)[turning]
+        path = np.insert(position, turning + 1, turned)
+        # What was before the first instant is not known: one step at its speed.
+        start = position[0] - velocity[0] * (steps[0] if len(steps) else 0.0)
+        state = presliding_state(np.insert(path, 0, start), self.presliding)[1:]
+        return np.delete(state, turning + 1 + np.arange(len(turning)))
 
     def columns(self, velocity: Array, direction: Array, out: Array) -> None:
         """Write one row of `out` (k, ...) per coefficient, for speeds and directions (...)."""

@@ -40,7 +40,7 @@ FOLDS: Final = 5
 BANDWIDTHS: Final = (10.0, 5.0, 7.0, 14.0, 20.0, 40.0)  # Hz
 # In the middle of what gears do first. A jump (zero) is no candidate: at rest its sign is that of
 # the noise.
-PRESLIDING: Final = (1e-4, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
+PRESLIDING: Final = (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
 # Rows near a reversal say how dry friction turns round, but not so well as sliding ones what it is:
 # where they do not help, intervals are honest only without them.
 LEFT_OUT: Final[tuple[LeftOut, ...]] = ("slow", "rests")

@@ -116,16 +116,19 @@ class JointFriction:
             return np.zeros((0, self.n_joints))
         return self.coupling.speeds[list(self.motors)]
 
-    def direction(self, position: Array, velocity: Array) -> Array:
+    def direction(self, time: Array, position: Array, velocity: Array) -> Array:
         """Return the direction of dry friction (m, n + k), of joints and then of `motors`.
 
         Args:
+            time: of m instants [s].
             position: of the joints along a motion (m, n) [rad or m].
             velocity: likewise (m, n).
         """
-        joints = [law.direction(position[:, j], velocity[:, j]) for j, law in enumerate(self.laws)]
+        joints = [
+            law.direction(time, position[:, j], velocity[:, j]) for j, law in enumerate(self.laws)
+        ]
         motors = [
-            self.laws[motor].direction(position @ speed, velocity @ speed)
+            self.laws[motor].direction(time, position @ speed, velocity @ speed)
             for motor, speed in zip(self.motors, self.motor_speeds(), strict=True)
         ]
         return np.column_stack([*joints, *motors])

@@ -137,7 +137,7 @@ class Samples:
         """Return samples whose dry friction has the direction that a model's law gives it."""
         if not any(law.presliding > 0.0 for law in model.friction.laws):
             return replace(self, motion=self.motion._replace(direction=None))
-        direction = model.friction.direction(self.motion.position, self.motion.velocity)
+        direction = model.friction.direction(*self.motion[:3])
         return replace(self, motion=self.motion._replace(direction=direction))
 
     def as_measured(self, joint: int, columns: Array) -> Array:

@@ -25,8 +25,8 @@ from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import InputError
 from hil.identify import Options, identify_campaign
-from hil.identify.options import FIXED
 from hil.identify.estimating import estimate_with
+from hil.identify.options import FIXED
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Silent

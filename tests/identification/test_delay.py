@@ -160,7 +160,7 @@ class TestCommonDelay:
         model = RobotModel.from_urdf(URDF, friction=law)
         time = np.arange(6000) * STEP
         late = motion(time - 0.005)
-        direction = model.friction.direction(late[0], late[1])
+        direction = model.friction.direction(time, late[0], late[1])
         recording = replace(
             a_recording(model, truth, 0.0),
             torque=model.torque(truth, *late, direction),

@@ -19,7 +19,7 @@ CUT = 1400  # of 2000 rows: what is fitted
 def a_recording(model: RobotModel = MODEL, values: np.ndarray | None = None) -> Recording:
     """A motion of the planted arm with noise on torque and position."""
     motion = a_motion()
-    direction = model.friction.direction(motion.position, motion.velocity)
+    direction = model.friction.direction(*motion[:3])
     rng = np.random.default_rng(5)
     torque = model.torque(truth() if values is None else values, *motion[1:4], direction)
     return Recording(
