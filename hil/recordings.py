@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 
 _ALWAYS = ("cycle", "gap", "position")
 _CHANNELS = {
-    "velocity": ("velocity",),
     "torque": ("torque",),
     "motor_current": ("target_current", "motor_current"),
     "commanded_position": ("commanded_position", "target_position"),
+    "velocity": ("velocity",),
 }
 """Columns of an archive that a recording takes, by what they become there."""
 

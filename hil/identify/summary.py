@@ -147,7 +147,7 @@ def _executed(model: RobotModel, training: Sequence[Samples], rows: Sequence[sli
     """Every sample of the motion, standing joints included, as the criteria of a plan see it."""
     factor = Factor.zero(model)
     for samples, part in zip(training, rows, strict=True):
-        motion = samples.motion.rows(part)
+        motion = samples.motion.rows(part)._replace(direction=None)
         factor = factor + Factor.from_samples(model, motion, samples.torque[part])
     return factor
 

@@ -104,7 +104,7 @@ def torque(condition: Condition) -> Array:
     body = pin.Inertia(load.mass, np.array(load.centre), 0.01 * load.mass * np.eye(3))
     arm.appendBodyToJoint(arm.njoints - 1, body, pin.SE3.Identity())
     data = arm.createData()
-    _, q, qd, qdd = motion()
+    q, qd, qdd = motion()[1:4]
     rigid = np.array([pin.rnea(arm, data, *state) for state in zip(q, qd, qdd, strict=True)])
     dry, viscous, third = condition.friction
     return rigid + ROTORS * qdd + np.sign(qd) * (dry + viscous * np.abs(qd) + third * qd**2)

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hil.errors import ArchiveError
-from hil.identify.options import Options
+from hil.identify.options import FIXED, Options
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.importers import ColumnMap, Robot, Use, import_log
@@ -34,6 +34,10 @@ UR5 = "ur5_robot.urdf"
 EPOCH_MS = 1_700_000_000_000
 
 
+PLAIN = replace(FIXED, torque_bandwidth=None)
+"""Nothing chosen automatically, for a plain estimate."""
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """An identification from an archive."""
@@ -49,7 +53,7 @@ def identify(
     log: str,
     columns: str,
     locked: tuple[str, ...] = (),
-    options: Options = Options(torque_bandwidth=None),
+    options: Options = PLAIN,
 ) -> Found:
     """The way of `hil import log` and `hil identify`, up to the plain estimate."""
     (folder / "map.toml").write_text(columns)
@@ -239,7 +243,7 @@ def test_a_delay_of_the_torque_is_noticed_and_on_demand_compensated(tmp_path: Pa
         [torque]
         columns = [7, 8, 9, 10, 11, 12]
         """
-    plain = Options(torque_bandwidth=None)
+    plain = replace(PLAIN, delay=0.0)
     unaware = identify(tmp_path, simulated, "log.csv", columns, options=plain)
     noticed = unaware.prepared.delays
     assert noticed is not None

@@ -95,7 +95,7 @@ def test_delays_that_were_compensated_axis_by_axis_are_no_doubt(split: Identific
 
 
 def test_delays_that_were_not_are_one_doubt_with_its_remedy(log: Path) -> None:
-    prepared = prepare_sources(gather_sources([log], 0.7), replace(PLAIN, delay=None), Silent())
+    prepared = prepare_sources(gather_sources([log], 0.7), replace(PLAIN, delay=0.0), Silent())
     assert prepared.assumed_delay.tolist() == [0.0] * 6
     assert not any("delay" in note for note in prepared.notes)
     assert prepared.delays is not None

@@ -65,7 +65,10 @@ ARRAYS = ColumnMap.model_validate({"position": {"columns": "q"}, "time": {"colum
 ALONE = ColumnMap.model_validate({"position": {"joints_along": "columns"}, "sample_rate": 500.0})
 NAMED = ColumnMap.model_validate({"position": {"columns": ["q1", "q2"]}, "time": {"column": "t"}})
 TOPICS = ColumnMap.model_validate(
-    {"position": {"columns": "/joint_states/position"}, "time": {"column": "/joint_states/stamp"}}
+    {
+        "position": {"columns": "/joint_states/position"},
+        "time": {"column": "/joint_states/stamp", "unit": "ns"},
+    }
 )
 
 
@@ -137,7 +140,9 @@ def seeds() -> list[bytes]:
     rows = np.zeros(8, [("q1", "<f8"), ("q2", "<f4"), ("at", "<M8[ns]"), ("t", "<f8")])
     rows["t"] = t
     np.save(typed, rows)
-    matlab = "q = [" + "; ".join(f"{a} {b}" for a, b in q) + "];\nt = [0 1 2 3 4 5 6 7]';\n"
+    matlab = (
+        "q = [" + "; ".join(f"{a} {b}" for a, b in q) + "];\nt = [0 .02 .04 .06 .08 .1 .12 .14]';\n"
+    )
     database = bag(folder() / "seed.db3", {"/joint_states": (STATE, states())})
     with closing(sqlite3.connect(database)) as connection:
         connection.execute("PRAGMA page_size = 512")
