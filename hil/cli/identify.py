@@ -154,7 +154,7 @@ def identify(
         bandwidth=_bandwidth(bandwidth),
         velocity=velocity,
         friction=friction_from(friction),
-        standstill=None if standstill == "auto" else standstill,
+        standstill=standstill,
         in_sample=in_sample,
     )
     unseen = predict or ()

@@ -66,7 +66,7 @@ class Options:
     bandwidth: float | Literal["auto"] = "auto"
     velocity: VelocitySource | Literal["auto"] = "auto"
     friction: Mapping[str, Any] | Literal["auto"] = "auto"
-    standstill: LeftOut | None = None
+    standstill: LeftOut | Literal["auto"] | None = "auto"
     in_sample: bool = False
 
     def __post_init__(self) -> None:
@@ -150,5 +150,7 @@ def _positive(term: str, figure: str) -> float:
     return value
 
 
-FIXED: Final = Options(estimator="wls", bandwidth=RIGID_BANDWIDTH, velocity="position", friction={})
+FIXED: Final = Options(
+    estimator="wls", bandwidth=RIGID_BANDWIDTH, velocity="position", friction={}, standstill=None
+)
 """Nothing chosen by inner prediction: the cell's own friction law, weighted least squares."""

@@ -238,7 +238,7 @@ def _stated(sources: Sources, options: Options) -> tuple[Sources, Preprocessing]
         smoother=options.smoother,
         rigid_bandwidth=RIGID_BANDWIDTH if options.bandwidth == "auto" else options.bandwidth,
         velocity="position" if options.velocity == "auto" else options.velocity,
-        left_out=options.standstill,
+        left_out=None if options.standstill == "auto" else options.standstill,
         smooth_torque=options.method == "paper",
         torque_delay=delay,
         torque_bandwidth=bandwidth if isinstance(bandwidth, float) else None,
@@ -254,7 +254,7 @@ def _questions(sources: Sources, options: Options) -> set[Question]:
         and options.smoother == "spline"
         and all(one.velocity is not None for one in recorded),
         "presliding": options.friction == "auto",
-        "rows": options.standstill is None,
+        "rows": options.standstill == "auto",
         # A cell file with a drive train says which terms are wanted.
         "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
         # A controller's own currents come through no low-pass.
