@@ -80,7 +80,7 @@ def read_at(time: Array, values: Array, at: Array) -> Array:
 def payload_torque(model: RobotModel, samples: Samples) -> Array:
     """Torque of the known payload (m, n), as the torque channel would have recorded it."""
     load = model.load_torque(*samples.motion[1:4])
-    for joint in range(model.n_joints if model.payload is not None else 0):
+    for joint in range(model.n_joints if model.has_load else 0):
         load[:, joint] = samples.as_measured(joint, load[:, joint : joint + 1])[:, 0]
     return load
 
