@@ -188,7 +188,8 @@ def choose_settings(
         low_pass: looked for where "low-pass" is among them.
 
     Returns:
-        The settings, and how they were chosen.
+        The settings, and how they were chosen; those of `start` where what is fitted is too short
+        to predict a part of it from the rest.
     """
     trial = _Trial(ready)
     now = start
@@ -220,6 +221,8 @@ def choose_settings(
         candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
         found = trial.decide("estimator", candidates)
         now, choices = found.settings, [*choices, found.choice]
+    if not math.isfinite(trial.error(now)):
+        return start, ()
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
 
 
@@ -256,6 +259,8 @@ class _Trial:
 
     def _predicted(self, settings: Settings) -> float:
         shrinkage, folds = settings.shrinkage, self._reduced(settings)
+        if not all(np.all(factor.samples > 0) for factor in folds.fitted):
+            return math.inf
 
         def estimate(k: int, factor: Factor) -> Array:
             weights = joint_weights(factor)

@@ -15,7 +15,10 @@ from hil.outcome import _load_series, _series_bytes
 from hil.progress import Silent
 from tests.hil.simulated_logs import simulate
 
-OPTIONS = replace(FIXED, friction={"presliding": 1e-4, "third": "none"}, delay=0.0)
+# The arm of the log starts without acceleration, which no rigid body does: slow rows are left out.
+OPTIONS = replace(
+    FIXED, friction={"presliding": 1e-4, "third": "none"}, delay=0.0, standstill="slow"
+)
 N = 6
 
 

@@ -14,7 +14,7 @@ from drivers.errors import NotAtStandstill
 from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
 from hil.campaign.folder import CampaignFolder
 from hil.errors import HilError
-from hil.identify import Options
+from hil.identify.options import FIXED
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
@@ -165,14 +165,14 @@ def _observed(
 def estimated(root: Path) -> tuple[Estimated | None, str]:
     """The estimate from a campaign folder, and why there is none.
 
-    As `hil identify` does it, without what it computes beside the parameters.
+    As `hil identify` does it with fixed settings, without what it computes beside the parameters.
     """
     folder = CampaignFolder(root)
     kinds = ("excitation", "validation", "standstill")
     paths = [path for kind in kinds for path in folder.completed(kind)]
     try:
-        sources = gather_sources(paths, Options().split, ())
-        prepared = prepare_sources(sources, Options(), Silent(), look_for_delay=False)
+        sources = gather_sources(paths, FIXED.split, ())
+        prepared = prepare_sources(sources, FIXED, Silent(), look_for_delay=False)
         result = estimate_repetitions(sources.cell.model, prepared.fitted)
     except (HilError, IdentificationError) as error:
         return None, f"{type(error).__name__}: {error}"
