@@ -149,13 +149,11 @@ class DelayEstimate:
         """The common delay, then each axis that deviates from it, in words."""
         who = "all axes" if self.agree else "all other axes"
         against = f"the {self.assumed * 1e3:.3g} ms assumed"
-        if self.reason is None:
+        if self.reason is None or self.significant:
             line = f"{self._words(self.common, self.common_std)},"
             line += f" {'' if self.significant else 'not '}significantly different from {against}"
         else:
             line = f"not determined; {self.reason}"
-            if self.significant:
-                line += f"; {self.common * 1e3:.2g} ms predicts better than {against}"
         lines = [f"{who}: {line}"]
         lines += [
             f"{name}: {self._words(self.common + deviation, std)}, which predicts better than the"

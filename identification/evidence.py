@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.carried_load import CarriedLoad, find_load
+from identification.causes import Causes, find_causes
 from identification.delay import DelayEstimate
 from identification.errors import IdentificationError
 from identification.estimation import Estimate, total
@@ -19,6 +20,7 @@ from identification.excitation.criteria import (
     information,
 )
 from identification.factor import Factor
+from identification.finding import Finding
 from identification.gravity_direction import GravityDirection, find_gravity
 from identification.inertia_ratio import InertiaRatio
 from identification.model import RobotModel
@@ -30,7 +32,6 @@ from identification.repeatability import Repeatability, repeatability
 from identification.repetitions import RepeatedEstimate
 from identification.residual_checks import ResidualChecks, check_residuals
 from identification.standard_gram import StandardGram, gravity_loads
-from identification.turned_axes import MOST_RECORDINGS, Turned, compare_turned
 from identification.validation import (
     PredictionError,
     over_all,
@@ -45,6 +46,8 @@ Array = NDArray[np.float64]
 SLOW: Final = 10.0
 SIGMAS: Final = 3.0
 _POSTURES: Final = 40
+# A few recordings of each kind decide on gravity and load as well as all.
+_MOST_RECORDINGS: Final = 3
 _PLAUSIBLE: Final = Implausible((), ())
 
 
@@ -62,6 +65,7 @@ class Surroundings:
         jumps: steps of the measured positions that no arm makes.
         controller_inertia: the controller's own diagonal inertia over the model's.
         assumed_delay: what the fit took that delay to be, of all axes or of each (n,) [s].
+        mended: what was wrong with the recordings and is made good in what was fitted.
     """
 
     torque_limit: Array | None = None
@@ -73,6 +77,7 @@ class Surroundings:
     nominal_scale: NominalScale | None = None
     jumps: tuple[PositionJump, ...] = ()
     controller_inertia: InertiaRatio | None = None
+    mended: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -108,7 +113,7 @@ class Evidence:
             [N·m or N]; None likewise.
         disagreement: of the repetitions' own estimates with the pooled one, the worst of them,
             as a share of each axis's torque (n,); None without repetitions.
-        turned: whether an axis seems to count the other way round, None if it was not tried.
+        causes: faults that explain errors of the fit, None if they were not looked for.
         gravity: the direction of gravity that fits best, None if it was not looked for.
         load: a body that the arm seems to carry on unseen motion only, None likewise.
         loaded: joints that gravity can load (n,), None if that was not looked at.
@@ -131,7 +136,7 @@ class Evidence:
     slow: Repeatability | None = None
     estimation_noise: Array | None = None
     disagreement: Array | None = None
-    turned: Turned | None = None
+    causes: Causes | None = None
     gravity: GravityDirection | None = None
     load: CarriedLoad | None = None
     loaded: NDArray[np.bool_] | None = None
@@ -202,6 +207,7 @@ def gather(
     nominal: Array | None = None,
     surroundings: Surroundings = Surroundings(),
     in_sample: bool = False,
+    names: Sequence[str] = (),
     slow: float = SLOW,
     sigmas: float = SIGMAS,
 ) -> Evidence:
@@ -217,6 +223,7 @@ def gather(
         nominal: parameters (p,) of the nominal model.
         surroundings: what is known of the cell beside its model.
         in_sample: whether the held-out motions are those of the training after all.
+        names: of the training recordings.
         slow: bandwidth in which systematic errors are looked for [Hz].
         sigmas: standard deviations that make a wrong sign certain.
 
@@ -231,7 +238,7 @@ def gather(
     position = np.concatenate([run.motion.position for run in held_out])
     unseen = total([run.factor(model) for run in held_out])
     error = over_all(prediction_error(model, values, held_out))
-    grams = [StandardGram.of(model, some[:MOST_RECORDINGS]) for some in (training, held_out)]
+    grams = [StandardGram.of(model, some[:_MOST_RECORDINGS]) for some in (training, held_out)]
     slow_errors = [slow_error(model, values, run, slow) for run in held_out if repeated]
     return Evidence(
         estimate=result.pooled,
@@ -243,7 +250,7 @@ def gather(
         slow=repeatability(model, values, training, slow) if repeated else None,
         estimation_noise=_estimation_noise(result, unseen) if repeated else None,
         disagreement=_disagreement(result) if repeated else None,
-        turned=compare_turned(model, training, held_out, slow),
+        causes=find_causes(model, training, values, names),
         gravity=find_gravity(model, *grams),
         load=find_load(model, *grams),
         loaded=gravity_loads(model, position[:: max(1, len(position) // _POSTURES)]),

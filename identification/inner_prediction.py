@@ -35,6 +35,8 @@ Question = Literal[
 ]
 
 FOLDS: Final = 5
+LOW_PASS: Final = "low-pass of the torque"
+"""Name of that choice."""
 # What a rigid model leaves out (elasticity of gears, the clock of a logger, the servo) begins at
 # some 10 Hz on most arms: the first candidate, which others have to beat.
 BANDWIDTHS: Final = (10.0, 5.0, 7.0, 14.0, 20.0, 40.0)  # Hz
@@ -208,7 +210,7 @@ def choose_settings(
         width = low_pass(now.model, now.preprocessing)
         if width is not None:
             filtered, behind = _sweep(trial, _with(now, torque_bandwidth=width), questions)
-            found = trial.decide("low-pass of the torque", [now, filtered], LOW_PASS_WORTHWHILE)
+            found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE)
             if found.choice.chosen:
                 now, choices = filtered, behind
             choices = [*choices, found.choice]

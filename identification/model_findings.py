@@ -1,4 +1,4 @@
-"""What the estimate itself says: undetermined, impossible, turned, or not the drive train's."""
+"""What the estimate itself says: undetermined, impossible, or not the drive train's."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.cause_findings import spoilt_by_outliers
 from identification.evidence import SIGMAS, Evidence
 from identification.finding import Finding, listed
 from identification.thresholds import Thresholds
@@ -122,53 +121,6 @@ def _all(names: Sequence[str], joints: NDArray[np.intp]) -> str:
     return listed([names[j] for j in joints.tolist()], len(joints))
 
 
-def turned(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
-    """An axis with which the recordings make more sense the other way round."""
-    found = evidence.turned
-    if found is None:
-        return
-    sure = found.highest < limit.turned
-    yield from _untold(names, evidence, limit)
-    if not sure.any() or _by_gravity(evidence, limit) or spoilt_by_outliers(evidence, limit):
-        return
-    best = float(found.ratio[sure].min())
-    # Arms have mirror images: two axes may do equally well.
-    alike = " or ".join(
-        name for axis, name in enumerate(names) if sure[axis] and found.ratio[axis] < 1.2 * best
-    )
-    yield Finding(
-        "direction of axes",
-        "wrong",
-        f"{evidence.tested_on} is predicted with {np.sqrt(best):.2f} times the error if {alike}"
-        " counts the other way round: the sign of its gear ratio or direction may be wrong",
-        f"jog {alike} by hand and compare its sense of rotation with the URDF's",
-        "cause",
-    )
-
-
-def _untold(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
-    """Joints that may count either way for all that the recordings say."""
-    found = evidence.turned
-    if found is None or evidence.in_sample:
-        return
-    untold = np.flatnonzero((found.highest >= limit.turned) & (found.lowest < limit.told))
-    if untold.size:
-        yield Finding(
-            "direction of axes",
-            "information",
-            f"the data do not tell the direction of {_all(names, untold)}: counting the other way"
-            " round would fit about as well",
-        )
-
-
-def _by_gravity(evidence: Evidence, limit: Thresholds) -> bool:
-    """Whether another gravity explains better what turning an axis round explains as well."""
-    gravity, turned = evidence.gravity, evidence.turned
-    if gravity is None or turned is None or not gravity.off(limit.gravity, limit.gravity_angle):
-        return False
-    return gravity.ratio < float(turned.ratio.min())
-
-
 def consistent(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
     """Repetitions that do not say the same."""
     share = evidence.disagreement
@@ -189,11 +141,24 @@ def delay(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterat
     """Torque that lags the position by another time than the fit took it to, axis by axis."""
     surroundings = evidence.surroundings
     found = surroundings.delays
-    if found is None or not found.determined.any():
+    if found is None:
+        return
+    assumed = np.broadcast_to(surroundings.assumed_delay, found.applied.shape)
+    if found.significant and np.array_equal(assumed, found.applied):
+        yield Finding(
+            "delay",
+            "doubtful",
+            f"the torque lags the position by {1e3 * found.common:.3g} ±"
+            f" {1e3 * found.half_interval:.2g} ms ({1e3 * found.assumed:.3g} ms were stated); that"
+            " was compensated",
+            "state the delay with --delay, or correct it where it arises",
+            "condition",
+        )
+        return
+    if not found.determined.any():
         return
     if evidence.estimate.undetermined or evidence.estimate.condition > limit.condition:
         return  # of a motion this poor a delay is another combination of parameters
-    assumed = np.broadcast_to(surroundings.assumed_delay, found.delays.shape)
     measured = [
         f"{name} {1e3 * found.delays[j]:.3g} ± {1e3 * found.interval_factor * found.std[j]:.2g} ms"
         f" ({1e3 * assumed[j]:.3g} ms assumed)"

@@ -17,6 +17,11 @@ def jumps(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Find
         yield replace(finding, role="cause")
 
 
+def mended(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Finding]:
+    """What was wrong with the recordings and is made good in what was fitted."""
+    yield from evidence.surroundings.mended
+
+
 def scale(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Finding]:
     """Torques that are not as large as the nominal inertias ask for."""
     found = evidence.surroundings.nominal_scale

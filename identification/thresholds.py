@@ -24,11 +24,9 @@ class Thresholds:
         systematic: slow error of one axis that neither noise nor a change of friction explains.
             Right models: below 0.1 % without, 1.9 % with ripple, drifting friction, elasticity
             and delay. One turned sign: 4.2 % and more on some axis.
-        turned: squared slow error with an axis turned the other way, over that as it is, which
-            three standard errors must leave below. With the right directions: 1.0 and more. With
-            a turned axis that matters: 0.36 at most (NS 16 with effects, UR10).
-        told: the same three standard errors down, below which the direction of an axis is not told
-            by the recordings. That is information, and no doubt.
+        cause: error of predicted blocks of the fit with a fault mended, over that as it is, below
+            which the fault is a reason to say no; above, it is doubtful. See
+            :mod:`identification.causes`.
         inconsistency: difference between the torque that one repetition's own estimate and the
             pooled one predict on the training motion, as a share of the torque. Noise of the
             size that `axis` allows makes 2 %.
@@ -80,8 +78,7 @@ class Thresholds:
     explained: float = 0.0
     little_explained: float = 0.5
     systematic: float = 0.03
-    turned: float = 0.7
-    told: float = 1.1
+    cause: float = 0.7
     inconsistency: float = 0.10
     friction: float = 0.03
     generalisation: float = 2.5

@@ -287,12 +287,6 @@ def _chosen(
     with reporter.task("choosing settings by inner prediction", 1) as task:
         settings, choices = choose_settings(ready, start, questions, low_pass)
         task.advance(1)
-    found = settings.preprocessing.torque_bandwidth
-    if "low-pass" in questions and found is not None:
-        sources = sources.with_doubt(
-            f"the recorded torque seems to have come through a low-pass of {found:.3g} Hz before "
-            "it was recorded (found on what was fitted); the model is filtered alike"
-        )
     law = settings.model.friction.laws[0]
     cell = sources.cell
     if "presliding" in questions:

@@ -159,6 +159,7 @@ def _judged(
             nominal=None if nominal is None else nominal.values,
             surroundings=surroundings_of(paths, prepared, result.pooled),
             in_sample=sources.in_sample,
+            names=[source.name for source in sources.training],
         )
         impossible = (*evidence.implausible.impossible, *consistency_reasons(consistency))
         evidence = replace(

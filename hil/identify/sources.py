@@ -42,6 +42,7 @@ class Source:
         origin: time of the first set-point [s].
         merged: samples that had the time stamp of the one before, and were averaged with it.
         clock: what was decided about its time stamps, in sentences.
+        retimed: whether other times than the stamps were used.
         context: the motion of a longer recording that this is a part of, and where it begins in
             it, so that filters know what lies beyond its ends. Its torques are zero outside.
     """
@@ -51,6 +52,7 @@ class Source:
     origin: float
     merged: int = 0
     clock: tuple[str, ...] = ()
+    retimed: bool = False
     context: tuple[Recording, int] | None = None
 
     def changed(self, change: Callable[[Recording], Recording]) -> Source:
@@ -316,10 +318,18 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
     merged = recording.n_samples - single.n_samples
     words: tuple[str, ...] = ()
+    stamped = single
     if archive.kind == "imported":  # a controller counts its own cycles
         clock = true_times(single)
-        single, words = clock.apply(single), tuple(clock.describe())
-    return Source(archive.path.name, single, float(single.time[0]), merged, words)
+        single, words = clock.apply(stamped), tuple(clock.describe())
+    return Source(
+        archive.path.name,
+        single,
+        float(single.time[0]),
+        merged,
+        words,
+        retimed=single is not stamped,
+    )
 
 
 def useful_part(archive: Archive, recording: Recording) -> range | None:
@@ -378,6 +388,7 @@ def _part(whole: Source, words: str, start: int, stop: int) -> Source:
         float(recording.time[min(start, recording.n_samples - 1)]),
         whole.merged,
         whole.clock,
+        whole.retimed,
         (context, start),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from identification.estimation import Estimate
 from identification.evidence import Surroundings
+from identification.finding import Finding
+from identification.inner_prediction import LOW_PASS
 from identification.masks import SATURATED
 from identification.nominal_prior import NOMINAL_SHARE
 from identification.nominal_scale import NominalScale, nominal_scale
@@ -47,7 +49,38 @@ def surroundings_of(paths: Sequence[Path], prepared: Prepared, estimate: Estimat
         ),
         delays=prepared.delays,
         assumed_delay=prepared.assumed_delay,
+        mended=(*_clock(prepared), *_low_pass(prepared)),
     )
+
+
+def _clock(prepared: Prepared) -> Iterator[Finding]:
+    """Time stamps that are not those of the samples."""
+    retimed = [source for source in prepared.sources.training if source.retimed]
+    if not retimed:
+        return
+    more = f"; likewise in {len(retimed) - 1} more recordings" if len(retimed) > 1 else ""
+    yield Finding(
+        "clock",
+        "doubtful",
+        f"{retimed[0].name}: {'; '.join(retimed[0].clock)}{more}",
+        "log the controller's own time beside each sample",
+        "condition",
+    )
+
+
+def _low_pass(prepared: Prepared) -> Iterator[Finding]:
+    """A low-pass of the torque that was found, and not stated."""
+    found = any(one.name == LOW_PASS and one.chosen for one in prepared.choices)
+    width = prepared.preprocessing.torque_bandwidth
+    if found and width is not None:
+        yield Finding(
+            "torque bandwidth",
+            "doubtful",
+            f"the recorded torque seems to have come through a low-pass of {width:.3g} Hz before"
+            " it was recorded; the model is filtered alike",
+            "record the torque unfiltered, or state its low-pass with --torque-bandwidth",
+            "condition",
+        )
 
 
 class Nominal(NamedTuple):

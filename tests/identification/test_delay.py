@@ -206,7 +206,7 @@ class TestUndeterminedDelay:
         assert found.reason is not None and found.significant
         np.testing.assert_array_equal(found.applied, found.common)
         (line,) = found.describe()
-        assert line.endswith("ms predicts better than the 0 ms assumed")
+        assert line.endswith("cycles), significantly different from the 0 ms assumed")
 
     def test_without_motion_there_is_no_row(self, model: RobotModel, truth: Array) -> None:
         still = a_recording(model, truth, 0.0, speed=0.0)
