@@ -51,7 +51,7 @@ def causes(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Itera
         check, words, step = _CAUSES[cause.fault.kind](names, cause)
         yield Finding(
             check,
-            "wrong" if cause.ratio < limit.cause else "doubtful",
+            "wrong" if cause.fault.discrete or cause.ratio < limit.cause else "doubtful",
             f"{words}; with that, parts of the fitted motion are predicted from the rest with"
             f" {cause.ratio:.2f} times the error",
             step,

@@ -90,6 +90,11 @@ class Fault:
     joints: tuple[int, ...] = ()
     part: Part | None = None
 
+    @property
+    def discrete(self) -> bool:
+        """Whether it is there or not: a sign or an order has no size."""
+        return self.kind in (*_OF_MOTION, *_OF_TORQUE)
+
 
 @dataclass(frozen=True)
 class Cause:
@@ -196,7 +201,7 @@ class _State:
 
     def mended(self, fault: Fault) -> _State:
         """The state with one fault less."""
-        if fault.kind in (*_OF_MOTION, *_OF_TORQUE):
+        if fault.discrete:
             moved = tuple(_mended(self.model, one, fault) for one in self.recordings)
             return replace(self, recordings=moved, _moved={})
         return replace(self, found=(*self.found, fault))
@@ -472,7 +477,7 @@ def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[flo
         tables: of the recordings.
         own: its columns (B, n, q, r).
     """
-    if fault.kind in ("changed arm", *_OF_MOTION, *_OF_TORQUE):
+    if fault.discrete or fault.kind == "changed arm":
         return None, 0.0
     p = score.values.shape[1]
     sizes = score.added[:, _SIZE.get(fault.kind, 0)]
@@ -480,8 +485,8 @@ def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[flo
         # Its column has the pooled parameters; what it multiplies is what the fit finds beside it.
         columns = own[..., :p, 0].reshape(-1, p)
         column = columns[np.argmax(columns.any(axis=1))]
-        power = np.einsum("bjpp->p", tables.gram[:, list(fault.joints), :p, :p]) * column
-        sizes = sizes * (power @ column) / (score.values @ power)
+        power = tables.gram[:, fault.joints[0], :p, :p].sum(axis=0) @ column
+        sizes = sizes * (power @ column) / ((score.values * (column != 0.0)) @ power)
     return float(sizes.mean()), float(np.sqrt((_FOLDS - 1) * sizes.var()))
 
 

@@ -25,8 +25,8 @@ class Thresholds:
             Right models: below 0.1 % without, 1.9 % with ripple, drifting friction, elasticity
             and delay. One turned sign: 4.2 % and more on some axis.
         cause: error of predicted blocks of the fit with a fault mended, over that as it is, below
-            which the fault is a reason to say no; above, it is doubtful. See
-            :mod:`identification.causes`.
+            which the fault is a reason to say no; above, it is doubtful, but for signs and orders,
+            which are right or wrong. See :mod:`identification.causes`.
         inconsistency: difference between the torque that one repetition's own estimate and the
             pooled one predict on the training motion, as a share of the torque. Noise of the
             size that `axis` allows makes 2 %.

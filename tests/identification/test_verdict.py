@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from identification.causes import Cause, Causes, Fault, Kind
 from identification.delay import DelayEstimate
 from identification.estimation import Estimate
 from identification.evidence import Evidence, Surroundings, gather
@@ -19,7 +20,6 @@ from identification.plausibility import Implausible
 from identification.preprocessing import Samples
 from identification.repeatability import Repeatability
 from identification.repetitions import estimate_repetitions
-from identification.turned_axes import Turned
 from identification.validation import PredictionError
 from identification.verdict import Thresholds, Verdict, judge
 from sim_fixtures.ns16 import urdf_text
@@ -167,9 +167,11 @@ def test_a_gear_ratio_turned_on_one_side_is_found(model: RobotModel, axis: int) 
     assert not verdict.good
     assert "must not be relied on" in verdict.line
     if axis < 3:
-        assert evidence.turned is not None
-        assert evidence.turned.ratio.argmin() in ((0, 3) if axis == 0 else (axis,))
-        assert evidence.turned.highest.min() < Thresholds().turned
+        assert evidence.causes is not None
+        first = evidence.causes.found[0]
+        assert first.fault.kind == "axis sign"
+        assert first.fault.joints in (((0,), (3,)) if axis == 0 else ((axis,),))
+        assert first.ratio < Thresholds().cause
 
 
 @pytest.mark.parametrize("coupling", ["k54", "k64", "k65"])
@@ -314,8 +316,8 @@ def evidence_with(**changes: object) -> Evidence:
 AXES = ("one", "two")
 
 
-def seems_turned(ratio: list[float], *, spread: float = 1.2) -> Turned:
-    return Turned(np.array(ratio), spread * np.array(ratio))
+def caused(kind: Kind, *joints: int, ratio: float = 0.4) -> Causes:
+    return Causes((Cause(Fault(kind, joints), ratio, 0.01, 0.001),), None, ())
 
 
 def test_a_single_recording_with_a_small_error_is_good() -> None:
@@ -335,11 +337,12 @@ def test_a_single_recording_with_a_small_error_is_good() -> None:
         ({"training": an_error(0.05), "held_out": an_error(0.2)}, "one 4.0 times to 20.0%"),
         ({"estimate": an_estimate(undetermined=("a",))}, "does not determine a"),
         ({"nominal": an_error(0.03)}, "nominal model predicts better"),
-        ({"turned": seems_turned([0.2, 5.0])}, "if one counts the other way round"),
-        (
-            {"turned": seems_turned([0.21, 0.2])},
-            "if one or two counts the other way round",
-        ),
+        ({"causes": caused("axis sign", 0)}, "one seems to count the other way round"),
+        ({"causes": caused("torque sign", 1)}, "torque of two seems to have the other sign"),
+        ({"causes": caused("torque order", 0, 1)}, "torques of one and two seem to stand in"),
+        ({"causes": caused("joint order", 0, 1)}, "positions and torques of one and two"),
+        ({"causes": caused("delay")}, "torque of all axes lags the position by 10 ± 2 ms"),
+        ({"causes": caused("gain", 1)}, "the torque of two is 1.01 ± 0.002 times"),
         ({"disagreement": np.array([0.2, 0.0])}, "repetitions disagree"),
         ({"implausible": Implausible(("m1 is negative",), ())}, "m1 is negative"),
     ],
@@ -351,8 +354,10 @@ def test_each_fault_turns_the_verdict_and_is_said(changes: dict[str, object], wo
     assert verdict.reasons[0] in verdict.line
 
 
-def test_an_axis_that_may_be_turned_by_chance_is_not_called_turned() -> None:
-    assert judge(AXES, evidence_with(turned=seems_turned([0.2, 5.0], spread=5.0))).good
+def test_a_cause_of_little_error_is_doubtful() -> None:
+    verdict = judge(AXES, evidence_with(causes=caused("gain", 1, ratio=0.85)))
+    assert verdict.good
+    assert any("torque of two is 1.01" in doubt for doubt in verdict.doubts)
 
 
 def test_a_model_that_does_not_beat_the_mean_torque_is_not_good() -> None:
@@ -473,12 +478,10 @@ def test_axes_with_the_same_step_share_one_line() -> None:
 
 
 def test_a_direction_that_the_data_do_not_tell_is_information() -> None:
-    verdict = judge(
-        AXES, evidence_with(turned=Turned(np.array([1.0, 20.0]), np.array([np.inf, 30.0])))
-    )
+    verdict = judge(AXES, evidence_with(causes=Causes((), None, undecided=(0,))))
     assert verdict.good and not any("direction" in doubt for doubt in verdict.doubts)
     (finding,) = (one for one in verdict.findings if one.level == "information")
-    assert finding.words.startswith("the data do not tell the direction of one:")
+    assert finding.words.startswith("the data do not determine the direction of one:")
 
 
 def test_locking_is_explained() -> None:
