@@ -70,6 +70,7 @@ _REVERSAL_PERIODS: Final = 0.5
 _FOLDS: Final = 5
 # Of the time, at most half as many of the covariance: one delay needs no more.
 _BLOCKS: Final = 79
+_WORTHWHILE: Final = 0.02  # of the squared error, that a delay of its own has to save
 _CHANCE: Final = 0.005  # of an axis that deviates by chance, each way
 
 
@@ -294,7 +295,7 @@ def _deviating(blocks: _Blocks, p: int, n: int) -> list[int]:
         solution = blocks.solution(basis)
         covariance, limit = blocks.covariance(basis, solution, _CHANCE / n)
         far = abs(solution.values[-1]) > limit * np.sqrt(covariance[-1, -1])
-        if errors[axis] >= error or not far:
+        if errors[axis] >= (1.0 - _WORTHWHILE) * error or not far:
             break
         axes.append(axis)
         left.remove(axis)

@@ -81,6 +81,27 @@ def size(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterato
             )
 
 
+def unexplained(_: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
+    """An error far above the noise of the recordings for which no cause was found."""
+    error, floor, causes = evidence.held_out.overall, evidence.floor, evidence.causes
+    if floor is None or causes is None or causes.found:
+        return
+    if error > limit.unexplained and error > limit.multiple * floor:
+        best = causes.best
+        least = "" if best is None else f" (the best of them leaves {best.ratio:.0%} of it)"
+        yield Finding(
+            "unexplained error",
+            "wrong",
+            f"the torque error on {evidence.tested_on} is {error:.1%},"
+            f" {error / floor:.1f} times the noise floor of {floor:.1%}, and none of the faults"
+            " that were tried explains it: delay, torque constants, signs and order of joints,"
+            f" payload, changes between parts of what was fitted{least}",
+            "look at what the model leaves out: the friction curves of the report, elasticity,"
+            " springs or balancers ([[robot.elements]] of the cell file), temperature",
+            "symptom",
+        )
+
+
 def explained(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
     """Whether the model beats the mean torque of each axis."""
     error = evidence.held_out

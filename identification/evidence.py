@@ -36,6 +36,7 @@ from identification.validation import (
     PredictionError,
     over_all,
     prediction_error,
+    residual,
     slow_error,
 )
 
@@ -108,6 +109,8 @@ class Evidence:
         friction_change: share by which friction was higher on an unseen motion than estimated,
             of all motions the one with the largest change, per joint (n,); None likewise.
         slow: what repeats and what does not of the low-passed residual; None likewise.
+        noise_floor: what no model can predict of the torque (n,) [N·m or N]: the residual above
+            the band of the motion, and what differs between repetitions; None if not measured.
         estimation_noise: standard deviation of the predicted torque on the unseen motion because
             the parameters come from noisy data, from the scatter over the repetitions (n,)
             [N·m or N]; None likewise.
@@ -134,6 +137,7 @@ class Evidence:
     held_out_apart: PredictionError | None = None
     friction_change: Array | None = None
     slow: Repeatability | None = None
+    noise_floor: Array | None = None
     estimation_noise: Array | None = None
     disagreement: Array | None = None
     causes: Causes | None = None
@@ -191,6 +195,16 @@ class Evidence:
         )
 
     @property
+    def floor(self) -> float | None:
+        """Noise floor over all axes, as a share of the held-out torque; None if not measured."""
+        if self.noise_floor is None:
+            return None
+        error = self.held_out
+        power = float(error.torque_squared.sum())
+        noise = float((np.nan_to_num(self.noise_floor) ** 2 * error.rows).sum())
+        return float(np.sqrt(noise / power)) if power > 0.0 else None
+
+    @property
     def share_of_limit(self) -> Array | None:
         """RMS error on unseen motion over the joint's torque limit (n,); None without limits."""
         limit = self.surroundings.torque_limit
@@ -239,6 +253,7 @@ def gather(
     unseen = total([run.factor(model) for run in held_out])
     error = over_all(prediction_error(model, values, held_out))
     grams = [StandardGram.of(model, some[:_MOST_RECORDINGS]) for some in (training, held_out)]
+    steady = repeatability(model, values, training, slow) if repeated else None
     slow_errors = [slow_error(model, values, run, slow) for run in held_out if repeated]
     return Evidence(
         estimate=result.pooled,
@@ -247,7 +262,8 @@ def gather(
         held_out_slow=over_all(one.error for one in slow_errors) if repeated else None,
         held_out_apart=over_all(one.apart for one in slow_errors) if repeated else None,
         friction_change=_largest([one.friction_change for one in slow_errors]),
-        slow=repeatability(model, values, training, slow) if repeated else None,
+        slow=steady,
+        noise_floor=_noise_floor(model, values, training[:_MOST_RECORDINGS], slow, steady),
         estimation_noise=_estimation_noise(result, unseen) if repeated else None,
         disagreement=_disagreement(result) if repeated else None,
         causes=find_causes(model, training, values, names),
@@ -277,6 +293,29 @@ def gather(
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
     )
+
+
+def _noise_floor(
+    model: RobotModel,
+    values: Array,
+    recordings: Sequence[Samples],
+    bandwidth: float,
+    steady: Repeatability | None,
+) -> Array:
+    """Standard deviation of the noise of each joint's torque (n,), NaN of one without rows.
+
+    White noise of the power that the residual has above the bandwidth, and what differs between
+    repetitions below it.
+    """
+    squares, rows = np.zeros((2, model.n_joints))
+    for samples in recordings:
+        fast = residual(model, values, samples) - residual(model, values, samples, bandwidth)
+        nyquist = 0.5 / float(np.median(np.diff(samples.motion.time)))
+        share = max(1.0 - bandwidth / nyquist, 0.5)  # of white noise that is above
+        squares += np.where(samples.usable, fast**2, 0.0).sum(axis=0) / share
+        rows += np.count_nonzero(samples.usable, axis=0)
+    white = squares / np.where(rows > 0.0, rows, np.nan)
+    return np.sqrt(white if steady is None else white + np.nan_to_num(steady.noise) ** 2)
 
 
 def _coupling(factor: Factor) -> CouplingIndex:

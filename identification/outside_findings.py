@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from identification.evidence import Evidence
 from identification.finding import Finding
 from identification.position_jumps import jump_findings
@@ -24,10 +26,15 @@ def mended(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Fin
 
 def scale(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Finding]:
     """Torques that are not as large as the nominal inertias ask for."""
-    found = evidence.surroundings.nominal_scale
-    if found is not None:
-        for finding in found.findings():
-            yield replace(finding, role="cause")
+    found, causes = evidence.surroundings.nominal_scale, evidence.causes
+    if found is None:
+        return
+    # Torques in another joint's column, or with the wrong sign, are not of the nominal size.
+    explained = {j for one in causes.found for j in one.fault.joints} if causes else set()
+    scale = found.scale.copy()
+    scale[sorted(explained)] = np.nan
+    for finding in replace(found, scale=scale).findings():
+        yield replace(finding, role="cause")
 
 
 def inertia(_: Sequence[str], evidence: Evidence, __: Thresholds) -> Iterator[Finding]:

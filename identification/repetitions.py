@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Samples
 
 Array = NDArray[np.float64]
+
+_FEWEST_TO_SCATTER: Final = 3
 
 Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
 """An estimator: some recordings and their factor to an estimate."""
@@ -73,6 +76,21 @@ class RepeatedEstimate:
                 else np.full(values.shape[1], np.nan)
             ),
         )
+
+    def with_scatter(self) -> RepeatedEstimate:
+        """The estimate with intervals no narrower than its repetitions scatter.
+
+        Blocks of time are shared by the repetitions, and errors of opposite signs in some of them
+        (a payload in every other one) cancel there. Two repetitions are too few to scatter.
+        """
+        if len(self.repetitions) < _FEWEST_TO_SCATTER:
+            return self
+        known = np.isfinite(self.pooled.std) & (self.pooled.std > 0.0)
+        ratio = np.where(known, self.scatter_std / np.where(known, self.pooled.std, 1.0), 1.0)
+        wider = np.fmax(ratio, 1.0)
+        covariance = self.pooled.covariance.copy()
+        covariance[np.ix_(known, known)] *= np.outer(wider, wider)[np.ix_(known, known)]
+        return replace(self, pooled=replace(self.pooled, covariance=covariance))
 
     @property
     def mean(self) -> Array:

@@ -39,7 +39,7 @@ class ResidualChecks:
     Attributes:
         torque_rms: measured torque of the rows that count (n,) [N·m or N].
         rms: residual of those rows (n,) [N·m or N].
-        colour: correlation in time.
+        colour: correlation in time, of what was fitted.
         speed: mean residual against the joint's own speed.
         position: against the joint's own position.
         ripple: against the angle of the joint's motor; None where no gear ratio is known.
@@ -119,7 +119,10 @@ def check_residuals(
     return ResidualChecks(
         torque_rms=np.sqrt(squares[0] / rows),
         rms=np.sqrt(squares[1] / rows),
-        colour=autocorrelation(left, steps_of([run.motion.time for run in runs])),
+        colour=autocorrelation(
+            left[: len(training)] or left,
+            steps_of([run.motion.time for run in training or runs]),
+        ),
         speed=Profile(speeds, _joined(speed, repeated).mean()),
         position=Profile(positions, _joined(position, repeated).mean()),
         ripple=Ripple(_joined(ripple, repeated).mean()) if ripple else None,

@@ -27,6 +27,9 @@ class Thresholds:
         cause: error of predicted blocks of the fit with a fault mended, over that as it is, below
             which the fault is a reason to say no; above, it is doubtful, but for signs and orders,
             which are right or wrong. See :mod:`identification.causes`.
+        unexplained: error over all axes that may stay without a cause however small the noise is,
+            and
+        multiple: of the noise floor up to which an error may be larger than that.
         inconsistency: difference between the torque that one repetition's own estimate and the
             pooled one predict on the training motion, as a share of the torque. Noise of the
             size that `axis` allows makes 2 %.
@@ -79,6 +82,8 @@ class Thresholds:
     little_explained: float = 0.5
     systematic: float = 0.03
     cause: float = 0.7
+    unexplained: float = 0.06
+    multiple: float = 5.0
     inconsistency: float = 0.10
     friction: float = 0.03
     generalisation: float = 2.5

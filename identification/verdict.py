@@ -33,6 +33,7 @@ _CHECKS = (
     cause_findings.friction_change,
     model_findings.plausible,
     error_findings.size,
+    error_findings.unexplained,
     error_findings.explained,
     error_findings.growth,
     model_findings.systematic,
@@ -141,6 +142,9 @@ def _measure(names: Sequence[str], evidence: Evidence) -> str:
         f"{'in-sample ' if evidence.in_sample else ''}torque error {error.overall:.1%} over all"
         f" axes, {error.relative[worst]:.1%} at worst ({names[worst]})"
     )
+    floor = evidence.floor
+    if floor:
+        text += f"; {error.overall / floor:.1f} times the noise floor of {floor:.1%}"
     systematic = evidence.systematic
     if systematic is not None and not np.all(np.isnan(systematic)):
         axis = int(np.nanargmax(systematic))

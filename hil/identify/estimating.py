@@ -97,6 +97,8 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         prior = cad_prior(prepared.sources.cell)
         case = _Case(model, fitted, prior, instrumental, prepared.shrinkage)
         result, doubts = _ESTIMATORS[options.estimator](case)
+        if prepared.sources.same_motion:
+            result = result.with_scatter()
         result = _with_delay_uncertainty(case, result, prepared.delay_variance)
         task.advance(1, "prior")
         posterior = _posterior(case, result.phase)

@@ -19,6 +19,7 @@ from identification.preprocessing import RIGID_BANDWIDTH, Preprocessing, Samples
 from identification.repetition_noise import repetition_noise
 from identification.shrinkage import Shrinkage
 from identification.signals.clock import time_base
+from identification.thresholds import Thresholds
 from identification.torque_channel import find_torque_bandwidth
 
 from .currents import with_torques
@@ -103,10 +104,10 @@ def prepare_sources(
         delays = _delays(sources, preprocessing, options, reporter)
     delay_notes: list[str] = []
     assumed = np.full(sources.cell.model.n_joints, preprocessing.torque_delay)
-    unknown = options.delay is None and sources.cell.file.controller is None
-    if delays is not None and (unknown or options.delay == "auto"):
+    by_axis = options.delay == "auto"
+    if delays is not None and (by_axis or (options.delay is None and _other(sources, delays))):
         sources, preprocessing, assumed, delay_notes = _compensated(
-            sources, preprocessing, delays, by_axis=options.delay == "auto"
+            sources, preprocessing, delays, by_axis=by_axis
         )
     sources, chosen, choices = _chosen(sources, preprocessing, options, reporter)
     preprocessing = chosen.preprocessing
@@ -359,6 +360,16 @@ def _compensated(
 
     moved = replace(sources, training=shifted(sources.training), held_out=shifted(sources.held_out))
     return moved, none, found.applied, notes
+
+
+def _other(sources: Sources, found: DelayEstimate) -> bool:
+    """Whether a delay that was found replaces the cell's.
+
+    That of a controller is known: only what differs by more than the estimate errs in closed loop
+    is another one.
+    """
+    stated = sources.cell.file.controller is not None
+    return not stated or abs(found.common - found.assumed) > Thresholds().delay * found.cycle
 
 
 def _masked(fitted: Sequence[Samples]) -> dict[str, NDArray[np.intp]]:

@@ -25,6 +25,7 @@ from identification.noise import standstill_variance
 from identification.recording import Recording, RecordingError
 from identification.resampling import without_repeats
 from identification.signals.clock import true_times
+from identification.signals.repeats import offsets_of_repetitions
 
 Array = NDArray[np.float64]
 
@@ -74,7 +75,7 @@ class Sources:
         metadata: of the first archive.
         plan: of the first archive; None where none was attached.
         training: what is fitted.
-        same_motion: whether these are repetitions of one planned motion.
+        same_motion: whether these are repetitions of one motion.
         held_out: what is predicted and never fitted.
         noise_variance: of the positions (n,) [rad²]; None where no standstill was recorded.
         torque_variance: of the torques at standstill (n,) [N²·m²]; None likewise.
@@ -161,7 +162,12 @@ def gather_sources(
         for doubt in Findings.of(archive.metadata).warnings
     ]
     doubts += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
-    same_motion = len({archive.attachments.get("plan.json") for archive in fitted}) == 1
+    plan = _plan_of(fitted[0])
+    same_motion = plan is not None and (
+        len({archive.attachments.get("plan.json") for archive in fitted}) == 1
+    )
+    if plan is None:
+        training, same_motion = _aligned(training)
     tested_on = "unseen motion"
     if in_sample:
         held_out, tested_on = training, "the motion that was fitted"
@@ -177,13 +183,12 @@ def gather_sources(
         training, held_out, doubt = _split(training, split)
         doubts.append(doubt)
     rest = [source_of(archive, cell, to_fit=False) for archive in by_kind.get("standstill", [])]
-    plan = _plan_of(fitted[0])
     return Sources(
         cell=cell,
         metadata=dict(fitted[0].metadata),
         plan=plan,
         training=tuple(training),
-        same_motion=same_motion and plan is not None,
+        same_motion=same_motion,
         held_out=tuple(held_out),
         noise_variance=position_noise(cell, rest[0].recording) if rest else None,
         torque_variance=_torque_variance(rest[0].recording) if rest else None,
@@ -191,6 +196,21 @@ def gather_sources(
         tested_on=tested_on,
         in_sample=in_sample,
     )
+
+
+def _aligned(sources: list[Source]) -> tuple[list[Source], bool]:
+    """Imported recordings with one origin if they show one motion, and whether they do."""
+    offsets = offsets_of_repetitions([source.recording for source in sources])
+    if offsets is None:
+        return sources, False
+    starts = [
+        source.recording.time[0] - offset for source, offset in zip(sources, offsets, strict=True)
+    ]
+    latest = max(starts)
+    return [
+        replace(source, origin=float(latest + offset))
+        for source, offset in zip(sources, offsets, strict=True)
+    ], True
 
 
 def _plan_of(archive: Archive) -> dict[str, Any] | None:

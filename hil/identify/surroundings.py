@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from identification.estimation import Estimate
 from identification.evidence import Surroundings
-from identification.finding import Finding
+from identification.finding import Finding, listed
 from identification.inner_prediction import LOW_PASS
 from identification.masks import SATURATED
 from identification.nominal_prior import NOMINAL_SHARE
@@ -24,6 +24,11 @@ from .controller_model import controller_error, controller_inertia
 from .prepared import Prepared
 
 Array = NDArray[np.float64]
+
+# Of a joint's range: what is smaller is rounding of floating-point numbers.
+_ROUNDING: Final = 1e-9
+_SMALL: Final = 0.01  # quantile of the moves between samples that is one step of a coarse encoder
+_COARSE: Final = 0.02  # share of the accelerations
 
 
 def surroundings_of(paths: Sequence[Path], prepared: Prepared, estimate: Estimate) -> Surroundings:
@@ -49,7 +54,7 @@ def surroundings_of(paths: Sequence[Path], prepared: Prepared, estimate: Estimat
         ),
         delays=prepared.delays,
         assumed_delay=prepared.assumed_delay,
-        mended=(*_clock(prepared), *_low_pass(prepared)),
+        mended=(*_clock(prepared), *_low_pass(prepared), *_resolution(prepared)),
     )
 
 
@@ -79,6 +84,38 @@ def _low_pass(prepared: Prepared) -> Iterator[Finding]:
             f"the recorded torque seems to have come through a low-pass of {width:.3g} Hz before"
             " it was recorded; the model is filtered alike",
             "record the torque unfiltered, or state its low-pass with --torque-bandwidth",
+            "condition",
+        )
+
+
+def _resolution(prepared: Prepared) -> Iterator[Finding]:
+    """Positions in steps so coarse that their accelerations are lost in them.
+
+    Rounding to a step q is white noise of variance q²/12; smoothed with a bandwidth B it leaves
+    accelerations of variance q²/12 (2 / rate) (2 pi)^4 B^5 / 5.
+    """
+    names, coarse = prepared.sources.cell.joint_names, dict[str, float]()
+    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
+        recording, motion = source.recording, samples.motion
+        interval = float(np.median(np.diff(recording.time)))
+        for j, name in enumerate(names):
+            moves = np.abs(np.diff(recording.position[:, j]))
+            moves = moves[moves > _ROUNDING * np.ptp(recording.position[:, j])]
+            if not moves.size:
+                continue
+            step = float(np.quantile(moves, _SMALL))
+            width = min(samples.position_bandwidth[j], 0.5 / interval)
+            noise = step**2 / 12.0 * 2.0 * interval * (2.0 * np.pi) ** 4 * width**5 / 5.0
+            if np.sqrt(noise) > _COARSE * motion.acceleration[:, j].std():
+                coarse[name] = max(step, coarse.get(name, 0.0))
+    if coarse:
+        each = listed([f"{name} {step:.2g}" for name, step in coarse.items()])
+        yield Finding(
+            "resolution",
+            "doubtful",
+            f"the positions are recorded in coarse steps [rad or m]: {each}; more than"
+            f" {_COARSE:.0%} of the accelerations is rounding",
+            "record positions with more digits, or identify with a lower --bandwidth",
             "condition",
         )
 
