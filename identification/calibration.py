@@ -14,7 +14,8 @@ part is predicted by inner folds: each stretch of time from parameters of the ot
 bias only as far as the model is right; and it holds the uncertainty of the folds' parameters, so
 that intervals are rather too wide than too narrow where the fitted part is short.
 
-Every row counts, at rest and at reversals too. Nothing held out is read to make an interval.
+Rows count at rest and at reversals too, but not where motion or torque are not known: beside gaps
+and ends, and saturated. Nothing held out is read to make an interval.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ from identification.errors import IdentificationError
 from identification.estimation import Estimate
 from identification.factor import Factor
 from identification.inner_prediction import FOLDS
+from identification.masks import SATURATED, TORN
 from identification.model import RobotModel
-from identification.phase_factor import FINE_BLOCK, PhaseFactor, block_runs, merged
+from identification.phase_factor import FINE_BLOCK, PhaseFactor, block_runs, counted, merged
 from identification.preprocessing import Samples
 from identification.quantiles import normal_limit, student_limit
 from identification.residual_blocks import BLOCK, FEWEST_BLOCKS, block_index
@@ -44,13 +46,14 @@ Refit = Callable[[Factor], Array]
 
 @dataclass(frozen=True, eq=False)
 class TorqueMeans:
-    """Means of [W | y] over B blocks of time of `BLOCK` seconds, every row of them.
+    """Means of [W | y] over B blocks of time of `BLOCK` seconds, rows at rest included.
 
     Attributes:
-        rows: per joint j over its columns and, last, the torque (B, c_j + 1).
+        rows: per joint j over its columns and, last, the torque (B, c_j + 1); NaN where less than
+            half of the block is known of the joint.
         columns: per joint the parameter index of each of its columns (c_j,).
         block: place of each block since the origin of its motion (B,).
-        count: time samples (B,).
+        count: samples that were averaged (B, n).
     """
 
     rows: tuple[Array, ...]
@@ -60,29 +63,21 @@ class TorqueMeans:
 
     @classmethod
     def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> TorqueMeans:
-        """Blocks of recordings one after the other; without those less than half full."""
+        """Blocks of recordings one after the other."""
+        parts = [_means(model, samples) for samples in recordings if len(samples.torque)]
         columns = model.plan.columns
-        rows: list[list[Array]] = [[np.zeros((0, len(own) + 1))] for own in columns]
-        blocks, counts = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
-        for samples in recordings:
-            index = block_index(samples)
-            count = np.bincount(index).astype(np.intp)
-            full = np.flatnonzero(count > 0.5 * count.max(initial=0))
-            sums = [np.zeros((len(count), len(own) + 1)) for own in columns]
-            whole = replace(samples, usable=samples.usable | True)
-            for part, chunk in augmented_rows(model, whole):
-                for block, at in block_runs(index[part]):
-                    for total, own in zip(sums, chunk, strict=True):
-                        total[block] += own[:, at].sum(axis=1)
-            for all_of_joint, total in zip(rows, sums, strict=True):
-                all_of_joint.append(total[full] / count[full, None])
-            blocks.append(full)
-            counts.append(count[full])
-        return cls(
-            tuple(np.concatenate(own) for own in rows),
+        empty = cls(
+            tuple(np.zeros((0, len(own) + 1)) for own in columns),
             columns,
-            np.concatenate(blocks),
-            np.concatenate(counts),
+            np.zeros(0, dtype=np.intp),
+            np.zeros((0, model.n_joints), dtype=np.intp),
+        )
+        every = [empty, *parts]
+        return cls(
+            tuple(np.concatenate(own) for own in zip(*(one.rows for one in every), strict=True)),
+            columns,
+            np.concatenate([one.block for one in every]),
+            np.concatenate([one.count for one in every]),
         )
 
     def errors(self, values: Array) -> Array:
@@ -108,7 +103,8 @@ class TorqueMeans:
 class Calibration:
     """Held-out means of torque and their 95 % intervals, per joint (n,).
 
-    NaN stands for a joint whose intervals are not known: it moved in one stretch of time only.
+    NaN stands for a joint without any, and for one whose intervals are not known: it moved in one
+    stretch of time only.
 
     Attributes:
         blocks: held-out means that were compared with their interval.
@@ -157,24 +153,33 @@ def calibrate(
         IdentificationError: there are fewer than `FEWEST_BLOCKS` blocks of the fitted motion, or
             a fold cannot be fitted.
     """
-    spread = np.sqrt(np.mean(inner_errors(phase, fitted, refit) ** 2, axis=0))
+    inner = inner_errors(phase, fitted, refit)
+    with np.errstate(invalid="ignore"):
+        spread = np.sqrt(np.nansum(inner**2, axis=0) / np.count_nonzero(~np.isnan(inner), axis=0))
     # Repetitions of one motion share their blocks: an error that repeats is no new error.
     limit = float(student_limit(0.025, len(np.unique(fitted.block))))
     known = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
     errors = np.abs(held_out.errors(estimate.values))
     by_parameters = estimate.interval_factor**2 * held_out.variance(known)
     half = np.sqrt(by_parameters + (limit * spread) ** 2)
-    white = estimate.noise_std**2 / held_out.count[:, None]
+    white = estimate.noise_std**2 / np.maximum(held_out.count, 1)
     white_half = np.sqrt(by_parameters + normal_limit(0.025) ** 2 * white)
-    judged = np.isfinite(spread) & (len(errors) > 0)
+    judged = ~np.isnan(errors) & np.isfinite(spread)
+    blocks = np.count_nonzero(judged, axis=0)
 
     def share(limits: Array) -> Array:
-        return np.where(judged, (errors <= limits).sum(axis=0) / max(1, len(errors)), np.nan)
+        inside = np.count_nonzero(judged & (errors <= limits), axis=0)
+        return np.where(blocks > 0, inside / np.maximum(blocks, 1), np.nan)
 
     return Calibration(
-        blocks=np.where(judged, len(errors), 0).astype(np.intp),
+        blocks=blocks,
         inside=share(half),
-        half_width=np.median(half, axis=0) if len(half) else np.full(len(spread), np.nan),
+        half_width=np.array(
+            [
+                np.median(own[counts]) if counts.any() else np.nan
+                for own, counts in zip(half.T, judged.T, strict=True)
+            ]
+        ),
         spread=spread,
         white_inside=share(white_half),
     )
@@ -184,7 +189,7 @@ def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
     """Errors of mean torques (B, n), each stretch of time predicted from the others.
 
     Stretches have equally many rows, and are cut at equal times of all recordings. NaN where the
-    other stretches have no row of the joint.
+    mean is not known, infinite where the other stretches have no row of the joint.
 
     Args:
         phase: the rows that are fitted.
@@ -201,14 +206,36 @@ def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
         raise IdentificationError(
             f"the fitted motion is too short to be predicted in parts: {BLOCK * len(rows):g} s"
         )
-    fold = np.floor(FOLDS * (np.cumsum(rows) - 0.5 * rows) / rows.sum()).astype(np.intp)
+    before = np.cumsum(rows) - 0.5 * rows
+    # Blocks at rest behind the last row belong to the last stretch.
+    fold = np.minimum(np.floor(FOLDS * before / rows.sum()).astype(np.intp), FOLDS - 1)
     found = np.full((len(means.block), phase.n_joints), np.nan)
     for k in range(FOLDS):
         others = phase.blocks(np.repeat(fold != k, fine)[: len(phase)]).total
         inside = fold[means.block] == k
         errors = means.errors(refit(others))[inside]
-        found[inside] = np.where(others.samples > 0, errors, np.nan)
+        errors[:, others.samples == 0] = np.inf
+        found[inside] = errors
     return found
+
+
+def _means(model: RobotModel, samples: Samples) -> TorqueMeans:
+    """Blocks of one recording, which has rows."""
+    known = np.ones(samples.torque.shape, dtype=np.bool_)
+    if samples.mask is not None:
+        for reason in (TORN, SATURATED):
+            known &= ~samples.mask.reasons[reason]
+    index = block_index(samples)
+    present = np.unique(index)
+    count = counted(index, known)[present]
+    sums = [np.zeros((int(index[-1]) + 1, len(own) + 1)) for own in model.plan.columns]
+    for part, chunk in augmented_rows(model, replace(samples, usable=known)):
+        for block, at in block_runs(index[part]):
+            for total, own in zip(sums, chunk, strict=True):
+                total[block] += own[:, at].sum(axis=1)
+    divisor = np.where(count > 0.5 * np.bincount(index).max(), count, np.nan)
+    rows = tuple(total[present] / divisor[:, j, None] for j, total in enumerate(sums))
+    return TorqueMeans(rows, model.plan.columns, present, count)
 
 
 def _pooled(shares: Array, blocks: NDArray[np.intp]) -> float:

@@ -143,12 +143,12 @@ class CalibrationResult(Frozen):
         shares = [1.0 if share is None else share for share in self.joint_inside]
         lowest = min(shares)
         text = (
-            f"of {self.means} held-out means of torque over {self.block:g} s, {self.inside:.0%} lie"
-            " inside their 95 % interval"
+            f"{self.inside:.1%} of {self.means} held-out means of torque ({self.block:g} s, per"
+            " joint) lie inside their 95% intervals"
         )
         if lowest < self.inside:
-            text += f" ({joint_names[shares.index(lowest)]}: {lowest:.0%})"
-        return f"{text}; if residuals were white it would be {self.white_inside:.0%}"
+            text += f", {lowest:.0%} of {joint_names[shares.index(lowest)]}"
+        return f"{text}; intervals for white residuals would hold {self.white_inside:.0%}"
 
 
 class DelaysResult(Frozen):

@@ -12,10 +12,11 @@ from identification.calibration import Calibration, TorqueMeans, calibrate, inne
 from identification.errors import IdentificationError
 from identification.estimation import joint_weights, solve
 from identification.factor import Factor
+from identification.masks import SATURATED, STANDSTILL, TORN, RowMask
 from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Samples
 from identification.repetitions import estimate_repetitions
-from tests.identification.two_link import MODEL, NOISE, a_motion, coloured, recording
+from tests.identification.two_link import MODEL, NOISE, a_motion, coloured, recording, truth
 
 Array = NDArray[np.float64]
 
@@ -128,9 +129,32 @@ class TestInnerFolds:
         with pytest.raises(IdentificationError, match="too short"):
             calibrated(samples.between(0, 400), samples.between(CUT, LENGTH))
 
+    def test_rest_behind_the_last_row_belongs_to_the_last_stretch(self) -> None:
+        """Rows that are not fitted are predicted all the same."""
+        samples = recording(coloured(np.random.default_rng(6), LENGTH, 5e-3, 0.05), MOTION)
+        usable = samples.usable.copy()
+        usable[2400:] = False
+        fitted = replace(samples, usable=usable).between(0, CUT)
+        phase, means = PhaseFactor.from_samples(MODEL, fitted), TorqueMeans.of(MODEL, [fitted])
+        assert np.isfinite(inner_errors(phase, means, least_squares)).all()
+
 
 class TestTorqueMeans:
-    def test_blocks_less_than_half_full_are_left_out(self) -> None:
+    def test_a_block_less_than_half_full_has_no_mean(self) -> None:
         samples = recording(np.zeros((LENGTH, 2)), MOTION)
-        assert TorqueMeans.of(MODEL, [samples.between(0, 1040)]).count.tolist() == [100] * 10
-        assert TorqueMeans.of(MODEL, [samples.between(0, 1060)]).count.tolist()[-2:] == [100, 60]
+        for length, known in ((1040, 10), (1060, 11)):
+            errors = TorqueMeans.of(MODEL, [samples.between(0, length)]).errors(truth())
+            assert len(errors) == 11
+            np.testing.assert_array_equal(np.isfinite(errors).sum(axis=0), known)
+
+    def test_rows_beside_an_end_are_left_out_and_those_at_rest_are_not(self) -> None:
+        """Where motion or torque are not known no model can be right; at rest it has to be."""
+        ends, slow = np.zeros((2, LENGTH, 2), dtype=np.bool_)
+        ends[:20], slow[40:60] = True, True
+        reasons = {TORN: ends, SATURATED: np.zeros_like(ends), STANDSTILL: slow}
+        mask = RowMask(reasons, (LENGTH, 2), ~(ends | slow))
+        error = np.where(ends, 1e3, np.where(slow, 1.0, 0.0))
+        samples = replace(recording(error, MOTION), usable=mask.usable, mask=mask)
+        means = TorqueMeans.of(MODEL, [samples])
+        np.testing.assert_array_equal(means.count[:2], [[80, 80], [100, 100]])
+        np.testing.assert_allclose(means.errors(truth())[:2], [[0.25] * 2, [0.0] * 2], atol=1e-9)
