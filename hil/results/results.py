@@ -141,7 +141,7 @@ class CalibrationResult(Frozen):
     def words(self, joint_names: Sequence[str]) -> str:
         """The figures, in a sentence without its full stop."""
         shares = [1.0 if share is None else share for share in self.joint_inside]
-        lowest = min(shares)
+        lowest = min(shares, default=1.0)
         text = (
             f"{self.inside:.1%} of {self.means} held-out means of torque ({self.block:g} s, per"
             " joint) lie inside their 95% intervals"
