@@ -6,7 +6,7 @@ FOLDER holds the folders of recordings that `benchmarks/recordings` describes.
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
 identify` does, by default settings; *plain* is `benchmarks.plain_fit` on the same rows. A ratio
-below 1 is won.
+below 1 is won. *Inside* is the share of hil's held-out means of torque inside their 95 % intervals.
 
 With ``--degraded``, the first held-out split of each robot and of the simulated cell is done again
 with copies of the logs, each with one fault (`benchmarks.degradations`): the error beside that of
@@ -67,6 +67,8 @@ class Row:
     Attributes:
         ratio: of hil's error to the plain one.
         seconds: that each took, by name.
+        inside: share of held-out means of torque inside hil's 95 % intervals; None in sample.
+        white_inside: share inside the intervals that white residuals would have.
     """
 
     data: str
@@ -77,6 +79,8 @@ class Row:
     hil_joints: list[float]
     plain_joints: list[float]
     seconds: dict[str, float]
+    inside: float | None
+    white_inside: float | None
 
 
 @dataclass(frozen=True)
@@ -180,6 +184,7 @@ def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str
     ours = identified_split(split, archives, parts)
     middle = time.perf_counter()
     plain, plain_joints = plain_errors(parts)
+    calibration = ours.results.calibration
     return Row(
         data=name,
         split=str(split),
@@ -189,6 +194,8 @@ def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str
         hil_joints=ours.joints,
         plain_joints=plain_joints,
         seconds={"hil": middle - start, "plain": time.perf_counter() - middle},
+        inside=None if calibration is None else calibration.inside,
+        white_inside=None if calibration is None else calibration.white_inside,
     )
 
 
@@ -360,8 +367,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 _HEADING: Final = (
-    f"{'recording':11} {'split':30} {'hil':>7} {'plain':>7} {'ratio':>6} {'hil':>6} {'plain':>7}"
-    "  by joint: hil/plain [%]"
+    f"{'recording':11} {'split':30} {'hil':>7} {'plain':>7} {'ratio':>6} {'inside':>6}"
+    f" {'hil':>6} {'plain':>7}  by joint: hil/plain [%]"
 )
 _DEGRADED_HEADING: Final = f"\n{'recording':11} {'fault':19} {'hil':>7} {'ratio':>6} right  named"
 
@@ -371,8 +378,9 @@ def _line(row: Row) -> str:
         f"{100 * ours:.3g}/{100 * plain:.3g}"
         for ours, plain in zip(row.hil_joints, row.plain_joints, strict=True)
     )
+    inside = "-" if row.inside is None else f"{row.inside:.0%}"
     return (
-        f"{row.data:11} {row.split:30} {row.hil:7.2%} {row.plain:7.2%} {row.ratio:6.3f}"
+        f"{row.data:11} {row.split:30} {row.hil:7.2%} {row.plain:7.2%} {row.ratio:6.3f} {inside:>6}"
         f" {row.seconds['hil']:4.0f} s {row.seconds['plain']:5.1f} s  {joints}"
     )
 

@@ -80,6 +80,20 @@ def shrunk_values(equations: NormalEquations, centre: Array, strength: float) ->
     return np.asarray(centre + solve(moved).values)
 
 
+def fitted_values(model: RobotModel, factor: Factor, shrinkage: Shrinkage) -> Array:
+    """Parameters (p,) of a factor, without their covariance.
+
+    Raises:
+        IdentificationError: no consistent parameters were found.
+    """
+    weights = joint_weights(factor)
+    equations = factor.weighted(weights)
+    if shrinkage.strength == 0.0:
+        return solve(equations).values
+    centre = consistent_centre(model, factor, weights, shrinkage.prior_weight)
+    return shrunk_values(equations, centre, shrinkage.strength)
+
+
 def fit_shrunk(
     model: RobotModel,
     recordings: Sequence[Samples],

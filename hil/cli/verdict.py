@@ -34,6 +34,8 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
             typer.echo(line, err=True)
         if results.fitted is not None and not quiet:
             say(results.fitted.words, err=True)
+        if results.calibration is not None and not quiet:
+            say(results.calibration.words(results.joint_names), err=True)
         for line in sentences(results, quiet=quiet):
             say(line, err=True)
         say(results.verdict.line)
@@ -50,6 +52,8 @@ def as_json(results: Results) -> str:
     found["undetermined"] = [one.name for one in results.parameters if one.undetermined]
     found["delays"] = None if results.delays is None else results.delays.model_dump(mode="json")
     found["fitted"] = None if results.fitted is None else results.fitted.model_dump(mode="json")
+    calibration = results.calibration
+    found["calibration"] = None if calibration is None else calibration.model_dump(mode="json")
     found["exports"] = None if results.exports is None else results.exports.model_dump(mode="json")
     return json_module.dumps(found)
 

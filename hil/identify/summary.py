@@ -47,6 +47,7 @@ from identification.verdict import Verdict
 from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, urdf_text
 
+from .calibration import calibration_result
 from .consistency import consistency_result
 from .essential import essential_result
 from .estimating import Estimation
@@ -99,6 +100,7 @@ def summarise(
         correlation=correlation(gram).tolist(),
         validation=[] if sources.in_sample else _validation(sources, estimate, prepared.held_out),
         fitted=_fitted(model, pooled.values, prepared),
+        calibration=calibration_result(prepared, estimation),
         delays=_delays(prepared),
         choices=[
             ChoiceResult(

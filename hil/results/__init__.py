@@ -7,6 +7,7 @@ from .exports import ExportResult
 from .judgement import FindingResult, JointJudgement, JudgementResult, ProfileResult
 from .results import (
     SCHEMA_VERSION,
+    CalibrationResult,
     ChoiceResult,
     CoverageResult,
     CriteriaResult,
@@ -24,6 +25,7 @@ from .results import (
 
 __all__ = [
     "BlindResult",
+    "CalibrationResult",
     "ConductResult",
     "ConsistencyResult",
     "ChoiceResult",

@@ -122,6 +122,35 @@ class FittedResult(Frozen):
         return text
 
 
+class CalibrationResult(Frozen):
+    """Held-out means of torque and their 95 % intervals; lists are per joint."""
+
+    block: float = Field(gt=0.0)
+    """Time that a mean is taken over, s."""
+    means: int = Field(gt=0)
+    """How many were compared with their interval, all joints."""
+    inside: float
+    """Share of them inside: 0.95 if the intervals are honest."""
+    white_inside: float
+    """Share inside the intervals that white residuals would have."""
+    joint_inside: list[float | None]
+    """Null for a joint whose intervals are not known."""
+    half_width: list[float | None]
+    """Median of half the interval, N·m or N."""
+
+    def words(self, joint_names: Sequence[str]) -> str:
+        """The figures, in a sentence without its full stop."""
+        shares = [1.0 if share is None else share for share in self.joint_inside]
+        lowest = min(shares, default=1.0)
+        text = (
+            f"{self.inside:.1%} of {self.means} held-out means of torque ({self.block:g} s, per"
+            " joint) lie inside their 95% intervals"
+        )
+        if lowest < self.inside:
+            text += f", {lowest:.0%} of {joint_names[shares.index(lowest)]}"
+        return f"{text}; intervals for white residuals would hold {self.white_inside:.0%}"
+
+
 class DelaysResult(Frozen):
     """Delay of the torque behind the position; lists are per joint, s."""
 
@@ -248,6 +277,8 @@ class Results(Frozen):
     """Empty where nothing was held out."""
     fitted: FittedResult | None = None
     """In-sample errors, to stand beside those on unseen motion."""
+    calibration: CalibrationResult | None = None
+    """Null where nothing was held out, or too little was fitted to predict parts of it."""
     delays: DelaysResult | None = None
     """Null where they could not be looked for."""
     choices: list[ChoiceResult] = Field(default_factory=list)
@@ -324,6 +355,9 @@ def _lists(results: Results) -> Iterator[tuple[str, Sequence[Any] | None, int]]:
             yield f"validation.{name}", getattr(one, name), n
     if results.fitted is not None:
         yield "fitted.relative_error", results.fitted.relative_error, n
+    if results.calibration is not None:
+        for name in ("joint_inside", "half_width"):
+            yield f"calibration.{name}", getattr(results.calibration, name), n
     if results.delays is not None:
         for name in ("found", "interval", "applied"):
             yield f"delays.{name}", getattr(results.delays, name), n

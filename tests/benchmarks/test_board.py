@@ -81,6 +81,8 @@ class TestRow:
             squares = np.square(joints) @ np.square(np.linalg.norm(torque, axis=0))
             assert error == pytest.approx(np.sqrt(squares) / np.linalg.norm(torque))
         assert found.ratio == found.hil / found.plain
+        assert (found.inside is None) == split.in_sample
+        assert found.inside is None or found.inside > 0.9
 
     def test_the_line_of_json(self, logs: dict[str, JointLog], archives: dict[str, Path]) -> None:
         split = Split(fitted="one", predicted="other")
@@ -89,6 +91,7 @@ class TestRow:
         assert found.keys() == {"rows", "worst_ratio", "mean_ratio"}
         assert found["rows"][0].keys() == {
             "data", "split", "hil", "plain", "ratio", "hil_joints", "plain_joints", "seconds",
+            "inside", "white_inside",
         }  # fmt: skip
         assert found["worst_ratio"] == pytest.approx(found["mean_ratio"])
 

@@ -47,6 +47,13 @@ def test_nearly_all_planted_values_lie_within_three_standard_deviations(
     assert coverage.within_3 >= 55
 
 
+def test_held_out_torque_lies_inside_its_intervals(found: Identification) -> None:
+    calibration = found.results.calibration
+    assert calibration is not None
+    assert calibration.inside >= 0.93
+    assert None not in calibration.joint_inside
+
+
 def test_the_planned_criteria_are_those_of_what_was_executed(found: Identification) -> None:
     """Over the same instants; stiction and noise of acceleration change columns by per mille."""
     planned, executed = found.results.excitation.planned, found.results.excitation.executed

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
-from hil.cli.verdict import as_json, table
+from hil.cli.verdict import as_json, finish, table
 from hil.errors import InputError
 from hil.identify import Identification, Options, identify_archives
 from hil.identify.prepared import prepare_sources
@@ -17,6 +19,7 @@ from hil.identify.sources import gather_sources
 from hil.identify.surroundings import nominal_of, surroundings_of
 from hil.importers import ColumnMap, Robot, import_log
 from hil.progress import Silent
+from hil.report import render_report
 from tests.hil.simulated_logs import simulate
 
 LATE = np.array([0.012, 0.012, 0.012, 0.004, 0.004, 0.004])  # s
@@ -64,6 +67,40 @@ def test_the_error_of_the_fit_stands_beside_that_of_the_prediction(split: Identi
         assert joint.fitted_relative == pytest.approx(fitted)
         assert joint.fitted_relative != joint.relative
     assert "fitted" in table(results)[0] and "in-sample" in results.fitted.words
+
+
+class TestCalibration:
+    """Held-out means of torque beside their 95 % intervals."""
+
+    def test_the_intervals_of_held_out_torque_are_honest(self, split: Identification) -> None:
+        """4.8 s of six axes, white noise: nine or ten block means each, all but a few inside."""
+        found = split.results.calibration
+        assert found is not None
+        assert 54 <= found.means <= 60
+        assert found.inside >= 0.9
+        assert len(found.joint_inside) == len(found.half_width) == 6
+
+    def test_the_line_stands_on_the_terminal_and_in_the_report(
+        self, split: Identification, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        results = split.results
+        assert results.calibration is not None
+        line = results.calibration.words(results.joint_names)
+        with suppress(typer.Exit):
+            finish(results, json=False)
+        assert line in " ".join(capsys.readouterr().err.split())
+        assert line in render_report(results, split.series)
+        assert json.loads(as_json(results))["calibration"]["means"] == results.calibration.means
+
+    def test_the_joint_with_the_fewest_is_named(self, split: Identification) -> None:
+        found = split.results.calibration
+        assert found is not None
+        shares = [1.0, 0.5, None, 1.0, 0.9, 1.0]
+        words = found.model_copy(update={"joint_inside": shares, "inside": 0.88}).words("abcdef")
+        assert words.startswith("88.0% of") and "50% of b" in words
+
+    def test_nothing_held_out_is_nothing_said(self, whole: Identification) -> None:
+        assert whole.results.calibration is None
 
 
 def test_in_sample_everything_is_fitted_and_nothing_is_called_good(
