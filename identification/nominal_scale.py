@@ -78,8 +78,28 @@ class NominalScale:
         most = np.count_nonzero(alike) > len(logs) / 2
         return float(np.exp(np.median(logs))) if most else 1.0
 
+    @property
+    def negated(self) -> bool:
+        """Whether the torque of every axis that says something has the other sign."""
+        known = np.isfinite(self.scale)
+        enough = np.count_nonzero(known) >= min(2, len(known))
+        return bool(enough and np.all(self.scale[known] + self.tolerance[known] < 0.0))
+
     def findings(self) -> list[Finding]:
         """What a verdict says: the axes that are off; nothing where none is."""
+        if self.negated:
+            known = np.flatnonzero(np.isfinite(self.scale))
+            figures = [f"{self.joint_names[j]} {self.scale[j]:.2g}" for j in known]
+            return [
+                Finding(
+                    "direction of axes",
+                    "wrong",
+                    "all torques seem to have the other sign: over that of the nominal inertias"
+                    f" they are {listed(figures)}",
+                    "give the torques of the column map scale = -1, or all torque constants the"
+                    " other sign",
+                )
+            ]
         common = self.common
         off = self.off if common == 1.0 else np.flatnonzero(np.isfinite(self.scale))
         if not off.size:

@@ -103,3 +103,10 @@ def test_torques_of_another_unit_or_of_the_motors_leave_no_model_to_rely_on(
     (finding,) = nominal_scale(model, nominal(model), scaled).findings()
     assert finding.level == "wrong"
     assert "unit" in finding.next_step and "side" in finding.next_step
+
+
+def test_all_torques_negated_are_one_finding(model: RobotModel) -> None:
+    negated = [replace(run, torque=-run.torque) for run in runs(model, standard(model, 0.05, 1), 1)]
+    (finding,) = nominal_scale(model, nominal(model), negated).findings()
+    assert (finding.check, finding.level) == ("direction of axes", "wrong")
+    assert "all torques seem to have the other sign" in finding.words
