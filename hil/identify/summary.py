@@ -255,6 +255,7 @@ def _parameters(cell: Cell, estimation: Estimation, truth: Array | None) -> list
             repetition_std=None if std is None else float(std[i]),
             truth=None if truth is None else float(truth[i]),
             undetermined=parameter in pooled.undetermined,
+            of_this_run=bool(model.friction_columns[i]),
             prior_std=None if isinstance(posterior, str) else float(posterior.prior_std[i]),
             prior_ratio=None if isinstance(posterior, str) else float(posterior.ratio[i]),
             learned=None if isinstance(posterior, str) else bool(posterior.learned[i]),

@@ -68,6 +68,8 @@ class ParameterResult(Frozen):
     """Planted value; only a simulated cell has one."""
     undetermined: bool = False
     """Whether the motion says nothing about it, alone or as part of a combination."""
+    of_this_run: bool = False
+    """Whether it holds for this run only: friction changes with the temperature of the gears."""
     prior_std: float | None = None
     """What was believed before the data, from CAD; infinite where nothing was."""
     prior_ratio: float | None = None
