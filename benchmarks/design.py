@@ -52,7 +52,7 @@ from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
 from planner import FourierSeries, JointLimits, PiecewiseCubic, PlannerError
 from planner.arrays import Array
 from planner.batch import plan_chunk
-from sim_fixtures.ns16 import CELL_PATH, urdf_text
+from sim_fixtures.ns16 import CELL_PATH
 
 N_VIA = 6
 FLY = 0.5
@@ -207,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     cell = Cell.load(CELL_PATH)
     objective = Objective(cell.model)
-    reference = pin.buildModelFromXML(urdf_text())
+    reference = pin.buildModelFromXML(cell.urdf)
     motion = of_length(cell.joint_limits, 16.0)
     result: dict[str, object] = {
         **compare(objective, reference, motion, options.repetitions),

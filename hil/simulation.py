@@ -42,7 +42,7 @@ def simulated_link(
         cell: names the planted truth in `[simulation]`.
         effects: switch on what the model leaves out, at the sizes the cell names.
         drive: what the robot really has, where it shall differ from the cell's drive train.
-        truth: rotor inertias and friction of the plant, where they shall differ from the cell's.
+        truth: what is planted in the plant, where it shall differ from the cell's.
         instead_of_hardware: simulate a cell that names a real link as well.
 
     Raises:
@@ -76,7 +76,7 @@ def simulated_controller(
         cell: its `[simulation]` says what the arm really is.
         effects: switch on what the model leaves out.
         drive: what the robot really has; the init packet announces the cell's drive train.
-        truth: rotor inertias and friction of the plant, if not the cell's.
+        truth: what is planted in the plant, if not the cell's.
         settings: how the controller behaves; `controller_settings(cell)` if left out.
         seed: of noise and model errors; the cell's if left out.
         faults: what goes wrong in controller and arm.
@@ -164,7 +164,7 @@ def simulated_drive(cell: Cell) -> SimulatedDrive:
 
 
 def planted_truth(cell: Cell) -> PlantTruth:
-    """Rotor inertias and friction planted in the plant.
+    """Rotor inertias, friction and inertias of links planted in the plant.
 
     Raises:
         CellError: joints with a third friction term differ in its law.
@@ -176,6 +176,7 @@ def planted_truth(cell: Cell) -> PlantTruth:
         viscous=np.array(settings.viscous),
         third=np.array(settings.third),
         third_law=_third_law(cell),
+        inertia_scale=np.array(settings.inertia_scale or [1.0]),
     )
 
 
@@ -235,6 +236,7 @@ def planted_values(cell: Cell) -> Array:
         coulomb=truth.coulomb,
         viscous=truth.viscous,
         third=truth.third,
+        inertia_scale=truth.inertia_scale,
     )
 
 

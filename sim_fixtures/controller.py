@@ -64,7 +64,7 @@ class SimulatedController:
     """A C4G with its robot; the peer of a transport in virtual time.
 
     Attributes:
-        truth: planted rotor inertias and friction.
+        truth: planted rotor inertias, friction and inertias of links.
         settings: as given.
         period: cycle [s].
         rejected_replies: replies that were not taken: wrong number, length or content.
@@ -87,9 +87,9 @@ class SimulatedController:
         """Power the cabinet up; the arm rests with closed brakes.
 
         Args:
-            urdf: URDF text with the true inertias.
+            urdf: URDF text; its inertias are true but for `truth.inertia_scale`.
             drive: what the robot really has; servo and plant work with it.
-            truth: rotor inertias and friction of the plant.
+            truth: rotor inertias, friction and inertias of links of the plant.
             settings: cycle, noise, gains, time table.
             seed: of the model's errors, the noise and the phases of the ripple.
             effects: unmodelled effects, none by default.

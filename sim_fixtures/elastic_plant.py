@@ -43,7 +43,7 @@ class ElasticPlant(Plant):
 
         Args:
             urdf: URDF text.
-            truth: rotor inertias and friction.
+            truth: rotor inertias, friction, and how far the links are those of the URDF.
             gravity: m/s2 in the base frame.
             position: joint angles [rad]; the URDF's zero if not given.
             brake_torque: dry friction of each joint's closed brake [N m].

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from sim_fixtures.plant import build_model
+from sim_fixtures.plant import build_model, scale_bodies
 from sim_fixtures.truth import PlantTruth
 
 Array = NDArray[np.float64]
@@ -33,8 +33,8 @@ class NominalModel:
         """Draw the errors.
 
         Args:
-            urdf: URDF text of the true arm.
-            truth: its rotor inertias and friction.
+            urdf: URDF text of the arm.
+            truth: its rotor inertias and friction, and how far its links are those of the URDF.
             gravity: m/s2 in the base frame.
             error: smallest and largest relative error of each figure.
             rng: where magnitudes and signs of the errors come from.
@@ -46,10 +46,8 @@ class NominalModel:
             return 1.0 + rng.uniform(*error, size=n) * signs
 
         self.rotor_inertia = truth.rotor_inertia * factors()
-        self._model = build_model(urdf, gravity, self.rotor_inertia)
-        for i, factor in enumerate(factors(), start=1):
-            scaled = self._model.inertias[i].toDynamicParameters() * factor
-            self._model.inertias[i] = pin.Inertia.FromDynamicParameters(scaled)
+        self._model = build_model(urdf, gravity, self.rotor_inertia, truth.inertia_scale)
+        scale_bodies(self._model, factors())
         self._data = self._model.createData()
         self._coulomb = truth.coulomb * factors()
         self._viscous = truth.viscous * factors()

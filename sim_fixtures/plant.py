@@ -25,8 +25,12 @@ from sim_fixtures.truth import PlantTruth
 Array = NDArray[np.float64]
 
 
-def build_model(urdf: str, gravity: ArrayLike, armature: ArrayLike) -> pin.Model:
+def build_model(
+    urdf: str, gravity: ArrayLike, armature: ArrayLike, inertia_scale: ArrayLike = 1.0
+) -> pin.Model:
     """Return pinocchio's model of a URDF text with gravity [m/s2] and armature [kg m2] set.
+
+    What each joint moves has `inertia_scale` (n,) times the inertia of the URDF.
 
     Raises:
         SettingError: the joints are not as many as the armatures, or not simple revolute ones.
@@ -39,7 +43,15 @@ def build_model(urdf: str, gravity: ArrayLike, armature: ArrayLike) -> pin.Model
         )
     model.gravity.linear = np.asarray(gravity, dtype=np.float64)
     model.armature = inertias
+    scale_bodies(model, inertia_scale)
     return model
+
+
+def scale_bodies(model: pin.Model, factor: ArrayLike) -> None:
+    """Scale mass, first moment and tensor of what each joint moves, in place; `factor` (n,)."""
+    for i, scale in enumerate(np.broadcast_to(factor, model.nv).tolist(), start=1):
+        body = model.inertias[i]
+        model.inertias[i] = pin.Inertia(scale * body.mass, body.lever, scale * body.inertia)
 
 
 def _with_one_angle_each(urdf: str) -> str:
@@ -72,7 +84,7 @@ class Plant:
     """A rigid arm under joint torques.
 
     Attributes:
-        truth: the planted rotor inertias and friction.
+        truth: the planted rotor inertias, friction and inertias of links.
         model: pinocchio's model; its armature holds the rotor inertias.
         position, velocity, acceleration: state (n,), rad, rad/s, rad/s2. The acceleration is the
             mean over the last step.
@@ -92,14 +104,14 @@ class Plant:
 
         Args:
             urdf: URDF text.
-            truth: rotor inertias and friction.
+            truth: rotor inertias, friction, and how far the links are those of the URDF.
             gravity: m/s2 in the base frame.
             position: joint angles [rad]; the URDF's zero if not given.
             brake_torque: dry friction of each joint's brake when it is closed [N m].
         """
         n = truth.n_joints
         self.truth = truth
-        self.model = build_model(urdf, gravity, truth.rotor_inertia)
+        self.model = build_model(urdf, gravity, truth.rotor_inertia, truth.inertia_scale)
         self.data = self.model.createData()
         start = np.zeros(n) if position is None else np.array(position, dtype=np.float64)
         if start.shape != (n,) or not np.isfinite(start).all():

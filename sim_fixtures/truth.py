@@ -1,4 +1,4 @@
-"""What is planted in the simulated plant besides the rigid bodies of the URDF."""
+"""What is planted in the simulated plant: rotors, friction and inertias of links."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TENSOR_KEYS = ("xx", "xy", "yy", "xz", "yz", "zz")
 
 @dataclass(frozen=True, eq=False)
 class PlantTruth:
-    """Rotor inertias and friction; every array (n,), on the joint side.
+    """Rotor inertias, friction and inertias of links; every array (n,), on the joint side.
 
     Friction torque: coulomb sgn(qd) + viscous qd + third sgn(qd) qd^2 (or third qd^3).
 
@@ -27,9 +27,12 @@ class PlantTruth:
         viscous: N m s/rad.
         third: N m s2/rad2 ("quadratic") or N m s3/rad3 ("cubic").
         third_law: which of the two.
+        inertia_scale: mass, first moment and tensor of what each joint moves, over those of the
+            URDF; (1,) for the same of all joints. Scaled alike, a possible body stays one.
 
     Raises:
-        SettingError: arrays of different sizes, non-finite or (all but `third`) negative values.
+        SettingError: arrays of different sizes, non-finite or (all but `third`) negative values,
+            a scale that is not positive.
     """
 
     rotor_inertia: Array
@@ -37,16 +40,21 @@ class PlantTruth:
     viscous: Array
     third: Array
     third_law: Literal["quadratic", "cubic"] = "quadratic"
+    inertia_scale: Array = field(default_factory=lambda: np.ones(1))
     _has_third: bool = field(init=False, repr=False, default=False)
 
     def __post_init__(self) -> None:
         n = np.size(self.rotor_inertia)
-        for name in ("rotor_inertia", "coulomb", "viscous", "third"):
+        if np.size(self.inertia_scale) == 1:
+            object.__setattr__(self, "inertia_scale", np.full(n, self.inertia_scale))
+        for name in ("rotor_inertia", "coulomb", "viscous", "third", "inertia_scale"):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != (n,) or not np.isfinite(values).all():
                 raise SettingError(name, values.tolist(), f"{n} finite numbers, one per joint")
             if name != "third" and values.min(initial=0.0) < 0.0:
                 raise SettingError(name, values.tolist(), "not negative")
+            if name == "inertia_scale" and not values.all():
+                raise SettingError(name, values.tolist(), "greater than zero")
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         object.__setattr__(self, "_has_third", bool(self.third.any()))

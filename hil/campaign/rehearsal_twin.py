@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio
@@ -26,7 +25,6 @@ from hil.simulation import (
     simulated_controller,
     simulated_provenance,
 )
-from identification.urdf_tree import urdf_tree
 from planner.toml_value import toml_value
 from sim_fixtures import ServoSettings, SimulatedDrive, UnmodelledEffects
 
@@ -62,15 +60,14 @@ class Twin:
     """A simulated arm to rehearse on.
 
     Attributes:
-        cell: as the PC knows it: nominal, but simulated, with fewer repetitions.
-        arm: the same cell with the inertias that were drawn; the controller's end.
+        cell: nominal, but simulated, with fewer repetitions; what was drawn is in its
+            `[simulation]`.
         truth: planted parameters (p,) in the order of the model.
         assumed: what the arm has by assumption, in sentences.
         seed: of everything drawn.
     """
 
     cell: Cell
-    arm: Cell
     truth: Array
     assumed: tuple[str, ...]
     seed: int
@@ -85,16 +82,14 @@ class Twin:
             repetitions: at most so many.
         """
         rng = np.random.default_rng(seed)
-        urdf = _drawn_inertias(cell.urdf, rng)
-        planted = _drawn_friction(cell, rng)
+        planted = _drawn(cell, rng)
         settings, assumed = _simulation(cell, planted, seed)
         text = _with_table(cell.text, "simulation", settings)
         text = replaced_value(text, "controller", "transport", toml_value("simulated"))
         fewer = min(repetitions, cell.campaign.repetitions)
         text = replaced_value(text, "campaign", "repetitions", fewer)
         twin = Cell.from_texts(text, cell.urdf, cell.path)
-        arm = Cell.from_texts(text, urdf, cell.path)
-        return cls(twin, arm, planted_values(arm), tuple(assumed), seed)
+        return cls(twin, planted_values(twin), tuple(assumed), seed)
 
     def link(self, seconds: float, *, effects: bool, drive: SimulatedDrive | None = None) -> Link:
         """A link in virtual time to the arm, with faults now and then.
@@ -112,7 +107,7 @@ class Twin:
             while_silent="continue",
         )
         controller = simulated_controller(
-            self.arm,
+            self.cell,
             settings=settings,
             effects=effects,
             drive=drive,
@@ -159,25 +154,8 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
     return tuple(faults)
 
 
-def _drawn_inertias(urdf: str, rng: np.random.Generator) -> str:
-    """The URDF with each link's mass and tensor scaled alike, so that it stays a possible body."""
-    root = urdf_tree(urdf)
-    for link in root.iter("link"):
-        inertial = link.find("inertial")
-        factor = 1.0 + SPREAD * rng.uniform(-1.0, 1.0)
-        if inertial is None:
-            continue
-        mass, tensor = inertial.find("mass"), inertial.find("inertia")
-        if mass is not None:
-            mass.set("value", repr(float(mass.get("value", "0")) * factor))
-        if tensor is not None:
-            for key, value in tensor.attrib.items():
-                tensor.set(key, repr(float(value) * factor))
-    return ElementTree.tostring(root, encoding="unicode")
-
-
-def _drawn_friction(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
-    """Rotors and friction within the spread of `[nominal]`."""
+def _drawn(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
+    """Inertias of links, rotors and friction within the spread of the URDF and of `[nominal]`."""
     nominal = cell.nominal
     n = len(cell.joint_names)
 
@@ -186,6 +164,7 @@ def _drawn_friction(cell: Cell, rng: np.random.Generator) -> dict[str, list[floa
         return (np.array(values) * factors).tolist()  # type: ignore[no-any-return]
 
     return {
+        "inertia_scale": drawn([1.0] * n),
         "rotor_inertia": drawn(nominal.rotor_inertia),
         "coulomb": drawn(nominal.coulomb),
         "viscous": drawn(nominal.viscous),

@@ -347,15 +347,24 @@ class Cell:
         )
 
     def parameter_values(
-        self, *, rotor_inertia: Array, coulomb: Array, viscous: Array, third: Array
+        self,
+        *,
+        rotor_inertia: Array,
+        coulomb: Array,
+        viscous: Array,
+        third: Array,
+        inertia_scale: Array | None = None,
     ) -> Array:
         """Parameter vector (p,) of the URDF's inertias with these joint-side figures (n,).
 
-        Springs and balancers have the figures of the file. Everything else, such as coupling
-        inertias, an offset or a Stribeck term, is zero.
+        Inertias of the links are those of the URDF, or `inertia_scale` (n,) times as large. Springs
+        and balancers have the figures of the file. Everything else, such as coupling inertias, an
+        offset or a Stribeck term, is zero.
         """
         model = self.model
         standard = model.nominal
+        if inertia_scale is not None:
+            standard[model.layout.links] *= inertia_scale[:, None]
         if model.rotor_inertia:
             standard[model.layout.rotors] = rotor_inertia
         known = {"f0": coulomb, "f1": viscous, "f2": third}

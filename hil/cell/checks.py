@@ -17,7 +17,12 @@ if TYPE_CHECKING:
 URDF_ROUNDING = 1e-5
 """Relative; a data sheet's degrees and a URDF's radians are rounded differently."""
 
-_MAY_BE_EMPTY = {"nominal.third", "limits.torque", "simulation.elasticity"}
+_MAY_BE_EMPTY = {
+    "nominal.third",
+    "limits.torque",
+    "simulation.elasticity",
+    "simulation.inertia_scale",
+}
 _PER_JOINT = ("nominal", "limits", "drive_train", "campaign", "simulation")
 _TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from .fields import NonNegative, Number, Table, Vector, Whole
+from .fields import NonNegative, Number, Positive, Table, Vector, Whole
 
 
 class SimulatedDriveTable(Table):
@@ -45,6 +45,11 @@ class SimulationTable(Table):
     seed: Whole = Field(default=1, ge=0, description="one seed is one bit-identical run")
     initial_deg: Vector = Field(
         description="where the simulated arm stands at first, degrees, in the frame of [limits]"
+    )
+    inertia_scale: list[Positive] = Field(
+        default_factory=list,
+        description="planted truth: mass, first moment and inertia of the link that each joint "
+        "moves over those of the URDF, or nothing where it is right",
     )
     rotor_inertia: list[NonNegative] = Field(description="planted truth, kg·m² at the joint")
     coulomb: Vector = Field(description="planted truth, N·m, one per joint")

@@ -45,7 +45,7 @@ from identification.repetitions import RepeatedEstimate
 from identification.validation import PredictionError, over_all, prediction_error
 from identification.verdict import Verdict
 from planner import FourierSeries
-from sim_fixtures.ns16 import TABLE2, urdf_text
+from sim_fixtures.ns16 import TABLE2, URDF_PATH
 
 from .calibration import calibration_result
 from .consistency import consistency_result
@@ -242,7 +242,7 @@ def _parameters(cell: Cell, estimation: Estimation, truth: Array | None) -> list
     pooled = estimate.pooled
     expressions = [*model.base.expressions(), *model.parameter_names[len(model.base.names) :]]
     std = estimate.std if len(estimate.repetitions) > 1 else None
-    printed = _table2_ids() if cell.urdf == urdf_text() else {}
+    printed = _table2_ids() if cell.urdf == URDF_PATH.read_text(encoding="utf-8") else {}
     return [
         ParameterResult(
             name=parameter,

@@ -7,7 +7,7 @@ from math import pi
 from typing import Final, NamedTuple
 
 from hil.cell import Cell
-from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
+from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
 
 
 class PrintedMotion(NamedTuple):
@@ -52,7 +52,7 @@ def printed_parameters(cell: Cell) -> dict[str, PrintedParameter]:
     The print's viscous and third terms are read as per degree and per degree², an assumption: per
     radian the viscous friction would be negligible.
     """
-    if cell.urdf != urdf_text():
+    if cell.urdf != URDF_PATH.read_text(encoding="utf-8"):
         return {}
     return {
         row.pivot or row.parameter: PrintedParameter(

@@ -27,8 +27,10 @@ TABLE2 = table2()
 
 
 def urdf_text() -> str:
-    """Return the text of ns16.urdf."""
-    return URDF_PATH.read_text(encoding="utf-8")
+    """Return the URDF of the arm with its planted inertias; those of ns16.urdf are nominal."""
+    from sim_fixtures.ns16.build_urdf import build_urdf  # which `python -m` runs, and imports this
+
+    return build_urdf()
 
 
 __all__ = [

@@ -1,5 +1,7 @@
 """Write ns16.urdf from the figures: `python -m sim_fixtures.ns16.build_urdf`.
 
+The file has the nominal inertias: the planted ones over `[simulation] inertia_scale` of cell.toml.
+
 Link frame i stands at O_{i-1} with the axes of DH frame i, so that the standard parameters that a
 rigid-body library reads from joint frame i *are* those of the paper: mass, first moment, and the
 tensor about the frame's origin. Joint i stands at p_{i-1} of link i-1, turned by Rx(alpha_i); its
@@ -8,18 +10,16 @@ axis is Rx(-alpha_i) z, because DH turns about z before it twists.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from math import pi, radians
-from pathlib import Path
 
 import numpy as np
 
 from sim_fixtures.errors import FixtureError
-from sim_fixtures.ns16 import geometry
+from sim_fixtures.ns16 import CELL_PATH, URDF_PATH, geometry
 from sim_fixtures.ns16.shapes import COLOURS, RGBA, SHAPES, Cylinder, Shape
 from sim_fixtures.ns16.truth import LinkInertia, load_truth
-
-URDF_PATH = Path(__file__).with_name("ns16.urdf")
 
 EFFORT = (2100.0, 2800.0, 755.0, 63.0, 151.0, 138.0)
 """Joint torque limits [N m]: what the assumed drives of the cell file give at their limits."""
@@ -27,6 +27,7 @@ EFFORT = (2100.0, 2800.0, 755.0, 63.0, 151.0, 138.0)
 _HEADER = """\
 <?xml version="1.0"?>
 <!-- Written by `python -m sim_fixtures.ns16.build_urdf`; edit geometry.py, shapes.py, truth.json.
+     Inertias are nominal: those of truth.json over `[simulation] inertia_scale` of cell.toml.
      Joint angles are the DH angles of Table 2, not the angles of the teach pendant.
      Rotor inertias are not part of a URDF; see truth.json. Efforts and velocities are assumed. -->
 <robot name="ns16">
@@ -59,29 +60,29 @@ def _shape(shape: Shape) -> str:
     return f"{origin}<geometry>{geometry_xml}</geometry>"
 
 
-def _inertial(link: LinkInertia, name: str) -> str:
-    """Return the inertial element; raise FixtureError where no rigid body could have it."""
+def _inertial(link: LinkInertia, name: str, scale: float = 1.0) -> str:
+    """Return the element of a link over `scale`; raise FixtureError where no body could have it."""
     xx, xy, xz, yy, yz, zz = link.tensor_at_centre
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     if link.mass <= 0.0 or moments[0] <= 0.0 or moments[2] >= moments[0] + moments[1]:
         raise FixtureError(f"{name}: no rigid body has mass {link.mass} and moments {moments}")
     tensor = " ".join(
-        f'i{key}="{_numbers([value])}"'
+        f'i{key}="{_numbers([value / scale])}"'
         for key, value in zip(
             ("xx", "xy", "xz", "yy", "yz", "zz"), link.tensor_at_centre, strict=True
         )
     )
     return (
         f"    <inertial>{_origin(link.centre_of_mass)}"
-        f'<mass value="{_numbers([link.mass])}"/><inertia {tensor}/></inertial>\n'
+        f'<mass value="{_numbers([link.mass / scale])}"/><inertia {tensor}/></inertial>\n'
     )
 
 
-def _link(name: str, inertia: LinkInertia | None) -> str:
-    """Return one link with its inertia and shapes."""
+def _link(name: str, inertia: LinkInertia | None, scale: float = 1.0) -> str:
+    """Return one link with its inertia, over `scale`, and shapes."""
     parts = [f'  <link name="{name}">\n']
     if inertia is not None:
-        parts.append(_inertial(inertia, name))
+        parts.append(_inertial(inertia, name, scale))
     material = f'<material name="{COLOURS[name]}"/>'
     for shape in SHAPES[name]:
         if shape.visible:
@@ -108,15 +109,15 @@ def _joint(i: int) -> str:
     )
 
 
-def build_urdf() -> str:
-    """Return the URDF text."""
+def build_urdf(inertia_scale: Sequence[float] = (1.0,) * 6) -> str:
+    """Return the URDF text with the planted inertias of links 1 ... 6 over `inertia_scale`."""
     truth = load_truth()
     parts = [_HEADER]
     for name, rgba in RGBA.items():
         parts.append(f'  <material name="{name}"><color rgba="{rgba}"/></material>\n')
     parts.append(_link("base_link", None))
-    for i, link in enumerate(truth.links):
-        parts += [_joint(i), _link(f"link_{i + 1}", link)]
+    for i, (link, scale) in enumerate(zip(truth.links, inertia_scale, strict=True)):
+        parts += [_joint(i), _link(f"link_{i + 1}", link, scale)]
     parts.append(
         '  <link name="flange"/>\n'
         '  <joint name="flange_mount" type="fixed">\n'
@@ -127,9 +128,15 @@ def build_urdf() -> str:
     return "".join(parts)
 
 
+def nominal_urdf() -> str:
+    """Return the text of ns16.urdf."""
+    cell = tomllib.loads(CELL_PATH.read_text(encoding="utf-8"))
+    return build_urdf(cell["simulation"]["inertia_scale"])
+
+
 def main() -> None:
     """Write the file beside this module."""
-    URDF_PATH.write_text(build_urdf(), encoding="utf-8")
+    URDF_PATH.write_text(nominal_urdf(), encoding="utf-8")
 
 
 if __name__ == "__main__":

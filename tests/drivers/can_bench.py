@@ -214,7 +214,7 @@ def ns16_controller(**settings) -> SimulatedController:
     truth = PlantTruth(*(np.array(cell["simulation"][name]) for name in names))
     figures = {"period": 0.002, "open_intervals": 1, "cold_start": True, **settings}
     return SimulatedController(
-        ns16.URDF_PATH.read_text(),
+        ns16.urdf_text(),
         drive,
         truth,
         ControllerSettings(**figures),

@@ -193,7 +193,7 @@ def test_a_prior_that_the_archives_of_an_arm_state_differently_is_refused(
     (folder / "manifest.json").unlink()
     victim = excitations(folder)[2]
     other = with_attachment(
-        victim, tmp_path / victim.name, "uncertainty = 0.1", "uncertainty = 0.3"
+        victim, tmp_path / victim.name, "uncertainty = 0.2", "uncertainty = 0.3"
     )
     other.replace(victim)
     with pytest.raises(InputError, match=rf"{victim.name}.*another \[nominal\]"):

@@ -193,7 +193,7 @@ def test_each_parameter_says_whether_it_was_learned_from_the_data(written: Resul
         assert parameter.learned == (parameter.prior_ratio < 0.5)
         assert not parameter.undetermined
     assert written.estimator.prior is not None
-    assert "10 %" in written.estimator.prior
+    assert "20 %" in written.estimator.prior
 
 
 # Results and the command line

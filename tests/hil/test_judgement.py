@@ -60,6 +60,13 @@ def test_the_simulated_controllers_model_is_off_by_what_was_planted(
     assert all(error is not None and 0.01 < error < 0.15 for error in errors)
 
 
+def test_identification_gains_over_the_nominal_model(judgement: JudgementResult) -> None:
+    """Nominal links, rotors and friction are wrong by 10 to 20 %; what was found is not."""
+    for joint in judgement.joints:
+        assert joint.nominal_relative is not None and joint.relative is not None
+        assert joint.nominal_relative > 2.0 * joint.relative
+
+
 def test_a_model_current_of_zeros_is_no_model(
     campaign: Campaign, cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from hil.campaign.rehearsal_twin import _drawn_inertias
 from hil.campaign.sealed import MESH, MISSING, checksums
 from hil.cell.urdf import urdf_limits
 from hil.importers.findings import urdf_limits as limits_of_an_import
@@ -27,14 +26,14 @@ def test_limits() -> None:
     assert limits_of_an_import(DRAKES)["hip"].upper == 2.0
 
 
-def test_the_twin_gets_other_inertias() -> None:
+def test_a_simulated_arm_gets_other_inertias() -> None:
     plain, drakes = (
-        pin.buildModelFromXML(_drawn_inertias(text, np.random.default_rng(1)))
+        build_model(text, (0.0, 0.0, -9.81), np.zeros(2), (1.1, 0.9))
         for text in (TWO_JOINTS, DRAKES)
     )
     masses = [inertia.mass for inertia in drakes.inertias]
     assert masses == [inertia.mass for inertia in plain.inertias]
-    assert masses[1] != pin.buildModelFromXML(TWO_JOINTS).inertias[1].mass
+    assert masses[1] == 1.1 * pin.buildModelFromXML(TWO_JOINTS).inertias[1].mass
 
 
 def test_a_simulated_joint_that_turns_on_and_on_has_one_angle() -> None:

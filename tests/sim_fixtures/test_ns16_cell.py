@@ -5,15 +5,49 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
 
 from sim_fixtures import ControllerSettings, ns16
 from sim_fixtures.ns16 import geometry
+
+Array = NDArray[np.float64]
 
 
 def test_the_planted_figures_are_those_of_the_truth(cell: dict[str, Any]) -> None:
     planted, truth = cell["simulation"], ns16.load_truth()
     for name in ("rotor_inertia", "coulomb", "viscous", "third"):
         assert tuple(planted[name]) == getattr(truth, name), name
+
+
+class TestNominal:
+    """Law: figures known before the arm moves are 10 to 20 % off the planted ones, both ways."""
+
+    @pytest.mark.parametrize("name", ["rotor_inertia", "coulomb", "viscous"])
+    def test_drives(self, cell: dict[str, Any], name: str) -> None:
+        self.check(np.divide(cell["nominal"][name], cell["simulation"][name]))
+
+    def test_links(self) -> None:
+        """The planted links are those of Table 2, however the URDF of the cell has them."""
+        nominal, planted = (
+            np.array([body.toDynamicParameters() for body in list(model.inertias)[1:]])
+            for model in (
+                pin.buildModelFromXML(text)
+                for text in (ns16.URDF_PATH.read_text(encoding="utf-8"), ns16.urdf_text())
+            )
+        )
+        scale = nominal[:, 0] / planted[:, 0]
+        self.check(scale)
+        np.testing.assert_allclose(nominal, scale[:, None] * planted, rtol=1e-12, atol=1e-14)
+
+    def test_the_stated_uncertainty(self, cell: dict[str, Any]) -> None:
+        assert cell["nominal"]["uncertainty"] == 0.2
+
+    def check(self, share: Array) -> None:
+        errors = np.abs(share - 1.0)
+        assert np.all((errors > 0.0995) & (errors < 0.2005))  # figures of 4 digits
+        assert share.min() < 1.0 < share.max()
 
 
 def test_the_limits_and_signs_are_those_of_the_geometry(cell: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sim_fixtures import FixtureError, ns16
 from sim_fixtures.ns16 import geometry
-from sim_fixtures.ns16.build_urdf import _inertial, build_urdf
+from sim_fixtures.ns16.build_urdf import _inertial, nominal_urdf
 from sim_fixtures.ns16.truth import LinkInertia
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ def wrist_and_flange(model: pin.Model, controller_deg: list[float]) -> tuple[Arr
 
 
 def test_the_file_is_what_the_figures_give() -> None:
-    assert ns16.urdf_text() == build_urdf()
+    assert ns16.URDF_PATH.read_text(encoding="utf-8") == nominal_urdf()
 
 
 def test_names(model: pin.Model) -> None:

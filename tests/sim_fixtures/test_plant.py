@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -209,3 +211,19 @@ def test_a_truth_of_the_wrong_size_is_refused(truth: PlantTruth) -> None:
         PlantTruth(truth.rotor_inertia, -truth.coulomb, truth.viscous, truth.third)
     with pytest.raises(SettingError, match="position"):
         Plant(ns16.urdf_text(), truth, position=np.zeros(5))
+    for scale in (np.ones(5), np.zeros(6), -np.ones(6)):
+        with pytest.raises(SettingError, match="inertia_scale"):
+            replace(truth, inertia_scale=scale)
+
+
+def test_links_have_the_planted_share_of_the_inertia_of_the_urdf(truth: PlantTruth) -> None:
+    """Mass, first moment and tensor alike, whatever the arm does."""
+    scale = np.array([1.2, 0.8, 1.1, 0.9, 1.15, 0.85])
+    plain = Plant(ns16.urdf_text(), truth).model
+    scaled = Plant(ns16.urdf_text(), replace(truth, inertia_scale=scale)).model
+    for body, own, factor in zip(
+        list(scaled.inertias)[1:], list(plain.inertias)[1:], scale, strict=True
+    ):
+        np.testing.assert_allclose(
+            body.toDynamicParameters(), factor * own.toDynamicParameters(), rtol=1e-12, atol=1e-14
+        )
