@@ -78,6 +78,7 @@ class ConsistentEstimate:
         unconstrained_relative_error: the same of the unconstrained estimate.
         reference: per link, what stood for its nominal body, in words (n,).
         status: "optimal", and how, where the conic solver alone did not get there.
+        solution: in the coordinates of the program (v,).
     """
 
     standard_names: tuple[str, ...]
@@ -93,6 +94,7 @@ class ConsistentEstimate:
     unconstrained_relative_error: float
     reference: tuple[str, ...]
     status: str
+    solution: Array
 
     @property
     def cost(self) -> float:
@@ -115,6 +117,7 @@ def consistent_estimate(
     *,
     weights: Array | None = None,
     options: Consistency = Consistency(),  # noqa: B008 - frozen
+    near: Array | None = None,
 ) -> ConsistentEstimate:
     """Fit physically consistent standard parameters and friction to the samples.
 
@@ -124,6 +127,7 @@ def consistent_estimate(
         unconstrained: the least-squares estimate of the same samples, to compare with.
         weights: per joint (n,); by default the inverse residual variance of an ordinary fit.
         options: prior and bounds.
+        near: `solution` of much the same samples, see :func:`solve_program`.
 
     Raises:
         InfeasibleError: the mass bounds contradict each other.
@@ -137,7 +141,7 @@ def consistent_estimate(
     equations = factor.weighted(weights)
     root = square_root(equations)
     program = Program.of(model, root, options)
-    solution, status = solve_program(program, options, equations.n)
+    solution, status = solve_program(program, options, equations.n, near)
     standard, others = program.physical(solution)
     found = margin(link_parameters(model, standard))
     if not np.all(found > 0.0):
@@ -170,6 +174,7 @@ def consistent_estimate(
         unconstrained_relative_error=free_relative,
         reference=program.bodies.words,
         status=status,
+        solution=solution,
     )
 
 

@@ -229,7 +229,9 @@ _SYMMETRIC: Final = _symmetric_basis()
 _UNIT_ENTRIES: Final = np.eye(4)[np.triu_indices(4)]
 
 
-def solve_program(program: Program, options: Consistency, rows: int) -> tuple[Array, str]:
+def solve_program(
+    program: Program, options: Consistency, rows: int, near: Array | None = None
+) -> tuple[Array, str]:
     """Return the solution u to rounding, and how it was found: a status in words.
 
     The prior counts for `prior_weight` rows at their noise. Where no machine fits the data to
@@ -239,6 +241,8 @@ def solve_program(program: Program, options: Consistency, rows: int) -> tuple[Ar
         program: what to solve.
         options: prior and bounds.
         rows: number of rows in the weighted normal equations.
+        near: solution of much the same program (v,): Newton's method starts there, with the
+            weight that the prior has there, which is quick and good for comparisons.
 
     Raises:
         SolverError: neither the solver nor Newton's method found an answer.
@@ -248,10 +252,15 @@ def solve_program(program: Program, options: Consistency, rows: int) -> tuple[Ar
         excess = program.rows.excess(u) / min(max(rows, 1), _MOST_ROWS)
         return options.prior_weight * max(1.0, excess)
 
-    start, status = _solve_cone(program, options)
     largest = np.full(len(program.masses), np.inf)
     if options.largest_mass is not None:
         largest = options.largest_mass
+    if near is not None:
+        free = _smooth(program, options, largest, np.zeros(len(largest), dtype=np.bool_))
+        found = polish(free._replace(weight=weight(near)), near)
+        if found.converged and np.all(program.masses @ found.u <= largest):
+            return found.u, "optimal (Newton, from a near solution)"
+    start, status = _solve_cone(program, options)
     if start is not None:
         at_bound = program.masses @ start >= largest * (1.0 - _ON_BOUND)
         found = polish(_smooth(program, options, largest, at_bound), start)

@@ -242,6 +242,7 @@ class _Trial:
         self._folds: dict[tuple[tuple[FrictionLaw, ...], Preprocessing], Folds] = {}
         self._errors: dict[tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage], float] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
+        self._near: dict[tuple[str, ...], Array] = {}  # a solution, from which others are found
 
     def decide(
         self, name: str, candidates: Sequence[Settings], share: float = WORTHWHILE
@@ -270,9 +271,12 @@ class _Trial:
                 return solve(factor.weighted(weights)).values
             key = settings.model.parameter_names, shrinkage.prior_weight, k
             if key not in self._centres:
-                self._centres[key] = consistent_centre(
-                    settings.model, factor, weights, shrinkage.prior_weight
+                near = self._near.get(settings.model.parameter_names)
+                found = consistent_centre(
+                    settings.model, factor, weights, shrinkage.prior_weight, near
                 )
+                self._centres[key] = found.estimate.values
+                self._near[settings.model.parameter_names] = found.solution
             return shrunk_values(factor.weighted(weights), self._centres[key], shrinkage.strength)
 
         try:

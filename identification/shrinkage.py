@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.consistent import consistent_estimate
+from identification.consistent import ConsistentEstimate, consistent_estimate
 from identification.consistent_program import Consistency
 from identification.covariance import block_covariance
 from identification.estimation import Estimate, estimate, joint_weights, solve
@@ -55,9 +55,20 @@ class Shrinkage:
 
 
 def consistent_centre(
-    model: RobotModel, factor: Factor, weights: Array, prior_weight: float
-) -> Array:
-    """Physically consistent parameters (p,) of the samples.
+    model: RobotModel,
+    factor: Factor,
+    weights: Array,
+    prior_weight: float,
+    near: Array | None = None,
+) -> ConsistentEstimate:
+    """Physically consistent parameters of the samples.
+
+    Args:
+        model: the robot.
+        factor: the samples.
+        weights: per joint (n,).
+        prior_weight: see `Shrinkage`.
+        near: `solution` of much the same samples; quick, and good for comparisons.
 
     Raises:
         IdentificationError: there are no rows, or no such parameters were found.
@@ -68,7 +79,8 @@ def consistent_centre(
         estimate(model, factor, weights),
         weights=weights,
         options=Consistency(prior_weight=prior_weight),
-    ).estimate.values
+        near=near,
+    )
 
 
 def shrunk_values(equations: NormalEquations, centre: Array, strength: float) -> Array:
@@ -90,7 +102,7 @@ def fitted_values(model: RobotModel, factor: Factor, shrinkage: Shrinkage) -> Ar
     equations = factor.weighted(weights)
     if shrinkage.strength == 0.0:
         return solve(equations).values
-    centre = consistent_centre(model, factor, weights, shrinkage.prior_weight)
+    centre = consistent_centre(model, factor, weights, shrinkage.prior_weight).estimate.values
     return shrunk_values(equations, centre, shrinkage.strength)
 
 
@@ -121,7 +133,7 @@ def fit_shrunk(
     free = estimate(model, factor)
     weights = joint_weights(factor)
     if centre is None:
-        centre = consistent_centre(model, factor, weights, shrinkage.prior_weight)
+        centre = consistent_centre(model, factor, weights, shrinkage.prior_weight).estimate.values
     equations = factor.weighted(weights)
     values = shrunk_values(equations, centre, shrinkage.strength)
     if math.isinf(shrinkage.strength):

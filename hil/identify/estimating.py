@@ -154,7 +154,9 @@ def _automatic(case: _Case) -> _Found:
     if case.shrinkage.strength == 0.0:
         return _least_squares("weighted")(case)
     total = total_phase(case.model, case.fitted).total
-    centre = consistent_centre(case.model, total, joint_weights(total), case.shrinkage.prior_weight)
+    centre = consistent_centre(
+        case.model, total, joint_weights(total), case.shrinkage.prior_weight
+    ).estimate.values
 
     def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
         return fit_shrunk(case.model, some, case.shrinkage, centre=centre, phase=phase)

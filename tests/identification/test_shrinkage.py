@@ -24,7 +24,7 @@ def samples() -> Samples:
 @pytest.fixture(scope="module")
 def centre(samples: Samples) -> np.ndarray:
     total = total_phase(MODEL, [samples]).total
-    return consistent_centre(MODEL, total, joint_weights(total), 0.1)
+    return consistent_centre(MODEL, total, joint_weights(total), 0.1).estimate.values
 
 
 class TestShrunkEstimate:
