@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.consistent_polish import Cone, Smooth, follow_path, polish
+from identification.consistent_polish import Cone, Minimum, Smooth, follow_path, polish
 from identification.dissipation import dissipation
 from identification.errors import IdentificationError, ShapeError
 from identification.estimation import WORST_CONDITION
@@ -37,6 +37,11 @@ _MOST_ROWS: Final = 100_000
 _TOLERANCE: Final = 1e-4
 # Share of a bound on a mass within which the solver's answer is on it.
 _ON_BOUND: Final = 1e-6
+
+
+# From a near solution: steps of the prior's weight, and its change at which they end.
+_NEAR_STEPS: Final = 10
+_NEAR_WEIGHT: Final = 0.01
 
 
 class InfeasibleError(IdentificationError):
@@ -241,8 +246,8 @@ def solve_program(
         program: what to solve.
         options: prior and bounds.
         rows: number of rows in the weighted normal equations.
-        near: solution of much the same program (v,): Newton's method starts there, with the
-            weight that the prior has there, which is quick and good for comparisons.
+        near: solution of much the same program (v,): Newton's method starts there, and ends when
+            the prior's weight has settled to a hundredth; quick, and good for comparisons.
 
     Raises:
         SolverError: neither the solver nor Newton's method found an answer.
@@ -255,11 +260,16 @@ def solve_program(
     largest = np.full(len(program.masses), np.inf)
     if options.largest_mass is not None:
         largest = options.largest_mass
-    if near is not None:
+    if near is not None and options.largest_mass is None:
         free = _smooth(program, options, largest, np.zeros(len(largest), dtype=np.bool_))
-        found = polish(free._replace(weight=weight(near)), near)
-        if found.converged and np.all(program.masses @ found.u <= largest):
-            return found.u, "optimal (Newton, from a near solution)"
+        found = Minimum(near, converged=True)
+        for _ in range(_NEAR_STEPS):
+            last = weight(found.u)
+            found = polish(free._replace(weight=last), found.u)
+            if not found.converged:
+                break
+            if abs(weight(found.u) - last) <= _NEAR_WEIGHT * last:
+                return found.u, "optimal (Newton, from a near solution)"
     start, status = _solve_cone(program, options)
     if start is not None:
         at_bound = program.masses @ start >= largest * (1.0 - _ON_BOUND)
