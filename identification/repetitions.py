@@ -81,15 +81,10 @@ class RepeatedEstimate:
         """The estimate with intervals no narrower than its repetitions scatter.
 
         Blocks of time are shared by the repetitions, and errors of opposite signs in some of them
-        (a payload in every other one) cancel there. Two repetitions are too few to scatter.
+        (a payload in every other one) cancel there.
         """
-        if len(self.repetitions) < _FEWEST_TO_SCATTER:
-            return self
-        known = np.isfinite(self.pooled.std) & (self.pooled.std > 0.0)
-        ratio = np.where(known, self.scatter_std / np.where(known, self.pooled.std, 1.0), 1.0)
-        wider = np.fmax(ratio, 1.0)
-        covariance = self.pooled.covariance.copy()
-        covariance[np.ix_(known, known)] *= np.outer(wider, wider)[np.ix_(known, known)]
+        values = np.array([one.values for one in self.repetitions])
+        covariance = no_narrower(self.pooled.covariance, values)
         return replace(self, pooled=replace(self.pooled, covariance=covariance))
 
     @property
@@ -101,6 +96,20 @@ class RepeatedEstimate:
     def std(self) -> Array:
         """Standard deviation over the repetitions (p,), NaN for one."""
         return np.asarray(self.scatter_std * np.sqrt(len(self.repetitions)))
+
+
+def no_narrower(covariance: Array, values: Array) -> Array:
+    """Covariance (p, p) with standard deviations of at least those of a mean of R values (R, p).
+
+    Two are too few to scatter: their covariance is as it is.
+    """
+    if len(values) < _FEWEST_TO_SCATTER:
+        return covariance
+    std = np.sqrt(np.diag(covariance))
+    known = np.isfinite(std) & (std > 0.0)
+    scatter = values.std(axis=0, ddof=1) / np.sqrt(len(values))
+    wider = np.where(known, np.fmax(scatter / np.where(known, std, 1.0), 1.0), 1.0)
+    return np.where(np.outer(known, known), covariance * np.outer(wider, wider), covariance)
 
 
 def estimate_repetitions(

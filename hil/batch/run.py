@@ -10,12 +10,15 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
+import numpy as np
+
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.progress import Reporter
 from identification import IdentificationError
 from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
+from identification.repetitions import no_narrower
 
 from .cache import Where
 from .discovery import discover
@@ -24,6 +27,7 @@ from .errors import NothingToFitError
 from .estimates import Estimator, Unseen, repetition_level, sum_level
 from .factors import cell_from, cell_in, opened
 from .keys import code_digest, settings_digest
+from .settling import of_one_motion
 from .tree_sum import TreeSum
 from .types import (
     ArchiveRef,
@@ -150,9 +154,10 @@ class _Estimates:
                 continue
             used = settings_digest(one.ready)
             payload = _carried(self._cell(refs[0]))
-            levels += self._level(
+            found = self._level(
                 "campaign", estimator, refs, phase, own, used, about.lines(), payload
             )
+            levels += [self._scattered(level, refs) for level in found]
             sums.add(phase)
             settings.add(used)
             everything += refs
@@ -170,7 +175,16 @@ class _Estimates:
             return
         used = settings.pop() if len(settings) == 1 else ""
         told = (*_setups(keys), *doubts.lines())
-        self._pooled += self._level("pooled", estimator, everything, whole, unseen, used, told)
+        pooled = self._level("pooled", estimator, everything, whole, unseen, used, told)
+        self._pooled += [self._scattered(level, everything) for level in pooled]
+
+    def _scattered(self, level: LevelEstimate, refs: Sequence[ArchiveRef]) -> LevelEstimate:
+        """An estimate with intervals no narrower than the repetitions it is from scatter."""
+        if not of_one_motion(refs) or level.covariance is None:
+            return level
+        values = np.array([one.values for one in self._repetitions[-len(refs) :]])
+        covariance = no_narrower(level.covariance, values)
+        return replace(level, covariance=covariance, std=np.sqrt(np.diag(covariance)))
 
     def _campaign(
         self, one: Campaign, estimator: Estimator

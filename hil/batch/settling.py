@@ -48,7 +48,7 @@ def consulted(refs: Sequence[ArchiveRef]) -> tuple[ArchiveRef, ...]:
     ordered = sorted(refs, key=lambda ref: ref.order)
     rest = [ref for ref in ordered if ref.use == "standstill"]
     fitted = [ref for ref in ordered if ref.use == "excitation"]
-    compared = not rest and _same_motion(fitted)
+    compared = not rest and of_one_motion(fitted)
     return (*rest, *fitted[: COMPARED if compared else 1])
 
 
@@ -77,7 +77,7 @@ def settle(refs: Sequence[ArchiveRef], choices: Choices, where: Where) -> Settle
     noise, words = None, THEIR_OWN
     if rest is not None:
         noise, words = position_noise(cell, rest), AT_REST
-    elif _same_motion(refs) and len(fitted) > 1:
+    elif of_one_motion(refs) and len(fitted) > 1:
         try:
             compared = repetition_noise([source.recording for _, source in fitted])
             noise, words = compared.position.white, BETWEEN
@@ -120,7 +120,8 @@ def _read(
     return rest, fitted
 
 
-def _same_motion(refs: Sequence[ArchiveRef]) -> bool:
+def of_one_motion(refs: Sequence[ArchiveRef]) -> bool:
+    """Whether the excitations among archives repeat one planned motion."""
     motions = {ref.motion for ref in refs if ref.use == "excitation"}
     return len(motions) == 1 and "" not in motions
 
