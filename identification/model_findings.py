@@ -144,7 +144,7 @@ def delay(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterat
     if found is None:
         return
     assumed = np.broadcast_to(surroundings.assumed_delay, found.applied.shape)
-    if found.significant and np.array_equal(assumed, found.applied):
+    if found.significant and found.agree and np.array_equal(assumed, found.applied):
         yield Finding(
             "delay",
             "doubtful",
