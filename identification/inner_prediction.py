@@ -94,7 +94,7 @@ class Settings:
             {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
                 how.left_out or "", "by the friction law"
             ),
-            "no low-pass" if width is None else f"low-pass of {width:.3g} Hz",
+            "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
             self.shrinkage.describe(),
         )
 
@@ -171,15 +171,15 @@ class Folds:
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
 """What is fitted, prepared for a model, and nothing else."""
 
-LowPass = Callable[[RobotModel, Preprocessing], float | None]
-"""Bandwidth [Hz] of a low-pass that the torque may have come through, None for none."""
+LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
+"""Settings with low-passes that the torque may have come through."""
 
 
 def choose_settings(
     ready: Ready,
     start: Settings,
     questions: Collection[Question],
-    low_pass: LowPass,
+    low_passes: LowPasses,
 ) -> tuple[Settings, tuple[Choice, ...]]:
     """Choose settings one question after the other, each with what was chosen before it.
 
@@ -187,7 +187,7 @@ def choose_settings(
         ready: prepares what is fitted.
         start: what is not asked for stays as it is here.
         questions: what is chosen.
-        low_pass: looked for where "low-pass" is among them.
+        low_passes: looked for where "low-pass" is among them.
 
     Returns:
         The settings, and how they were chosen; those of `start` where what is fitted is too short
@@ -205,11 +205,15 @@ def choose_settings(
     if "estimator" in questions:
         quick = [Shrinkage(strength) for strength in STRENGTHS]
         now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
-    now, choices = _sweep(trial, now, questions)
+    first = now
+    now, choices = _sweep(trial, first, questions)
     if "low-pass" in questions:
-        width = low_pass(now.model, now.preprocessing)
-        if width is not None:
-            filtered, behind = _sweep(trial, _with(now, torque_bandwidth=width), questions)
+        # Looked for from the beginning: a narrow bandwidth of the motion or a long presliding
+        # displacement, once chosen, would stand in for a part of it.
+        possible = low_passes(first.model, first.preprocessing)
+        if possible:
+            some = [replace(first, preprocessing=one) for one in possible]
+            filtered, behind = _sweep(trial, trial.best(some), questions)
             found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE)
             if found.choice.chosen:
                 now, choices = filtered, behind
@@ -252,6 +256,10 @@ class _Trial:
         chosen = best if errors[best] < (1.0 - share) * errors[0] else 0
         words = _differences(candidates)
         return _Decision(candidates[chosen], Choice(name, words, tuple(errors), chosen))
+
+    def best(self, candidates: Sequence[Settings]) -> Settings:
+        """The one that predicts best, of candidates none of which is simpler."""
+        return min(candidates, key=self.error)
 
     def error(self, settings: Settings) -> float:
         """``||e|| / ||tau||``, infinite where some stretch cannot be predicted."""

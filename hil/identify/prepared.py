@@ -20,7 +20,7 @@ from identification.repetition_noise import repetition_noise
 from identification.shrinkage import Shrinkage
 from identification.signals.clock import time_base
 from identification.thresholds import Thresholds
-from identification.torque_channel import find_torque_bandwidth
+from identification.torque_channel import possible_low_passes
 
 from .currents import with_torques
 from .options import Options
@@ -98,8 +98,8 @@ def prepare_sources(
     notes = _time_bases(sources)
     sources, noise_note = _with_noise(sources)
     sources = with_torques(sources)
-    sources, preprocessing = _stated(sources, options)
-    delays = None
+    sources, stated = _stated(sources, options)
+    preprocessing, delays = stated, None
     if look_for_delay or options.delay == "auto":
         delays = _delays(sources, preprocessing, options, reporter)
     delay_notes: list[str] = []
@@ -109,7 +109,13 @@ def prepare_sources(
         sources, preprocessing, assumed, delay_notes = _compensated(
             sources, preprocessing, delays, by_axis=by_axis
         )
-    sources, chosen, choices = _chosen(sources, preprocessing, options, reporter)
+    sources, chosen, choices = _chosen(
+        sources, preprocessing, stated.torque_delay, options, reporter
+    )
+    if chosen.preprocessing.torque_delay != preprocessing.torque_delay:
+        # A causal low-pass lags by itself: what was found is no delay beside it.
+        delays, delay_notes = None, ["the torque lags the position by its low-pass alone"]
+        assumed = np.full(sources.cell.model.n_joints, stated.torque_delay)
     preprocessing = chosen.preprocessing
     # A verdict on smoothed torque would flatter: what is judged is the torque as recorded.
     judged = replace(preprocessing, smooth_torque=False)
@@ -268,10 +274,22 @@ def _questions(sources: Sources, options: Options) -> set[Question]:
 
 
 def _chosen(
-    sources: Sources, stated: Preprocessing, options: Options, reporter: Reporter
+    sources: Sources,
+    preprocessing: Preprocessing,
+    undelayed: float,
+    options: Options,
+    reporter: Reporter,
 ) -> tuple[Sources, Settings, tuple[Choice, ...]]:
-    """Choose what is automatic, on the fitted part alone."""
-    start = Settings(sources.cell.model, stated)
+    """Choose what is automatic, on the fitted part alone.
+
+    Args:
+        sources: the recordings.
+        preprocessing: what is known, and the delay that was found.
+        undelayed: delay of the torque beside a causal low-pass [s].
+        options: what is automatic.
+        reporter: of progress.
+    """
+    start = Settings(sources.cell.model, preprocessing)
     questions = _questions(sources, options)
     if not questions:
         return sources, start, ()
@@ -280,13 +298,17 @@ def _chosen(
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
         return [samples_of(source, sources, how, model) for source in read]
 
-    def low_pass(model: RobotModel, how: Preprocessing) -> float | None:
-        return find_torque_bandwidth(
-            read[0].recording, model, noise_variance=sources.noise_variance, options=how
+    def low_passes(model: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
+        return possible_low_passes(
+            read[0].recording,
+            model,
+            noise_variance=sources.noise_variance,
+            options=how,
+            undelayed=undelayed,
         )
 
     with reporter.task("choosing settings by inner prediction", 1) as task:
-        settings, choices = choose_settings(ready, start, questions, low_pass)
+        settings, choices = choose_settings(ready, start, questions, low_passes)
         task.advance(1)
     law = settings.model.friction.laws[0]
     cell = sources.cell
