@@ -109,13 +109,15 @@ def prepare_sources(
         sources, preprocessing, assumed, delay_notes = _compensated(
             sources, preprocessing, delays, by_axis=by_axis
         )
-    sources, chosen, choices = _chosen(
-        sources, preprocessing, stated.torque_delay, options, reporter
-    )
+    undelayed = (preprocessing if by_axis else stated).torque_delay
+    sources, chosen, choices = _chosen(sources, preprocessing, undelayed, options, reporter)
     if chosen.preprocessing.torque_delay != preprocessing.torque_delay:
-        # A causal low-pass lags by itself: what was found is no delay beside it.
-        delays, delay_notes = None, ["the torque lags the position by its low-pass alone"]
-        assumed = np.full(sources.cell.model.n_joints, stated.torque_delay)
+        # It was found without the low-pass, and may be nothing but the lag of that.
+        delays, assumed = None, np.full(sources.cell.model.n_joints, undelayed)
+        delay_notes = [
+            f"no other delay than the assumed {undelayed * 1e3:.3g} ms was applied beside the"
+            " low-pass of the torque"
+        ]
     preprocessing = chosen.preprocessing
     # A verdict on smoothed torque would flatter: what is judged is the torque as recorded.
     judged = replace(preprocessing, smooth_torque=False)
