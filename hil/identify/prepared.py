@@ -111,14 +111,16 @@ def prepare_sources(
         )
     undelayed = (preprocessing if by_axis else stated).torque_delay
     sources, chosen, choices = _chosen(sources, preprocessing, undelayed, options, reporter)
-    if chosen.preprocessing.torque_delay != preprocessing.torque_delay:
+    how = chosen.preprocessing
+    lags = how.torque_bandwidth is not None and how.torque_shape.causal
+    if delays is not None and (lags or how.torque_delay != preprocessing.torque_delay):
         # It was found without the low-pass, and may be nothing but the lag of that.
         delays, assumed = None, np.full(sources.cell.model.n_joints, undelayed)
         delay_notes = [
             f"no other delay than the assumed {undelayed * 1e3:.3g} ms was applied beside the"
             " low-pass of the torque"
         ]
-    preprocessing = chosen.preprocessing
+    preprocessing = how
     # A verdict on smoothed torque would flatter: what is judged is the torque as recorded.
     judged = replace(preprocessing, smooth_torque=False)
     with reporter.task(
