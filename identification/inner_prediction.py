@@ -106,7 +106,8 @@ class Choice:
     Attributes:
         name: what was chosen.
         candidates: in words.
-        errors: ``||e|| / ||tau||`` of each candidate.
+        errors: ``||e|| / ||tau||`` of each candidate over all joints; of a low-pass the geometric
+            mean of those of each joint.
         chosen: index of the one that was taken.
     """
 
@@ -114,6 +115,18 @@ class Choice:
     candidates: tuple[str, ...]
     errors: tuple[float, ...]
     chosen: int
+
+
+class Errors(NamedTuple):
+    """Errors of predictions, infinite where some stretch cannot be predicted.
+
+    Attributes:
+        overall: ``||e|| / ||tau||`` over all joints.
+        by_joint: geometric mean of those of each joint.
+    """
+
+    overall: float = math.inf
+    by_joint: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,14 +171,21 @@ class Folds:
         others = [factor for index, factor in enumerate(self.fitted) if index != k]
         return sum(others[1:], others[0])
 
-    def error(self, estimate: Callable[[int, Factor], Array]) -> float:
-        """``||e|| / ||tau||`` of predictions by ``estimate(k, factor without stretch k)``."""
-        squares = 0.0
+    def errors(self, estimate: Callable[[int, Factor], Array]) -> Errors:
+        """Errors of predictions by ``estimate(k, factor without stretch k)``."""
+        squares = np.zeros(self.predicted[0].n_joints)
         for k, target in enumerate(self.predicted):
             augmented = np.append(-estimate(k, self.without(k)), 1.0)
-            squares += float(np.einsum("i,jik,k->", augmented, target.gram, augmented))
-        torque = sum(float(target.gram[:, -1, -1].sum()) for target in self.predicted)
-        return math.sqrt(max(squares, 0.0) / torque) if torque > 0.0 else math.nan
+            squares += np.einsum("i,jik,k->j", augmented, target.gram, augmented)
+        torque = np.sum([target.gram[:, -1, -1] for target in self.predicted], axis=0)
+        if not torque.any():
+            return Errors(math.nan, math.nan)
+        loaded = torque > 0.0
+        shares = np.maximum(squares[loaded] / torque[loaded], np.finfo(np.float64).tiny)
+        return Errors(
+            math.sqrt(max(float(squares.sum()), 0.0) / float(torque.sum())),
+            math.exp(0.5 * float(np.log(shares).mean())),
+        )
 
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
@@ -214,7 +234,8 @@ def choose_settings(
         if possible:
             some = [replace(first, preprocessing=one) for one in possible]
             filtered, behind = _sweep(trial, trial.best(some), questions)
-            found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE)
+            # All joints come through the same channel: the largest errors are not to decide alone.
+            found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
             if found.choice.chosen:
                 now, choices = filtered, behind
             choices = [*choices, found.choice]
@@ -227,7 +248,7 @@ def choose_settings(
         candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
         found = trial.decide("estimator", candidates)
         now, choices = found.settings, [*choices, found.choice]
-    if not math.isfinite(trial.error(now)):
+    if not math.isfinite(trial.errors(now).overall):
         return start, ()
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
 
@@ -244,33 +265,39 @@ class _Trial:
         self._ready = ready
         self._samples: dict[Preprocessing, list[Samples]] = {}
         self._folds: dict[tuple[tuple[FrictionLaw, ...], Preprocessing], Folds] = {}
-        self._errors: dict[tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage], float] = {}
+        self._errors: dict[tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage], Errors] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
 
     def decide(
-        self, name: str, candidates: Sequence[Settings], share: float = WORTHWHILE
+        self,
+        name: str,
+        candidates: Sequence[Settings],
+        share: float = WORTHWHILE,
+        *,
+        by_joint: bool = False,
     ) -> _Decision:
         """Take the first candidate, or the best one if it predicts better by that share."""
-        errors = [self.error(one) for one in candidates]
+        each = [self.errors(one) for one in candidates]
+        errors = [one.by_joint if by_joint else one.overall for one in each]
         best = int(np.nanargmin(errors)) if np.any(np.isfinite(errors)) else 0
         chosen = best if errors[best] < (1.0 - share) * errors[0] else 0
         words = _differences(candidates)
         return _Decision(candidates[chosen], Choice(name, words, tuple(errors), chosen))
 
     def best(self, candidates: Sequence[Settings]) -> Settings:
-        """The one that predicts best, of candidates none of which is simpler."""
-        return min(candidates, key=self.error)
+        """The one that predicts best on average over the joints."""
+        return min(candidates, key=lambda one: self.errors(one).by_joint)
 
-    def error(self, settings: Settings) -> float:
-        """``||e|| / ||tau||``, infinite where some stretch cannot be predicted."""
+    def errors(self, settings: Settings) -> Errors:
+        """Errors of predicting each stretch from the others."""
         if settings.key not in self._errors:
             self._errors[settings.key] = self._predicted(settings)
         return self._errors[settings.key]
 
-    def _predicted(self, settings: Settings) -> float:
+    def _predicted(self, settings: Settings) -> Errors:
         shrinkage, folds = settings.shrinkage, self._reduced(settings)
         if not all(np.all(factor.samples > 0) for factor in folds.fitted):
-            return math.inf
+            return Errors()
 
         def estimate(k: int, factor: Factor) -> Array:
             weights = joint_weights(factor)
@@ -284,9 +311,9 @@ class _Trial:
             return shrunk_values(factor.weighted(weights), self._centres[key], shrinkage.strength)
 
         try:
-            return folds.error(estimate)
+            return folds.errors(estimate)
         except IdentificationError:
-            return math.inf
+            return Errors()
 
     def renew_centres(self) -> None:
         """Find consistent solutions anew, with the settings that are asked for next."""
