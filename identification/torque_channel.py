@@ -98,9 +98,9 @@ def possible_low_passes(
     """Settings with the low-passes that fit a recording best, one of each kind.
 
     The kinds are causal ones, whose lag is what a delay without a low-pass would have to stand in
-    for, and ones without phase, beside that delay and without it. A kind that fits no better than
-    no low-pass is left out. The motion is read with a wide bandwidth: a narrow one would itself
-    be a low-pass of the regressor.
+    for, and ones without phase, beside that delay or without it, as fits better. A kind that fits
+    no better than no low-pass is left out. The motion is read with a wide bandwidth: a narrow one
+    would itself be a low-pass of the regressor.
 
     Args:
         recording: checked, with torque.
@@ -111,21 +111,25 @@ def possible_low_passes(
             options if left out.
     """
     still = options.torque_delay if undelayed is None else undelayed
+    kinds = ((sorted({still, options.torque_delay}), WITHOUT_PHASE), ([still], FORWARDS))
+    wide = replace(options, rigid_bandwidth=RIGID_BANDWIDTH)
     found = []
-    kinds = [(still, WITHOUT_PHASE), (still, FORWARDS)]
-    if options.torque_delay != still:
-        kinds.append((options.torque_delay, WITHOUT_PHASE))
-    for delay, shapes in kinds:
-        how = replace(options, rigid_bandwidth=RIGID_BANDWIDTH, torque_delay=delay)
-        channel = _Channel.of(recording, model, noise_variance, how)
-        best = min((channel.best(shape) for shape in shapes), key=lambda fit: fit.misfit)
-        if best.misfit < float(np.nanmean(channel.log_residuals())):
+    for delays, shapes in kinds:
+        fits = []
+        for delay in delays:
+            how = replace(wide, torque_delay=delay)
+            channel = _Channel.of(recording, model, noise_variance, how)
+            best = min((channel.best(shape) for shape in shapes), key=lambda fit: fit.misfit)
+            if best.misfit < float(np.nanmean(channel.log_residuals())):
+                fits.append((best, delay))
+        if fits:
+            fit, delay = min(fits, key=lambda one: one[0].misfit)
             found.append(
                 replace(
                     options,
                     torque_delay=delay,
-                    torque_bandwidth=best.bandwidth,
-                    torque_shape=best.shape,
+                    torque_bandwidth=fit.bandwidth,
+                    torque_shape=fit.shape,
                 )
             )
     return tuple(found)
