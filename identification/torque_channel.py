@@ -98,9 +98,9 @@ def possible_low_passes(
     """Settings with the low-passes that fit a recording best, one of each kind.
 
     The kinds are causal ones, whose lag is what a delay without a low-pass would have to stand in
-    for, and ones without phase, beside that delay or without it, as fits better. A kind that fits
-    no better than no low-pass is left out. The motion is read with a wide bandwidth: a narrow one
-    would itself be a low-pass of the regressor.
+    for, and ones without phase, beside that delay or without it, as fits better. A kind whose
+    residuals are not clearly smaller than with a delay by itself is left out. The motion is read
+    with a wide bandwidth: a narrow one would itself be a low-pass of the regressor.
 
     Args:
         recording: checked, with torque.
@@ -111,17 +111,18 @@ def possible_low_passes(
             options if left out.
     """
     still = options.torque_delay if undelayed is None else undelayed
-    kinds = ((sorted({still, options.torque_delay}), WITHOUT_PHASE), ([still], FORWARDS))
     wide = replace(options, rigid_bandwidth=RIGID_BANDWIDTH)
+    channels = {
+        delay: _Channel.of(recording, model, noise_variance, replace(wide, torque_delay=delay))
+        for delay in {still, options.torque_delay}
+    }
+    # What a delay by itself explains as well is no low-pass.
+    plain = min(float(np.nanmean(one.log_residuals())) for one in channels.values())
+    enough = plain + math.log(1.0 - _WORTHWHILE)
     found = []
-    for delays, shapes in kinds:
-        fits = []
-        for delay in delays:
-            how = replace(wide, torque_delay=delay)
-            channel = _Channel.of(recording, model, noise_variance, how)
-            best = min((channel.best(shape) for shape in shapes), key=lambda fit: fit.misfit)
-            if best.misfit < float(np.nanmean(channel.log_residuals())):
-                fits.append((best, delay))
+    for delays, shapes in ((tuple(channels), WITHOUT_PHASE), ((still,), FORWARDS)):
+        fits = [(channels[delay].best(shape), delay) for delay in delays for shape in shapes]
+        fits = [one for one in fits if one[0].misfit < enough]
         if fits:
             fit, delay = min(fits, key=lambda one: one[0].misfit)
             found.append(
