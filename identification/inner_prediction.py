@@ -94,7 +94,7 @@ class Settings:
             {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
                 how.left_out or "", "by the friction law"
             ),
-            "no low-pass" if width is None else f"low-pass of {width:.3g} Hz",
+            "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
             self.shrinkage.describe(),
         )
 
@@ -106,7 +106,8 @@ class Choice:
     Attributes:
         name: what was chosen.
         candidates: in words.
-        errors: ``||e|| / ||tau||`` of each candidate.
+        errors: ``||e|| / ||tau||`` of each candidate over all joints; of a low-pass the geometric
+            mean of those of each joint.
         chosen: index of the one that was taken.
     """
 
@@ -114,6 +115,18 @@ class Choice:
     candidates: tuple[str, ...]
     errors: tuple[float, ...]
     chosen: int
+
+
+class Errors(NamedTuple):
+    """Errors of predictions, infinite where some stretch cannot be predicted.
+
+    Attributes:
+        overall: ``||e|| / ||tau||`` over all joints.
+        by_joint: geometric mean of those of each joint.
+    """
+
+    overall: float = math.inf
+    by_joint: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,28 +171,35 @@ class Folds:
         others = [factor for index, factor in enumerate(self.fitted) if index != k]
         return sum(others[1:], others[0])
 
-    def error(self, estimate: Callable[[int, Factor], Array]) -> float:
-        """``||e|| / ||tau||`` of predictions by ``estimate(k, factor without stretch k)``."""
-        squares = 0.0
+    def errors(self, estimate: Callable[[int, Factor], Array]) -> Errors:
+        """Errors of predictions by ``estimate(k, factor without stretch k)``."""
+        squares = np.zeros(self.predicted[0].n_joints)
         for k, target in enumerate(self.predicted):
             augmented = np.append(-estimate(k, self.without(k)), 1.0)
-            squares += float(np.einsum("i,jik,k->", augmented, target.gram, augmented))
-        torque = sum(float(target.gram[:, -1, -1].sum()) for target in self.predicted)
-        return math.sqrt(max(squares, 0.0) / torque) if torque > 0.0 else math.nan
+            squares += np.einsum("i,jik,k->j", augmented, target.gram, augmented)
+        torque = np.sum([target.gram[:, -1, -1] for target in self.predicted], axis=0)
+        if not torque.any():
+            return Errors(math.nan, math.nan)
+        loaded = torque > 0.0
+        shares = np.maximum(squares[loaded] / torque[loaded], np.finfo(np.float64).tiny)
+        return Errors(
+            math.sqrt(max(float(squares.sum()), 0.0) / float(torque.sum())),
+            math.exp(0.5 * float(np.log(shares).mean())),
+        )
 
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
 """What is fitted, prepared for a model, and nothing else."""
 
-LowPass = Callable[[RobotModel, Preprocessing], float | None]
-"""Bandwidth [Hz] of a low-pass that the torque may have come through, None for none."""
+LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
+"""Settings with low-passes that the torque may have come through."""
 
 
 def choose_settings(
     ready: Ready,
     start: Settings,
     questions: Collection[Question],
-    low_pass: LowPass,
+    low_passes: LowPasses,
 ) -> tuple[Settings, tuple[Choice, ...]]:
     """Choose settings one question after the other, each with what was chosen before it.
 
@@ -187,7 +207,7 @@ def choose_settings(
         ready: prepares what is fitted.
         start: what is not asked for stays as it is here.
         questions: what is chosen.
-        low_pass: looked for where "low-pass" is among them.
+        low_passes: looked for where "low-pass" is among them.
 
     Returns:
         The settings, and how they were chosen; those of `start` where what is fitted is too short
@@ -205,12 +225,17 @@ def choose_settings(
     if "estimator" in questions:
         quick = [Shrinkage(strength) for strength in STRENGTHS]
         now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
-    now, choices = _sweep(trial, now, questions)
+    first = now
+    now, choices = _sweep(trial, first, questions)
     if "low-pass" in questions:
-        width = low_pass(now.model, now.preprocessing)
-        if width is not None:
-            filtered, behind = _sweep(trial, _with(now, torque_bandwidth=width), questions)
-            found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE)
+        # Looked for from the beginning: a narrow bandwidth of the motion or a long presliding
+        # displacement, once chosen, would stand in for a part of it.
+        possible = low_passes(first.model, first.preprocessing)
+        if possible:
+            some = [replace(first, preprocessing=one) for one in possible]
+            filtered, behind = _sweep(trial, trial.best(some), questions)
+            # All joints come through the same channel: the largest errors are not to decide alone.
+            found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
             if found.choice.chosen:
                 now, choices = filtered, behind
             choices = [*choices, found.choice]
@@ -223,7 +248,7 @@ def choose_settings(
         candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
         found = trial.decide("estimator", candidates)
         now, choices = found.settings, [*choices, found.choice]
-    if not math.isfinite(trial.error(now)):
+    if not math.isfinite(trial.errors(now).overall):
         return start, ()
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
 
@@ -240,30 +265,40 @@ class _Trial:
         self._ready = ready
         self._samples: dict[Preprocessing, list[Samples]] = {}
         self._folds: dict[tuple[tuple[FrictionLaw, ...], Preprocessing], Folds] = {}
-        self._errors: dict[tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage], float] = {}
+        self._errors: dict[tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage], Errors] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
         self._near: dict[tuple[str, ...], Array] = {}  # a solution, from which others are found
 
     def decide(
-        self, name: str, candidates: Sequence[Settings], share: float = WORTHWHILE
+        self,
+        name: str,
+        candidates: Sequence[Settings],
+        share: float = WORTHWHILE,
+        *,
+        by_joint: bool = False,
     ) -> _Decision:
         """Take the first candidate, or the best one if it predicts better by that share."""
-        errors = [self.error(one) for one in candidates]
+        each = [self.errors(one) for one in candidates]
+        errors = [one.by_joint if by_joint else one.overall for one in each]
         best = int(np.nanargmin(errors)) if np.any(np.isfinite(errors)) else 0
         chosen = best if errors[best] < (1.0 - share) * errors[0] else 0
         words = _differences(candidates)
         return _Decision(candidates[chosen], Choice(name, words, tuple(errors), chosen))
 
-    def error(self, settings: Settings) -> float:
-        """``||e|| / ||tau||``, infinite where some stretch cannot be predicted."""
+    def best(self, candidates: Sequence[Settings]) -> Settings:
+        """The one that predicts best on average over the joints."""
+        return min(candidates, key=lambda one: self.errors(one).by_joint)
+
+    def errors(self, settings: Settings) -> Errors:
+        """Errors of predicting each stretch from the others."""
         if settings.key not in self._errors:
             self._errors[settings.key] = self._predicted(settings)
         return self._errors[settings.key]
 
-    def _predicted(self, settings: Settings) -> float:
+    def _predicted(self, settings: Settings) -> Errors:
         shrinkage, folds = settings.shrinkage, self._reduced(settings)
         if not all(np.all(factor.samples > 0) for factor in folds.fitted):
-            return math.inf
+            return Errors()
 
         def estimate(k: int, factor: Factor) -> Array:
             weights = joint_weights(factor)
@@ -280,9 +315,9 @@ class _Trial:
             return shrunk_values(factor.weighted(weights), self._centres[key], shrinkage.strength)
 
         try:
-            return folds.error(estimate)
+            return folds.errors(estimate)
         except IdentificationError:
-            return math.inf
+            return Errors()
 
     def renew_centres(self) -> None:
         """Find consistent solutions anew, with the settings that are asked for next."""

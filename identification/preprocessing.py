@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from identification.butterworth import butterworth_motion, choose_cutoff
 from identification.factor import Factor
+from identification.low_passes import SMOOTHER, LowPassShape, low_passed
 from identification.masks import (
     REVERSAL_PERIODS,
     SHORTEST_STRETCH,
@@ -22,7 +23,7 @@ from identification.motion import Motion
 from identification.noise import difference_variance
 from identification.recording import Recording, RecordingError
 from identification.regressor import Regressor
-from identification.smoothing_spline import fit_smoothing_spline, low_pass
+from identification.smoothing_spline import fit_smoothing_spline
 
 Array = NDArray[np.float64]
 
@@ -61,7 +62,9 @@ class Preprocessing:
             of a low-pass that the torque has come through before it was logged, as many
             controllers do it: the regressor then goes through the same low-pass and the torque
             is left alone. None: it has come through none.
-        torque_delay: time by which the recorded torque lags the recorded position [s].
+        torque_shape: how that low-pass falls off; `smooth_torque` is always by the spline's.
+        torque_delay: time by which the recorded torque lags the recorded position [s], beside
+            the lag of a causal low-pass.
         reversal_periods: of the smoothing's bandwidth that are left out on either side of a
             reversal, where `left_out` is "slow".
     """
@@ -72,6 +75,7 @@ class Preprocessing:
     left_out: LeftOut | None = None
     smooth_torque: bool = False
     torque_bandwidth: float | None = None
+    torque_shape: LowPassShape = SMOOTHER
     torque_delay: float = 0.0
     reversal_periods: float = REVERSAL_PERIODS
 
@@ -96,6 +100,7 @@ class Samples:
         position_bandwidth: of the smoothing, per joint (n,) [Hz].
         torque_bandwidth: of the low-pass the torque has come through, per joint (n,) [Hz]; the
             regressor has to go through it as well. None: it has come through none.
+        torque_shape: of that low-pass.
         mask: why rows do not count; None where nobody asked.
         whole: the samples that these are part of, and which part: a low-pass reads what comes
             before and after. None where they are all there is.
@@ -108,6 +113,7 @@ class Samples:
     origin: float
     position_bandwidth: Array
     torque_bandwidth: Array | None = None
+    torque_shape: LowPassShape = SMOOTHER
     mask: RowMask | None = None
     whole: tuple[Samples, slice] | None = None
 
@@ -145,7 +151,7 @@ class Samples:
         if self.torque_bandwidth is None:
             return columns
         bandwidth = np.full(columns.shape[1], self.torque_bandwidth[joint])
-        return _low_passed(self.motion.time, columns, bandwidth, self.segments)
+        return _low_passed(self.motion.time, columns, bandwidth, self.segments, self.torque_shape)
 
     def regressor(self, model: RobotModel) -> Regressor:
         """Regressor of every row, usable or not, as the torque channel would record it."""
@@ -267,6 +273,7 @@ def prepare(
         origin=recording.motion_start if origin is None else origin,
         position_bandwidth=bandwidth,
         torque_bandwidth=torque_bandwidth,
+        torque_shape=SMOOTHER if options.smooth_torque else options.torque_shape,
         mask=mask,
     ).directed(model)
     return _unloaded(samples, model) if model.has_load else samples
@@ -345,7 +352,11 @@ def _attainable(variance: Array, measured: Array) -> Array:
 
 
 def _low_passed(
-    time: Array, columns: Array, bandwidth: Array, segments: tuple[slice, ...]
+    time: Array,
+    columns: Array,
+    bandwidth: Array,
+    segments: tuple[slice, ...],
+    shape: LowPassShape = SMOOTHER,
 ) -> Array:
     """Columns (m, c), each through a low-pass of its own (c,), segment by segment."""
     filtered = np.zeros_like(columns)
@@ -354,7 +365,7 @@ def _low_passed(
             continue
         for value in np.unique(bandwidth):
             alike = bandwidth == value
-            filtered[segment, alike] = low_pass(
-                time[segment], columns[segment][:, alike], float(value)
+            filtered[segment, alike] = low_passed(
+                time[segment], columns[segment][:, alike], float(value), shape
             )
     return filtered

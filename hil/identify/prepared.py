@@ -20,7 +20,7 @@ from identification.repetition_noise import repetition_noise
 from identification.shrinkage import Shrinkage
 from identification.signals.clock import time_base
 from identification.thresholds import Thresholds
-from identification.torque_channel import find_torque_bandwidth
+from identification.torque_channel import possible_low_passes
 
 from .currents import with_torques
 from .options import Options
@@ -98,8 +98,8 @@ def prepare_sources(
     notes = _time_bases(sources)
     sources, noise_note = _with_noise(sources)
     sources = with_torques(sources)
-    sources, preprocessing = _stated(sources, options)
-    delays = None
+    sources, stated = _stated(sources, options)
+    preprocessing, delays = stated, None
     if look_for_delay or options.delay == "auto":
         delays = _delays(sources, preprocessing, options, reporter)
     delay_notes: list[str] = []
@@ -109,8 +109,18 @@ def prepare_sources(
         sources, preprocessing, assumed, delay_notes = _compensated(
             sources, preprocessing, delays, by_axis=by_axis
         )
-    sources, chosen, choices = _chosen(sources, preprocessing, options, reporter)
-    preprocessing = chosen.preprocessing
+    undelayed = (preprocessing if by_axis else stated).torque_delay
+    sources, chosen, choices = _chosen(sources, preprocessing, undelayed, options, reporter)
+    how = chosen.preprocessing
+    lags = how.torque_bandwidth is not None and how.torque_shape.causal
+    if delays is not None and (lags or how.torque_delay != preprocessing.torque_delay):
+        # It was found without the low-pass, and may be nothing but the lag of that.
+        delays, assumed = None, np.full(sources.cell.model.n_joints, undelayed)
+        delay_notes = [
+            f"no other delay than the assumed {undelayed * 1e3:.3g} ms was applied beside the"
+            " low-pass of the torque"
+        ]
+    preprocessing = how
     # A verdict on smoothed torque would flatter: what is judged is the torque as recorded.
     judged = replace(preprocessing, smooth_torque=False)
     with reporter.task(
@@ -268,10 +278,22 @@ def _questions(sources: Sources, options: Options) -> set[Question]:
 
 
 def _chosen(
-    sources: Sources, stated: Preprocessing, options: Options, reporter: Reporter
+    sources: Sources,
+    preprocessing: Preprocessing,
+    undelayed: float,
+    options: Options,
+    reporter: Reporter,
 ) -> tuple[Sources, Settings, tuple[Choice, ...]]:
-    """Choose what is automatic, on the fitted part alone."""
-    start = Settings(sources.cell.model, stated)
+    """Choose what is automatic, on the fitted part alone.
+
+    Args:
+        sources: the recordings.
+        preprocessing: what is known, and the delay that was found.
+        undelayed: delay of the torque beside a causal low-pass [s].
+        options: what is automatic.
+        reporter: of progress.
+    """
+    start = Settings(sources.cell.model, preprocessing)
     questions = _questions(sources, options)
     if not questions:
         return sources, start, ()
@@ -280,13 +302,17 @@ def _chosen(
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
         return [samples_of(source, sources, how, model) for source in read]
 
-    def low_pass(model: RobotModel, how: Preprocessing) -> float | None:
-        return find_torque_bandwidth(
-            read[0].recording, model, noise_variance=sources.noise_variance, options=how
+    def low_passes(model: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
+        return possible_low_passes(
+            read[0].recording,
+            model,
+            noise_variance=sources.noise_variance,
+            options=how,
+            undelayed=undelayed,
         )
 
     with reporter.task("choosing settings by inner prediction", 1) as task:
-        settings, choices = choose_settings(ready, start, questions, low_pass)
+        settings, choices = choose_settings(ready, start, questions, low_passes)
         task.advance(1)
     law = settings.model.friction.laws[0]
     cell = sources.cell

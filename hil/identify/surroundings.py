@@ -76,14 +76,18 @@ def _clock(prepared: Prepared) -> Iterator[Finding]:
 def _low_pass(prepared: Prepared) -> Iterator[Finding]:
     """A low-pass of the torque that was found, and not stated."""
     found = any(one.name == LOW_PASS and one.chosen for one in prepared.choices)
-    width = prepared.preprocessing.torque_bandwidth
+    how = prepared.preprocessing
+    width = how.torque_bandwidth
     if found and width is not None:
         yield Finding(
             "torque bandwidth",
             "doubtful",
-            f"the recorded torque seems to have come through a low-pass of {width:.3g} Hz before"
-            " it was recorded; the model is filtered alike",
-            "record the torque unfiltered, or state its low-pass with --torque-bandwidth",
+            f"the recorded torque seems to have come through a low-pass of {width:.3g} Hz"
+            f" ({how.torque_shape}) before it was recorded; the model is filtered alike",
+            "record the torque unfiltered"
+            + (
+                "" if how.torque_shape.causal else ", or state its low-pass with --torque-bandwidth"
+            ),
             "condition",
         )
 
