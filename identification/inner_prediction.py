@@ -46,6 +46,7 @@ PRESLIDING: Final = (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
 # Rows near a reversal say how dry friction turns round, but not so well as sliding ones what it is:
 # where they do not help, intervals are honest only without them.
 LEFT_OUT: Final[tuple[LeftOut, ...]] = ("slow", "rests")
+NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # of a low-pass that was found
 STRENGTHS: Final = (0.0, 1e-3, 1e-2, 0.1, 1.0, math.inf)
 PRIOR_WEIGHTS: Final = (0.01, 0.1, 1.0, 10.0)
 # Beyond Coulomb and viscous friction; one of them alone, for they look alike.
@@ -223,7 +224,8 @@ def choose_settings(
         now = replace(now, model=now.model.with_friction(presliding=PRESLIDING[0]))
     choices: list[Choice] = []
     if "estimator" in questions:
-        quick = [Shrinkage(strength) for strength in STRENGTHS]
+        # The consistent solution is found once: what is compared on the way has to follow the data.
+        quick = [Shrinkage(strength) for strength in STRENGTHS if math.isfinite(strength)]
         now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
     first = now
     now, choices = _sweep(trial, first, questions)
@@ -234,6 +236,8 @@ def choose_settings(
         if possible:
             some = [replace(first, preprocessing=one) for one in possible]
             filtered, behind = _sweep(trial, trial.best(some), questions)
+            # The residual's least is flat; prediction with what was chosen beside it is sharper.
+            filtered = trial.decide("", _widths(filtered), share=0.0).settings
             # All joints come through the same channel: the largest errors are not to decide alone.
             found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
             if found.choice.chosen:
@@ -399,6 +403,11 @@ _SWEPT: Final[tuple[tuple[Question, str, Callable[[Settings], list[Settings]]], 
 
 def _friction_terms(now: Settings) -> list[Settings]:
     return [replace(now, model=now.model.with_friction(**terms)) for terms in FRICTION_TERMS]
+
+
+def _widths(now: Settings) -> list[Settings]:
+    width = now.preprocessing.torque_bandwidth or math.nan
+    return [_with(now, torque_bandwidth=share * width) for share in NEARBY]
 
 
 def _shrinkages(prior_weights: Sequence[float]) -> list[Shrinkage]:

@@ -141,9 +141,13 @@ class Samples:
 
     def directed(self, model: RobotModel) -> Samples:
         """Return samples whose dry friction has the direction that a model's law gives it."""
-        if not any(law.presliding > 0.0 for law in model.friction.laws):
-            return replace(self, motion=self.motion._replace(direction=None))
-        direction = model.friction.direction(*self.motion[:3])
+        if self.whole is not None:
+            whole, part = self.whole
+            whole = whole.directed(model)
+            return replace(self, motion=whole.motion.rows(part), whole=(whole, part))
+        direction = None
+        if any(law.presliding > 0.0 for law in model.friction.laws):
+            direction = model.friction.direction(*self.motion[:3])
         return replace(self, motion=self.motion._replace(direction=direction))
 
     def as_measured(self, joint: int, columns: Array) -> Array:
