@@ -23,6 +23,7 @@ from hil.campaign.quick_design import design
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.identify import identify_campaign
+from hil.identify.options import FIXED
 from hil.progress import Silent
 from hil.simulation import simulated_controller
 from tests.hil.fast_cell import fast_cell
@@ -113,8 +114,8 @@ def finish_in_virtual_time(campaign: Campaign, seed: int) -> None:
 
 
 def estimate_of(campaign: Campaign) -> Estimated:
-    """What is found in the archives of a campaign."""
-    pooled = identify_campaign(campaign.folder.root, Silent()).estimate.pooled
+    """What is found in the archives of a campaign with fixed settings, so that rounds compare."""
+    pooled = identify_campaign(campaign.folder.root, Silent(), FIXED).estimate.pooled
     return Estimated(np.asarray(pooled.values), np.asarray(pooled.covariance))
 
 
