@@ -3,12 +3,13 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PYTEST = $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 # The tests start processes by the hundred, and each would compile all sources anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo docs pictures test test-slow coverage mutants audit bench clean
+.PHONY: help setup demo docs pictures test test-safety test-all test-slow coverage mutants audit bench clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -32,13 +33,19 @@ pictures: $(STAMP)  ## draw the documentation's pictures anew: every example's, 
 	cp runs/examples/*.png examples/pictures/
 	$(BIN)/python docs/screen_picture.py
 
-test: $(STAMP)  ## lint, types, floors, declared dependencies and the fast tests
+test: $(STAMP)  ## lint, types, floors, declared dependencies and the quick tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/deptry .
-	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not slow and not qemu and not safety and not long"
+
+test-safety: $(STAMP)  ## what drives an arm, and what breaks it: for any change on the way to the controller
+	$(PYTEST) -m "safety and not slow and not qemu"
+
+test-all: $(STAMP)  ## every test but those that take minutes
+	$(PYTEST)
 
 test-slow: $(STAMP)  ## the tests that take minutes
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,fuzz,fuse]'

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
@@ -19,7 +20,8 @@ from identification.preprocessing import Samples
 
 Array = NDArray[np.float64]
 
-_FEWEST_TO_SCATTER: Final = 3
+# Share of equal repetitions that scatter by less than what counts as more than chance.
+_CERTAIN: Final = 0.99
 
 Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
 """An estimator: some recordings and their factor to an estimate."""
@@ -101,14 +103,17 @@ class RepeatedEstimate:
 def no_narrower(covariance: Array, values: Array) -> Array:
     """Covariance (p, p) with standard deviations of at least those of a mean of R values (R, p).
 
-    Two are too few to scatter: their covariance is as it is.
+    As far as these are larger beyond chance: a few values scatter by more or less than they should.
     """
-    if len(values) < _FEWEST_TO_SCATTER:
+    freedom = len(values) - 1
+    if freedom < 1:
         return covariance
     std = np.sqrt(np.diag(covariance))
     known = np.isfinite(std) & (std > 0.0)
     scatter = values.std(axis=0, ddof=1) / np.sqrt(len(values))
-    wider = np.where(known, np.fmax(scatter / np.where(known, std, 1.0), 1.0), 1.0)
+    ratio = np.where(known, scatter / np.where(known, std, 1.0), 1.0)
+    chance = np.sqrt(scipy.stats.chi2.ppf(_CERTAIN, freedom) / freedom)
+    wider = np.where(ratio > chance, ratio, 1.0)
     return np.where(np.outer(known, known), covariance * np.outer(wider, wider), covariance)
 
 

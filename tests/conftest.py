@@ -17,6 +17,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.tiers import tier_of
+
 settings.register_profile(
     "hil", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
@@ -45,6 +47,9 @@ _LONGEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     rank = {name: place for place, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))  # within a file as it was
+    for item in items:
+        if (tier := tier_of(item.path)) is not None:
+            item.add_marker(tier)
 
 
 @pytest.fixture(scope="session")

@@ -391,11 +391,13 @@ def _compensated(
 def _other(sources: Sources, found: DelayEstimate) -> bool:
     """Whether a delay that was found replaces the cell's.
 
-    That of a controller is known: only what differs by more than the estimate errs in closed loop
-    is another one.
+    That of a controller is known: only what is well determined and differs by more than the
+    estimate errs in closed loop is another one.
     """
-    stated = sources.cell.file.controller is not None
-    return not stated or abs(found.common - found.assumed) > Thresholds().delay * found.cycle
+    if sources.cell.file.controller is None:
+        return True
+    apart = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
+    return apart and bool(found.determined.all())
 
 
 def _masked(fitted: Sequence[Samples]) -> dict[str, NDArray[np.intp]]:

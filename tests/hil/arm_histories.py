@@ -21,7 +21,7 @@ from identification.estimation import estimate, joint_weights
 from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Samples
-from sim_fixtures.ns16 import CELL_PATH
+from sim_fixtures.ns16 import CELL_PATH, urdf_text
 
 Array = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ def trend_of(life: Life, count: int, seed: int = 7) -> ArmTrend:
 
 @cache
 def cell() -> Cell:
-    return Cell.load(CELL_PATH)
+    return Cell.from_texts(CELL_PATH.read_text("utf-8"), urdf_text(), CELL_PATH)
 
 
 def model() -> RobotModel:
