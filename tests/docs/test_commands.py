@@ -183,15 +183,15 @@ def test_no_exception_is_left_over() -> None:
 
 
 FAST = ("connect.md", "motion.md")
-AFTER_A_DEMO = ("README.md", "tutorial.md")
+AFTER_A_DEMO = ("commands.md", "tutorial.md")
 AFTER_TWO = {
-    "README.md": ("march", "june"),
+    "commands.md": ("march", "june"),
     "compare.md": ("march", "june"),
     "design.md": ("demo",),
     "study.md": ("a", "b"),
 }
 """Pages that name campaigns of one arm, and how."""
-SLOW = ("README.md", "compare.md", "design.md", "study.md", "tutorial.md")
+SLOW = ("commands.md", "compare.md", "design.md", "study.md", "tutorial.md")
 
 
 @pytest.mark.parametrize(
