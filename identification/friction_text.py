@@ -3,61 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import Final, NamedTuple
+from collections.abc import Iterable, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.friction import FrictionLaw
+from identification.friction import Coulomb, FrictionLaw, FrictionTerm, Viscous
 from identification.model import RobotModel
 
 Array = NDArray[np.float64]
-
-
-class _Kind(NamedTuple):
-    """A kind of term; the third term of different joints may be of two kinds."""
-
-    symbol: str
-    name: str  # of the tuple of coefficients in the source
-    formula: str  # for people; v is the joint's speed
-    code: str  # v: speed, sign: of the speed
-    words: str
-
-
-_KINDS: Final = (
-    _Kind("f0", "COULOMB", "f0 sgn(v)", "COULOMB[joint] * sign", "Coulomb (dry) friction f0"),
-    _Kind("f1", "VISCOUS", "f1 v", "VISCOUS[joint] * v", "viscous friction f1"),
-    _Kind(
-        "fd",
-        "DIFFERENCE",
-        "fd |v|",
-        "DIFFERENCE[joint] * abs(v)",
-        "half the difference fd of viscous friction forwards and backwards",
-    ),
-    _Kind(
-        "f2",
-        "THIRD",
-        "f2 sgn(v) v²",
-        "THIRD[joint] * v * abs(v)",
-        "a term f2 with the speed squared",
-    ),
-    _Kind(
-        "f2",
-        "CUBIC",
-        "f2 v³",
-        "CUBIC[joint] * v**3",
-        "a term f2 with the third power of the speed",
-    ),
-    _Kind(
-        "fs",
-        "STRIBECK",
-        "fs sgn(v) exp(-(v/vs)²)",
-        "STRIBECK[joint] * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
-        "what friction is larger by at low speed, fs (Stribeck)",
-    ),
-    _Kind("fo", "OFFSET", "fo", "OFFSET[joint]", "a constant offset fo"),
-)
 
 
 def friction_in_words(model: RobotModel, coefficients: Array) -> str:
@@ -70,7 +25,9 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
     table, motors = friction.table(coefficients), friction.motor_table(coefficients)
     if not friction.terms:
         return "The joints have no friction.\n"
-    kinds = _kinds(friction.laws)
+    kinds = friction.kinds
+    # The third term of different joints may be of two kinds.
+    shared = [one.symbol for one, other in combinations(kinds, 2) if one.symbol == other.symbol]
     lines = []
     if kinds:
         lines += [
@@ -82,18 +39,20 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
     for joint, (name, law) in enumerate(zip(model.joint_names, friction.laws, strict=True)):
         revolute = bool(model.chain.revolute[joint])
         values = [
-            f"{symbol} = {table[symbol][joint]:.5g} {law.unit(symbol, revolute=revolute)}"
-            for symbol in law.symbols
+            f"{term.symbol} = {table[term.symbol][joint]:.5g} {term.unit(revolute=revolute)}"
+            for term in law.terms
         ]
-        if law.third is not None and {"THIRD", "CUBIC"} <= {kind.name for kind in kinds}:
-            values.append(f"f2 with {'v³' if law.third == 'cubic' else 'sgn(v) v²'}")
-        if law.stribeck is not None:
-            values.append(f"vs = {law.stribeck:g} {'rad/s' if revolute else 'm/s'}")
+        for term in law.terms:
+            if term.symbol in shared:
+                values.append(f"{term.symbol} with {term.basis}")
+            if term.speed_symbol:
+                speed = f"{term.speed:g} {'rad/s' if revolute else 'm/s'}"
+                values.append(f"{term.speed_symbol} = {speed}")
         lines.append(f"{_line(name)}: " + (", ".join(values) or "no friction"))
     if any(law.asymmetric and law.coulomb for law in friction.laws):
         lines.append(
             "Coulomb friction is f0 + fo forwards and f0 - fo backwards: its asymmetry cannot be"
-            " told from the zero error of a sensor."
+            " distinguished from the zero error of a sensor."
         )
     lines += _motor_lines(model, motors)
     return "\n".join(lines) + "\n"
@@ -112,26 +71,27 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     friction, n = model.friction, model.n_joints
     table = friction.table(coefficients)
     motors = friction.motor_table(coefficients)
-    kinds = _kinds(friction.laws)
+    kinds = friction.kinds
     lines = ['"""Identified friction of a robot\'s joints. Source: hil."""', ""]
     lines += [
         f"JOINTS = {_tuple(repr(name) for name in model.joint_names)}",
         f"LINEAR = {_tuple(repr(_linear(law)) for law in friction.laws)}"
         "  # rad/s or m/s: slower, the sign was fitted as linear",
     ]
+    if any(" E " in kind.code for kind in kinds):
+        lines.append(f"E = {math.e!r}")
     for kind in kinds:
-        has = [_has(law, kind) for law in friction.laws]
-        values = np.where(has, table[kind.symbol], 0.0)
+        terms, name = [kind.of(law) for law in friction.laws], kind.label.upper()
+        values = np.where([term is not None for term in terms], table[kind.symbol], 0.0)
         units = {
-            law.unit(kind.symbol, revolute=bool(turns))
-            for law, turns, own in zip(friction.laws, model.chain.revolute, has, strict=True)
-            if own
+            term.unit(revolute=bool(turns))
+            for term, turns in zip(terms, model.chain.revolute, strict=True)
+            if term is not None
         }
-        lines.append(f"{kind.name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
-        if kind.symbol == "fs":
-            speeds = np.array([law.stribeck or 1.0 for law in friction.laws])
-            lines.append(f"STRIBECK_SPEED = {_numbers(speeds)}  # rad/s or m/s")
-            lines.append(f"E = {math.e!r}")
+        lines.append(f"{name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
+        if kind.speed_symbol:
+            speeds = np.array([1.0 if term is None else term.speed for term in terms])
+            lines.append(f"{name}_SPEED = {_numbers(speeds)}  # rad/s or m/s")
     lines.append(_motor_table(model, motors))
     lines += [
         "",
@@ -151,7 +111,8 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     ]
     if any("sign" in kind.code for kind in kinds):
         lines.append("    sign = direction(v, max(LINEAR[joint], smooth))")
-    lines.append("    return " + (" + ".join(kind.code for kind in kinds) or "0.0"))
+    summands = [f"{kind.label.upper()}[joint]{kind.code}" for kind in kinds]
+    lines.append("    return " + (" + ".join(summands) or "0.0"))
     lines += [
         "",
         "",
@@ -197,10 +158,9 @@ def _motor_lines(model: RobotModel, motors: dict[int, dict[str, float]]) -> list
             ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({_line(model.joint_names[j])})"
             for j in np.flatnonzero(share)
         )
-        law, revolute = model.friction.laws[motor], bool(model.chain.revolute[motor])
+        units = {t.symbol: t.unit for t in model.friction.terms if t.motor and t.owner == motor}
         numbers = ", ".join(
-            f"{symbol} = {value:.5g} {law.unit(symbol, revolute=revolute)}"
-            for symbol, value in values.items()
+            f"{symbol} = {value:.5g} {units[symbol]}" for symbol, value in values.items()
         )
         lines.append(
             f"motor {motor + 1}, at v = {turning}: {numbers}; each of these joints feels that"
@@ -212,7 +172,8 @@ def _motor_lines(model: RobotModel, motors: dict[int, dict[str, float]]) -> list
 def _motor_table(model: RobotModel, motors: dict[int, dict[str, float]]) -> str:
     """Return the line of source with coupled motors: shares of speed, coefficients, linear zone."""
     rows = [
-        f"({_numbers(share)}, {_number(values.get('f0', 0.0))}, {_number(values.get('f1', 0.0))},"
+        f"({_numbers(share)},"
+        f" {', '.join(_number(values.get(kind.symbol, 0.0)) for kind in (Coulomb, Viscous))},"
         f" {_linear(model.friction.laws[motor])!r})"
         for (motor, values), share in zip(
             motors.items(), model.friction.motor_speeds(), strict=True
@@ -226,18 +187,8 @@ def _linear(law: FrictionLaw) -> float:
     return float(law.standstill) if law.zone == "linear" else 0.0
 
 
-def _kinds(laws: tuple[FrictionLaw, ...]) -> list[_Kind]:
-    return [kind for kind in _KINDS if any(_has(law, kind) for law in laws)]
-
-
-def _has(law: FrictionLaw, kind: _Kind) -> bool:
-    if kind.symbol != "f2":
-        return kind.symbol in law.symbols
-    return law.third == ("cubic" if kind.name == "CUBIC" else "quadratic")
-
-
-def _formula(kinds: list[_Kind]) -> str:
-    return " + ".join(kind.formula for kind in kinds)
+def _formula(kinds: Sequence[type[FrictionTerm]]) -> str:
+    return " + ".join(kind.formula() for kind in kinds)
 
 
 def _line(name: str) -> str:

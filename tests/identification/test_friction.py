@@ -38,13 +38,6 @@ def test_the_cubic_third_term_and_the_offset() -> None:
 def test_a_law_without_any_term_has_no_columns() -> None:
     law = FrictionLaw(coulomb=False, viscous=False, third=None)
     assert law.symbols == ()
-    assert law.names(6) == ()
-
-
-def test_names_go_term_by_term() -> None:
-    assert FrictionLaw(third=None, offset=True).names(2) == (
-        "f0_1", "f0_2", "f1_1", "f1_2", "fo_1", "fo_2",
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -57,7 +50,7 @@ def test_names_go_term_by_term() -> None:
 )
 def test_units_follow_the_term_and_the_joint(third: str, revolute: bool, unit: str) -> None:
     law = FrictionLaw(third=third)  # type: ignore[arg-type]
-    assert law.unit("f2", revolute=revolute) == unit
+    assert law.terms[-1].unit(revolute=revolute) == unit
 
 
 def test_a_joint_moves_above_the_standstill_speed_in_either_direction() -> None:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
 from identification.coupling import Coupling
-from identification.dissipation import dissipation
-from identification.joint_friction import JointFriction
+from identification.friction import JointFriction, dissipation
 from sim_fixtures.ns16 import urdf_text
 
 Array = NDArray[np.float64]
