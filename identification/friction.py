@@ -249,19 +249,11 @@ class Offset(FrictionTerm):
         return np.zeros_like(at.v)
 
 
-TERMS: Final[tuple[type[FrictionTerm], ...]] = (
-    Coulomb,
-    Viscous,
-    Asymmetric,
-    Quadratic,
-    Cubic,
-    Stribeck,
-    Offset,
-)
+Kind = type[FrictionTerm]
+TERMS: Final[tuple[Kind, ...]] = (Coulomb, Viscous, Asymmetric, Quadratic, Cubic, Stribeck, Offset)
 """All terms that a joint can have, in the order of the parameters."""
 
-SYMBOLS: Final = tuple(dict.fromkeys(kind.symbol for kind in TERMS))
-"""Their symbols."""
+_SYMBOLS: Final = tuple(dict.fromkeys(kind.symbol for kind in TERMS))
 
 ABSENT: Final[Mapping[str, Any]] = {"third": "none", "stribeck": 0.0}
 """How a cell file writes None, by option."""
@@ -280,10 +272,9 @@ class FrictionLaw:
             any value there; see `zone`.
         stribeck: fixed speed v_s [rad/s, m/s] of a term ``fs sgn(v) exp(-(v / v_s)**2)``, by which
             friction is larger at low speed; none without it.
-        asymmetric: friction differs by direction. The viscous coefficient is f1 + fd forwards and
-            f1 - fd backwards, with a term ``fd |v|``. Coulomb friction is f0 + fo forwards and
-            f0 - fo backwards: its asymmetry is the constant column of the offset, which is there
-            then too, and the two cannot be distinguished.
+        asymmetric: friction differs by direction, viscous by a term ``fd |v|``. Coulomb friction is
+            f0 + fo forwards and f0 - fo backwards: its asymmetry is the constant column of the
+            offset, which is there then too, and the two cannot be distinguished.
         presliding: displacement d [rad, m] over which dry friction reverses; zero for a jump.
         zone: what becomes of rows slower than standstill. "exclude": they are not fitted, see
             :meth:`moving`. "linear": they are, with sgn(v) replaced by v / standstill.
@@ -346,7 +337,7 @@ class FrictionLaw:
 
     @property
     def symbols(self) -> tuple[str, ...]:
-        """Their symbols: a subset of :data:`SYMBOLS`."""
+        """Their symbols."""
         return tuple(term.symbol for term in self.terms)
 
     def words(self) -> tuple[str, str]:
@@ -391,13 +382,10 @@ class FrictionLaw:
         state = presliding_state(np.insert(path, 0, start), self.presliding)[1:]
         return np.delete(state, turning + 1 + np.arange(len(turning)))
 
-    def columns(self, velocity: Array, direction: Array, out: Array | None = None) -> Array:
+    def columns(self, velocity: Array, direction: Array) -> Array:
         """Return one row per coefficient (k, ...), for speeds and directions (...)."""
-        terms = self.terms
-        rows = np.empty((len(terms), *np.shape(velocity))) if out is None else out
-        for term, row in zip(terms, rows, strict=True):
-            row[...] = term.column(velocity, direction)
-        return rows
+        rows = [term.column(velocity, direction) for term in self.terms]
+        return np.reshape(rows, (len(rows), *np.shape(velocity)))
 
     def moving(self, velocity: Array) -> NDArray[np.bool_]:
         """Return where this law can be fitted: faster than standstill, or in a linear zone."""
@@ -491,7 +479,7 @@ class JointFriction:
                 term.unit(revolute=self.revolute[owner]),
             )
             for part in owners
-            for symbol in SYMBOLS
+            for symbol in _SYMBOLS
             for owner, motor in part
             for term in self.laws[owner].terms
             # A motor's share of any other term cannot be distinguished from that of the joints.
@@ -514,7 +502,7 @@ class JointFriction:
         return tuple(dict.fromkeys(kind.symbol for kind in self.kinds))
 
     @property
-    def kinds(self) -> tuple[type[FrictionTerm], ...]:
+    def kinds(self) -> tuple[Kind, ...]:
         """Kinds of term that any joint has, in order."""
         return tuple(kind for kind in TERMS if any(kind.of(law) for law in self.laws))
 

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.friction import Coulomb, FrictionLaw, FrictionTerm, Viscous
+from identification.friction import Coulomb, FrictionLaw, Kind, Viscous
 from identification.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -187,7 +187,7 @@ def _linear(law: FrictionLaw) -> float:
     return float(law.standstill) if law.zone == "linear" else 0.0
 
 
-def _formula(kinds: Sequence[type[FrictionTerm]]) -> str:
+def _formula(kinds: Sequence[Kind]) -> str:
     return " + ".join(kind.formula() for kind in kinds)
 
 

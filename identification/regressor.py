@@ -348,7 +348,7 @@ class _Workspace:
         if self._joint_friction is not None:
             self._write_direction(self._joint_friction, direction, len(q))
         for law, velocity, turned, target in self._friction:
-            law.columns(velocity, turned, target)
+            target[...] = law.columns(velocity, turned)
         for source, target in self._drives:
             np.copyto(target, source)
         for element, joint, target in self._elements:

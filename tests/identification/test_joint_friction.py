@@ -83,9 +83,8 @@ def test_names_go_term_by_term_over_the_joints_that_have_it() -> None:
 def test_asymmetric_friction_brings_the_offset_that_its_coulomb_part_is() -> None:
     law = FrictionLaw(third=None, asymmetric=True)
     assert law.symbols == ("f0", "f1", "fd", "fo")
-    forwards, backwards = np.empty((2, 4, 1))
-    law.columns(np.array([2.0]), np.ones(1), forwards)
-    law.columns(np.array([-2.0]), -np.ones(1), backwards)
+    forwards = law.columns(np.array([2.0]), np.ones(1))
+    backwards = law.columns(np.array([-2.0]), -np.ones(1))
     f0, f1, fd, fo = 5.0, 3.0, 0.5, 1.0
     values = np.array([f0, f1, fd, fo])
     assert (values @ forwards)[0] == (f0 + fo) + (f1 + fd) * 2.0
