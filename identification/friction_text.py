@@ -121,8 +121,8 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         "    result = [friction(joint, v, smooth) for joint, v in enumerate(speeds)]",
         "    for share, coulomb, viscous, linear in MOTORS:",
         "        v = sum(s * speed for s, speed in zip(share, speeds))",
-        "        taken = coulomb * direction(v, max(linear, smooth)) + viscous * v",
-        "        result = [total + s * taken for total, s in zip(result, share)]",
+        "        torque = coulomb * direction(v, max(linear, smooth)) + viscous * v",
+        "        result = [total + s * torque for total, s in zip(result, share)]",
         "    return result",
     ]
     return "\n".join(lines) + "\n"
