@@ -566,7 +566,7 @@ class JointFriction:
         Raises:
             ShapeError: they are not (k,).
         """
-        values = self._checked(coefficients)
+        values = self.checked(coefficients)
         rows = {symbol: np.full(self.n_joints, np.nan) for symbol in self.symbols}
         for term, value in zip(self.terms, values, strict=True):
             if not term.motor:
@@ -576,12 +576,17 @@ class JointFriction:
     def motor_table(self, coefficients: Array) -> dict[int, dict[str, float]]:
         """Return the coefficients of coupled motors by motor, from 0, and symbol."""
         rows: dict[int, dict[str, float]] = {motor: {} for motor in self.motors}
-        for term, value in zip(self.terms, self._checked(coefficients), strict=True):
+        for term, value in zip(self.terms, self.checked(coefficients), strict=True):
             if term.motor:
                 rows[term.owner][term.symbol] = float(value)
         return rows
 
-    def _checked(self, coefficients: Array) -> Array:
+    def checked(self, coefficients: Array) -> Array:
+        """Return the k coefficients.
+
+        Raises:
+            ShapeError: they are not (k,).
+        """
         values = np.asarray(coefficients, dtype=np.float64)
         if values.shape != (len(self.terms),):
             raise ShapeError("coefficients", values.shape, f"({len(self.terms)},)")

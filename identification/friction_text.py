@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.friction import Coulomb, FrictionLaw, Kind, Viscous
+from identification.friction import FrictionLaw, Kind
 from identification.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -69,30 +69,31 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
     friction, n = model.friction, model.n_joints
-    table = friction.table(coefficients)
-    motors = friction.motor_table(coefficients)
-    kinds = friction.kinds
-    lines = ['"""Identified friction of a robot\'s joints. Source: hil."""', ""]
-    lines += [
+    laws = *friction.laws, *(friction.laws[motor] for motor in friction.motors)
+    coefficients = friction.checked(coefficients)
+    lines = [
+        '"""Identified friction of a robot\'s joints. Source: hil."""',
+        "",
         f"JOINTS = {_tuple(repr(name) for name in model.joint_names)}",
-        f"LINEAR = {_tuple(repr(_linear(law)) for law in friction.laws)}"
+        f"MOTORS = {_tuple(map(_numbers, friction.motor_speeds()))}  # speed per joint speed",
+        "# Of the joints, then of these motors:",
+        f"LINEAR = {_tuple(repr(_linear(law)) for law in laws)}"
         "  # rad/s or m/s: slower, the sign was fitted as linear",
     ]
+    kinds = friction.kinds
     if any(" E " in kind.code for kind in kinds):
         lines.append(f"E = {math.e!r}")
     for kind in kinds:
-        terms, name = [kind.of(law) for law in friction.laws], kind.label.upper()
-        values = np.where([term is not None for term in terms], table[kind.symbol], 0.0)
-        units = {
-            term.unit(revolute=bool(turns))
-            for term, turns in zip(terms, model.chain.revolute, strict=True)
-            if term is not None
-        }
+        values, speeds, units = np.zeros(len(laws)), np.ones(len(laws)), set()
+        for (_, term, owner, motor, unit), value in zip(friction.terms, coefficients, strict=True):
+            if isinstance(term, kind):
+                place = n + friction.motors.index(owner) if motor else owner
+                values[place], speeds[place] = value, term.speed
+                units.add(unit)
+        name = kind.label.upper()
         lines.append(f"{name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
         if kind.speed_symbol:
-            speeds = np.array([1.0 if term is None else term.speed for term in terms])
             lines.append(f"{name}_SPEED = {_numbers(speeds)}  # rad/s or m/s")
-    lines.append(_motor_table(model, motors))
     lines += [
         "",
         "",
@@ -119,9 +120,9 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         "def torques(speeds, smooth=0.0):",
         f'    """Return friction of all {n} joints at their speeds, coupled motors included."""',
         "    result = [friction(joint, v, smooth) for joint, v in enumerate(speeds)]",
-        "    for share, coulomb, viscous, linear in MOTORS:",
+        "    for motor, share in enumerate(MOTORS, len(JOINTS)):",
         "        v = sum(s * speed for s, speed in zip(share, speeds))",
-        "        torque = coulomb * direction(v, max(linear, smooth)) + viscous * v",
+        "        torque = friction(motor, v, smooth)",
         "        result = [total + s * torque for total, s in zip(result, share)]",
         "    return result",
     ]
@@ -167,19 +168,6 @@ def _motor_lines(model: RobotModel, motors: dict[int, dict[str, float]]) -> list
             " torque times its factor"
         )
     return lines
-
-
-def _motor_table(model: RobotModel, motors: dict[int, dict[str, float]]) -> str:
-    """Return the line of source with coupled motors: shares of speed, coefficients, linear zone."""
-    rows = [
-        f"({_numbers(share)},"
-        f" {', '.join(_number(values.get(kind.symbol, 0.0)) for kind in (Coulomb, Viscous))},"
-        f" {_linear(model.friction.laws[motor])!r})"
-        for (motor, values), share in zip(
-            motors.items(), model.friction.motor_speeds(), strict=True
-        )
-    ]
-    return f"MOTORS = {_tuple(rows)}  # speed per joint speed, Coulomb, viscous, linear"
 
 
 def _linear(law: FrictionLaw) -> float:
