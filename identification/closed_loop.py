@@ -161,13 +161,12 @@ class _Friction:
         """Take the friction out of parameters (p,)."""
         friction = model.friction
         speeds = np.concatenate([np.eye(model.n_joints), friction.motor_speeds()])
-        laws = friction.laws + tuple(friction.laws[motor] for motor in friction.motors)
-        places = {motor: model.n_joints + k for k, motor in enumerate(friction.motors)}
         coefficients: dict[FrictionTerm, Array] = {}
         for one, value in zip(friction.terms, values[model.friction_part], strict=True):
-            place = places[one.owner] if one.motor else one.owner
-            coefficients.setdefault(one.term, np.zeros(len(speeds)))[place] = value
-        standstill = np.maximum([law.standstill for law in laws], _NARROWEST_STANDSTILL)
+            row = coefficients.setdefault(one.term, np.zeros(len(speeds)))
+            row[friction.place(one)] = value
+        slow = [law.standstill for law in friction.all_laws]
+        standstill = np.maximum(slow, _NARROWEST_STANDSTILL)
         return cls(speeds, tuple(coefficients.items()), standstill)
 
     def torque(self, qd: Array) -> Array:

@@ -497,9 +497,9 @@ class JointFriction:
         return tuple(term.unit for term in self.terms)
 
     @property
-    def symbols(self) -> tuple[str, ...]:
-        """Symbols that any joint has, in order."""
-        return tuple(dict.fromkeys(kind.symbol for kind in self.kinds))
+    def all_laws(self) -> tuple[FrictionLaw, ...]:
+        """Laws of the joints, then of `motors`."""
+        return *self.laws, *(self.laws[motor] for motor in self.motors)
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
@@ -560,29 +560,12 @@ class JointFriction:
             moving[:, speed != 0.0] &= turning[:, None]
         return moving
 
-    def table(self, coefficients: Array) -> dict[str, Array]:
-        """Return the joints' coefficients (k,) by symbol, each (n,); NaN where a joint has none.
+    def place(self, term: JointTerm) -> int:
+        """Return the place of a term's joint or motor among the joints, then `motors`."""
+        return self.n_joints + self.motors.index(term.owner) if term.motor else term.owner
 
-        Raises:
-            ShapeError: they are not (k,).
-        """
-        values = self.checked(coefficients)
-        rows = {symbol: np.full(self.n_joints, np.nan) for symbol in self.symbols}
-        for term, value in zip(self.terms, values, strict=True):
-            if not term.motor:
-                rows[term.symbol][term.owner] = value
-        return rows
-
-    def motor_table(self, coefficients: Array) -> dict[int, dict[str, float]]:
-        """Return the coefficients of coupled motors by motor, from 0, and symbol."""
-        rows: dict[int, dict[str, float]] = {motor: {} for motor in self.motors}
-        for term, value in zip(self.terms, self.checked(coefficients), strict=True):
-            if term.motor:
-                rows[term.owner][term.symbol] = float(value)
-        return rows
-
-    def checked(self, coefficients: Array) -> Array:
-        """Return the k coefficients.
+    def table(self, coefficients: Array) -> tuple[dict[str, float], ...]:
+        """Return the coefficients (k,) by symbol of each joint, then of each of `motors`.
 
         Raises:
             ShapeError: they are not (k,).
@@ -590,7 +573,10 @@ class JointFriction:
         values = np.asarray(coefficients, dtype=np.float64)
         if values.shape != (len(self.terms),):
             raise ShapeError("coefficients", values.shape, f"({len(self.terms)},)")
-        return values
+        rows: tuple[dict[str, float], ...] = tuple({} for _ in self.all_laws)
+        for term, value in zip(self.terms, values.tolist(), strict=True):
+            rows[self.place(term)][term.symbol] = value
+        return rows
 
 
 class Dissipation(NamedTuple):

@@ -49,8 +49,8 @@ def friction_curve(
         high: highest speed, at least zero.
     """
     law = model.friction.laws[joint]
-    table = model.friction.table(values[model.base.rank :])
-    coefficients = np.array([table[symbol][joint] for symbol in law.symbols])
+    table = model.friction.table(values[model.friction_part])
+    coefficients = np.array([*table[joint].values()])
     steps = np.linspace(0.0, 1.0, SPEEDS) ** 2
     # Never zero itself, where the direction is none: the curve has to show the jump.
     steps[0] = 1e-6 * steps[1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -22,7 +22,7 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
     friction = model.friction
-    table, motors = friction.table(coefficients), friction.motor_table(coefficients)
+    table = friction.table(coefficients)
     if not friction.terms:
         return "The joints have no friction.\n"
     kinds = friction.kinds
@@ -38,10 +38,7 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
         ]
     for joint, (name, law) in enumerate(zip(model.joint_names, friction.laws, strict=True)):
         revolute = bool(model.chain.revolute[joint])
-        values = [
-            f"{term.symbol} = {table[term.symbol][joint]:.5g} {term.unit(revolute=revolute)}"
-            for term in law.terms
-        ]
+        values = _values(law, table[joint], revolute)
         for term in law.terms:
             if term.symbol in shared:
                 values.append(f"{term.symbol} with {term.basis}")
@@ -54,7 +51,7 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
             "Coulomb friction is f0 + fo forwards and f0 - fo backwards: its asymmetry cannot be"
             " distinguished from the zero error of a sensor."
         )
-    lines += _motor_lines(model, motors)
+    lines += _motor_lines(model, table[model.n_joints :])
     return "\n".join(lines) + "\n"
 
 
@@ -69,8 +66,7 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
     friction, n = model.friction, model.n_joints
-    laws = *friction.laws, *(friction.laws[motor] for motor in friction.motors)
-    coefficients = friction.checked(coefficients)
+    laws, table = friction.all_laws, friction.table(coefficients)
     lines = [
         '"""Identified friction of a robot\'s joints. Source: hil."""',
         "",
@@ -85,11 +81,11 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         lines.append(f"E = {math.e!r}")
     for kind in kinds:
         values, speeds, units = np.zeros(len(laws)), np.ones(len(laws)), set()
-        for (_, term, owner, motor, unit), value in zip(friction.terms, coefficients, strict=True):
-            if isinstance(term, kind):
-                place = n + friction.motors.index(owner) if motor else owner
-                values[place], speeds[place] = value, term.speed
-                units.add(unit)
+        for one in friction.terms:
+            if isinstance(one.term, kind):
+                place = friction.place(one)
+                values[place], speeds[place] = table[place][one.symbol], one.term.speed
+                units.add(one.unit)
         name = kind.label.upper()
         lines.append(f"{name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
         if kind.speed_symbol:
@@ -152,20 +148,26 @@ def _standstill_lines(model: RobotModel) -> list[str]:
     return lines
 
 
-def _motor_lines(model: RobotModel, motors: dict[int, dict[str, float]]) -> list[str]:
-    lines = []
-    for (motor, values), share in zip(motors.items(), model.friction.motor_speeds(), strict=True):
+def _values(law: FrictionLaw, coefficients: Mapping[str, float], revolute: bool) -> list[str]:
+    """Return the coefficients that are given, with their units."""
+    return [
+        f"{term.symbol} = {coefficients[term.symbol]:.5g} {term.unit(revolute=revolute)}"
+        for term in law.terms
+        if term.symbol in coefficients
+    ]
+
+
+def _motor_lines(model: RobotModel, table: Sequence[Mapping[str, float]]) -> list[str]:
+    lines, friction = [], model.friction
+    for motor, values, share in zip(friction.motors, table, friction.motor_speeds(), strict=True):
         turning = " + ".join(
             ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({_line(model.joint_names[j])})"
             for j in np.flatnonzero(share)
         )
-        units = {t.symbol: t.unit for t in model.friction.terms if t.motor and t.owner == motor}
-        numbers = ", ".join(
-            f"{symbol} = {value:.5g} {units[symbol]}" for symbol, value in values.items()
-        )
+        numbers = _values(friction.laws[motor], values, friction.revolute[motor])
         lines.append(
-            f"motor {motor + 1}, at v = {turning}: {numbers}; each of these joints feels that"
-            " torque times its factor"
+            f"motor {motor + 1}, at v = {turning}: {', '.join(numbers)}; each of these joints feels"
+            " that torque times its factor"
         )
     return lines
 

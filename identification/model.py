@@ -319,7 +319,7 @@ def _base_parameters(
 def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Array) -> None:
     """Refuse an offset whose column, constant on one joint, the inertial columns contain."""
     n = chain.n_joints
-    if Offset.symbol not in friction.symbols:
+    if Offset not in friction.kinds:
         return
     offsets = np.tile(np.eye(n), (len(columns) // n, 1))
     for joint, share in enumerate(share_left(offsets, columns)):

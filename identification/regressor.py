@@ -233,9 +233,9 @@ class _Workspace:
         self._elements = self._element_parts(plan)
         self._contractions: list[_Contraction] = []
         first = 0
-        for link, kept in enumerate(plan.links):
-            inertia = [s for s in kept if s < N_INERTIA]
-            for symbols, moments_only in ((inertia, True), (kept[len(inertia) :], False)):
+        for link, own in enumerate(plan.links):
+            inertia = [s for s in own if s < N_INERTIA]
+            for symbols, moments_only in ((inertia, True), (own[len(inertia) :], False)):
                 if symbols:
                     joints = _as_slice(plan.chain.ancestors(link))
                     self._add(link, joints, symbols, moments_only, first)

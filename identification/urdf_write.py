@@ -248,11 +248,7 @@ def _friction(model: RobotModel, friction: Array | None) -> dict[str, dict[str, 
     """Return friction coefficients by joint and symbol, nothing without friction."""
     if friction is None:
         return {}
-    table = model.friction.table(friction)
-    return {
-        joint: {symbol: float(table[symbol][j]) for symbol in law.symbols}
-        for j, (joint, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True))
-    }
+    return dict(zip(model.joint_names, model.friction.table(friction), strict=False))
 
 
 def _refuse_impossible(

@@ -247,7 +247,7 @@ def test_a_load_on_unseen_motion_only_is_named_and_weighed(model: RobotModel, ma
     assert len(verdict.next_steps) == 1
 
 
-def test_friction_that_changed_is_told_in_full_and_named_as_the_reason(model: RobotModel) -> None:
+def test_changed_friction_is_given_in_full_as_the_reason(model: RobotModel) -> None:
     def warmer(motion: Motion, _: Array) -> Array:
         return 0.2 * (COULOMB * np.sign(motion.velocity) + VISCOUS * motion.velocity)
 
@@ -442,7 +442,7 @@ def test_payloads_are_asked_for_only_where_gravity_loads_the_axis() -> None:
     assert "of two with a known payload" in step and "of one with the drive's data sheet" in step
 
 
-def test_what_sound_models_reach_is_no_doubt_and_nothing_is_not_told() -> None:
+def test_what_sound_models_reach_is_no_warning() -> None:
     verdict = judge(AXES, evidence_with(**slowly_off(0.019, 0.0)))
     assert not any("noise does not explain" in doubt for doubt in verdict.doubts)
     assert "beyond what noise explains 1.9% at worst" in verdict.line
@@ -487,7 +487,7 @@ def test_axes_with_the_same_step_share_one_line() -> None:
     assert len(steps) == 1 and "one, two" in steps[0]
 
 
-def test_a_direction_that_the_data_do_not_tell_is_information() -> None:
+def test_an_undetermined_direction_is_information() -> None:
     verdict = judge(AXES, evidence_with(causes=Causes((), None, undecided=(0,))))
     assert verdict.good and not any("direction" in doubt for doubt in verdict.doubts)
     (finding,) = (one for one in verdict.findings if one.level == "information")
