@@ -182,12 +182,9 @@ def planted_truth(cell: Cell) -> PlantTruth:
 
 def _third_law(cell: Cell) -> Literal["quadratic", "cubic"]:
     """The third friction law of the joints that are planted with one."""
-    table = cell.file.robot.friction
-    own = {name: joint.third or table.third for name, joint in table.joints.items()}
-    planted = [
-        name for name, third in zip(cell.joint_names, cell.simulation.third, strict=True) if third
-    ]
-    laws = {own.get(name, table.third) for name in planted} - {"none"}
+    joints = zip(cell.joint_names, cell.model.friction.laws, cell.simulation.third, strict=True)
+    planted = {name: law.third for name, law, third in joints if third}
+    laws = set(planted.values()) - {None}
     if len(laws) > 1:
         raise CellError(
             cell.path,

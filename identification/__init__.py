@@ -23,13 +23,12 @@ from identification.essential import Elimination, eliminate
 from identification.estimation import Estimate, estimate
 from identification.evidence import Evidence, gather
 from identification.factor import Factor, NormalEquations
-from identification.friction import FrictionLaw
+from identification.friction import FrictionLaw, JointFriction
 from identification.friction_text import friction_in_words, friction_source
 from identification.gains import Gains, identify_gains
 from identification.instrument_factor import InstrumentFactor
 from identification.instrument_motion import planned_motion
 from identification.instrumental import InstrumentalEstimate, estimate_instrumental
-from identification.joint_friction import JointFriction
 from identification.least_squares import (
     fit_least_squares,
     ordinary_least_squares,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Final
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def gravity(_: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
-    """Gravity that pulls another way than the cell says."""
+    """Gravity in another direction than the cell says."""
     found = evidence.gravity
     if found is not None and found.off(limit.gravity, limit.gravity_angle):
         declared, best = (_vector(one) for one in (found.declared, found.best))
@@ -39,7 +39,7 @@ def _vector(gravity: Array) -> str:
 
 
 def causes(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
-    """Faults with which, once mended, parts of what was fitted are predicted better."""
+    """Faults whose correction makes parts of the fitted recordings better predictable."""
     found = evidence.causes
     if found is None:
         return
@@ -48,13 +48,14 @@ def causes(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Itera
     for cause in () if hidden else found.found:
         if cause.ratio > gravity_ratio:
             continue
-        check, words, step = _CAUSES[cause.fault.kind](names, cause)
+        template = _TEMPLATES[cause.fault.kind]
+        figures = _figures(names, cause, template)
         yield Finding(
-            check,
+            template.check,
             "wrong" if cause.fault.discrete or cause.ratio < limit.cause else "doubtful",
-            f"{words}; with that, parts of the fitted motion are predicted from the rest with"
-            f" {cause.ratio:.2f} times the error",
-            step,
+            f"{template.statement.format(**figures)}; with that corrected, parts of the fitted"
+            f" motion are predicted from the rest with {cause.ratio:.2f} times the error",
+            template.step.format(**figures),
             "cause",
         )
     if found.undecided and not evidence.in_sample and not found.found:
@@ -62,8 +63,8 @@ def causes(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Itera
             "direction of axes",
             "information",
             "the data do not determine the direction of"
-            f" {listed([names[j] for j in found.undecided], len(names))}: counting the other way"
-            " round would fit about as well",
+            f" {listed([names[j] for j in found.undecided], len(names))}: the opposite direction"
+            " fits about as well",
         )
 
 
@@ -75,119 +76,99 @@ def _gravity_ratio(evidence: Evidence, limit: Thresholds) -> float:
     return float(np.sqrt(found.ratio))
 
 
-_Words = tuple[str, str, str]
+class _Template(NamedTuple):
+    """What is said of one kind of cause: templates that :func:`_figures` fill.
+
+    Attributes:
+        check: what was looked at.
+        statement: what seems to be wrong.
+        step: what to do about it.
+        scale: from a cause's size to the figure that is shown.
+        offset: added to that.
+    """
+
+    check: str
+    statement: str
+    step: str
+    scale: float = 1.0
+    offset: float = 0.0
 
 
-def _of(names: Sequence[str], cause: Cause) -> str:
-    return listed([names[j] for j in cause.fault.joints], len(names)) or "all axes"
+def _order(of: str) -> _Template:
+    return _Template(
+        "order of joints",
+        f"the {of} of {{first}} and {{last}} seem to be interchanged",
+        "check the order of the columns in the column map against the joints of the URDF",
+    )
 
 
-def _figure(cause: Cause, scale: float = 1.0, offset: float = 0.0) -> str:
-    size = abs(offset + scale * (cause.size or 0.0))
-    return f"{size:.3g} ± {abs(scale) * 2.0 * cause.std:.2g}"
+def _change(of: str) -> _Template:
+    return _Template(
+        "sameness",
+        f"in {{part}} the {of} of {{joints}} seems to be {{size}} times that in the rest of the"
+        " fitted recordings",
+        "look at what changed in between: temperature, brakes, drive settings of {joints}",
+        offset=1.0,
+    )
 
 
-def _where(cause: Cause) -> str:
-    return "" if cause.fault.part is None else cause.fault.part.words
-
-
-def _delay(names: Sequence[str], cause: Cause) -> _Words:
-    verb = "lags" if (cause.size or 0.0) > 0.0 else "leads"
-    return (
+_TEMPLATES: Final[dict[Kind, _Template]] = {
+    "delay": _Template(
         "delay",
-        f"the torque of {_of(names, cause)} {verb} the position by {_figure(cause, 1e3)} ms more"
-        " than assumed",
-        "identify with --delay auto, and correct the delay where it arises",
-    )
-
-
-def _gain(names: Sequence[str], cause: Cause) -> _Words:
-    joint = _of(names, cause)
-    return (
+        "the torque of {joints} lags the position by {size} ms {more} than assumed",
+        "run `hil identify --delay auto`, and correct the delay where it arises",
+        scale=1e3,
+    ),
+    "gain": _Template(
         "torque constant",
-        f"the torque of {joint} is {_figure(cause, 1.0, 1.0)} times what the torques of the other"
-        " axes ask for",
-        f"check torque constant and gear ratio of {joint}; a known payload settles it (hil gains)",
-    )
-
-
-def _torque_sign(names: Sequence[str], cause: Cause) -> _Words:
-    joint = _of(names, cause)
-    return (
+        "the torque of {joints} is {size} times what fits the torques of the other axes",
+        "check torque constant and gear ratio of {joints}; recordings with and without a known"
+        " payload determine the constant (`hil gains --loaded`)",
+        offset=1.0,
+    ),
+    "torque sign": _Template(
         "direction of axes",
-        f"the torque of {joint} seems to have the other sign",
-        f"check the sign of the torque of {joint} in the column map, or of its torque constant",
-    )
-
-
-def _axis_sign(names: Sequence[str], cause: Cause) -> _Words:
-    joint = _of(names, cause)
-    return (
+        "the torque of {joints} seems to have the other sign",
+        "check the sign of the torque of {joints} in the column map, or of its torque constant",
+    ),
+    "axis sign": _Template(
         "direction of axes",
-        f"{joint} seems to count the other way round than in the URDF: the sign of its gear ratio"
+        "{joints} seems to turn in the direction opposite to the URDF's: the sign of its gear ratio"
         " or direction may be wrong",
-        f"jog {joint} by hand and compare its direction of rotation with the URDF's",
-    )
-
-
-def _order(of: str) -> Callable[[Sequence[str], Cause], _Words]:
-    def words(names: Sequence[str], cause: Cause) -> _Words:
-        first, second = (names[j] for j in cause.fault.joints)
-        return (
-            "order of joints",
-            f"the {of} of {first} and {second} seem to stand in each other's column",
-            "check the order of the columns in the column map against the joints of the URDF",
-        )
-
-    return words
-
-
-def _payload(_: Sequence[str], cause: Cause) -> _Words:
-    more = "more" if (cause.size or 0.0) > 0.0 else "less"
-    return (
-        "sameness",
-        f"in {_where(cause)} the arm seems to have carried {_figure(cause)} kg {more} than in the"
-        " rest of what was fitted",
-        "fit only recordings with one payload, or state what each carries (hil import log"
-        " --payload)",
-    )
-
-
-def _changed(what: str) -> Callable[[Sequence[str], Cause], _Words]:
-    def words(names: Sequence[str], cause: Cause) -> _Words:
-        joint = _of(names, cause)
-        return (
-            "sameness",
-            f"in {_where(cause)} the {what} of {joint} seems to be {_figure(cause, 1.0, 1.0)} times"
-            " that in the rest of what was fitted",
-            f"look at what changed in between: temperature, brakes, drive settings of {joint}",
-        )
-
-    return words
-
-
-def _changed_arm(_: Sequence[str], cause: Cause) -> _Words:
-    return (
-        "sameness",
-        f"{_where(cause)} seems to be of another arm, tool or setting than the rest of what was"
-        " fitted",
-        "identify from recordings of one arm in one condition",
-    )
-
-
-_CAUSES: Final[dict[Kind, Callable[[Sequence[str], Cause], _Words]]] = {
-    "delay": _delay,
-    "gain": _gain,
-    "torque sign": _torque_sign,
+        "jog {joints} by hand and compare its direction of rotation with the URDF's",
+    ),
     "torque order": _order("torques"),
-    "axis sign": _axis_sign,
     "position order": _order("positions"),
     "joint order": _order("positions and torques"),
-    "payload": _payload,
-    "changed gain": _changed("torque"),
-    "changed friction": _changed("friction"),
-    "changed arm": _changed_arm,
+    "payload": _Template(
+        "sameness",
+        "in {part} the arm seems to have carried {size} kg {more} than in the rest of the fitted"
+        " recordings",
+        "identify the recordings of each payload separately, and state a payload that is known in"
+        " their cell file ([robot.payload])",
+    ),
+    "changed gain": _change("torque"),
+    "changed friction": _change("friction"),
+    "changed arm": _Template(
+        "sameness",
+        "{part} seems to be of another arm, tool or setting than the rest of the fitted recordings",
+        "identify from recordings of one arm in one condition",
+    ),
 }
+
+
+def _figures(names: Sequence[str], cause: Cause, template: _Template) -> dict[str, str]:
+    """What the fields of a template stand for."""
+    joints = [names[j] for j in cause.fault.joints] or ["all axes"]
+    size, scale = cause.size or 0.0, template.scale
+    return {
+        "joints": listed(joints, len(names)),
+        "first": joints[0],
+        "last": joints[-1],
+        "part": "" if cause.fault.part is None else cause.fault.part.words,
+        "size": f"{abs(template.offset + scale * size):.3g} ± {scale * 2.0 * cause.std:.2g}",
+        "more": "more" if size > 0.0 else "less",
+    }
 
 
 def load(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
@@ -200,8 +181,8 @@ def load(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterato
         "load",
         "wrong",
         f"on {evidence.tested_on} the arm seems to have carried {more} than on what was fitted: a"
-        f" body on its last link explains {_most(found.explained)} of what the errors exceed those"
-        " of the fit by",
+        f" body on its last link explains {_most(found.explained)} of the error beyond that of the"
+        " fit",
         "record both with the same tool and payload, or identify and predict with the payload that"
         " was carried",
         "cause",
@@ -231,12 +212,13 @@ def outliers(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Ite
     yield Finding(
         "outliers",
         "wrong" if spoilt_by_outliers(evidence, limit) else "doubtful",
-        f"single samples far outside of all others make most of the error of"
+        f"single samples far outside of all others cause most of the error of"
         f" {listed([names[j] for j in joints])} on {evidence.tested_on} (at most"
         f" {found.share[most]:.2%} of the samples, {names[most]}); without them it is"
         f" {found.without.overall:.1%} over all axes",
-        "look at the torques in the log: spikes, torn packets, collisions; mend or leave them out,"
-        " and fit with --estimator tukey or huber, which they cannot pull far",
+        "look at the torques in the log: spikes, damaged packets, collisions; correct or leave them"
+        " out, and fit with an estimator that bounds their influence (`hil identify --estimator"
+        " tukey`, or huber)",
         "cause",
     )
 
@@ -262,14 +244,18 @@ def friction_change(
         return
     decisive = evidence.spoilt_by_friction(limit.systematic)
     worth = np.abs(change) > limit.friction
-    told = np.flatnonzero(decisive | (worth & ~evidence.beyond_friction(limit.systematic)))
-    if not told.size:
+    joints = np.flatnonzero(decisive | (worth & ~evidence.beyond_friction(limit.systematic)))
+    if not joints.size:
         return
-    words = f"friction of {_changes(names, change, told)} on {evidence.tested_on} than when it was"
+    words = (
+        f"friction of {_changes(names, change, joints)} on {evidence.tested_on} than when it was"
+    )
     words += " estimated"
     if decisive.any():
         spoilt = listed([names[j] for j in np.flatnonzero(decisive).tolist()], len(names))
-        words += f", more than the {FRICTION_CHANGE:.0%} that warm gears excuse; that explains the"
+        words += (
+            f", more than the {FRICTION_CHANGE:.0%} expected of warmer gears; that explains the"
+        )
         words += f" error of {spoilt}"
     yield Finding(
         "friction",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from identification.elements import JointElements
 from identification.errors import IdentificationError, ShapeError
-from identification.friction import SYMBOLS
+from identification.friction import FrictionTerm
 from identification.instrument_motion import Instruments
 from identification.kinematics import FROM_PINOCCHIO, Chain
 from identification.model import RobotModel
@@ -148,15 +148,12 @@ class _Friction:
 
     Attributes:
         speeds: speed of each of the a joints and motors per joint speed (a, n).
-        coefficients: by symbol (a,), zero where there is no such term.
-        cubic: whether the third term is (a,).
-        stribeck, standstill: speeds (a,).
+        terms: with their coefficients (a,), zero where there is no such term.
+        standstill: speeds (a,).
     """
 
     speeds: Array
-    coefficients: dict[str, Array]
-    cubic: NDArray[np.bool_]
-    stribeck: Array
+    terms: tuple[tuple[FrictionTerm, Array], ...]
     standstill: Array
 
     @classmethod
@@ -164,40 +161,31 @@ class _Friction:
         """Take the friction out of parameters (p,)."""
         friction = model.friction
         speeds = np.concatenate([np.eye(model.n_joints), friction.motor_speeds()])
-        laws = friction.laws + tuple(friction.laws[motor] for motor in friction.motors)
-        places = {motor: model.n_joints + k for k, motor in enumerate(friction.motors)}
-        coefficients = {symbol: np.zeros(len(speeds)) for symbol in SYMBOLS}
-        for term, value in zip(friction.terms, values[model.friction_part], strict=True):
-            place = places[term.owner] if term.motor else term.owner
-            coefficients[term.symbol][place] = value
-        return cls(
-            speeds=speeds,
-            coefficients=coefficients,
-            cubic=np.array([law.third == "cubic" for law in laws]),
-            stribeck=np.array([law.stribeck or 1.0 for law in laws]),
-            standstill=np.maximum([law.standstill for law in laws], _NARROWEST_STANDSTILL),
-        )
+        coefficients: dict[FrictionTerm, Array] = {}
+        for one, value in zip(friction.terms, values[model.friction_part], strict=True):
+            row = coefficients.setdefault(one.term, np.zeros(len(speeds)))
+            row[friction.place(one)] = value
+        slow = [law.standstill for law in friction.all_laws]
+        standstill = np.maximum(slow, _NARROWEST_STANDSTILL)
+        return cls(speeds, tuple(coefficients.items()), standstill)
 
     def torque(self, qd: Array) -> Array:
         """Torque (n,) at joint speeds (n,)."""
-        v, c = self.speeds @ qd, self.coefficients
-        size = np.abs(v)
-        dry = c["f0"] + c["fs"] * np.exp(-((v / self.stribeck) ** 2))
-        third = c["f2"] * np.where(self.cubic, size**2, size)
-        torque = dry * np.clip(v / self.standstill, -1.0, 1.0) + (c["f1"] + third) * v
-        return np.asarray(self.speeds.T @ (torque + c["fd"] * size + c["fo"]))
+        v = self.speeds @ qd
+        direction = np.clip(v / self.standstill, -1.0, 1.0)
+        torque = np.zeros_like(v)
+        for term, coefficients in self.terms:
+            torque += coefficients * term.column(v, direction)
+        return np.asarray(self.speeds.T @ torque)
 
     def slope(self, qd: Array) -> Array:
-        """Derivative with joint speeds (n, n), of each joint or motor never negative.
-
-        Without the fall of the Stribeck term, which only the step after the next would feel.
-        """
-        v, c = self.speeds @ qd, self.coefficients
-        size = np.abs(v)
-        third = c["f2"] * np.where(self.cubic, 3.0 * size**2, 2.0 * size)
-        sticking = (size < self.standstill) * (c["f0"] + c["fs"]) / self.standstill
-        slope = np.maximum(c["f1"] + c["fd"] * np.sign(v) + third + sticking, 0.0)
-        return np.asarray((self.speeds.T * slope) @ self.speeds)
+        """Derivative with joint speeds (n, n), of each joint or motor never negative."""
+        v = self.speeds @ qd
+        sticking = (np.abs(v) < self.standstill) / self.standstill
+        slope = np.zeros_like(v)
+        for term, coefficients in self.terms:
+            slope += coefficients * term.slope(v, sticking)
+        return np.asarray((self.speeds.T * np.maximum(slope, 0.0)) @ self.speeds)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ strictly inside.
 
 Where motors turn with several joints, the rotors' inertia matrix, coupling inertias beside the
 diagonal, is kept positive definite in place of I_im >= 0. What friction needs to take energy says
-:mod:`identification.dissipation`: signs of the third friction term and of the offset are left open.
+:mod:`identification.friction`: signs of the third friction term and of the offset are left open.
 """
 
 from __future__ import annotations

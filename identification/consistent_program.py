@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.consistent_polish import Cone, Minimum, Smooth, follow_path, polish
-from identification.dissipation import dissipation
 from identification.errors import IdentificationError, ShapeError
 from identification.estimation import WORST_CONDITION
 from identification.factor import NormalEquations
+from identification.friction import dissipation
 from identification.model import RobotModel
 from identification.pseudo_inertia import inertial_from_pseudo
 from identification.reference_bodies import ReferenceBodies, reference_bodies

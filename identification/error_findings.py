@@ -23,7 +23,8 @@ def untested(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Ite
             "wrong",
             "everything was fitted and nothing held out: all errors are in-sample, and no unseen"
             " motion tells whether the model predicts",
-            "identify without --in-sample, or hold a recording out with --predict",
+            "run `hil identify --predict ARCHIVE` with a recording that is not fitted, without"
+            " `hil identify --in-sample`",
         )
     rows = evidence.held_out.rows
     still = [name for axis, name in enumerate(names) if rows[axis] < limit.rows]
@@ -34,7 +35,8 @@ def untested(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Ite
             f"{listed(still)} moved in fewer than {limit.rows} samples of"
             f" {evidence.tested_on}, which tests nothing",
             f"record an unseen motion in which {listed(still)} moves; if it is meant to stand"
-            " still, lock it (locked under [robot] in the cell file; --held when importing a log)",
+            " still, lock it (locked under [robot] in the cell file, or `hil import log --held"
+            " JOINT`)",
         )
     silent = (rows > 0) & (evidence.held_out.torque_squared == 0.0)
     if silent.any():

@@ -7,7 +7,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.friction import OFFSET
 from identification.model import RobotModel
 from identification.preprocessing import Samples
 
@@ -19,7 +18,6 @@ TRAVELS: Final = 60
 """Points of a curve after a reversal."""
 # Of the presliding displacement: what is left of the change by then is less than 1 %.
 _TURNED: Final = 6.0
-_DRY: Final = ("f0", "fs")
 
 
 class FrictionCurve(NamedTuple):
@@ -51,22 +49,20 @@ def friction_curve(
         high: highest speed, at least zero.
     """
     law = model.friction.laws[joint]
-    table = model.friction.table(values[model.base.rank :])
-    coefficients = {symbol: float(table[symbol][joint]) for symbol in law.symbols}
+    table = model.friction.table(values[model.friction_part])
+    coefficients = np.array([*table[joint].values()])
     steps = np.linspace(0.0, 1.0, SPEEDS) ** 2
     # Never zero itself, where the direction is none: the curve has to show the jump.
     steps[0] = 1e-6 * steps[1]
     speed = np.concatenate([low * steps[::-1], high * steps])
-    columns = np.zeros((len(law.symbols), speed.size))
-    law.columns(speed, law.sign(speed), columns)
-    sliding = np.array([*coefficients.values()]) @ columns
+    sliding = coefficients @ law.columns(speed, law.sign(speed))
     if law.presliding == 0.0:
         nothing = np.full(TRAVELS, np.nan)
         return FrictionCurve(speed, sliding, nothing, nothing)
     travel = np.linspace(0.0, _TURNED * law.presliding, TRAVELS)
-    dry = sum(coefficients.get(symbol, 0.0) for symbol in _DRY)
     state = 1.0 - 2.0 * np.exp(-travel / law.presliding)
-    return FrictionCurve(speed, sliding, travel, dry * state + coefficients.get(OFFSET, 0.0))
+    turning = coefficients @ law.columns(np.zeros(TRAVELS), state)
+    return FrictionCurve(speed, sliding, travel, turning)
 
 
 def friction_torque(model: RobotModel, values: Array, samples: Samples) -> Array:

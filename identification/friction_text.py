@@ -3,61 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import Final, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.friction import FrictionLaw
+from identification.friction import FrictionLaw, Kind
 from identification.model import RobotModel
 
 Array = NDArray[np.float64]
-
-
-class _Kind(NamedTuple):
-    """A kind of term; the third term of different joints may be of two kinds."""
-
-    symbol: str
-    name: str  # of the tuple of coefficients in the source
-    formula: str  # for people; v is the joint's speed
-    code: str  # v: speed, sign: of the speed
-    words: str
-
-
-_KINDS: Final = (
-    _Kind("f0", "COULOMB", "f0 sgn(v)", "COULOMB[joint] * sign", "Coulomb (dry) friction f0"),
-    _Kind("f1", "VISCOUS", "f1 v", "VISCOUS[joint] * v", "viscous friction f1"),
-    _Kind(
-        "fd",
-        "DIFFERENCE",
-        "fd |v|",
-        "DIFFERENCE[joint] * abs(v)",
-        "half the difference fd of viscous friction forwards and backwards",
-    ),
-    _Kind(
-        "f2",
-        "THIRD",
-        "f2 sgn(v) v²",
-        "THIRD[joint] * v * abs(v)",
-        "a term f2 with the speed squared",
-    ),
-    _Kind(
-        "f2",
-        "CUBIC",
-        "f2 v³",
-        "CUBIC[joint] * v**3",
-        "a term f2 with the third power of the speed",
-    ),
-    _Kind(
-        "fs",
-        "STRIBECK",
-        "fs sgn(v) exp(-(v/vs)²)",
-        "STRIBECK[joint] * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
-        "what friction is larger by at low speed, fs (Stribeck)",
-    ),
-    _Kind("fo", "OFFSET", "fo", "OFFSET[joint]", "a constant offset fo"),
-)
 
 
 def friction_in_words(model: RobotModel, coefficients: Array) -> str:
@@ -67,10 +22,12 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
     friction = model.friction
-    table, motors = friction.table(coefficients), friction.motor_table(coefficients)
+    table = friction.table(coefficients)
     if not friction.terms:
         return "The joints have no friction.\n"
-    kinds = _kinds(friction.laws)
+    kinds = friction.kinds
+    # The third term of different joints may be of two kinds.
+    shared = [one.symbol for one, other in combinations(kinds, 2) if one.symbol == other.symbol]
     lines = []
     if kinds:
         lines += [
@@ -81,21 +38,20 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
         ]
     for joint, (name, law) in enumerate(zip(model.joint_names, friction.laws, strict=True)):
         revolute = bool(model.chain.revolute[joint])
-        values = [
-            f"{symbol} = {table[symbol][joint]:.5g} {law.unit(symbol, revolute=revolute)}"
-            for symbol in law.symbols
-        ]
-        if law.third is not None and {"THIRD", "CUBIC"} <= {kind.name for kind in kinds}:
-            values.append(f"f2 with {'v³' if law.third == 'cubic' else 'sgn(v) v²'}")
-        if law.stribeck is not None:
-            values.append(f"vs = {law.stribeck:g} {'rad/s' if revolute else 'm/s'}")
+        values = _values(law, table[joint], revolute)
+        for term in law.terms:
+            if term.symbol in shared:
+                values.append(f"{term.symbol} with {term.basis}")
+            if term.speed_symbol:
+                speed = f"{term.speed:g} {'rad/s' if revolute else 'm/s'}"
+                values.append(f"{term.speed_symbol} = {speed}")
         lines.append(f"{_line(name)}: " + (", ".join(values) or "no friction"))
     if any(law.asymmetric and law.coulomb for law in friction.laws):
         lines.append(
             "Coulomb friction is f0 + fo forwards and f0 - fo backwards: its asymmetry cannot be"
-            " told from the zero error of a sensor."
+            " distinguished from the zero error of a sensor."
         )
-    lines += _motor_lines(model, motors)
+    lines += _motor_lines(model, table[model.n_joints :])
     return "\n".join(lines) + "\n"
 
 
@@ -110,29 +66,30 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
     friction, n = model.friction, model.n_joints
-    table = friction.table(coefficients)
-    motors = friction.motor_table(coefficients)
-    kinds = _kinds(friction.laws)
-    lines = ['"""Identified friction of a robot\'s joints. Source: hil."""', ""]
-    lines += [
+    laws, table = friction.all_laws, friction.table(coefficients)
+    lines = [
+        '"""Identified friction of a robot\'s joints. Source: hil."""',
+        "",
         f"JOINTS = {_tuple(repr(name) for name in model.joint_names)}",
-        f"LINEAR = {_tuple(repr(_linear(law)) for law in friction.laws)}"
+        f"MOTORS = {_tuple(map(_numbers, friction.motor_speeds()))}  # speed per joint speed",
+        "# Of the joints, then of these motors:",
+        f"LINEAR = {_tuple(repr(_linear(law)) for law in laws)}"
         "  # rad/s or m/s: slower, the sign was fitted as linear",
     ]
+    kinds = friction.kinds
+    if any(" E " in kind.code for kind in kinds):
+        lines.append(f"E = {math.e!r}")
     for kind in kinds:
-        has = [_has(law, kind) for law in friction.laws]
-        values = np.where(has, table[kind.symbol], 0.0)
-        units = {
-            law.unit(kind.symbol, revolute=bool(turns))
-            for law, turns, own in zip(friction.laws, model.chain.revolute, has, strict=True)
-            if own
-        }
-        lines.append(f"{kind.name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
-        if kind.symbol == "fs":
-            speeds = np.array([law.stribeck or 1.0 for law in friction.laws])
-            lines.append(f"STRIBECK_SPEED = {_numbers(speeds)}  # rad/s or m/s")
-            lines.append(f"E = {math.e!r}")
-    lines.append(_motor_table(model, motors))
+        values, speeds, units = np.zeros(len(laws)), np.ones(len(laws)), set()
+        for one in friction.terms:
+            if isinstance(one.term, kind):
+                place = friction.place(one)
+                values[place], speeds[place] = table[place][one.symbol], one.term.speed
+                units.add(one.unit)
+        name = kind.label.upper()
+        lines.append(f"{name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
+        if kind.speed_symbol:
+            lines.append(f"{name}_SPEED = {_numbers(speeds)}  # rad/s or m/s")
     lines += [
         "",
         "",
@@ -151,17 +108,18 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     ]
     if any("sign" in kind.code for kind in kinds):
         lines.append("    sign = direction(v, max(LINEAR[joint], smooth))")
-    lines.append("    return " + (" + ".join(kind.code for kind in kinds) or "0.0"))
+    summands = [f"{kind.label.upper()}[joint]{kind.code}" for kind in kinds]
+    lines.append("    return " + (" + ".join(summands) or "0.0"))
     lines += [
         "",
         "",
         "def torques(speeds, smooth=0.0):",
         f'    """Return friction of all {n} joints at their speeds, coupled motors included."""',
         "    result = [friction(joint, v, smooth) for joint, v in enumerate(speeds)]",
-        "    for share, coulomb, viscous, linear in MOTORS:",
+        "    for motor, share in enumerate(MOTORS, len(JOINTS)):",
         "        v = sum(s * speed for s, speed in zip(share, speeds))",
-        "        taken = coulomb * direction(v, max(linear, smooth)) + viscous * v",
-        "        result = [total + s * taken for total, s in zip(result, share)]",
+        "        torque = friction(motor, v, smooth)",
+        "        result = [total + s * torque for total, s in zip(result, share)]",
         "    return result",
     ]
     return "\n".join(lines) + "\n"
@@ -190,35 +148,28 @@ def _standstill_lines(model: RobotModel) -> list[str]:
     return lines
 
 
-def _motor_lines(model: RobotModel, motors: dict[int, dict[str, float]]) -> list[str]:
-    lines = []
-    for (motor, values), share in zip(motors.items(), model.friction.motor_speeds(), strict=True):
+def _values(law: FrictionLaw, coefficients: Mapping[str, float], revolute: bool) -> list[str]:
+    """Return the coefficients that are given, with their units."""
+    return [
+        f"{term.symbol} = {coefficients[term.symbol]:.5g} {term.unit(revolute=revolute)}"
+        for term in law.terms
+        if term.symbol in coefficients
+    ]
+
+
+def _motor_lines(model: RobotModel, table: Sequence[Mapping[str, float]]) -> list[str]:
+    lines, friction = [], model.friction
+    for motor, values, share in zip(friction.motors, table, friction.motor_speeds(), strict=True):
         turning = " + ".join(
             ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({_line(model.joint_names[j])})"
             for j in np.flatnonzero(share)
         )
-        law, revolute = model.friction.laws[motor], bool(model.chain.revolute[motor])
-        numbers = ", ".join(
-            f"{symbol} = {value:.5g} {law.unit(symbol, revolute=revolute)}"
-            for symbol, value in values.items()
-        )
+        numbers = _values(friction.laws[motor], values, friction.revolute[motor])
         lines.append(
-            f"motor {motor + 1}, at v = {turning}: {numbers}; each of these joints feels that"
-            " torque times its factor"
+            f"motor {motor + 1}, at v = {turning}: {', '.join(numbers)}; each of these joints feels"
+            " that torque times its factor"
         )
     return lines
-
-
-def _motor_table(model: RobotModel, motors: dict[int, dict[str, float]]) -> str:
-    """Return the line of source with coupled motors: shares of speed, coefficients, linear zone."""
-    rows = [
-        f"({_numbers(share)}, {_number(values.get('f0', 0.0))}, {_number(values.get('f1', 0.0))},"
-        f" {_linear(model.friction.laws[motor])!r})"
-        for (motor, values), share in zip(
-            motors.items(), model.friction.motor_speeds(), strict=True
-        )
-    ]
-    return f"MOTORS = {_tuple(rows)}  # speed per joint speed, Coulomb, viscous, linear"
 
 
 def _linear(law: FrictionLaw) -> float:
@@ -226,18 +177,8 @@ def _linear(law: FrictionLaw) -> float:
     return float(law.standstill) if law.zone == "linear" else 0.0
 
 
-def _kinds(laws: tuple[FrictionLaw, ...]) -> list[_Kind]:
-    return [kind for kind in _KINDS if any(_has(law, kind) for law in laws)]
-
-
-def _has(law: FrictionLaw, kind: _Kind) -> bool:
-    if kind.symbol != "f2":
-        return kind.symbol in law.symbols
-    return law.third == ("cubic" if kind.name == "CUBIC" else "quadratic")
-
-
-def _formula(kinds: list[_Kind]) -> str:
-    return " + ".join(kind.formula for kind in kinds)
+def _formula(kinds: Sequence[Kind]) -> str:
+    return " + ".join(kind.formula() for kind in kinds)
 
 
 def _line(name: str) -> str:

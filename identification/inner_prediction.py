@@ -23,7 +23,7 @@ from identification.augmented_rows import augmented_rows
 from identification.errors import IdentificationError
 from identification.estimation import joint_weights, solve
 from identification.factor import Factor
-from identification.friction import FrictionLaw, law_words
+from identification.friction import FrictionLaw
 from identification.masks import LeftOut
 from identification.model import RobotModel
 from identification.preprocessing import Preprocessing, Samples, VelocitySource
@@ -91,7 +91,7 @@ class Settings:
         return (
             f"{how.rigid_bandwidth:g} Hz",
             "measured velocity" if how.velocity == "measured" else "velocity from positions",
-            *law_words(self.model.friction.laws[0]),
+            *self.model.friction.laws[0].words(),
             {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
                 how.left_out or "", "by the friction law"
             ),

@@ -14,8 +14,7 @@ from identification.base_parameters import TOLERANCE, BaseParameters, select_bas
 from identification.coupling import Coupling
 from identification.elements import Element, ElementError, JointElements
 from identification.errors import ModelError, ShapeError
-from identification.friction import OFFSET, FrictionLaw
-from identification.joint_friction import JointFriction
+from identification.friction import FrictionLaw, JointFriction, Offset
 from identification.kinematics import Chain, chain_from_urdf
 from identification.payload import Load, Payload
 from identification.regressor import Regressor, RegressorPlan, joint_arrays
@@ -320,11 +319,11 @@ def _base_parameters(
 def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Array) -> None:
     """Refuse an offset whose column, constant on one joint, the inertial columns contain."""
     n = chain.n_joints
-    if OFFSET not in friction.symbols:
+    if Offset not in friction.kinds:
         return
     offsets = np.tile(np.eye(n), (len(columns) // n, 1))
     for joint, share in enumerate(share_left(offsets, columns)):
-        if share <= TOLERANCE and OFFSET in friction.laws[joint].symbols:
+        if share <= TOLERANCE and Offset.symbol in friction.laws[joint].symbols:
             name = chain.joint_names[joint]
             raise ModelError(
                 f"joint {name!r} slides along gravity and has a rotor inertia: the offset of its "
@@ -339,7 +338,7 @@ def _refuse_known_shape(
 ) -> None:
     """Refuse an element whose column the others contain, such as a weight's or an offset's."""
     m, n = q.shape
-    offsets = [j for j, law in enumerate(friction.laws) if OFFSET in law.symbols]
+    offsets = [j for j, law in enumerate(friction.laws) if Offset.symbol in law.symbols]
     columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])
     for element, joint, place in elements.identified():
         own = element.columns(q[:, joint])

@@ -11,7 +11,7 @@ from identification.evidence import SIGMAS, Evidence
 from identification.finding import Finding, listed
 from identification.thresholds import Thresholds
 
-_RICHER = "design a motion for this arm (hil design) and record that"
+_RICHER = "design a motion for this arm (`hil design`) and record that"
 
 
 def determined(_: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
@@ -107,7 +107,8 @@ def _constants(names: Sequence[str], joints: NDArray[np.intp], evidence: Evidenc
     steps = []
     if weighed.size:
         steps.append(
-            f"check the torque constant of {_all(names, weighed)} with a known payload (hil gains)"
+            f"check the torque constant of {_all(names, weighed)} with a known payload (`hil"
+            " gains`)"
         )
     if other.size:
         steps.append(
@@ -151,7 +152,7 @@ def delay(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterat
             f"the torque lags the position by {1e3 * found.common:.3g} ±"
             f" {1e3 * found.half_interval:.2g} ms ({1e3 * found.assumed:.3g} ms were stated); that"
             " was compensated",
-            "state the delay with --delay, or correct it where it arises",
+            "state it (`hil identify --delay SECONDS`), or correct it where it arises",
             "condition",
         )
         return
@@ -172,7 +173,7 @@ def delay(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterat
             "doubtful",
             "the torque seems to lag the position by another time than was assumed: "
             + listed([measured[j] for j in off]),
-            "identify with --delay auto and compare, or correct the delay in the cell",
+            "compare with `hil identify --delay auto`, or correct the delay in the cell",
             "cause",
         )
     else:

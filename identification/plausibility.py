@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from identification.estimation import Estimate
 from identification.factor import Factor
-from identification.friction import OFFSET
+from identification.friction import Coulomb
 from identification.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -108,17 +108,13 @@ def _friction(
     found = []
     first = model.base.rank
     for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
-        column = np.zeros((len(law.symbols), 1))
         one = speed[joint : joint + 1]
-        law.columns(one, law.sign(one), column)
-        at_speed = dict(zip(law.symbols, column[:, 0], strict=True))
         top, coulomb = np.zeros((2, len(estimate.values)))
-        for k, term in enumerate(model.friction.terms, start=first):
-            if term.motor or term.owner != joint or term.symbol == OFFSET:
+        for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
+            if motor or owner != joint or not term.is_friction:
                 continue
-            top[k] = at_speed[term.symbol]
-            if term.symbol == "f0":
-                coulomb[k] = 1.0
+            top[k] = term.column(one, law.sign(one))[0]
+            coulomb[k] = isinstance(term, Coulomb)
         torque = _torque_rms(motion, np.where(top != 0.0, estimate.values, 0.0))
         if _is_negative(estimate, coulomb, sigmas):
             words = (

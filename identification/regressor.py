@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from identification.elements import Element, JointElements
 from identification.errors import ShapeError
-from identification.friction import FrictionLaw
-from identification.joint_friction import JointFriction
+from identification.friction import FrictionLaw, JointFriction, JointTerm
 from identification.kinematics import Chain
 from identification.link_motion import LinkMotion
 from identification.wrench import (
@@ -181,7 +180,7 @@ class _OwnRows(NamedTuple):
     """Rows of one joint, in the working array, that belong to its drive."""
 
     friction: slice  # its own law, term by term
-    motors: dict[tuple[int, str], int]  # by coupled motor and symbol
+    motors: dict[JointTerm, int]  # of coupled motors
     rotor: int | None
     couplings: dict[int, int]  # by the joint that it is coupled to
     elements: slice  # those on it, one after the other
@@ -191,13 +190,13 @@ class _OwnRows(NamedTuple):
     def of(cls, plan: RegressorPlan, joint: int) -> _OwnRows:
         """Lay out the rows of a joint, one behind the other."""
         row = plan.first_own
-        motors: dict[tuple[int, str], int] = {}
+        motors: dict[JointTerm, int] = {}
         if plan.friction is not None:
             row += len(plan.friction.laws[joint].symbols)
             speeds = plan.friction.motor_speeds()[:, joint]
             felt = {m for m, s in zip(plan.friction.motors, speeds, strict=True) if s != 0.0}
             acting = [t for t in plan.friction.terms if t.motor and t.owner in felt]
-            motors = {(term.owner, term.symbol): row + k for k, term in enumerate(acting)}
+            motors = {term: row + k for k, term in enumerate(acting)}
         friction = slice(plan.first_own, row)
         row += len(motors)
         rotor = row if plan.rotors[joint] else None
@@ -234,9 +233,9 @@ class _Workspace:
         self._elements = self._element_parts(plan)
         self._contractions: list[_Contraction] = []
         first = 0
-        for link, kept in enumerate(plan.links):
-            inertia = [s for s in kept if s < N_INERTIA]
-            for symbols, moments_only in ((inertia, True), (kept[len(inertia) :], False)):
+        for link, own in enumerate(plan.links):
+            inertia = [s for s in own if s < N_INERTIA]
+            for symbols, moments_only in ((inertia, True), (own[len(inertia) :], False)):
                 if symbols:
                     joints = _as_slice(plan.chain.ancestors(link))
                     self._add(link, joints, symbols, moments_only, first)
@@ -313,11 +312,12 @@ class _Workspace:
         for motor, share, direction in zip(
             friction.motors, friction.motor_speeds(), directions, strict=True
         ):
-            column = {"f0": direction, "f1": share @ self._motion.velocity}
+            speed = share @ self._motion.velocity
             for joint in np.flatnonzero(share):
-                for (index, symbol), row in self._own[joint].motors.items():
-                    if index == motor:
-                        np.multiply(share[joint], column[symbol], out=self.rows[joint, row])
+                for (_, term, owner, _, _), row in self._own[joint].motors.items():
+                    if owner == motor:
+                        column = term.column(speed, direction)
+                        np.multiply(share[joint], column, out=self.rows[joint, row])
 
     def _write_direction(self, friction: JointFriction, direction: Array | None, k: int) -> None:
         if direction is not None:
@@ -348,7 +348,7 @@ class _Workspace:
         if self._joint_friction is not None:
             self._write_direction(self._joint_friction, direction, len(q))
         for law, velocity, turned, target in self._friction:
-            law.columns(velocity, turned, target)
+            target[...] = law.columns(velocity, turned)
         for source, target in self._drives:
             np.copyto(target, source)
         for element, joint, target in self._elements:
@@ -405,13 +405,11 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
             place += 1
     first_friction = offsets[-1] + len(plan.couplings)
     terms = plan.friction.terms if plan.friction is not None else ()
-    places = {(t.motor, t.owner, t.symbol): first_friction + k for k, t in enumerate(terms)}
+    places = {term: first_friction + k for k, term in enumerate(terms)}
     first_element = first_friction + len(terms)
     for joint, own in enumerate(plan.own):
-        if plan.friction is not None:
-            symbols = plan.friction.laws[joint].symbols
-            columns[joint] += [places[False, joint, symbol] for symbol in symbols]
-            columns[joint] += [places[True, motor, symbol] for motor, symbol in own.motors]
+        columns[joint] += [places[t] for t in terms if not t.motor and t.owner == joint]
+        columns[joint] += [places[term] for term in own.motors]
         if own.rotor is not None:
             columns[joint].append(offsets[joint] + len(plan.links[joint]))
         for other in own.couplings:

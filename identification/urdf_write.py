@@ -27,6 +27,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
+from identification.friction import TERMS
 from identification.kinematics import chain_from_urdf, pinocchio_model
 from identification.locked_bodies import locked_bodies, without_locked
 from identification.model import RobotModel
@@ -46,7 +47,7 @@ _TENSOR: Final = {
     "iyz": (1, 2),
     "izz": (2, 2),
 }
-_DYNAMICS: Final = {"f1": "damping", "f0": "friction"}
+_DYNAMICS: Final = {kind.symbol: kind.urdf for kind in reversed(TERMS) if kind.urdf}
 _STATES: Final = 50
 _SEED: Final = 20140902
 # Of the largest torque of a joint: what going through centre of mass and decimal text may cost.
@@ -106,14 +107,10 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
 
 def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
     """Return in words which of the model's parameters a URDF has no place for."""
-    symbols = model.friction.symbols
     absent = {
         "rotor inertias": model.rotor_inertia,
         "coupling inertias": bool(model.layout.pairs),
-        "the third friction term": "f2" in symbols,
-        "the Stribeck term": "fs" in symbols,
-        "what differs between directions in viscous friction": "fd" in symbols,
-        "the friction offset": "fo" in symbols,
+        **{kind.words: not kind.urdf for kind in model.friction.kinds},
         "friction of coupled motors": bool(model.friction.motors),
         "the payload": model.payload is not None,
         "springs and balancers": bool(model.elements.elements),
@@ -251,11 +248,7 @@ def _friction(model: RobotModel, friction: Array | None) -> dict[str, dict[str, 
     """Return friction coefficients by joint and symbol, nothing without friction."""
     if friction is None:
         return {}
-    table = model.friction.table(friction)
-    return {
-        joint: {symbol: float(table[symbol][j]) for symbol in law.symbols}
-        for j, (joint, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True))
-    }
+    return dict(zip(model.joint_names, model.friction.table(friction), strict=False))
 
 
 def _refuse_impossible(

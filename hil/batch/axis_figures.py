@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from identification import RobotModel
 from identification.factor import Factor
-from identification.friction import FrictionLaw
-from identification.joint_friction import FrictionTerm
+from identification.friction import Viscous
 
 Array = NDArray[np.float64]
 
@@ -25,7 +24,7 @@ def speed_rms(model: RobotModel, factor: Factor) -> Array:
     """
     squares = np.full(model.n_joints, np.nan)
     for k, term in enumerate(model.friction.terms):
-        if term.symbol == "f1" and (not term.motor or np.isnan(squares[term.owner])):
+        if isinstance(term.term, Viscous) and (not term.motor or np.isnan(squares[term.owner])):
             column = model.base.rank + k
             squares[term.owner] = factor.gram[term.owner, column, column]
     return _rms(squares, factor.samples)
@@ -45,23 +44,9 @@ def friction_weights(model: RobotModel, speed: Array) -> Array:
     for k, term in enumerate(model.friction.terms):
         own = float(speed[term.owner])
         at = own if math.isfinite(own) and own > 0.0 else _ANY_SPEED
-        weights[term.owner, model.base.rank + k] = _weight(term, model.friction.laws, at)
+        forwards, backwards = term.term.column(np.array([at, -at]), np.array([1.0, -1.0]))
+        weights[term.owner, model.base.rank + k] = 0.5 * (forwards - backwards)
     return weights
-
-
-def _weight(term: FrictionTerm, laws: tuple[FrictionLaw, ...], speed: float) -> float:
-    law = laws[term.owner]
-    match term.symbol:
-        case "f0":
-            return 1.0
-        case "f1":
-            return speed
-        case "f2":
-            return speed**3 if law.third == "cubic" else speed**2
-        case "fs":
-            return math.exp(-((speed / law.stribeck) ** 2)) if law.stribeck else 0.0
-        case _:
-            return 0.0
 
 
 def friction_of(values: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:

@@ -367,10 +367,10 @@ class Cell:
             standard[model.layout.links] *= inertia_scale[:, None]
         if model.rotor_inertia:
             standard[model.layout.rotors] = rotor_inertia
-        known = {"f0": coulomb, "f1": viscous, "f2": third}
+        known = {"coulomb": coulomb, "viscous": viscous, "third": third}
         friction = [
-            known[term.symbol][term.owner] if term.symbol in known and not term.motor else 0.0
-            for term in model.friction.terms
+            0.0 if motor or term.option not in known else known[term.option][owner]
+            for _, term, owner, motor, _ in model.friction.terms
         ]
         return np.concatenate([model.base.grouping @ standard, friction, model.elements.nominal])
 

@@ -99,17 +99,7 @@ def _override(friction: FrictionTable, name: str) -> FrictionTable:
 
 def _law(path: Path, field: str, table: FrictionTable) -> FrictionLaw:
     with _blamed(path, field, None, "correct that table"):
-        return FrictionLaw(
-            coulomb=table.coulomb,
-            viscous=table.viscous,
-            third=None if table.third == "none" else table.third,
-            offset=table.offset,
-            standstill=table.standstill,
-            stribeck=table.stribeck or None,
-            asymmetric=table.asymmetric,
-            zone=table.zone,
-            presliding=table.presliding,
-        )
+        return FrictionLaw.from_table(table.model_dump(exclude={"joints"}))
 
 
 def _coupling(

@@ -12,7 +12,7 @@ from hil.cli.verdict import finish
 from hil.errors import InputError
 from hil.files import make_folder
 from hil.identify import Options, identify_archives, identify_campaign
-from hil.identify.options import ESTIMATORS, Estimator, friction_from
+from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator, friction_from
 from hil.outcome import write_outcome
 from hil.progress import reporter as make_reporter
 from hil.reading import lies_there
@@ -95,10 +95,9 @@ def identify(
         str,
         typer.Option(
             metavar="TERMS|auto",
-            help="Friction law, whatever the archive says: some of coulomb, viscous, quadratic, "
-            "cubic, offset, asymmetric, stribeck=RAD/S, presliding=RAD, with commas between "
-            "them. auto: the archive's, with what predicts best at reversals (and, of imported "
-            "recordings, at speed).",
+            help=f"Friction law, whatever the archive says: some of {FRICTION_TERMS}, with commas "
+            "between them. auto: the archive's, with what predicts best at reversals (and, of "
+            "imported recordings, at speed).",
         ),
     ] = "auto",
     standstill: Annotated[
@@ -153,7 +152,7 @@ def identify(
         estimator=estimator,
         bandwidth=_bandwidth(bandwidth),
         velocity=velocity,
-        friction=friction_from(friction),
+        friction="auto" if friction == "auto" else friction_from(friction),
         standstill=standstill,
         in_sample=in_sample,
     )

@@ -11,6 +11,7 @@ import typer
 
 from hil.archive import open_archive
 from hil.errors import InputError
+from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
     STANDARD_GRAVITY,
     ColumnMap,
@@ -72,10 +73,7 @@ Gravity = Annotated[
 ]
 Friction = Annotated[
     str,
-    typer.Option(
-        help="Friction terms, comma separated: coulomb, viscous, offset, quadratic (sgn(v) v²) or "
-        "cubic (v³). A cell file can say more."
-    ),
+    typer.Option(help=f"Friction law: some of {FRICTION_TERMS}, with commas between them."),
 ]
 Standstill = Annotated[
     float,
@@ -369,23 +367,8 @@ def _names(renamed: list[str]) -> dict[str, str]:
 
 
 def _law(terms: str, standstill: float) -> FrictionLaw:
-    wanted = {term.strip() for term in terms.split(",") if term.strip()}
-    known = {"coulomb", "viscous", "quadratic", "cubic", "offset"}
-    if wanted - known or {"quadratic", "cubic"} <= wanted:
-        raise InputError(
-            None,
-            f"{terms!r} is no friction law",
-            field="--friction",
-            remedy=f"use some of {', '.join(sorted(known))}, not both quadratic and cubic",
-        )
     if not math.isfinite(standstill):
         raise InputError(
             None, f"{standstill} is no speed", field="--standstill", remedy="give rad/s, as in 0.01"
         )
-    return FrictionLaw(
-        coulomb="coulomb" in wanted,
-        viscous="viscous" in wanted,
-        third="quadratic" if "quadratic" in wanted else "cubic" if "cubic" in wanted else None,
-        offset="offset" in wanted,
-        standstill=standstill,
-    )
+    return FrictionLaw.from_table({**friction_from(terms), "standstill": standstill})

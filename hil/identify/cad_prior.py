@@ -36,16 +36,11 @@ def _known(
     """Mean and standard deviation by name of what the table gives and the model has."""
     if table is None:
         return {}
-    columns = {
-        "I{}m": (table.rotor_inertia, share or FRICTION_SHARE),
-        "f0_{}": (table.coulomb, FRICTION_SHARE),
-        "f1_{}": (table.viscous, FRICTION_SHARE),
-        "f2_{}": (table.third, FRICTION_SHARE),
-    }
-    names = {*model.standard_names, *model.parameter_names[model.base.rank :]}
-    return {
-        name: (value, part * abs(value))
-        for pattern, (values, part) in columns.items()
-        for joint, value in enumerate(values, 1)
-        if value != 0.0 and (name := pattern.format(joint)) in names
-    }
+    share = share or FRICTION_SHARE
+    known = {f"I{j}m": (value, share * value) for j, value in enumerate(table.rotor_inertia, 1)}
+    for name, term, owner, motor, _ in model.friction.terms:
+        values = getattr(table, term.option, None)
+        if values and not motor:
+            known[name] = values[owner], FRICTION_SHARE * abs(values[owner])
+    names = {*model.standard_names, *model.friction.names}
+    return {name: one for name, one in known.items() if one[0] != 0.0 and name in names}

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args
 
 from hil.errors import InputError
+from identification.friction import ABSENT, TERMS
 from identification.masks import LeftOut
 from identification.preprocessing import RIGID_BANDWIDTH, Smoother, VelocitySource
 
@@ -93,44 +94,38 @@ class Options:
             )
 
 
-_TERMS: Final = ("coulomb", "viscous", "quadratic", "cubic", "offset", "asymmetric")
+FRICTION_TERMS: Final = ", ".join(
+    [f"{kind.label.lower()}{'=RAD/S' if kind.speed_symbol else ''}" for kind in TERMS]
+    + ["presliding=RAD"]
+)
+"""Of which a friction law can be put together."""
 
 
-def friction_from(text: str) -> Mapping[str, Any] | Literal["auto"]:
+def friction_from(text: str) -> Mapping[str, Any]:
     """A friction law from its terms: ``coulomb,viscous,offset,presliding=1e-4``.
 
     Returns:
         Entries of `[robot.friction]`; terms that are not named are left out of the law.
 
     Raises:
-        InputError: a term is unknown, or its figure is none.
+        InputError: a term is unknown or excludes another, or its figure is none.
     """
-    if text == "auto":
-        return "auto"
-    entries: dict[str, Any] = {
-        "coulomb": False,
-        "viscous": False,
-        "third": "none",
-        "offset": False,
-        "asymmetric": False,
-        "stribeck": 0.0,
-        "presliding": 0.0,
-    }
+    known = {kind.label.lower(): kind for kind in TERMS}
+    absent = {kind.option: ABSENT.get(kind.option, False) for kind in TERMS} | {"presliding": 0.0}
+    entries: dict[str, Any] = dict(absent)
     for term in text.split(","):
         name, _, figure = term.strip().partition("=")
-        if name in ("quadratic", "cubic") and not figure:
-            entries["third"] = name
-        elif name in _TERMS and not figure:
-            entries[name] = True
-        elif name in ("stribeck", "presliding"):
-            entries[name] = _positive(term, figure)
+        kind = known.get(name)
+        if name == "presliding" or (kind is not None and kind.speed_symbol):
+            entries[kind.option if kind else name] = _positive(term, figure)
+        elif kind is not None and not figure and entries[kind.option] == absent[kind.option]:
+            entries[kind.option] = kind.label if kind.option in ABSENT else True
         else:
             raise InputError(
                 None,
-                f"{term.strip()!r} is no term of friction",
+                f"{term.strip()!r} is no term of friction, or excludes another one",
                 field="--friction",
-                remedy=f"use auto, or some of {', '.join(_TERMS)}, stribeck=SPEED (rad/s) and "
-                "presliding=DISPLACEMENT (rad), with commas between them",
+                remedy=f"use auto, or some of {FRICTION_TERMS}, with commas between them",
             )
     return entries
 

@@ -195,16 +195,6 @@ def _cell_text(
     locked: Mapping[str, float],
 ) -> str:
     """The smallest cell file: the robot alone, without limits, drive train or controller."""
-    law = {
-        "coulomb": friction.coulomb,
-        "viscous": friction.viscous,
-        "third": friction.third or "none",
-        "offset": friction.offset,
-        "standstill": friction.standstill,
-        "stribeck": friction.stribeck or 0.0,
-        "asymmetric": friction.asymmetric,
-        "zone": friction.zone,
-    }
     lines = [
         "[cell]",
         f"name = {toml_value(_writable(name)[:80] or 'robot')}",
@@ -216,7 +206,7 @@ def _cell_text(
         *([f"locked = {_inline(locked)}"] if locked else []),
         "",
         "[robot.friction]",
-        *(f"{key} = {toml_value(value)}" for key, value in law.items()),
+        *(f"{key} = {toml_value(value)}" for key, value in friction.table().items()),
     ]
     return "\n".join(lines) + "\n"
 

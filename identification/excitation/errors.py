@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from identification.errors import IdentificationError
 
 if TYPE_CHECKING:
-    from identification.excitation.constraints import Violation
+    from identification.excitation.violation import Violation
 
 
 class CollisionModelError(IdentificationError):

@@ -1,4 +1,4 @@
-"""Campaigns compared: planted changes are found, and nothing else; strangers are refused."""
+"""Campaigns compared: planted changes are found, and nothing else; another arm is refused."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     assert stiff != usual.text != other
     return {
         name: ran(root / name, Cell.from_texts(text, usual.urdf, usual.path), plan)
-        for name, text in (("march", usual.text), ("june", stiff), ("stranger", other))
+        for name, text in (("march", usual.text), ("june", stiff), ("other", other))
     }
 
 
@@ -118,8 +118,8 @@ def test_a_script_gets_numbers_and_an_exit_status_if_it_wants_one(
 
 def test_different_arms_are_refused_with_what_they_differ_in(folders: dict[str, Path]) -> None:
     """Whichever of them comes first."""
-    with pytest.raises(InputError, match=r"(march|stranger): is of another arm.*\[drive_train\]"):
-        compared(folders["march"], folders["stranger"])
+    with pytest.raises(InputError, match=r"(march|other): is of another arm.*\[drive_train\]"):
+        compared(folders["march"], folders["other"])
 
 
 def test_one_campaign_is_nothing_to_compare(folders: dict[str, Path]) -> None:
@@ -134,7 +134,7 @@ def test_one_campaign_or_two_arms_are_refused_before_anything_is_estimated(
         raise AssertionError
 
     monkeypatch.setattr("hil.batch.run.Work", estimated)
-    for pair in ("march", "march"), ("march", "stranger"):
+    for pair in ("march", "march"), ("march", "other"):
         with pytest.raises(InputError):
             compared(*(folders[name] for name in pair))
 

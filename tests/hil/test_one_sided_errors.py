@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import hil.identify.sources
 from hil.campaign import Campaign, CampaignPlan
@@ -23,7 +22,7 @@ from hil.progress import Silent
 from hil.recordings import recording_of
 from hil.results import VerdictResult
 from hil.simulation import simulated_drive
-from identification import FrictionLaw
+from identification.friction import Coulomb
 from sim_fixtures import SimulatedDrive
 
 Run = Callable[..., Campaign]
@@ -126,18 +125,7 @@ def test_friction_columns_of_the_wrong_sign_are_red(
     honest: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The prediction stays as good, but friction that drives a joint is impossible."""
-    columns = FrictionLaw.columns
-
-    def turned(
-        law: FrictionLaw,
-        velocity: NDArray[np.float64],
-        direction: NDArray[np.float64],
-        out: NDArray[np.float64],
-    ) -> None:
-        columns(law, velocity, direction, out)
-        out[0] *= -1.0
-
-    monkeypatch.setattr(FrictionLaw, "columns", turned)
+    monkeypatch.setattr(Coulomb, "_column", lambda _, at: -at.s)
     found = verdict(honest)
     assert not found.good, found.line
     assert any("Coulomb friction of" in reason for reason in found.reasons)

@@ -113,12 +113,11 @@ def test_friction_by_direction_and_at_low_speed_only_takes_energy() -> None:
     friction = np.array([planted[term.symbol] for term in model.friction.terms])
     truth = np.concatenate([model.base.grouping @ model.nominal, friction])
     found = fitted(model, truth, noise=0.01)
-    table = model.friction.table(found.friction)
     tolerance = 1e-12
-    assert np.all(table["f0"] >= 0.0)
-    assert np.all(table["f0"] + table["fs"] >= -tolerance)
-    assert np.all(table["f1"] + table["fd"] >= -tolerance)
-    assert np.all(table["f1"] - table["fd"] >= -tolerance)
+    for own in model.friction.table(found.friction):
+        assert own["f0"] >= 0.0
+        assert own["f0"] + own["fs"] >= -tolerance
+        assert abs(own["fd"]) <= own["f1"] + tolerance
     # And what nature makes comes back.
     planted |= {"f1": 0.9, "fs": 0.7}
     friction = np.array([planted[term.symbol] for term in model.friction.terms])

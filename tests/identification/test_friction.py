@@ -1,18 +1,18 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from identification.errors import ModelError
-from identification.friction import FrictionLaw
+from identification.friction import TERMS, FrictionLaw, FrictionTerm, Stribeck
 
 SPEED = np.array([-2.0, -1e-9, 0.0, 1e-9, 0.5])
 
 
 def columns(law: FrictionLaw) -> np.ndarray:
-    out = np.full((len(law.symbols), len(SPEED)), np.nan)
-    law.columns(SPEED, law.sign(SPEED), out)
-    return out
+    return law.columns(SPEED, law.sign(SPEED))
 
 
 def test_the_default_law_is_coulomb_viscous_and_quadratic() -> None:
@@ -38,13 +38,6 @@ def test_the_cubic_third_term_and_the_offset() -> None:
 def test_a_law_without_any_term_has_no_columns() -> None:
     law = FrictionLaw(coulomb=False, viscous=False, third=None)
     assert law.symbols == ()
-    assert law.names(6) == ()
-
-
-def test_names_go_term_by_term() -> None:
-    assert FrictionLaw(third=None, offset=True).names(2) == (
-        "f0_1", "f0_2", "f1_1", "f1_2", "fo_1", "fo_2",
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -57,7 +50,7 @@ def test_names_go_term_by_term() -> None:
 )
 def test_units_follow_the_term_and_the_joint(third: str, revolute: bool, unit: str) -> None:
     law = FrictionLaw(third=third)  # type: ignore[arg-type]
-    assert law.unit("f2", revolute=revolute) == unit
+    assert law.terms[-1].unit(revolute=revolute) == unit
 
 
 def test_a_joint_moves_above_the_standstill_speed_in_either_direction() -> None:
@@ -75,3 +68,42 @@ def test_a_senseless_standstill_speed_is_refused(speed: float) -> None:
 def test_an_unknown_third_term_is_refused_with_what_is_known() -> None:
     with pytest.raises(ModelError, match=r"quadratic.*cubic"):
         FrictionLaw(third="stribeck")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", TERMS)
+class TestFrictionTerms:
+    """Each term is one column, in whatever form it is written."""
+
+    SPEED = np.array([-2.0, -0.3, 0.1, 0.7])
+    STEP = 1e-6
+
+    def test_source_code_computes_the_column(self, kind: type[FrictionTerm]) -> None:
+        term = kind(0.4)
+        speeds = {f"{kind.label.upper()}_SPEED": [term.speed], "joint": 0, "E": math.e}
+        code = [eval("1.0" + kind.code, {"v": v, "sign": np.sign(v), **speeds}) for v in self.SPEED]
+        np.testing.assert_allclose(code, term.column(self.SPEED, np.sign(self.SPEED)), rtol=1e-14)
+
+    def test_slope_is_the_derivative_of_the_column(self, kind: type[FrictionTerm]) -> None:
+        """At a speed that the direction has no part in; the fall of Stribeck's is left out."""
+        if kind is Stribeck:
+            return
+        sign, term = np.sign(self.SPEED), kind(0.4)
+        above, below = (term.column(self.SPEED + d, sign) for d in (self.STEP, -self.STEP))
+        slope = term.slope(self.SPEED, np.zeros(4))
+        np.testing.assert_allclose(slope, (above - below) / (2.0 * self.STEP), atol=1e-8)
+
+
+class TestFrictionTable:
+    """A law as `[robot.friction]` has it."""
+
+    @pytest.mark.parametrize(
+        "law", [FrictionLaw(), FrictionLaw(third=None, stribeck=0.1, zone="linear", offset=True)]
+    )
+    def test_laws_come_back_from_their_tables(self, law: FrictionLaw) -> None:
+        assert None not in law.table().values()
+        assert FrictionLaw.from_table(law.table()) == law
+
+    def test_a_speed_of_zero_means_no_stribeck_term(self) -> None:
+        assert FrictionLaw.from_table({"stribeck": 0.0}).stribeck is None
+        with pytest.raises(ModelError, match="Stribeck speed"):
+            FrictionLaw(stribeck=0.0)

@@ -133,7 +133,7 @@ def test_words_name_what_is_special_about_a_joint_or_motor() -> None:
     assert "Slower than 0.1 rad/s (m/s) shoulder: sgn(v) is v / standstill" in text
     assert "Slower than 0.01 rad/s (m/s) elbow: nothing was fitted" in text
     assert "vs = 0.4 rad/s" in text
-    assert "its asymmetry cannot be told from the zero error of a sensor" in text
+    assert "its asymmetry cannot be distinguished from the zero error of a sensor" in text
     assert "motor 2, at v = 0.5 v(shoulder) + v(elbow): f0 = 7 N·m, f1 = 8 N·m·s/rad" in text
 
 

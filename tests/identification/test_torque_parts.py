@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from identification.elements import TorsionSpring
 from identification.friction import FrictionLaw
 from identification.friction_curve import friction_curve, friction_torque
 from identification.model import RobotModel
@@ -111,6 +112,14 @@ class TestFrictionCurve:
         assert curve.turning[-1] == pytest.approx(FO[0] + F0[0], rel=0.01)
         zero = np.interp(0.0, curve.turning - FO[0], curve.travel)
         assert zero == pytest.approx(PRESLIDING * np.log(2.0), rel=0.02)
+
+    def test_of_an_arm_with_an_identified_spring(self) -> None:
+        """Parameters behind those of friction are none of the curve's."""
+        law = FrictionLaw(third=None, offset=True)
+        spring = TorsionSpring("shoulder", 0.2, identified=True)
+        model = RobotModel.from_urdf(URDF, friction=law, elements=[spring])
+        curve = friction_curve(model, np.append(values_of(model_with()), 25.0), 0, -1.0, 1.0)
+        assert curve.sliding[-1] == pytest.approx(F0[0] + F1[0] + FO[0])
 
     def test_is_what_the_data_lie_on(self) -> None:
         """Torque without the other parts, of a perfect model, lies on the curve."""

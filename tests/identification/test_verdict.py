@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -246,7 +247,7 @@ def test_a_load_on_unseen_motion_only_is_named_and_weighed(model: RobotModel, ma
     assert len(verdict.next_steps) == 1
 
 
-def test_friction_that_changed_is_told_in_full_and_named_as_the_reason(model: RobotModel) -> None:
+def test_changed_friction_is_given_in_full_as_the_reason(model: RobotModel) -> None:
     def warmer(motion: Motion, _: Array) -> Array:
         return 0.2 * (COULOMB * np.sign(motion.velocity) + VISCOUS * motion.velocity)
 
@@ -336,11 +337,14 @@ def test_a_single_recording_with_a_small_error_is_good() -> None:
         ({"training": an_error(0.05), "held_out": an_error(0.2)}, "one 4.0 times to 20.0%"),
         ({"estimate": an_estimate(undetermined=("a",))}, "does not determine a"),
         ({"nominal": an_error(0.03)}, "nominal model predicts better"),
-        ({"causes": caused("axis sign", 0)}, "one seems to count the other way round"),
+        ({"causes": caused("axis sign", 0)}, "one seems to turn in the direction opposite"),
         ({"causes": caused("torque sign", 1)}, "torque of two seems to have the other sign"),
-        ({"causes": caused("torque order", 0, 1)}, "torques of one and two seem to stand in"),
+        (
+            {"causes": caused("torque order", 0, 1)},
+            "torques of one and two seem to be interchanged",
+        ),
         ({"causes": caused("joint order", 0, 1)}, "positions and torques of one and two"),
-        ({"causes": caused("delay")}, "torque of all axes lags the position by 10 ± 2 ms"),
+        ({"causes": caused("delay")}, "of all axes lags the position by 10 ± 2 ms more"),
         ({"causes": caused("gain", 1)}, "the torque of two is 1.01 ± 0.002 times"),
         ({"disagreement": np.array([0.2, 0.0])}, "repetitions disagree"),
         ({"implausible": Implausible(("m1 is negative",), ())}, "m1 is negative"),
@@ -351,6 +355,13 @@ def test_each_fault_turns_the_verdict_and_is_said(changes: dict[str, object], wo
     assert not verdict.good
     assert any(words in reason for reason in verdict.reasons)
     assert verdict.reasons[0] in verdict.line
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_each_kind_of_cause_has_a_statement_and_a_step(kind: Kind) -> None:
+    verdict = judge(AXES, evidence_with(causes=caused(kind, 0, 1)))
+    (finding,) = (one for one in verdict.findings if one.role == "cause")
+    assert not {"{", "}"} & {*finding.words, *finding.next_step} and finding.next_step
 
 
 def test_a_cause_of_little_error_is_doubtful() -> None:
@@ -431,7 +442,7 @@ def test_payloads_are_asked_for_only_where_gravity_loads_the_axis() -> None:
     assert "of two with a known payload" in step and "of one with the drive's data sheet" in step
 
 
-def test_what_sound_models_reach_is_no_doubt_and_nothing_is_not_told() -> None:
+def test_what_sound_models_reach_is_no_warning() -> None:
     verdict = judge(AXES, evidence_with(**slowly_off(0.019, 0.0)))
     assert not any("noise does not explain" in doubt for doubt in verdict.doubts)
     assert "beyond what noise explains 1.9% at worst" in verdict.line
@@ -476,7 +487,7 @@ def test_axes_with_the_same_step_share_one_line() -> None:
     assert len(steps) == 1 and "one, two" in steps[0]
 
 
-def test_a_direction_that_the_data_do_not_tell_is_information() -> None:
+def test_an_undetermined_direction_is_information() -> None:
     verdict = judge(AXES, evidence_with(causes=Causes((), None, undecided=(0,))))
     assert verdict.good and not any("direction" in doubt for doubt in verdict.doubts)
     (finding,) = (one for one in verdict.findings if one.level == "information")
