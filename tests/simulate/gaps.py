@@ -50,7 +50,8 @@ def _outcome_of_motion(life: Life, first: Exchanged, second: Exchanged) -> str |
 def piles(seen: Observed) -> Iterator[Broken]:
     """Of packets of one kind that waited together in open mode only one gets an answer.
 
-    ARCHITECTURE.md, "Late answers are dropped": answers to the others would run the motion ahead of the arm.
+    ARCHITECTURE.md, "Late answers are dropped": answers to the others would run the motion ahead
+    of the arm.
     """
     mode = seen.cell.controller.mode
     end = _HEADER + _AXIS * (len(seen.cell.joint_names) + seen.controller.foreign_axes)
