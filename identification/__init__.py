@@ -52,7 +52,6 @@ from identification.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.resampling import resample
 from identification.robust import RobustEstimate, robust_estimate
 from identification.signals.clock import Clock, TimeBase, time_base, true_times
-from identification.torque_channel import find_torque_bandwidth
 from identification.urdf_write import write_urdf
 from identification.validation import PredictionError, prediction_error
 from identification.verdict import Thresholds, Verdict, judge
@@ -84,7 +83,6 @@ __all__ = [
     "prepare",
     "smooth",
     "standstill_variance",
-    "find_torque_bandwidth",
     "DelayEstimate",
     "estimate_delays",
     "delay_sensitivity",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,10 +13,18 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.identify.cad_prior import cad_prior
+from hil.identify.settings import Settings
 from identification import IdentificationError
 from identification.consistent import consistent_estimate
 from identification.covariance import block_covariance, with_block_covariance
-from identification.estimation import Estimate, estimate, nothing_usable
+from identification.delay_compensation import with_uncertain_delay
+from identification.estimation import (
+    Estimate,
+    estimate,
+    mark_undetermined,
+    nothing_usable,
+    solve,
+)
 from identification.factor import Factor
 from identification.least_squares import Weighting, weights_of
 from identification.model import RobotModel
@@ -23,8 +32,11 @@ from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
 from identification.prior import GaussianPrior, with_prior
 from identification.qr_factor import QR_CONDITION
+from identification.repetitions import no_narrower
+from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 
 from .axis_figures import speed_rms
+from .doubts import Doubts
 from .types import ArchiveRef, BatchEstimator, Level, LevelEstimate, Summary
 
 Array = NDArray[np.float64]
@@ -38,14 +50,16 @@ class Estimator:
 
     Args:
         name: of the estimator.
-        cell: says what the arm is, and what is believed of it.
+        cell: says what the arm is, and what is believed of it; with the law of the settings.
+        settings: of the arm.
 
     Raises:
         InputError: the estimator needs a prior, and the cell has none.
     """
 
-    def __init__(self, name: BatchEstimator, cell: Cell) -> None:
-        self.name = name
+    def __init__(self, name: BatchEstimator, cell: Cell, settings: Settings) -> None:
+        self.name, self.delay_variance = name, settings.delay_variance
+        self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
         self.model: RobotModel = cell.model
         self._prior: GaussianPrior | None = None
         if name == "prior":
@@ -59,20 +73,13 @@ class Estimator:
                 )
             self._prior = prior
 
-    def of_archive(self, summary: Summary) -> Estimated:
-        """The estimate from one archive alone.
+    @property
+    def draws(self) -> bool:
+        """Whether the estimate of an archive depends on the centre of all."""
+        return 0.0 < self._shrinkage.strength < math.inf
 
-        Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
-        repetitions is about noise.
-        """
-        if self._prior is None:
-            return summary.fits[self._weighting].estimate, ()
-        free = summary.fits["weighted"]
-        factor, wide = free.estimate.interval_factor, free.design_effect
-        return self._posterior(summary.total.total, self._prior, wide, factor), ()
-
-    def of_sum(self, phase: PhaseFactor) -> Estimated:
-        """The estimate from a sum over archives.
+    def centre(self, phase: PhaseFactor) -> Array | None:
+        """What estimates from a sum and its archives are drawn towards (p,); None for nothing.
 
         Raises:
             IdentificationError: there is not one usable row, or no consistent solution.
@@ -80,6 +87,43 @@ class Estimator:
         total = phase.total
         if not total.samples.any():
             raise IdentificationError(nothing_usable(self.model))
+        if self._shrinkage.strength == 0.0:
+            return None
+        weight = self._shrinkage.prior_weight
+        return consistent_centre(self.model, total, self.weights(total), weight).estimate.values
+
+    def of_archive(self, summary: Summary, centre: Array | None) -> Estimated:
+        """The estimate from one archive alone, drawn towards the centre of all.
+
+        Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
+        repetitions is about noise. A prior's covariance is that of white residuals times the design
+        effect.
+        """
+        free, total = summary.fits[self._weighting], summary.total.total
+        if self._prior is not None:
+            factor, wide = free.estimate.interval_factor, free.design_effect
+            return self._posterior(total, self._prior, wide, factor), ()
+        if centre is None or not self.draws:
+            return free.estimate, ()
+        found = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
+        equations = total.weighted(self.weights(total))
+        prior = self._shrinkage.strength * np.diag(np.diag(equations.A))
+        solution = solve(equations._replace(A=equations.A + prior))
+        covariance = max(1.0, free.design_effect) * solution.inverse
+        mark_undetermined(covariance, solution.determined)
+        factor = free.estimate.interval_factor
+        return replace(found, covariance=covariance, interval_factor=factor), ()
+
+    def of_sum(self, phase: PhaseFactor, centre: Array | None) -> Estimated:
+        """The estimate from a sum over archives, drawn towards its centre.
+
+        Raises:
+            IdentificationError: there is no consistent solution.
+        """
+        total = phase.total
+        if centre is not None:
+            found = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=phase)
+            return _checked(found)
         if self._prior is not None:
             weights = self.weights(total)
             free = estimate(self.model, total, weights)
@@ -185,10 +229,52 @@ def _torque_rms(factor: Factor) -> Array:
     return np.asarray(np.sqrt(factor.gram[:, -1, -1] / rows))
 
 
-def repetition_level(estimator: Estimator, summary: Summary, settings: str) -> LevelEstimate:
-    """The estimate of one archive."""
+def of_one_motion(refs: Sequence[ArchiveRef]) -> bool:
+    """Whether the excitations among archives repeat one planned motion."""
+    motions = {ref.motion for ref in refs if ref.use == "excitation"}
+    return len(motions) == 1 and "" not in motions
+
+
+class Together:
+    """What is fitted together and what is predicted by it, beside the sum of the factors.
+
+    Attributes:
+        refs: archives that were fitted.
+        repetitions: the estimate of each.
+        unseen: what is predicted.
+        products: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`.
+        doubts: about all archives.
+        settings: digests.
+    """
+
+    def __init__(self) -> None:
+        self.refs: list[ArchiveRef] = []
+        self.repetitions: list[LevelEstimate] = []
+        self.unseen, self.doubts = Unseen(), Doubts()
+        self.products: Array | None = None
+        self.settings: set[str] = set()
+
+    def add(self, other: Together) -> None:
+        """Take in what is fitted elsewhere."""
+        self.refs += other.refs
+        self.repetitions += other.repetitions
+        self.unseen += other.unseen
+        self.doubts.add(other.doubts)
+        self.settings |= other.settings
+        self.add_products(other.products)
+
+    def add_products(self, products: Array | None) -> None:
+        """Take in those of an archive, or of several."""
+        if products is not None:
+            self.products = products if self.products is None else self.products + products
+
+
+def repetition_level(
+    estimator: Estimator, summary: Summary, settings: str, centre: Array | None = None
+) -> LevelEstimate:
+    """The estimate of one archive, drawn towards the centre of those that are fitted together."""
     ref = summary.ref
-    found, doubts = estimator.of_archive(summary)
+    found, doubts = estimator.of_archive(summary, centre)
     nothing = np.full(estimator.model.n_joints, np.nan)
     return LevelEstimate(
         level="repetition",
@@ -212,30 +298,36 @@ def repetition_level(estimator: Estimator, summary: Summary, settings: str) -> L
 def sum_level(
     level: Level,
     estimator: Estimator,
-    refs: Sequence[ArchiveRef],
+    together: Together,
     phase: PhaseFactor,
-    unseen: Unseen,
-    settings: str,
+    centre: Array | None,
     doubts: Sequence[str] = (),
     payload: Payload | None = None,
 ) -> LevelEstimate:
     """The estimate of a campaign, or of all campaigns of an arm.
 
+    Its intervals are no narrower than the repetitions of one motion scatter.
+
     Args:
         level: which.
         estimator: of the arm.
-        refs: archives that were fitted.
+        together: archives that were fitted, and what is known beside them.
         phase: the sum of their factors.
-        unseen: what is predicted.
-        settings: digest, "" where campaigns have different ones.
-        doubts: about the archives.
+        centre: of that sum, see `Estimator.centre`.
+        doubts: about setups.
         payload: that the campaign's cell states.
 
     Raises:
         IdentificationError: there is no estimate.
     """
-    found, own = estimator.of_sum(phase)
-    total, setups = phase.total, {ref.setup for ref in refs}
+    found, own = estimator.of_sum(phase, centre)
+    refs, unseen, total = together.refs, together.unseen, phase.total
+    if of_one_motion(refs):
+        values = np.array([one.values for one in together.repetitions])
+        found = replace(found, covariance=no_narrower(found.covariance, values))
+    if together.products is not None:
+        found = with_uncertain_delay(found, total, together.products, estimator.delay_variance)
+    setups, settings = {ref.setup for ref in refs}, together.settings
     left, torque = unseen.errors(found.values, phase.n_joints)
     return LevelEstimate(
         level=level,
@@ -250,8 +342,8 @@ def sum_level(
         torque_rms=_torque_rms(total),
         unseen_rms=left,
         unseen_torque_rms=torque,
-        settings=settings,
-        doubts=(*own, *doubts),
+        settings=next(iter(settings)) if len(settings) == 1 else "",
+        doubts=(*own, *doubts, *together.doubts.lines()),
         speed_rms=speed_rms(estimator.model, total),
         information=total.weighted(estimator.weights(total)).A,
         setup=setups.pop() if len(setups) == 1 else "",

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from hil.identify.options import Options
+from hil.identify.settings import Settings
 from hil.progress import Reporter, Task
 from identification.phase_factor import PhaseFactor
 
@@ -18,7 +20,7 @@ from .on_workers import ArchiveTask, Summed
 from .settling import Settled, consulted, known_settings
 from .tasks import Done, bundle_kept, bundle_sent, campaign_settled, opened_once
 from .tree_sum import TreeSum
-from .types import ArchiveRef, Broken, Bundle, Choices, GroupKey, Settings
+from .types import ArchiveRef, Broken, Bundle, GroupKey
 from .workers import Workers
 
 _ROUNDS: Final = 3
@@ -32,6 +34,7 @@ class Campaign:
     Attributes:
         key: of the group.
         refs: archives, without those found to be broken.
+        arms: settings of its arm; None where it decides on them.
         settings: None until they are settled.
         bundles: archives that are reduced together.
         reason: why it could not be settled, "" if it could.
@@ -39,9 +42,15 @@ class Campaign:
 
     key: GroupKey
     refs: tuple[ArchiveRef, ...]
+    arms: Settings | None = None
     settings: Settings | None = None
     bundles: list[tuple[ArchiveRef, ...]] = field(default_factory=list)
     reason: str = ""
+
+    @property
+    def consulted(self) -> tuple[ArchiveRef, ...]:
+        """The archives that its settings depend on."""
+        return consulted(self.refs, self.arms)
 
     @property
     def ready(self) -> Settings:
@@ -76,7 +85,7 @@ class Work:
 
     Args:
         workers: who does it.
-        choices: of the preprocessing.
+        options: how archives are read.
         where: results of single archives are kept.
         reporter: of progress.
 
@@ -86,31 +95,46 @@ class Work:
     """
 
     def __init__(
-        self, workers: Workers, choices: Choices, where: Where, reporter: Reporter
+        self, workers: Workers, options: Options, where: Where, reporter: Reporter
     ) -> None:
         self.broken: list[Broken] = []
         self.read = 0
-        self._workers, self._choices = workers, choices
+        self._workers, self._options = workers, options
         self._where, self._reporter = where, reporter
         self._loose: dict[tuple[ArchiveRef, ...], Bundle] = {}
         self._far_sums: Iterator[Summed[PhaseFactor, Done]] = iter(())
         self._task: Task | None = None
 
     def settle(self, campaigns: Sequence[Campaign]) -> list[Campaign]:
-        """Give each campaign its settings; returns those that have some."""
+        """Give each campaign its settings; returns those that have some.
+
+        Those of an arm are decided on the first of its campaigns that can be read.
+        """
+        arms: dict[str, Settings] = {}
+        left = list(campaigns)
+        while left:
+            first = {one.key.arm: one for one in reversed(left) if one.key.arm not in arms}
+            now = list(first.values()) or left
+            self._settle_all(now, arms)
+            arms |= {arm: one.settings for arm, one in first.items() if one.settings is not None}
+            left = [one for one in left if first and first.get(one.key.arm) is not one]
+        return [one for one in campaigns if one.settings is not None]
+
+    def _settle_all(self, campaigns: Sequence[Campaign], arms: Mapping[str, Settings]) -> None:
+        """Settle campaigns, those of decided arms by their settings, without what is broken."""
         waiting = []
         for one in campaigns:
-            one.settings = known_settings(consulted(one.refs), self._choices, self._where)
+            one.arms = arms.get(one.key.arm)
+            one.settings = known_settings(one.consulted, self._options, one.arms, self._where)
             if one.settings is None:
                 waiting.append(one)
         self._settle(waiting)
         failed = [one for one in waiting if one.reason]
         for one in failed:
-            self._drop(one, self._unreadable(consulted(one.refs)))
+            self._drop(one, self._unreadable(one.consulted))
         self._settle([one for one in failed if one.refs])
         self._settle_by_the_next(waiting)
         self.broken += [Broken(one.key.campaign, one.reason) for one in waiting if one.reason]
-        return [one for one in campaigns if one.settings is not None]
 
     def reduce(self, campaigns: Sequence[Campaign]) -> None:
         """Have all bundles of the campaigns reduced and kept.
@@ -180,7 +204,7 @@ class Work:
                 if one.settings is None and len(one.refs) == left[id(one)]:
                     one.reason = one.reason or (
                         "none of its archives says how it is to be read"
-                        if consulted(one.refs)
+                        if one.consulted
                         else "it holds no excitation"
                     )
 
@@ -189,7 +213,7 @@ class Work:
             ArchiveTask(
                 one.key.campaign,
                 campaign_settled,
-                (consulted(one.refs), self._choices, self._where),
+                (one.consulted, self._options, one.arms, self._where),
             )
             for one in campaigns
         ]

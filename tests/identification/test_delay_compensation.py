@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from identification.delay_compensation import (
     compensate,
     delay_sensitivity,
+    rate_products,
     with_delay_uncertainty,
 )
 from identification.errors import IdentificationError, ShapeError
@@ -69,7 +70,10 @@ class TestDelayUncertainty:
             return prepare(recording, model, options=options)
 
         fitted = self.fit(model, samples(0.004))
-        slope = delay_sensitivity(model, [samples(0.004)], np.array([1.0, 25.0]), fitted.values)
+        middle, weights = samples(0.004), np.array([1.0, 25.0])
+        slope = delay_sensitivity(
+            middle.factor(model), rate_products(model, middle), weights, fitted.values
+        )
         ends = [self.fit(model, samples(0.004 + side)).values for side in (-5e-4, 5e-4)]
         assert slope == pytest.approx((ends[1] - ends[0]) / 1e-3, rel=0.03)
 
