@@ -22,6 +22,7 @@ from hil.batch.types import ArchiveRef, BatchResult, Broken, Summary
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli.reidentify_words import alarm_lines, skipped_line
+from hil.identify.options import FIXED
 from hil.progress import Silent
 
 from .arm_histories import Load, steady, trend_of
@@ -62,7 +63,7 @@ def record(monkeypatch: pytest.MonkeyPatch) -> Record:
 
 
 def batch(folder: Path) -> BatchResult:
-    return reidentify([str(folder)], Plan(keep=False), Here(), Silent())
+    return reidentify([str(folder)], Plan(FIXED, keep=False), Here(), Silent())
 
 
 def test_doubts_of_import_and_of_torque_constants_stand_with_every_estimate(
