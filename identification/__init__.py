@@ -8,7 +8,8 @@ from identification.delay import DelayEstimate, estimate_delays
 from identification.delay_compensation import (
     compensate,
     delay_sensitivity,
-    with_delay_uncertainty,
+    rate_products,
+    with_uncertain_delay,
 )
 from identification.elements import (
     Anchors,
@@ -86,7 +87,8 @@ __all__ = [
     "DelayEstimate",
     "estimate_delays",
     "delay_sensitivity",
-    "with_delay_uncertainty",
+    "rate_products",
+    "with_uncertain_delay",
     "compensate",
     "Gains",
     "identify_gains",

@@ -129,10 +129,10 @@ def delay_sensitivity(factor: Factor, products: Array, weights: Array, values: A
 def with_uncertain_delay(
     estimate: Estimate, factor: Factor, products: Array, variance: float
 ) -> Estimate:
-    """Return the estimate of a factor with the uncertainty of its delay (variance in s²).
+    """Return the estimate with the uncertainty of the delay in its covariance.
 
     Args:
-        estimate: weighted by its own noise.
+        estimate: made with one delay taken for certain.
         factor: of what was fitted.
         products: its `rate_products` (n, p, p + 1).
         variance: of the delay [s²].
@@ -140,21 +140,5 @@ def with_uncertain_delay(
     noise = estimate.noise_std
     weights = np.where(np.isfinite(noise), noise, np.inf) ** -2.0
     moved = delay_sensitivity(factor, products, weights, estimate.values)
-    return with_delay_uncertainty(estimate, moved, variance)
-
-
-def with_delay_uncertainty(estimate: Estimate, sensitivity: Array, variance: float) -> Estimate:
-    """Return the estimate with the uncertainty of the delay in its covariance.
-
-    Args:
-        estimate: made with one delay taken for certain.
-        sensitivity: of the parameters to that delay (p,), see :func:`delay_sensitivity`.
-        variance: of the delay [s²].
-
-    Raises:
-        ShapeError: not one sensitivity per parameter.
-    """
-    if sensitivity.shape != estimate.values.shape:
-        raise ShapeError("sensitivity", sensitivity.shape, str(estimate.values.shape))
-    known = np.where(np.isfinite(np.diag(estimate.covariance)), sensitivity, 0.0)
+    known = np.where(np.isfinite(np.diag(estimate.covariance)), moved, 0.0)
     return replace(estimate, covariance=estimate.covariance + variance * np.outer(known, known))

@@ -16,21 +16,19 @@ from hil.identify.cad_prior import cad_prior
 from hil.identify.settings import Settings
 from identification import IdentificationError
 from identification.consistent import consistent_estimate
-from identification.covariance import block_covariance, with_block_covariance
 from identification.delay_compensation import with_uncertain_delay
 from identification.estimation import (
     Estimate,
-    estimate,
     mark_undetermined,
     nothing_usable,
     solve,
 )
 from identification.factor import Factor
-from identification.least_squares import Weighting, weights_of
+from identification.least_squares import Weighting, fit_least_squares, weights_of
 from identification.model import RobotModel
 from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
-from identification.prior import GaussianPrior, with_prior
+from identification.prior import GaussianPrior, fit_with_prior, with_prior
 from identification.qr_factor import QR_CONDITION
 from identification.repetitions import no_narrower
 from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
@@ -101,18 +99,20 @@ class Estimator:
         """
         free, total = summary.fits[self._weighting], summary.total.total
         if self._prior is not None:
-            factor, wide = free.estimate.interval_factor, free.design_effect
-            return self._posterior(total, self._prior, wide, factor), ()
+            weights, effect = self.weights(total), max(1.0, free.design_effect)
+            found = with_prior(self.model, total, self._prior, weights, design_effect=effect)
+            factor = free.estimate.interval_factor
+            return replace(found.estimate, interval_factor=factor), ()
         if centre is None or not self.draws:
             return free.estimate, ()
-        found = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
+        drawn = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
         equations = total.weighted(self.weights(total))
         prior = self._shrinkage.strength * np.diag(np.diag(equations.A))
         solution = solve(equations._replace(A=equations.A + prior))
         covariance = max(1.0, free.design_effect) * solution.inverse
         mark_undetermined(covariance, solution.determined)
         factor = free.estimate.interval_factor
-        return replace(found, covariance=covariance, interval_factor=factor), ()
+        return replace(drawn, covariance=covariance, interval_factor=factor), ()
 
     def of_sum(self, phase: PhaseFactor, centre: Array | None) -> Estimated:
         """The estimate from a sum over archives, drawn towards its centre.
@@ -120,25 +120,15 @@ class Estimator:
         Raises:
             IdentificationError: there is no consistent solution.
         """
-        total = phase.total
         if centre is not None:
             found = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=phase)
-            return _checked(found)
-        if self._prior is not None:
-            weights = self.weights(total)
-            free = estimate(self.model, total, weights)
-            wide = block_covariance(phase, weights, free.values)
-            return _checked(
-                self._posterior(total, self._prior, wide.design_effect, wide.interval_factor)
-            )
-        weighting = self._weighting
-        weights = self.weights(total)
-        free = with_block_covariance(
-            estimate(self.model, total, weights), phase, weights, f"{weighting} least squares"
-        )
-        if self.name != "consistent":
-            return _checked(free)
-        return _checked(consistent_estimate(self.model, total, free).estimate)
+        elif self._prior is not None:
+            found = fit_with_prior(self.model, (), self._prior, phase=phase).estimate
+        else:
+            found = fit_least_squares(self.model, (), self._weighting, phase=phase)
+        if self.name == "consistent":
+            found = consistent_estimate(self.model, phase.total, found).estimate
+        return _checked(found)
 
     def weights(self, total: Factor) -> Array:
         """Weight of each joint's rows (n,)."""
@@ -149,14 +139,6 @@ class Estimator:
     @property
     def _weighting(self) -> Weighting:
         return "ordinary" if self.name == "ols" else "weighted"
-
-    def _posterior(
-        self, total: Factor, prior: GaussianPrior, design_effect: float, interval_factor: float
-    ) -> Estimate:
-        """As :func:`identification.prior.fit_with_prior`, which may read samples."""
-        weights, effect = self.weights(total), max(1.0, design_effect)
-        found = with_prior(self.model, total, prior, weights, design_effect=effect)
-        return replace(found.estimate, interval_factor=interval_factor)
 
 
 def _checked(found: Estimate) -> Estimated:

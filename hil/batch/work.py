@@ -37,7 +37,6 @@ class Campaign:
         arms: settings of its arm; None where it decides on them.
         settings: None until they are settled.
         bundles: archives that are reduced together.
-        reason: why it could not be settled, "" if it could.
     """
 
     key: GroupKey
@@ -45,7 +44,6 @@ class Campaign:
     arms: Settings | None = None
     settings: Settings | None = None
     bundles: list[tuple[ArchiveRef, ...]] = field(default_factory=list)
-    reason: str = ""
 
     @property
     def consulted(self) -> tuple[ArchiveRef, ...]:
@@ -121,20 +119,35 @@ class Work:
         return [one for one in campaigns if one.settings is not None]
 
     def _settle_all(self, campaigns: Sequence[Campaign], arms: Mapping[str, Settings]) -> None:
-        """Settle campaigns, those of decided arms by their settings, without what is broken."""
-        waiting = []
+        """Settle campaigns, those of decided arms by their settings.
+
+        A campaign is asked again as long as archives that it was asked for turn out to be broken.
+        """
         for one in campaigns:
             one.arms = arms.get(one.key.arm)
             one.settings = known_settings(one.consulted, self._options, one.arms, self._where)
-            if one.settings is None:
-                waiting.append(one)
-        self._settle(waiting)
-        failed = [one for one in waiting if one.reason]
-        for one in failed:
-            self._drop(one, self._unreadable(one.consulted))
-        self._settle([one for one in failed if one.refs])
-        self._settle_by_the_next(waiting)
-        self.broken += [Broken(one.key.campaign, one.reason) for one in waiting if one.reason]
+        left = [one for one in campaigns if one.settings is None]
+        while left:
+            tasks = [
+                ArchiveTask(
+                    one.key.campaign,
+                    campaign_settled,
+                    (one.consulted, self._options, one.arms, self._where),
+                )
+                for one in left
+            ]
+            notes = self._ask(tasks, "settling campaigns")
+            again = []
+            for one, note in zip(left, notes, strict=True):
+                settled, count = isinstance(note, Settled), len(one.refs)
+                one.settings = note.settings if settled else None
+                self._drop(one, note.broken if settled else self._unreadable(one.consulted))
+                if one.settings is None and one.refs and len(one.refs) < count:
+                    again.append(one)
+                elif one.settings is None and (one.refs or not settled):
+                    reason = _why_not_settled(one) if settled else note.reason
+                    self.broken.append(Broken(one.key.campaign, reason))
+            left = again
 
     def reduce(self, campaigns: Sequence[Campaign]) -> None:
         """Have all bundles of the campaigns reduced and kept.
@@ -187,43 +200,6 @@ class Work:
             return self._far(one, next(self._far_sums))
         found = (self._bundle(one, refs) for refs in one.bundles)
         return Collected(found, lambda: self._advance(1, one.key.campaign))
-
-    def _settle_by_the_next(self, campaigns: Sequence[Campaign]) -> None:
-        """Where those consulted were broken and nothing is settled, ask the archives left."""
-        while True:
-            left = {
-                id(one): len(one.refs)
-                for one in campaigns
-                if one.settings is None and not one.reason and one.refs
-            }
-            if not left:
-                return
-            asked = [one for one in campaigns if id(one) in left]
-            self._settle(asked)
-            for one in asked:
-                if one.settings is None and len(one.refs) == left[id(one)]:
-                    one.reason = one.reason or (
-                        "none of its archives says how it is to be read"
-                        if one.consulted
-                        else "it holds no excitation"
-                    )
-
-    def _settle(self, campaigns: Sequence[Campaign]) -> None:
-        tasks = [
-            ArchiveTask(
-                one.key.campaign,
-                campaign_settled,
-                (one.consulted, self._options, one.arms, self._where),
-            )
-            for one in campaigns
-        ]
-        for one, note in zip(campaigns, self._ask(tasks, "settling campaigns"), strict=True):
-            one.reason = ""
-            if isinstance(note, Settled):
-                one.settings = note.settings
-                self._drop(one, note.broken)
-            else:
-                one.reason = note.reason
 
     def _one_by_one(self, one: Campaign, refs: Sequence[ArchiveRef]) -> tuple[ArchiveRef, ...]:
         """Reduce a bundle that ended its process archive by archive; returns those that do not."""
@@ -319,6 +295,12 @@ class Work:
     def _advance(self, units: float, note: str = "") -> None:
         if self._task is not None:
             self._task.advance(units, note)
+
+
+def _why_not_settled(one: Campaign) -> str:
+    if one.consulted:
+        return "none of its archives says how it is to be read"
+    return "it holds no excitation"
 
 
 def _archives(campaigns: Sequence[Campaign]) -> int:
