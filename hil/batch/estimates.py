@@ -94,8 +94,9 @@ class Estimator:
         """The estimate from one archive alone, drawn towards the centre of all.
 
         Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
-        repetitions is about noise. A prior's covariance is that of white residuals times the design
-        effect.
+        repetitions is about noise. Blocks of time are not kept of an archive: with a prior the
+        covariance is that of white residuals times the design effect, and of what is drawn towards
+        the centre it is that of the free estimate, drawn alike.
         """
         free, total = summary.fits[self._weighting], summary.total.total
         if self._prior is not None:
@@ -106,13 +107,21 @@ class Estimator:
         if centre is None or not self.draws:
             return free.estimate, ()
         drawn = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
-        equations = total.weighted(self.weights(total))
-        prior = self._shrinkage.strength * np.diag(np.diag(equations.A))
-        solution = solve(equations._replace(A=equations.A + prior))
-        covariance = max(1.0, free.design_effect) * solution.inverse
+        own, equations = free.estimate, total.weighted(self.weights(total))
+        prior = self._shrinkage.strength * np.diag(equations.A)
+        solution = solve(equations._replace(A=equations.A + np.diag(prior)))
+        share = solution.inverse @ equations.A
+        known = np.where(np.isfinite(own.covariance), own.covariance, 0.0)
+        covariance = share @ known @ share.T
+        covariance += max(1.0, free.design_effect) * (solution.inverse * prior) @ solution.inverse
         mark_undetermined(covariance, solution.determined)
-        factor = free.estimate.interval_factor
-        return replace(drawn, covariance=covariance, interval_factor=factor), ()
+        words = own.method.partition(", ")[2]
+        return replace(
+            drawn,
+            covariance=covariance,
+            interval_factor=own.interval_factor,
+            method=f"weighted least squares, {self._shrinkage.describe()}; {words}",
+        ), ()
 
     def of_sum(self, phase: PhaseFactor, centre: Array | None) -> Estimated:
         """The estimate from a sum over archives, drawn towards its centre.

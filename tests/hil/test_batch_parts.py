@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from hil.batch.cache import Store, Where, decoded, encoded
 from hil.batch.errors import CacheError
 from hil.batch.keeping import BUNDLE, bundles
+from hil.batch.kept_forms import settings_from, settings_header
 from hil.batch.keys import arm_digest, settings_digest, sum_key
 from hil.batch.local import LocalWorkers
 from hil.batch.on_workers import ArchiveTask, Part
@@ -26,6 +27,7 @@ from hil.cell import Cell
 from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
 from hil.identify.settings import Settings
 from identification.inner_prediction import Choice
+from identification.low_passes import LowPassShape
 from identification.preprocessing import Preprocessing
 from identification.shrinkage import Shrinkage
 from sim_fixtures.ns16 import CELL_PATH
@@ -143,6 +145,21 @@ def test_factors_are_known_by_everything_they_depend_on() -> None:
     assert len({settings_digest(one) for one in (plain, *others)}) == 1 + len(others)
     digest = settings_digest(plain)
     assert sum_key([a_ref(0), a_ref(1)], digest) != sum_key([a_ref(1), a_ref(0)], digest)
+
+
+def test_settings_are_kept_to_the_last_bit() -> None:
+    settings = Settings(
+        Preprocessing(torque_bandwidth=1.0 / 3.0, torque_shape=LowPassShape(2, causal=True)),
+        friction={"presliding": 1e-4, "third": "none"},
+        noise_variance=(1e-9 / 3.0,) * 6,
+        shrinkage=Shrinkage(np.inf),
+        choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
+    )
+    entry = decoded(encoded(KEY, settings_header(settings), {}), KEY)
+    assert entry is not None
+    assert settings_from(entry.header) == settings
+    assert settings_from(entry.header | {"preprocessing": {"smoother": "none"}}) is None
+    assert settings_from({"smoother": "spline", "torque_delay": 0.0}) is None
 
 
 # Who does the work

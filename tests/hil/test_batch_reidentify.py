@@ -25,12 +25,14 @@ from hil.batch.types import ESTIMATORS, BatchEstimator, BatchResult
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import InputError
-from hil.identify import identify_campaign
+from hil.identify import Options, identify_campaign
+from hil.identify.deciding import Decided, decide
 from hil.identify.estimating import estimate_with
 from hil.identify.options import FIXED
 from hil.identify.prepared import prepare_sources
-from hil.identify.sources import gather_sources
-from hil.progress import Silent
+from hil.identify.sources import Sources, gather_sources
+from hil.progress import Reporter, Silent
+from identification.shrinkage import Shrinkage
 
 from .batch_workers import Here
 
@@ -92,6 +94,28 @@ def test_campaign_and_repetitions_are_those_of_hil_identify(campaign: Campaign) 
         np.testing.assert_allclose(mine.std, own.std, **EXACT)
 
 
+def test_what_is_drawn_towards_a_machine_is_that_of_hil_identify(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Repetitions too, towards the machine of all; of their intervals only the words."""
+
+    def drawn(sources: Sources, options: Options, reporter: Reporter) -> Decided:
+        found = decide(sources, FIXED, reporter)
+        return found._replace(settings=replace(found.settings, shrinkage=Shrinkage(0.1)))
+
+    monkeypatch.setattr("hil.identify.prepared.decide", drawn)
+    monkeypatch.setattr("hil.batch.settling.decide", drawn)
+    options = replace(FIXED, estimator="auto")
+    prepared = prepare_sources(gather_sources(archives(campaign), 0.7), options, Silent())
+    one = estimate_with(prepared, options, Silent()).result
+    found = batch(campaign.folder.root, plan=Plan(options, keep=False))
+    np.testing.assert_allclose(found.campaigns[0].values, one.pooled.values, **EXACT)
+    np.testing.assert_allclose(found.campaigns[0].std, one.pooled.std, **EXACT)
+    for mine, own in zip(found.repetitions, one.repetitions, strict=True):
+        np.testing.assert_allclose(mine.values, own.values, **EXACT)
+        assert mine.method == own.method
+
+
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_gives_what_it_gives_with_samples(
     name: BatchEstimator, campaign: Campaign, tmp_path: Path
@@ -142,6 +166,34 @@ def test_campaigns_of_an_arm_are_pooled(
     apart = result.pooled[0].values - found.pooled[0].values
     assert np.abs(apart / found.pooled[0].std).max() < 1e-6
     np.testing.assert_allclose(result.pooled[0].std, found.pooled[0].std, rtol=1e-6)
+
+
+def test_settings_are_decided_once_for_each_arm(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the first campaign that can be read; the noise of the positions is each one's own."""
+    names = ("excitation_000", "excitation_001", "excitation_002", "standstill")
+    for folder, wanted in (("a", names[:1]), ("b", names[1:2]), ("c", names[2:])):
+        (tmp_path / folder).mkdir()
+        for name in wanted:
+            (path,) = campaign.folder.archives.glob(f"{name}*.mcap")
+            shutil.copy(path, tmp_path / folder / path.name)
+    damaged = bytearray((tmp_path / "a" / "excitation_000_a1.mcap").read_bytes())
+    middle = len(damaged) // 2
+    damaged[middle : middle + 2000] = bytes(2000)
+    (tmp_path / "a" / "excitation_000_a1.mcap").write_bytes(damaged)
+    read: list[list[str]] = []
+
+    def spied(sources: Sources, options: Options, reporter: Reporter) -> Decided:
+        read.append([source.name for source in sources.training])
+        return decide(sources, options, reporter)
+
+    monkeypatch.setattr("hil.batch.settling.decide", spied)
+    found = batch(tmp_path, plan=Plan(replace(FIXED, friction="auto"), keep=False))
+    assert read == [["excitation_001_a1.mcap"]]
+    assert [Path(one.campaign).name for one in found.campaigns] == ["b", "c"]
+    assert found.campaigns[0].settings != found.campaigns[1].settings
+    assert found.pooled[0].repetitions == 2
 
 
 def test_a_copy_counts_once(campaign: Campaign, tmp_path: Path) -> None:
