@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.errors import InputError
-from hil.identify.cad_prior import cad_prior
+from hil.identify.cad_prior import cad_prior, required
 from hil.identify.settings import Settings
 from identification import IdentificationError
 from identification.consistent import consistent_estimate
@@ -28,7 +27,7 @@ from identification.least_squares import Weighting, fit_least_squares, weights_o
 from identification.model import RobotModel
 from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
-from identification.prior import GaussianPrior, fit_with_prior, with_prior
+from identification.prior import fit_with_prior, with_prior
 from identification.qr_factor import QR_CONDITION
 from identification.repetitions import no_narrower
 from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
@@ -59,17 +58,7 @@ class Estimator:
         self.name, self.delay_variance = name, settings.delay_variance
         self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
         self.model: RobotModel = cell.model
-        self._prior: GaussianPrior | None = None
-        if name == "prior":
-            prior = cad_prior(cell)
-            if isinstance(prior, str):
-                raise InputError(
-                    cell.path,
-                    f"there is no prior to be had: {prior}",
-                    field="--estimator prior",
-                    remedy="give inertias in the URDF, or use --estimator wls",
-                )
-            self._prior = prior
+        self._prior = required(cad_prior(cell)) if name == "prior" else None
 
     @property
     def draws(self) -> bool:

@@ -112,7 +112,7 @@ def summary_from(entry: Entry, ref: ArchiveRef) -> Summary:
     return Summary(ref, total, fits, duration, _interned(entry.header["doubts"]), products)
 
 
-def _fit(entry: Entry, name: str, told: Mapping[str, Any], total: PhaseFactor) -> Fit:
+def _fit(entry: Entry, name: str, header: Mapping[str, Any], total: PhaseFactor) -> Fit:
     """Words that most archives share are held once."""
     count = total.n_parameters
     row, column = _triangle(count)
@@ -120,20 +120,20 @@ def _fit(entry: Entry, name: str, told: Mapping[str, Any], total: PhaseFactor) -
     triangle = _array(entry, f"{name}.covariance", np.float64, (len(row),))
     covariance[row, column] = covariance[column, row] = triangle
     estimate = Estimate(
-        names=texts(told["names"]),
-        units=texts(told["units"]),
+        names=texts(header["names"]),
+        units=texts(header["units"]),
         values=_array(entry, f"{name}.values", np.float64, (count,)),
         covariance=covariance,
         noise_std=_array(entry, f"{name}.noise_std", np.float64, (total.n_joints,)),
         samples=_array(entry, f"{name}.samples", np.intp, (total.n_joints,)),
-        method=intern(text(told["method"])),
-        condition=number(told["condition"]),
-        undetermined=_interned(told["undetermined"]),
-        interval_factor=number(told["interval_factor"]),
+        method=intern(text(header["method"])),
+        condition=number(header["condition"]),
+        undetermined=_interned(header["undetermined"]),
+        interval_factor=number(header["interval_factor"]),
     )
     if estimate.names != total.parameter_names or len(estimate.units) != count:
         raise ValueError("an estimate of another model than its sum")
-    return Fit(estimate, number(told["design_effect"]))
+    return Fit(estimate, number(header["design_effect"]))
 
 
 def _array(
@@ -149,8 +149,8 @@ def _array(
     return array
 
 
-def _interned(told: Any) -> tuple[str, ...]:
-    return tuple(map(intern, texts(told)))
+def _interned(words: Any) -> tuple[str, ...]:
+    return tuple(map(intern, texts(words)))
 
 
 def require_one_model(factors: Sequence[PhaseFactor]) -> None:

@@ -27,7 +27,7 @@ from identification.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.robust import RobustEstimate, robust_estimate
 from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 
-from .cad_prior import cad_prior
+from .cad_prior import cad_prior, required
 from .instruments import InstrumentalFit, fit_instrumental, widely_smoothed
 from .options import Estimator, Options
 from .prepared import Prepared
@@ -194,14 +194,7 @@ def _robust_doubts(model: RobotModel, found: RobustEstimate) -> list[str]:
 
 
 def _with_prior(case: _Case) -> _Found:
-    prior = case.prior
-    if isinstance(prior, str):
-        raise InputError(
-            None,
-            f"there is no prior to be had: {prior}",
-            field="--estimator prior",
-            remedy="give inertias in the URDF, or use --estimator wls",
-        )
+    prior = required(case.prior)
     fits: list[PosteriorEstimate] = []
 
     def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:

@@ -119,8 +119,8 @@ def samples_of(
     whole = prepare(
         recording,
         model or cell.model,
-        noise_variance=as_array(settings.noise_variance),
-        torque_variance=as_array(settings.torque_variance),
+        noise_variance=_array(settings.noise_variance),
+        torque_variance=_array(settings.torque_variance),
         options=settings.preprocessing,
         origin=source.origin,
         current_limit=_current_limit(cell),
@@ -141,8 +141,7 @@ def judged_samples(source: Source, cell: Cell, settings: Settings) -> Samples:
     return samples_of(source, cell, settings.preprocessed(smooth_torque=False)).moving()
 
 
-def as_array(figures: tuple[float, ...] | None) -> Array | None:
-    """Figures (n,) for computing; None for none."""
+def _array(figures: tuple[float, ...] | None) -> Array | None:
     return None if figures is None else np.array(figures)
 
 

@@ -59,21 +59,21 @@ def unfiltered(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
 
 class TestFilteredTorque:
     def test_none_is_claimed_without_one(self, unfiltered: Prepared) -> None:
-        assert unfiltered.preprocessing.torque_bandwidth is None
+        assert unfiltered.settings.preprocessing.torque_bandwidth is None
 
     @pytest.mark.parametrize("order", [1, 4])
     def test_without_phase(self, tmp_path: Path, order: int, unfiltered: Prepared) -> None:
         found = prepared(tmp_path, order)
-        assert found.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert found.settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
         assert held_out_error(found) < 1.3 * held_out_error(unfiltered)
 
     @pytest.mark.parametrize("order", [1, 2])
     def test_a_lag_is_no_delay(self, tmp_path: Path, order: int, unfiltered: Prepared) -> None:
         """A low-pass that runs forwards lags by some ten ms, which are not taken for a delay."""
         found = prepared(tmp_path, order, causal=True)
-        assert found.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
-        assert found.preprocessing.torque_shape.causal
-        assert found.preprocessing.torque_delay == 0.0
+        assert found.settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert found.settings.preprocessing.torque_shape.causal
+        assert found.settings.preprocessing.torque_delay == 0.0
         assert found.delays is None
         assert held_out_error(found) < 1.3 * held_out_error(unfiltered)
 
