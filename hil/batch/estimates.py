@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -149,24 +149,6 @@ def _checked(found: Estimate) -> Estimated:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Unseen:
-    """What was recorded of motions that are not fitted: the sum of the totals; None if nothing."""
-
-    total: PhaseFactor | None = None
-
-    def __add__(self, other: Unseen) -> Unseen:
-        if self.total is None or other.total is None:
-            return self if other.total is None else other
-        return Unseen(self.total + other.total)
-
-    def errors(self, values: Array, n_joints: int) -> tuple[Array, Array]:
-        """RMS per joint (n,) of the torque that is left, and of the torque; NaN if nothing."""
-        if self.total is None:
-            return np.full(n_joints, np.nan), np.full(n_joints, np.nan)
-        return errors(self.total.total, values)
-
-
 def errors(factor: Factor, values: Array) -> tuple[Array, Array]:
     """RMS per joint (n,) of the torque that is left by parameters (p,), and of the torque."""
     augmented = np.append(-values, 1.0)
@@ -221,7 +203,7 @@ class Together:
     Attributes:
         refs: archives that were fitted.
         repetitions: the estimate of each.
-        unseen: what is predicted.
+        unseen: sum of the totals of what is predicted; None if nothing is.
         products: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`.
         doubts: about all archives.
         settings: digests.
@@ -230,23 +212,24 @@ class Together:
     def __init__(self) -> None:
         self.refs: list[ArchiveRef] = []
         self.repetitions: list[LevelEstimate] = []
-        self.unseen, self.doubts = Unseen(), Doubts()
+        self.unseen: PhaseFactor | None = None
         self.products: Array | None = None
+        self.doubts = Doubts()
         self.settings: set[str] = set()
 
     def add(self, other: Together) -> None:
         """Take in what is fitted elsewhere."""
         self.refs += other.refs
         self.repetitions += other.repetitions
-        self.unseen += other.unseen
+        self.unseen = plus(self.unseen, other.unseen)
+        self.products = plus(self.products, other.products)
         self.doubts.add(other.doubts)
         self.settings |= other.settings
-        self.add_products(other.products)
 
-    def add_products(self, products: Array | None) -> None:
-        """Take in those of an archive, or of several."""
-        if products is not None:
-            self.products = products if self.products is None else self.products + products
+
+def plus(one: Any, other: Any) -> Any:
+    """The sum of two terms that may be nothing."""
+    return one if other is None else other if one is None else one + other
 
 
 def repetition_level(
@@ -301,14 +284,16 @@ def sum_level(
         IdentificationError: there is no estimate.
     """
     found, own = estimator.of_sum(phase, centre)
-    refs, unseen, total = together.refs, together.unseen, phase.total
+    refs, total = together.refs, phase.total
+    unseen = None if together.unseen is None else together.unseen.total
     if of_one_motion(refs):
         values = np.array([one.values for one in together.repetitions])
         found = replace(found, covariance=no_narrower(found.covariance, values))
     if together.products is not None:
         found = with_uncertain_delay(found, total, together.products, estimator.delay_variance)
     setups, settings = {ref.setup for ref in refs}, together.settings
-    left, torque = unseen.errors(found.values, phase.n_joints)
+    nothing = np.full(phase.n_joints, np.nan)
+    left, torque = (nothing, nothing) if unseen is None else errors(unseen, found.values)
     return LevelEstimate(
         level=level,
         arm=refs[0].arm,
@@ -328,5 +313,5 @@ def sum_level(
         information=total.weighted(estimator.weights(total)).A,
         setup=setups.pop() if len(setups) == 1 else "",
         payload=payload,
-        unseen=None if unseen.total is None else unseen.total.total,
+        unseen=unseen,
     )

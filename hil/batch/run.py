@@ -22,7 +22,7 @@ from identification.phase_factor import PhaseFactor
 from .cache import Where
 from .discovery import discover
 from .errors import NothingToFitError
-from .estimates import Estimator, Together, Unseen, repetition_level, sum_level
+from .estimates import Estimator, Together, plus, repetition_level, sum_level
 from .factors import cell_from, cell_in, opened
 from .keys import code_digest, settings_digest
 from .tree_sum import TreeSum
@@ -195,9 +195,9 @@ class _Estimates:
                     else:
                         together.repetitions.append(repetition_level(estimator, summary, used))
                     together.refs.append(summary.ref)
-                    together.add_products(summary.products)
+                    together.products = plus(together.products, summary.products)
                 else:
-                    together.unseen += Unseen(summary.total)
+                    together.unseen = plus(together.unseen, summary.total)
         phase = collected.total
         levels: list[LevelEstimate] = []
         if phase is None:
