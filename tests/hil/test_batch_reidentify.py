@@ -34,7 +34,7 @@ from hil.identify.sources import Sources, gather_sources
 from hil.progress import Reporter, Silent
 from identification.shrinkage import Shrinkage
 
-from .batch_workers import Here
+from .batch_workers import NOTHING_OPEN, Here
 
 EXACT = {"rtol": 1e-9, "atol": 0.0}
 
@@ -492,8 +492,7 @@ def test_the_command_lists_what_is_broken_and_says_so_in_its_status(
     folder: Path, tmp_path: Path
 ) -> None:
     command = ["reidentify", str(folder), "--workers", "1", "-o", str(tmp_path / "out")]
-    command += ["--bandwidth", "40", "--friction", "coulomb,viscous", "--standstill", "slow"]
-    command += ["--estimator", "wls"]
+    command += NOTHING_OPEN
     ran = CliRunner().invoke(app, command)
     assert ran.exit_code == 0, ran.output
     assert "3 repetitions in 1 campaign of 1 arm; 5 archives read" in ran.output
