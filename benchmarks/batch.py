@@ -29,6 +29,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
@@ -39,6 +40,7 @@ from hil.batch.on_workers import ArchiveTask, Summed, run_task
 from hil.batch.run import Plan, reidentify
 from hil.batch.types import BatchResult
 from hil.batch.workers import Workers, summed
+from hil.identify.options import FIXED
 from hil.progress import Silent
 
 T = TypeVar("T")
@@ -182,7 +184,9 @@ def _measured(campaigns: Sequence[Path], workers: int | None) -> dict[str, Any]:
 
 
 def _run(places: Sequence[str], cache: Path, estimator: Any, workers: Workers) -> BatchResult:
-    return reidentify(places, Plan(estimator, cache=cache), workers, Silent())
+    return reidentify(
+        places, Plan(replace(FIXED, estimator=estimator), cache=cache), workers, Silent()
+    )
 
 
 def _timed(

@@ -34,7 +34,7 @@ import argparse
 import json
 import tempfile
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -43,7 +43,8 @@ import numpy as np
 from benchmarks.published import FITTED_SHARE, Published
 from hil.identify import Options
 from hil.identify.estimating import estimate_with
-from hil.identify.prepared import prepare_sources, samples_of
+from hil.identify.prepared import prepare_sources
+from hil.identify.settings import samples_of
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from hil.recordings import open_recording
@@ -53,6 +54,7 @@ from identification.essential import eliminate
 from identification.estimation import Estimate, joint_weights, solve
 from identification.factor import NormalEquations
 from identification.friction import FrictionLaw
+from identification.inner_prediction import Settings, choose_settings
 from identification.least_squares import fit_least_squares
 from identification.losses import Huber, Tukey
 from identification.model import RobotModel
@@ -62,7 +64,7 @@ from identification.preprocessing import Preprocessing, Samples, prepare
 from identification.prior import fit_with_prior
 from identification.recording import Recording
 from identification.robust import robust_estimate
-from identification.torque_channel import find_torque_bandwidth
+from identification.torque_channel import possible_low_passes
 from identification.validation import prediction_error
 from planner.arrays import Array
 
@@ -126,10 +128,24 @@ class Case:
         """Fitted and predicted samples, and how they were treated."""
         options = self.options
         if not options.smooth_torque:
-            found = find_torque_bandwidth(split.fitted, model)
-            options = replace(options, torque_bandwidth=found)
+            options = _with_low_pass(split.fitted, model, options)
         fitted, predicted = (prepare(part, model, options=options) for part in split)
         return fitted, predicted, options
+
+
+def _with_low_pass(
+    recording: Recording, model: RobotModel, options: Preprocessing
+) -> Preprocessing:
+    """With the low-pass of the torque, if predicting stretches from the others asks for one."""
+
+    def ready(of: RobotModel, how: Preprocessing) -> list[Samples]:
+        return [prepare(recording, of, options=how)]
+
+    def low_passes(of: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
+        return possible_low_passes(recording, of, options=how)
+
+    start = Settings(model, options)
+    return choose_settings(ready, start, {"low-pass"}, low_passes)[0].preprocessing
 
 
 Estimator = Callable[[RobotModel, Samples], Array]
@@ -242,7 +258,7 @@ def default_errors(folder: Path) -> dict[str, float]:
         prepared = prepare_sources(sources, options, Silent())
         values = estimate_with(prepared, options, Silent()).result.pooled.values
         sources, model = prepared.sources, prepared.sources.cell.model
-        predicted = samples_of(sources.held_out[0], sources, prepared.preprocessing, model)
+        predicted = samples_of(sources.held_out[0], sources.cell, prepared.settings, model)
         found[kind] = error(model, values, predicted)
     return found
 

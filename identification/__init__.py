@@ -8,7 +8,8 @@ from identification.delay import DelayEstimate, estimate_delays
 from identification.delay_compensation import (
     compensate,
     delay_sensitivity,
-    with_delay_uncertainty,
+    rate_products,
+    with_uncertain_delay,
 )
 from identification.elements import (
     Anchors,
@@ -51,7 +52,6 @@ from identification.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.resampling import resample
 from identification.robust import RobustEstimate, robust_estimate
 from identification.signals.clock import Clock, TimeBase, time_base, true_times
-from identification.torque_channel import find_torque_bandwidth
 from identification.urdf_write import write_urdf
 from identification.validation import PredictionError, prediction_error
 from identification.verdict import Thresholds, Verdict, judge
@@ -83,11 +83,11 @@ __all__ = [
     "prepare",
     "smooth",
     "standstill_variance",
-    "find_torque_bandwidth",
     "DelayEstimate",
     "estimate_delays",
     "delay_sensitivity",
-    "with_delay_uncertainty",
+    "rate_products",
+    "with_uncertain_delay",
     "compensate",
     "Gains",
     "identify_gains",

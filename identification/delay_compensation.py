@@ -10,7 +10,8 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.estimation import Estimate, solve, total
+from identification.estimation import Estimate, solve
+from identification.factor import Factor
 from identification.model import RobotModel
 from identification.preprocessing import Samples
 from identification.recording import Recording
@@ -94,42 +95,50 @@ def predicted_rate(samples: Samples, torque: Array) -> Array:
     return rate
 
 
-def delay_sensitivity(
-    model: RobotModel, recordings: Sequence[Samples], weights: Array, values: Array
-) -> Array:
+def rate_products(model: RobotModel, samples: Samples) -> Array:
+    """Sums ``W' d[W | t]/dt`` over the usable rows per joint (n, p, p + 1); recordings add up.
+
+    The torque t is that of the known payload.
+    """
+    products = np.zeros((model.n_joints, model.n_parameters, model.n_parameters + 1))
+    load = payload_torque(model, samples)
+    for joint, (block, columns) in enumerate(zip(*samples.regressor(model), strict=True)):
+        rows = samples.usable[:, joint]
+        rate = predicted_rate(samples, np.column_stack([block, load[:, joint]]))
+        places = np.ix_(columns, np.append(columns, model.n_parameters))
+        products[joint][places] = block[rows].T @ rate[rows]
+    return products
+
+
+def delay_sensitivity(factor: Factor, products: Array, weights: Array, values: Array) -> Array:
     """Change of the estimated parameters per second of delay taken for the torque (p,).
 
     A later delay compares the torque with earlier motion, which is another torque by its rate of
     change; the parameters move by the fit of that rate.
 
     Args:
-        model: the robot.
-        recordings: what was fitted.
+        factor: of what was fitted.
+        products: its `rate_products` (n, p, p + 1).
         weights: per joint (n,).
         values: the estimate (p,).
-
-    Raises:
-        ShapeError: `values` are not (p,).
     """
-    rates = []
-    for one in recordings:
-        torque = one.predicted_torque(model, values) + payload_torque(model, one)
-        rates.append(replace(one, torque=predicted_rate(one, torque)))
-    return solve(total([one.factor(model) for one in rates]).weighted(weights)).values
+    rate = np.tensordot(weights, products, axes=1) @ np.append(values, 1.0)
+    return solve(factor.weighted(weights)._replace(b=rate)).values
 
 
-def with_delay_uncertainty(estimate: Estimate, sensitivity: Array, variance: float) -> Estimate:
+def with_uncertain_delay(
+    estimate: Estimate, factor: Factor, products: Array, variance: float
+) -> Estimate:
     """Return the estimate with the uncertainty of the delay in its covariance.
 
     Args:
         estimate: made with one delay taken for certain.
-        sensitivity: of the parameters to that delay (p,), see :func:`delay_sensitivity`.
+        factor: of what was fitted.
+        products: its `rate_products` (n, p, p + 1).
         variance: of the delay [s²].
-
-    Raises:
-        ShapeError: not one sensitivity per parameter.
     """
-    if sensitivity.shape != estimate.values.shape:
-        raise ShapeError("sensitivity", sensitivity.shape, str(estimate.values.shape))
-    known = np.where(np.isfinite(np.diag(estimate.covariance)), sensitivity, 0.0)
+    noise = estimate.noise_std
+    weights = np.where(np.isfinite(noise), noise, np.inf) ** -2.0
+    moved = delay_sensitivity(factor, products, weights, estimate.values)
+    known = np.where(np.isfinite(np.diag(estimate.covariance)), moved, 0.0)
     return replace(estimate, covariance=estimate.covariance + variance * np.outer(known, known))

@@ -10,7 +10,7 @@ factors stacked (Golub and Van Loan 2013, section 6.5; "TSQR").
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -236,10 +236,10 @@ def reduced(
     Args:
         model: the robot.
         recordings: can be gone through twice: a sequence, not a generator.
-        gram: their factor, if it is known.
+        gram: their factor, if it is known; without recordings all there is.
 
     Raises:
-        IdentificationError: no recordings, or they can be gone through only once.
+        IdentificationError: neither recordings nor factor, or they can be gone through only once.
     """
     if iter(recordings) is recordings:
         raise IdentificationError("recordings may have to be read twice: a sequence is needed")
@@ -248,7 +248,8 @@ def reduced(
         if not factors:
             raise IdentificationError("there are no recordings to estimate from")
         gram = total(factors)
-    if solve(gram.weighted(np.ones(model.n_joints))).condition <= QR_CONDITION:
+    alone = isinstance(recordings, Sequence) and not recordings
+    if alone or solve(gram.weighted(np.ones(model.n_joints))).condition <= QR_CONDITION:
         return gram
     triangles = (QRFactor.from_samples(model, samples) for samples in recordings)
     return sum(triangles, QRFactor.zero(model))

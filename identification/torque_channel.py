@@ -23,16 +23,12 @@ from identification.low_passes import (
 )
 from identification.masks import LONGEST_END, torn_rows
 from identification.model import RobotModel
-from identification.noise import difference_variance
 from identification.preprocessing import RIGID_BANDWIDTH, Preprocessing, prepare
 from identification.recording import Recording
 
 Array = NDArray[np.float64]
 
 LOWEST_BANDWIDTH: Final = 0.5  # Hz; below it nothing of a robot's motion would be left
-# A channel whose white noise is less than this share of what the model leaves over has been
-# filtered: unfiltered torque always has noise of the size of the residual's fast part.
-_NOISELESS: Final = 0.02
 # The low-pass has to earn its place: residuals smaller by this share, on average over joints.
 _WORTHWHILE: Final = 0.05
 # Candidates per factor of ten in bandwidth, before the best one is refined.
@@ -55,38 +51,6 @@ class LowPassFit(NamedTuple):
     shape: LowPassShape
 
 
-def find_torque_bandwidth(
-    recording: Recording,
-    model: RobotModel,
-    *,
-    noise_variance: Array | None = None,
-    options: Preprocessing = Preprocessing(),  # noqa: B008 - frozen
-) -> float | None:
-    """Bandwidth [Hz] of the low-pass the torque has come through, None if it seems to be none.
-
-    Many controllers log a smoothed effort: Coulomb friction, a step in the regressor, is then a
-    slope in the torque, and a fit of one to the other is wrong at every reversal. Sought is the
-    bandwidth with which the regressor fits the recording best (least mean log residual over the
-    joints), without phase. Use only recordings that the fit may use.
-
-    Args:
-        recording: checked, with torque.
-        model: the robot.
-        noise_variance: of the positions (n,), see :func:`identification.preprocessing.smooth`.
-        options: the other settings.
-    """
-    assert recording.torque is not None
-    channel = _Channel.of(recording, model, noise_variance, options)
-    unfiltered = channel.log_residuals()
-    white = difference_variance(recording.time, recording.torque)
-    if np.any(np.sqrt(white) > _NOISELESS * np.exp(unfiltered)):
-        return None
-    found = channel.best(SMOOTHER)
-    if found.misfit > float(np.nanmean(unfiltered)) + np.log(1.0 - _WORTHWHILE):
-        return None
-    return found.bandwidth
-
-
 def possible_low_passes(
     recording: Recording,
     model: RobotModel,
@@ -96,6 +60,9 @@ def possible_low_passes(
     undelayed: float | None = None,
 ) -> tuple[Preprocessing, ...]:
     """Settings with the low-passes that fit a recording best, one of each kind.
+
+    Many controllers log a smoothed effort: Coulomb friction, a step in the regressor, is then a
+    slope in the torque, and a fit of one to the other is wrong at every reversal.
 
     The kinds are causal ones, whose lag is what a delay without a low-pass would have to stand in
     for, and ones without phase, beside that delay or without it, as fits better. A kind whose

@@ -2,29 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.errors import InputError
-from hil.identify.cad_prior import cad_prior
+from hil.identify.cad_prior import cad_prior, required
+from hil.identify.settings import Settings
 from identification import IdentificationError
 from identification.consistent import consistent_estimate
-from identification.covariance import block_covariance, with_block_covariance
-from identification.estimation import Estimate, estimate, nothing_usable
+from identification.delay_compensation import with_uncertain_delay
+from identification.estimation import (
+    Estimate,
+    mark_undetermined,
+    nothing_usable,
+    solve,
+)
 from identification.factor import Factor
-from identification.least_squares import Weighting, weights_of
+from identification.least_squares import Weighting, fit_least_squares, weights_of
 from identification.model import RobotModel
 from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
-from identification.prior import GaussianPrior, with_prior
+from identification.prior import fit_with_prior, with_prior
 from identification.qr_factor import QR_CONDITION
+from identification.repetitions import no_narrower
+from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 
 from .axis_figures import speed_rms
+from .doubts import Doubts
 from .types import ArchiveRef, BatchEstimator, Level, LevelEstimate, Summary
 
 Array = NDArray[np.float64]
@@ -38,41 +47,26 @@ class Estimator:
 
     Args:
         name: of the estimator.
-        cell: says what the arm is, and what is believed of it.
+        cell: says what the arm is, and what is believed of it; with the law of the settings.
+        settings: of the arm.
 
     Raises:
         InputError: the estimator needs a prior, and the cell has none.
     """
 
-    def __init__(self, name: BatchEstimator, cell: Cell) -> None:
-        self.name = name
+    def __init__(self, name: BatchEstimator, cell: Cell, settings: Settings) -> None:
+        self.name, self.delay_variance = name, settings.delay_variance
+        self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
         self.model: RobotModel = cell.model
-        self._prior: GaussianPrior | None = None
-        if name == "prior":
-            prior = cad_prior(cell)
-            if isinstance(prior, str):
-                raise InputError(
-                    cell.path,
-                    f"there is no prior to be had: {prior}",
-                    field="--estimator prior",
-                    remedy="give inertias in the URDF, or use --estimator wls",
-                )
-            self._prior = prior
+        self._prior = required(cad_prior(cell)) if name == "prior" else None
 
-    def of_archive(self, summary: Summary) -> Estimated:
-        """The estimate from one archive alone.
+    @property
+    def draws(self) -> bool:
+        """Whether the estimate of an archive depends on the centre of all."""
+        return 0.0 < self._shrinkage.strength < math.inf
 
-        Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
-        repetitions is about noise.
-        """
-        if self._prior is None:
-            return summary.fits[self._weighting].estimate, ()
-        free = summary.fits["weighted"]
-        factor, wide = free.estimate.interval_factor, free.design_effect
-        return self._posterior(summary.total.total, self._prior, wide, factor), ()
-
-    def of_sum(self, phase: PhaseFactor) -> Estimated:
-        """The estimate from a sum over archives.
+    def centre(self, phase: PhaseFactor) -> Array | None:
+        """What estimates from a sum and its archives are drawn towards (p,); None for nothing.
 
         Raises:
             IdentificationError: there is not one usable row, or no consistent solution.
@@ -80,21 +74,59 @@ class Estimator:
         total = phase.total
         if not total.samples.any():
             raise IdentificationError(nothing_usable(self.model))
+        if self._shrinkage.strength == 0.0:
+            return None
+        weight = self._shrinkage.prior_weight
+        return consistent_centre(self.model, total, self.weights(total), weight).estimate.values
+
+    def of_archive(self, summary: Summary, centre: Array | None) -> Estimated:
+        """The estimate from one archive alone, drawn towards the centre of all.
+
+        Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
+        repetitions is about noise. Blocks of time are not kept of an archive: with a prior the
+        covariance is that of white residuals times the design effect, and of what is drawn towards
+        the centre it is that of the free estimate, drawn alike.
+        """
+        free, total = summary.fits[self._weighting], summary.total.total
         if self._prior is not None:
-            weights = self.weights(total)
-            free = estimate(self.model, total, weights)
-            wide = block_covariance(phase, weights, free.values)
-            return _checked(
-                self._posterior(total, self._prior, wide.design_effect, wide.interval_factor)
-            )
-        weighting = self._weighting
-        weights = self.weights(total)
-        free = with_block_covariance(
-            estimate(self.model, total, weights), phase, weights, f"{weighting} least squares"
-        )
-        if self.name != "consistent":
-            return _checked(free)
-        return _checked(consistent_estimate(self.model, total, free).estimate)
+            weights, effect = self.weights(total), max(1.0, free.design_effect)
+            found = with_prior(self.model, total, self._prior, weights, design_effect=effect)
+            factor = free.estimate.interval_factor
+            return replace(found.estimate, interval_factor=factor), ()
+        if centre is None or not self.draws:
+            return free.estimate, ()
+        drawn = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
+        own, equations = free.estimate, total.weighted(self.weights(total))
+        prior = self._shrinkage.strength * np.diag(equations.A)
+        solution = solve(equations._replace(A=equations.A + np.diag(prior)))
+        share = solution.inverse @ equations.A
+        known = np.where(np.isfinite(own.covariance), own.covariance, 0.0)
+        covariance = share @ known @ share.T
+        covariance += max(1.0, free.design_effect) * (solution.inverse * prior) @ solution.inverse
+        mark_undetermined(covariance, solution.determined)
+        words = own.method.partition(", ")[2]
+        return replace(
+            drawn,
+            covariance=covariance,
+            interval_factor=own.interval_factor,
+            method=f"weighted least squares, {self._shrinkage.describe()}; {words}",
+        ), ()
+
+    def of_sum(self, phase: PhaseFactor, centre: Array | None) -> Estimated:
+        """The estimate from a sum over archives, drawn towards its centre.
+
+        Raises:
+            IdentificationError: there is no consistent solution.
+        """
+        if centre is not None:
+            found = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=phase)
+        elif self._prior is not None:
+            found = fit_with_prior(self.model, (), self._prior, phase=phase).estimate
+        else:
+            found = fit_least_squares(self.model, (), self._weighting, phase=phase)
+        if self.name == "consistent":
+            found = consistent_estimate(self.model, phase.total, found).estimate
+        return _checked(found)
 
     def weights(self, total: Factor) -> Array:
         """Weight of each joint's rows (n,)."""
@@ -106,14 +138,6 @@ class Estimator:
     def _weighting(self) -> Weighting:
         return "ordinary" if self.name == "ols" else "weighted"
 
-    def _posterior(
-        self, total: Factor, prior: GaussianPrior, design_effect: float, interval_factor: float
-    ) -> Estimate:
-        """As :func:`identification.prior.fit_with_prior`, which may read samples."""
-        weights, effect = self.weights(total), max(1.0, design_effect)
-        found = with_prior(self.model, total, prior, weights, design_effect=effect)
-        return replace(found.estimate, interval_factor=interval_factor)
-
 
 def _checked(found: Estimate) -> Estimated:
     if found.undetermined or found.condition <= QR_CONDITION:
@@ -123,24 +147,6 @@ def _checked(found: Estimate) -> Estimated:
         "parameters apart, and sums of squares lose digits there; `hil identify` on these archives "
         "uses QR",
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Unseen:
-    """What was recorded of motions that are not fitted: the sum of the totals; None if nothing."""
-
-    total: PhaseFactor | None = None
-
-    def __add__(self, other: Unseen) -> Unseen:
-        if self.total is None or other.total is None:
-            return self if other.total is None else other
-        return Unseen(self.total + other.total)
-
-    def errors(self, values: Array, n_joints: int) -> tuple[Array, Array]:
-        """RMS per joint (n,) of the torque that is left, and of the torque; NaN if nothing."""
-        if self.total is None:
-            return np.full(n_joints, np.nan), np.full(n_joints, np.nan)
-        return errors(self.total.total, values)
 
 
 def errors(factor: Factor, values: Array) -> tuple[Array, Array]:
@@ -185,10 +191,53 @@ def _torque_rms(factor: Factor) -> Array:
     return np.asarray(np.sqrt(factor.gram[:, -1, -1] / rows))
 
 
-def repetition_level(estimator: Estimator, summary: Summary, settings: str) -> LevelEstimate:
-    """The estimate of one archive."""
+def of_one_motion(refs: Sequence[ArchiveRef]) -> bool:
+    """Whether the excitations among archives repeat one planned motion."""
+    motions = {ref.motion for ref in refs if ref.use == "excitation"}
+    return len(motions) == 1 and "" not in motions
+
+
+class Together:
+    """What is fitted together and what is predicted by it, beside the sum of the factors.
+
+    Attributes:
+        refs: archives that were fitted.
+        repetitions: the estimate of each.
+        unseen: sum of the totals of what is predicted; None if nothing is.
+        products: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`.
+        doubts: about all archives.
+        settings: digests.
+    """
+
+    def __init__(self) -> None:
+        self.refs: list[ArchiveRef] = []
+        self.repetitions: list[LevelEstimate] = []
+        self.unseen: PhaseFactor | None = None
+        self.products: Array | None = None
+        self.doubts = Doubts()
+        self.settings: set[str] = set()
+
+    def add(self, other: Together) -> None:
+        """Take in what is fitted elsewhere."""
+        self.refs += other.refs
+        self.repetitions += other.repetitions
+        self.unseen = plus(self.unseen, other.unseen)
+        self.products = plus(self.products, other.products)
+        self.doubts.add(other.doubts)
+        self.settings |= other.settings
+
+
+def plus(one: Any, other: Any) -> Any:
+    """The sum of two terms that may be nothing."""
+    return one if other is None else other if one is None else one + other
+
+
+def repetition_level(
+    estimator: Estimator, summary: Summary, settings: str, centre: Array | None = None
+) -> LevelEstimate:
+    """The estimate of one archive, drawn towards the centre of those that are fitted together."""
     ref = summary.ref
-    found, doubts = estimator.of_archive(summary)
+    found, doubts = estimator.of_archive(summary, centre)
     nothing = np.full(estimator.model.n_joints, np.nan)
     return LevelEstimate(
         level="repetition",
@@ -212,31 +261,39 @@ def repetition_level(estimator: Estimator, summary: Summary, settings: str) -> L
 def sum_level(
     level: Level,
     estimator: Estimator,
-    refs: Sequence[ArchiveRef],
+    together: Together,
     phase: PhaseFactor,
-    unseen: Unseen,
-    settings: str,
+    centre: Array | None,
     doubts: Sequence[str] = (),
     payload: Payload | None = None,
 ) -> LevelEstimate:
     """The estimate of a campaign, or of all campaigns of an arm.
 
+    Its intervals are no narrower than the repetitions of one motion scatter.
+
     Args:
         level: which.
         estimator: of the arm.
-        refs: archives that were fitted.
+        together: archives that were fitted, and what is known beside them.
         phase: the sum of their factors.
-        unseen: what is predicted.
-        settings: digest, "" where campaigns have different ones.
-        doubts: about the archives.
+        centre: of that sum, see `Estimator.centre`.
+        doubts: about setups.
         payload: that the campaign's cell states.
 
     Raises:
         IdentificationError: there is no estimate.
     """
-    found, own = estimator.of_sum(phase)
-    total, setups = phase.total, {ref.setup for ref in refs}
-    left, torque = unseen.errors(found.values, phase.n_joints)
+    found, own = estimator.of_sum(phase, centre)
+    refs, total = together.refs, phase.total
+    unseen = None if together.unseen is None else together.unseen.total
+    if of_one_motion(refs):
+        values = np.array([one.values for one in together.repetitions])
+        found = replace(found, covariance=no_narrower(found.covariance, values))
+    if together.products is not None:
+        found = with_uncertain_delay(found, total, together.products, estimator.delay_variance)
+    setups, settings = {ref.setup for ref in refs}, together.settings
+    nothing = np.full(phase.n_joints, np.nan)
+    left, torque = (nothing, nothing) if unseen is None else errors(unseen, found.values)
     return LevelEstimate(
         level=level,
         arm=refs[0].arm,
@@ -250,11 +307,11 @@ def sum_level(
         torque_rms=_torque_rms(total),
         unseen_rms=left,
         unseen_torque_rms=torque,
-        settings=settings,
-        doubts=(*own, *doubts),
+        settings=next(iter(settings)) if len(settings) == 1 else "",
+        doubts=(*own, *doubts, *together.doubts.lines()),
         speed_rms=speed_rms(estimator.model, total),
         information=total.weighted(estimator.weights(total)).A,
         setup=setups.pop() if len(setups) == 1 else "",
         payload=payload,
-        unseen=None if unseen.total is None else unseen.total.total,
+        unseen=unseen,
     )

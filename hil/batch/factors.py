@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import lru_cache
 from hashlib import file_digest
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,18 +20,20 @@ from hil.archive import CONTROLLERS_OWN, Archive, open_archive
 from hil.cell import Cell
 from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
+from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
 from hil.identify.sources import Source, known_doubts, source_of
 from hil.importers import Findings
 from identification import IdentificationError
 from identification.covariance import block_covariance
+from identification.delay_compensation import rate_products
 from identification.estimation import Estimate
 from identification.least_squares import Weighting, fit_least_squares, weights_of
 from identification.model import RobotModel
 from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Preprocessing, Samples, prepare
+from identification.preprocessing import Samples
 
 from .errors import ChangedError, TornError
-from .types import ArchiveFactor, ArchiveRef, Broken, Bundle, FileStamp, Fit, Settings, Summary
+from .types import ArchiveFactor, ArchiveRef, Broken, Bundle, FileStamp, Fit, Summary
 
 BUNDLE: Final = 16
 """Archives of a campaign that are reduced together. Of each a summary is kept, of all of them one
@@ -57,35 +59,38 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> ArchiveFactor:
         HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
         IdentificationError: there is not one usable row in it.
     """
+    archive, source = source_in(ref)
+    source = signals_of(source, settings)
+    cell, fitted = cell_in(archive, settings), ref.use == "excitation"
+    samples = (samples_of if fitted else judged_samples)(source, cell, settings)
+    model, time = cell.model, source.recording.time
+    phase = PhaseFactor.from_samples(model, samples)
+    summary = Summary(
+        ref=ref,
+        total=phase.merged(max(1, len(phase))),
+        fits=_fits(model, samples, phase) if fitted else {},
+        duration=float(time[-1] - time[0]),
+        doubts=_doubts(archive, cell, source),
+        products=rate_products(model, samples) if fitted and settings.delay_variance else None,
+    )
+    return ArchiveFactor(summary, phase)
+
+
+def source_in(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]:
+    """An archive, and what of it is of use.
+
+    Raises:
+        HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
+    """
     with opened(ref) as archive:
-        cell = cell_in(archive)
-        source = source_of(archive, cell)
-    model, recording = cell.model, source.recording
-    if recording.torque is None:
+        source = source_of(archive, cell_in(archive), to_fit=to_fit)
+    if to_fit and source.recording.torque is None:
         raise ArchiveError(
             ref.location,
             "holds motor currents and no torques",
             remedy="find the torque constants with `hil gains` and import it again",
         )
-    noise = None if settings.noise_variance is None else np.array(settings.noise_variance)
-    drives = cell.file.drive_train
-    samples = prepare(
-        recording,
-        model,
-        noise_variance=noise,
-        options=preprocessing(settings),
-        origin=source.origin,
-        current_limit=None if drives is None else np.array(cell.drive_table.current_limit),
-    )
-    phase = PhaseFactor.from_samples(model, samples)
-    summary = Summary(
-        ref=ref,
-        total=phase.merged(max(1, len(phase))),
-        fits=_fits(model, samples, phase) if ref.use == "excitation" else {},
-        duration=float(recording.time[-1] - recording.time[0]),
-        doubts=_doubts(archive, cell, source),
-    )
-    return ArchiveFactor(summary, phase)
+    return archive, source
 
 
 def reduce_bundle(
@@ -200,29 +205,22 @@ def stamp_of(path: Path) -> FileStamp:
     return FileStamp(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino)
 
 
-def cell_in(archive: Archive) -> Cell:
-    """The cell that travels in an archive; those of one campaign share theirs.
+def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
+    """The cell that travels in an archive, with the law of settings if there are any.
 
     Raises:
         ArchiveError: the archive carries no cell or no URDF, or one that is no text.
         CellError: the cell is not right.
     """
-    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"))
+    friction = {} if settings is None else settings.friction
+    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"), *friction.items())
 
 
 @lru_cache(maxsize=8)
-def cell_from(text: str, urdf: str) -> Cell:
-    """The cell of these texts."""
-    return Cell.from_texts(text, urdf, Path("cell.toml"))
-
-
-def preprocessing(settings: Settings) -> Preprocessing:
-    """The settings as `identification.preprocessing` has them."""
-    return Preprocessing(
-        smoother=settings.smoother,
-        torque_delay=settings.torque_delay,
-        torque_bandwidth=settings.torque_bandwidth,
-    )
+def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
+    """The cell of these texts, with a friction law of these entries if there are any."""
+    cell = Cell.from_texts(text, urdf, Path("cell.toml"))
+    return cell.with_friction(**dict(friction)) if friction else cell
 
 
 def _fits(model: RobotModel, samples: Samples, phase: PhaseFactor) -> dict[str, Fit]:

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from hil.identify.settings import Settings
 from identification.estimation import Estimate
 from identification.phase_factor import PhaseFactor
 from planner.plain import number, table, text, texts, whole
 
 from .cache import Entry
 from .factors import WEIGHTINGS
-from .types import ArchiveRef, Fit, Settings, Summary
+from .types import ArchiveRef, Fit, Summary
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -71,6 +72,8 @@ def summary_entry(summary: Summary) -> tuple[dict[str, Any], Arrays]:
     """A summary as header and arrays."""
     header, arrays = phase_entry(summary.total, "total.")
     header |= {"duration": summary.duration, "doubts": list(summary.doubts), "fits": {}}
+    if summary.products is not None:
+        arrays["products"] = summary.products
     for name, fit in summary.fits.items():
         one = fit.estimate
         row, column = _triangle(len(one.values))
@@ -95,17 +98,21 @@ def summary_from(entry: Entry, ref: ArchiveRef) -> Summary:
     total = phase_from(entry, "total.")
     if total is None:
         raise ValueError("a summary without its sum")
-    told = table(entry.header["fits"])
-    if set(told) != (set(WEIGHTINGS) if ref.use == "excitation" else set()):
+    found = table(entry.header["fits"])
+    if set(found) != (set(WEIGHTINGS) if ref.use == "excitation" else set()):
         raise ValueError("other fits than there are")
-    fits = {name: _fit(entry, name, table(one), total) for name, one in told.items()}
+    fits = {name: _fit(entry, name, table(one), total) for name, one in found.items()}
     duration = number(entry.header["duration"])
     if not 0.0 <= duration < inf:
         raise ValueError("a duration that is none")
-    return Summary(ref, total, fits, duration, _interned(entry.header["doubts"]))
+    products = None
+    if "products" in entry.arrays:
+        shape = total.n_joints, total.n_parameters, total.n_parameters + 1
+        products = _array(entry, "products", np.float64, shape)
+    return Summary(ref, total, fits, duration, _interned(entry.header["doubts"]), products)
 
 
-def _fit(entry: Entry, name: str, told: Mapping[str, Any], total: PhaseFactor) -> Fit:
+def _fit(entry: Entry, name: str, header: Mapping[str, Any], total: PhaseFactor) -> Fit:
     """Words that most archives share are held once."""
     count = total.n_parameters
     row, column = _triangle(count)
@@ -113,20 +120,20 @@ def _fit(entry: Entry, name: str, told: Mapping[str, Any], total: PhaseFactor) -
     triangle = _array(entry, f"{name}.covariance", np.float64, (len(row),))
     covariance[row, column] = covariance[column, row] = triangle
     estimate = Estimate(
-        names=texts(told["names"]),
-        units=texts(told["units"]),
+        names=texts(header["names"]),
+        units=texts(header["units"]),
         values=_array(entry, f"{name}.values", np.float64, (count,)),
         covariance=covariance,
         noise_std=_array(entry, f"{name}.noise_std", np.float64, (total.n_joints,)),
         samples=_array(entry, f"{name}.samples", np.intp, (total.n_joints,)),
-        method=intern(text(told["method"])),
-        condition=number(told["condition"]),
-        undetermined=_interned(told["undetermined"]),
-        interval_factor=number(told["interval_factor"]),
+        method=intern(text(header["method"])),
+        condition=number(header["condition"]),
+        undetermined=_interned(header["undetermined"]),
+        interval_factor=number(header["interval_factor"]),
     )
     if estimate.names != total.parameter_names or len(estimate.units) != count:
         raise ValueError("an estimate of another model than its sum")
-    return Fit(estimate, number(told["design_effect"]))
+    return Fit(estimate, number(header["design_effect"]))
 
 
 def _array(
@@ -142,8 +149,8 @@ def _array(
     return array
 
 
-def _interned(told: Any) -> tuple[str, ...]:
-    return tuple(map(intern, texts(told)))
+def _interned(words: Any) -> tuple[str, ...]:
+    return tuple(map(intern, texts(words)))
 
 
 def require_one_model(factors: Sequence[PhaseFactor]) -> None:

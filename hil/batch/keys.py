@@ -16,14 +16,17 @@ import drivers
 import hil
 import identification
 from hil.cell import Cell
+from hil.identify.options import Options
+from hil.identify.settings import Settings
 
-from .types import ArchiveRef, Choices, Settings
+from .types import ArchiveRef
 
 # What stands between the bytes of an archive and all that is kept of it.
 _PROGRAMS: Final = (
     (drivers, ("*.py",)),
     (identification, ("*.py",)),
     (hil, ("recordings.py", "archive/*.py", "cell/*.py", "identify/sources.py")),
+    (hil, ("identify/deciding.py", "identify/options.py", "identify/settings.py")),
     (hil, ("importers/findings.py",)),
     (hil, ("batch/examining.py", "batch/factors.py", "batch/settling.py", "batch/kept_forms.py")),
     (hil, ("batch/keys.py", "batch/setup.py")),
@@ -80,13 +83,19 @@ def belief_digest(cell: Cell) -> str:
 def settings_digest(settings: Settings) -> str:
     """Digest of all that, beside its bytes, decides about the factor of an archive."""
     entries = asdict(settings)
-    del entries["noise"]
-    return _digest(entries)
+    for later in ("shrinkage", "choices"):  # of the estimate
+        del entries[later]
+    return _digest([entries, code_digest()])
 
 
-def choices_digest(choices: Choices, refs: Sequence[ArchiveRef]) -> str:
-    """Digest of what settings are settled from: choices, archives, programs."""
-    return _digest([asdict(choices), [ref.sha256 for ref in refs], code_digest()])
+def decision_digest(options: Options, arms: Settings | None, refs: Sequence[ArchiveRef]) -> str:
+    """Digest of what settings are settled from: options or the arm's settings, archives, programs.
+
+    Of the estimators only the automatic one asks anything.
+    """
+    asked = asdict(options) | {"estimator": options.estimator == "auto"}
+    known = None if arms is None else asdict(arms)
+    return _digest([asked, known, [ref.sha256 for ref in refs], code_digest()])
 
 
 def summary_key(ref: ArchiveRef, settings: str) -> str:

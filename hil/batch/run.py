@@ -9,36 +9,33 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-
-import numpy as np
+from typing import cast
 
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.identify.options import Options
 from hil.progress import Reporter
 from identification import IdentificationError
 from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
-from identification.repetitions import no_narrower
 
 from .cache import Where
 from .discovery import discover
-from .doubts import Doubts
 from .errors import NothingToFitError
-from .estimates import Estimator, Unseen, repetition_level, sum_level
+from .estimates import Estimator, Together, plus, repetition_level, sum_level
 from .factors import cell_from, cell_in, opened
 from .keys import code_digest, settings_digest
-from .settling import of_one_motion
 from .tree_sum import TreeSum
 from .types import (
+    ESTIMATORS,
     ArchiveRef,
     Arm,
     BatchEstimator,
     BatchResult,
     Broken,
-    Choices,
     GroupKey,
-    Level,
     LevelEstimate,
+    Summary,
 )
 from .work import Campaign, Work
 from .workers import Workers
@@ -49,16 +46,29 @@ class Plan:
     """How a batch is run.
 
     Attributes:
-        estimator: by name.
-        choices: of the preprocessing.
+        options: as of `hil identify`, with an estimator that needs no sample; a single recording is
+            never split.
         cache: folder for what is kept; None: beside the archives.
         keep: whether anything is kept at all.
     """
 
-    estimator: BatchEstimator = "wls"
-    choices: Choices = Choices()  # noqa: RUF009 - frozen
+    options: Options = Options()
     cache: Path | None = None
     keep: bool = True
+
+    def __post_init__(self) -> None:
+        if self.options.estimator not in ESTIMATORS:
+            raise InputError(
+                None,
+                f"the estimator {self.options.estimator!r} reads samples",
+                field="--estimator",
+                remedy=f"use {', '.join(ESTIMATORS)}",
+            )
+
+    @property
+    def estimator(self) -> BatchEstimator:
+        """By name."""
+        return cast(BatchEstimator, self.options.estimator)
 
 
 def reidentify(
@@ -89,7 +99,7 @@ def reidentify(
     with _kept(plan) as where:
         found = discover(roots, where, workers, reporter)
         check(found.refs)
-        work = Work(workers, plan.choices, where, reporter)
+        work = Work(workers, plan.options, where, reporter)
         work.broken += found.broken
         campaigns = [
             Campaign(key, tuple(refs)) for key, refs in groupby(found.refs, lambda ref: ref.key)
@@ -141,88 +151,76 @@ class _Estimates:
 
     def _arm(self, digest: str, members: Sequence[Campaign]) -> None:
         """Campaigns of one arm, and all of them together."""
-        self._arms[digest] = Arm(digest, self._cell(members[0].refs[0]))
+        settings = members[0].ready
+        self._arms[digest] = Arm(digest, settings.law(self._cell(members[0].refs[0])))
         if self._plan.estimator == "prior":
             _require_one_belief(members)
-        estimator = Estimator(self._plan.estimator, self._arms[digest].cell)
-        everything: list[ArchiveRef] = []
-        sums, unseen, settings, levels = TreeSum[PhaseFactor](), Unseen(), set(), []
-        doubts = Doubts()
+        estimator = Estimator(self._plan.estimator, self._arms[digest].cell, settings)
+        everything, sums = Together(), TreeSum[PhaseFactor]()
+        levels: list[LevelEstimate] = []
         for one in members:
-            refs, phase, own, about = self._campaign(one, estimator)
-            if phase is None:
-                continue
-            used = settings_digest(one.ready)
-            payload = _carried(self._cell(refs[0]))
-            found = self._level(
-                "campaign", estimator, refs, phase, own, used, about.lines(), payload
-            )
-            levels += [self._scattered(level, refs) for level in found]
-            sums.add(phase)
-            settings.add(used)
-            everything += refs
-            unseen += own
-            doubts.add(about)
-        whole = sums.result()
+            together, phase, found = self._campaign(one, estimator)
+            levels += found
+            if phase is not None:
+                sums.add(phase)
+                everything.add(together)
         self._campaigns += levels
-        if whole is None:
-            return
-        keys = {ref.key for ref in everything}
+        whole, keys = sums.result(), {ref.key for ref in everything.refs}
         if len(keys) == 1:
             self._pooled += [
                 replace(one, level="pooled", campaign="", payload=None) for one in levels
             ]
-            return
-        used = settings.pop() if len(settings) == 1 else ""
-        told = (*_setups(keys), *doubts.lines())
-        pooled = self._level("pooled", estimator, everything, whole, unseen, used, told)
-        self._pooled += [self._scattered(level, everything) for level in pooled]
-
-    def _scattered(self, level: LevelEstimate, refs: Sequence[ArchiveRef]) -> LevelEstimate:
-        """An estimate with intervals no narrower than the repetitions it is from scatter."""
-        if not of_one_motion(refs) or level.covariance is None:
-            return level
-        values = np.array([one.values for one in self._repetitions[-len(refs) :]])
-        covariance = no_narrower(level.covariance, values)
-        return replace(level, covariance=covariance, std=np.sqrt(np.diag(covariance)))
+        elif whole is not None:
+            with self._failing(f"arm {digest[:8]}"):
+                centre = estimator.centre(whole)
+                self._pooled.append(
+                    sum_level("pooled", estimator, everything, whole, centre, _setups(keys))
+                )
 
     def _campaign(
         self, one: Campaign, estimator: Estimator
-    ) -> tuple[list[ArchiveRef], PhaseFactor | None, Unseen, Doubts]:
-        """Archives of one campaign that are fitted, their sum, what is predicted, and doubts."""
-        used = settings_digest(one.ready)
-        refs: list[ArchiveRef] = []
-        unseen, doubts = Unseen(), Doubts()
+    ) -> tuple[Together, PhaseFactor | None, list[LevelEstimate]]:
+        """Archives of one campaign, the sum of those that are fitted, and the estimate if any."""
+        together, used = Together(), settings_digest(one.ready)
+        together.settings.add(used)
+        waiting: list[Summary] = []  # for the centre of all; of very many archives if need be only
         collected = self._work.collected(one)
         for bundle in collected:
             self._work.broken += bundle.broken
             for summary in bundle.summaries:
-                doubts.note(summary)
+                together.doubts.note(summary)
                 if summary.ref.use == "excitation":
-                    refs.append(summary.ref)
-                    self._repetitions.append(repetition_level(estimator, summary, used))
+                    if estimator.draws:
+                        waiting.append(summary)
+                    else:
+                        together.repetitions.append(repetition_level(estimator, summary, used))
+                    together.refs.append(summary.ref)
+                    together.products = plus(together.products, summary.products)
                 else:
-                    unseen += Unseen(summary.total)
-        return refs, collected.total, unseen, doubts
+                    together.unseen = plus(together.unseen, summary.total)
+        phase = collected.total
+        levels: list[LevelEstimate] = []
+        if phase is None:
+            return together, None, levels
+        with self._failing(one.key.campaign):
+            centre = estimator.centre(phase)
+            together.repetitions += [
+                repetition_level(estimator, summary, used, centre) for summary in waiting
+            ]
+            payload = _carried(self._cell(together.refs[0]))
+            levels.append(
+                sum_level("campaign", estimator, together, phase, centre, payload=payload)
+            )
+        self._repetitions += together.repetitions
+        return together, phase, levels
 
-    def _level(
-        self,
-        level: Level,
-        estimator: Estimator,
-        refs: Sequence[ArchiveRef],
-        phase: PhaseFactor,
-        unseen: Unseen,
-        settings: str,
-        doubts: Sequence[str],
-        payload: Payload | None = None,
-    ) -> list[LevelEstimate]:
-        """The estimate from a sum; none, and the reason among what is broken, if it fails."""
+    @contextmanager
+    def _failing(self, name: str) -> Iterator[None]:
+        """What cannot be estimated is listed with the reason, and costs nothing else."""
         try:
-            return [sum_level(level, estimator, refs, phase, unseen, settings, doubts, payload)]
+            yield
         except IdentificationError as error:
-            name = refs[0].campaign if level == "campaign" else f"arm {refs[0].arm[:8]}"
             self._work.broken.append(Broken(name, str(error)))
-            return []
 
     def _cell(self, ref: ArchiveRef) -> Cell:
         """The cell of an archive."""

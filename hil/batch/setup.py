@@ -10,17 +10,12 @@ from collections.abc import Iterable
 
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable
+from hil.identify.settings import stated_delay
 
 
 def setup_of(cell: Cell) -> str:
     """Delay of the torque and payload of a cell in words, with every digit; "" for neither."""
     return ", ".join(filter(None, (_lag(stated_delay(cell)), _load(cell.file.robot.payload))))
-
-
-def stated_delay(cell: Cell) -> float:
-    """Time by which the torque lags the position, as `[controller]` states it [s]."""
-    controller = cell.file.controller
-    return controller.current_delay_cycles * cell.period if controller else 0.0
 
 
 def _lag(delay: float) -> str:

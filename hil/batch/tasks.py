@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from hil.errors import HilError
+from hil.identify.options import Options
+from hil.identify.settings import Settings
 from identification import IdentificationError
 from identification.phase_factor import PhaseFactor
 
@@ -14,7 +16,7 @@ from .factors import opened, without_sum
 from .keeping import bundle_with_cache
 from .on_workers import Part
 from .settling import Settled, settle
-from .types import ArchiveRef, Broken, Bundle, Choices, Settings
+from .types import ArchiveRef, Broken, Bundle
 
 
 class Done(NamedTuple):
@@ -44,10 +46,10 @@ def bundle_sent(
 
 
 def campaign_settled(
-    refs: Sequence[ArchiveRef], choices: Choices, where: Where
+    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
 ) -> Part[None, Settled]:
     """Settle a campaign."""
-    return Part(None, settle(refs, choices, where))
+    return Part(None, settle(refs, options, arms, where))
 
 
 def opened_once(ref: ArchiveRef) -> Part[None, Broken | None]:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.errors import InputError
 from identification.estimation import Estimate
 from identification.factor import Factor
 from identification.payload import Payload
 from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Smoother
 
 Array = NDArray[np.float64]
 
 Level = Literal["repetition", "campaign", "pooled"]
-BatchEstimator = Literal["wls", "ols", "prior", "consistent"]
+BatchEstimator = Literal["auto", "wls", "ols", "prior", "consistent"]
 
 ESTIMATORS: Final[tuple[BatchEstimator, ...]] = get_args(BatchEstimator)
 """The estimators that need factors only, and no sample."""
@@ -104,55 +102,6 @@ class Broken(NamedTuple):
     reason: str
 
 
-@dataclass(frozen=True)
-class Choices:
-    """What a person may choose about the preprocessing.
-
-    Attributes:
-        smoother: of the positions.
-        delay: time by which the torque lags the position [s]; None takes it from the cell.
-        torque_bandwidth: low-pass [Hz] the torque has come through; None for none, "auto" looks
-            for one in imported torques.
-
-    Raises:
-        InputError: a name is unknown.
-    """
-
-    smoother: Smoother = "spline"
-    delay: float | None = None
-    torque_bandwidth: float | Literal["auto"] | None = "auto"
-
-    def __post_init__(self) -> None:
-        if self.smoother not in get_args(Smoother):
-            known = ", ".join(get_args(Smoother))
-            raise InputError(
-                None, f"{self.smoother!r} is no smoother", field="smoother", remedy=f"use {known}"
-            )
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How the archives of one campaign become factors: choices, and what the campaign settled.
-
-    With the bytes of an archive they determine its factor.
-
-    Attributes:
-        smoother: of the positions.
-        torque_delay: [s].
-        torque_bandwidth: [Hz]; None for none.
-        noise_variance: of the positions (n,) [rad² or m²]; None takes each archive's own.
-        code: digest of the programs that make factors.
-        noise: where `noise_variance` comes from, in words.
-    """
-
-    smoother: Smoother
-    torque_delay: float
-    torque_bandwidth: float | None
-    noise_variance: tuple[float, ...] | None
-    code: str
-    noise: str = field(default="", compare=False)
-
-
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The estimate from one archive alone.
@@ -176,6 +125,8 @@ class Summary:
         fits: by weighting, "weighted" and "ordinary"; none of a validation run.
         duration: from first to last sample [s].
         doubts: what a reader must know of it.
+        products: (n, p, p + 1), see :func:`identification.delay_compensation.rate_products`; None
+            where the delay is known, or nothing is fitted.
     """
 
     ref: ArchiveRef
@@ -183,6 +134,7 @@ class Summary:
     fits: Mapping[str, Fit]
     duration: float
     doubts: tuple[str, ...] = ()
+    products: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from hil.identify.options import Options
+from hil.identify.settings import Settings
 from hil.progress import Reporter, Task
 from identification.phase_factor import PhaseFactor
 
@@ -18,7 +20,7 @@ from .on_workers import ArchiveTask, Summed
 from .settling import Settled, consulted, known_settings
 from .tasks import Done, bundle_kept, bundle_sent, campaign_settled, opened_once
 from .tree_sum import TreeSum
-from .types import ArchiveRef, Broken, Bundle, Choices, GroupKey, Settings
+from .types import ArchiveRef, Broken, Bundle, GroupKey
 from .workers import Workers
 
 _ROUNDS: Final = 3
@@ -32,16 +34,21 @@ class Campaign:
     Attributes:
         key: of the group.
         refs: archives, without those found to be broken.
+        arms: settings of its arm; None where it decides on them.
         settings: None until they are settled.
         bundles: archives that are reduced together.
-        reason: why it could not be settled, "" if it could.
     """
 
     key: GroupKey
     refs: tuple[ArchiveRef, ...]
+    arms: Settings | None = None
     settings: Settings | None = None
     bundles: list[tuple[ArchiveRef, ...]] = field(default_factory=list)
-    reason: str = ""
+
+    @property
+    def consulted(self) -> tuple[ArchiveRef, ...]:
+        """The archives that its settings depend on."""
+        return consulted(self.refs, self.arms)
 
     @property
     def ready(self) -> Settings:
@@ -76,7 +83,7 @@ class Work:
 
     Args:
         workers: who does it.
-        choices: of the preprocessing.
+        options: how archives are read.
         where: results of single archives are kept.
         reporter: of progress.
 
@@ -86,31 +93,61 @@ class Work:
     """
 
     def __init__(
-        self, workers: Workers, choices: Choices, where: Where, reporter: Reporter
+        self, workers: Workers, options: Options, where: Where, reporter: Reporter
     ) -> None:
         self.broken: list[Broken] = []
         self.read = 0
-        self._workers, self._choices = workers, choices
+        self._workers, self._options = workers, options
         self._where, self._reporter = where, reporter
         self._loose: dict[tuple[ArchiveRef, ...], Bundle] = {}
         self._far_sums: Iterator[Summed[PhaseFactor, Done]] = iter(())
         self._task: Task | None = None
 
     def settle(self, campaigns: Sequence[Campaign]) -> list[Campaign]:
-        """Give each campaign its settings; returns those that have some."""
-        waiting = []
-        for one in campaigns:
-            one.settings = known_settings(consulted(one.refs), self._choices, self._where)
-            if one.settings is None:
-                waiting.append(one)
-        self._settle(waiting)
-        failed = [one for one in waiting if one.reason]
-        for one in failed:
-            self._drop(one, self._unreadable(consulted(one.refs)))
-        self._settle([one for one in failed if one.refs])
-        self._settle_by_the_next(waiting)
-        self.broken += [Broken(one.key.campaign, one.reason) for one in waiting if one.reason]
+        """Give each campaign its settings; returns those that have some.
+
+        Those of an arm are decided on the first of its campaigns that can be read.
+        """
+        arms: dict[str, Settings] = {}
+        left = list(campaigns)
+        while left:
+            first = {one.key.arm: one for one in reversed(left) if one.key.arm not in arms}
+            now = list(first.values()) or left
+            self._settle_all(now, arms)
+            arms |= {arm: one.settings for arm, one in first.items() if one.settings is not None}
+            left = [one for one in left if first and first.get(one.key.arm) is not one]
         return [one for one in campaigns if one.settings is not None]
+
+    def _settle_all(self, campaigns: Sequence[Campaign], arms: Mapping[str, Settings]) -> None:
+        """Settle campaigns, those of decided arms by their settings.
+
+        A campaign is asked again as long as archives that it was asked for turn out to be broken.
+        """
+        for one in campaigns:
+            one.arms = arms.get(one.key.arm)
+            one.settings = known_settings(one.consulted, self._options, one.arms, self._where)
+        left = [one for one in campaigns if one.settings is None]
+        while left:
+            tasks = [
+                ArchiveTask(
+                    one.key.campaign,
+                    campaign_settled,
+                    (one.consulted, self._options, one.arms, self._where),
+                )
+                for one in left
+            ]
+            notes = self._ask(tasks, "settling campaigns")
+            again = []
+            for one, note in zip(left, notes, strict=True):
+                settled, count = isinstance(note, Settled), len(one.refs)
+                one.settings = note.settings if settled else None
+                self._drop(one, note.broken if settled else self._unreadable(one.consulted))
+                if one.settings is None and one.refs and len(one.refs) < count:
+                    again.append(one)
+                elif one.settings is None and (one.refs or not settled):
+                    reason = _why_not_settled(one) if settled else note.reason
+                    self.broken.append(Broken(one.key.campaign, reason))
+            left = again
 
     def reduce(self, campaigns: Sequence[Campaign]) -> None:
         """Have all bundles of the campaigns reduced and kept.
@@ -163,43 +200,6 @@ class Work:
             return self._far(one, next(self._far_sums))
         found = (self._bundle(one, refs) for refs in one.bundles)
         return Collected(found, lambda: self._advance(1, one.key.campaign))
-
-    def _settle_by_the_next(self, campaigns: Sequence[Campaign]) -> None:
-        """Where those consulted were broken and nothing is settled, ask the archives left."""
-        while True:
-            left = {
-                id(one): len(one.refs)
-                for one in campaigns
-                if one.settings is None and not one.reason and one.refs
-            }
-            if not left:
-                return
-            asked = [one for one in campaigns if id(one) in left]
-            self._settle(asked)
-            for one in asked:
-                if one.settings is None and len(one.refs) == left[id(one)]:
-                    one.reason = one.reason or (
-                        "none of its archives says how it is to be read"
-                        if consulted(one.refs)
-                        else "it holds no excitation"
-                    )
-
-    def _settle(self, campaigns: Sequence[Campaign]) -> None:
-        tasks = [
-            ArchiveTask(
-                one.key.campaign,
-                campaign_settled,
-                (consulted(one.refs), self._choices, self._where),
-            )
-            for one in campaigns
-        ]
-        for one, note in zip(campaigns, self._ask(tasks, "settling campaigns"), strict=True):
-            one.reason = ""
-            if isinstance(note, Settled):
-                one.settings = note.settings
-                self._drop(one, note.broken)
-            else:
-                one.reason = note.reason
 
     def _one_by_one(self, one: Campaign, refs: Sequence[ArchiveRef]) -> tuple[ArchiveRef, ...]:
         """Reduce a bundle that ended its process archive by archive; returns those that do not."""
@@ -295,6 +295,12 @@ class Work:
     def _advance(self, units: float, note: str = "") -> None:
         if self._task is not None:
             self._task.advance(units, note)
+
+
+def _why_not_settled(one: Campaign) -> str:
+    if one.consulted:
+        return "none of its archives says how it is to be read"
+    return "it holds no excitation"
 
 
 def _archives(campaigns: Sequence[Campaign]) -> int:

@@ -9,15 +9,13 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.identify_options import LONGEST_DELAY
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
 from hil.identify.gain_run import GainsFound, find_gains
 from hil.progress import reporter as make_reporter
 from identification.gains import GainMethod
 from identification.payload import Payload
-
-LONGEST_DELAY = 0.5
-"""s; what is longer is a slip of the unit."""
 
 
 def gains(

@@ -15,15 +15,26 @@ from hil.batch.keys import code_digest
 from hil.batch.local import TIMEOUT, LocalWorkers
 from hil.batch.table import write_tables
 from hil.batch.trend import Trends, trends, write_trend
-from hil.batch.types import BatchEstimator, BatchResult, Choices
+from hil.batch.types import BatchEstimator, BatchResult
 from hil.batch.workers import Workers
 from hil.cli import reidentify_words as words
-from hil.cli.identify import LONGEST_DELAY, bandwidth_from
+from hil.cli.identify_options import (
+    BandwidthOption,
+    DelayOption,
+    FrictionOption,
+    SmootherOption,
+    StandstillOption,
+    TorqueBandwidthOption,
+    VelocityOption,
+    bandwidth_from,
+    delay_from,
+    torque_bandwidth_from,
+)
 from hil.files import make_folder, writing_to
+from hil.identify.options import Options, friction_from
 from hil.printable import printable
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
-from identification.preprocessing import Smoother
 
 SOME_BROKEN: Final = 5
 """Exit status: done, but some archives could not be used."""
@@ -50,7 +61,7 @@ def reidentify(
     estimator: Annotated[
         BatchEstimator,
         typer.Option(help="One of those that need no sample: see `hil identify --estimator`."),
-    ] = "wls",
+    ] = "auto",
     workers: Annotated[
         int | None,
         typer.Option(min=1, help="Processes; one for each core if left out.", show_default=False),
@@ -72,26 +83,13 @@ def reidentify(
             show_default=False,
         ),
     ] = None,
-    delay: Annotated[
-        float | None,
-        typer.Option(
-            min=-LONGEST_DELAY,
-            max=LONGEST_DELAY,
-            metavar="SECONDS",
-            help="Time by which the torque lags the position; the cell's if left out.",
-            show_default=False,
-        ),
-    ] = None,
-    smoother: Annotated[
-        Smoother, typer.Option(help="Of the positions; see `hil identify --smoother`.")
-    ] = "spline",
-    torque_bandwidth: Annotated[
-        str,
-        typer.Option(
-            help='Low-pass in Hz that the torque came through, "none", or "auto": looked for in '
-            "imported torques."
-        ),
-    ] = "auto",
+    bandwidth: BandwidthOption = "auto",
+    velocity: VelocityOption = "auto",
+    friction: FrictionOption = "auto",
+    standstill: StandstillOption = "auto",
+    delay: DelayOption = None,
+    smoother: SmootherOption = "spline",
+    torque_bandwidth: TorqueBandwidthOption = "auto",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only what matters.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
 ) -> None:
@@ -109,8 +107,16 @@ def reidentify(
         make_folder(output)
     keep = cache != "none"
     plan = run.Plan(
-        estimator=estimator,
-        choices=Choices(smoother, delay, bandwidth_from(torque_bandwidth)),
+        Options(
+            delay=delay_from(delay),
+            torque_bandwidth=torque_bandwidth_from(torque_bandwidth),
+            smoother=smoother,
+            estimator=estimator,
+            bandwidth=bandwidth_from(bandwidth),
+            velocity=velocity,
+            friction=friction_from(friction),
+            standstill=standstill,
+        ),
         cache=Path(cache) if keep and cache is not None else None,
         keep=keep,
     )

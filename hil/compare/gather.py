@@ -14,6 +14,7 @@ from hil.batch.types import ArchiveRef, Arm, Broken, LevelEstimate
 from hil.batch.workers import Workers
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.identify.options import Options
 from hil.progress import Reporter
 
 _TWO: Final = "name two campaigns or more of one arm"
@@ -50,14 +51,19 @@ def gather(
             stands for its folder.
         workers: read the archives.
         reporter: told of the progress.
-        plan: how to identify.
+        plan: how to identify; by default with least squares, which draw no change towards
+            anything.
 
     Raises:
         InputError: there is one campaign only, or campaigns are of different arms.
     """
     roots = [_folder(place) for place in places]
     result = run.reidentify(
-        roots, plan or run.Plan(), workers, reporter, check=_require_campaigns_of_one_arm
+        roots,
+        plan or run.Plan(Options(estimator="wls")),
+        workers,
+        reporter,
+        check=_require_campaigns_of_one_arm,
     )
     campaigns = list(result.campaigns)
     if len(campaigns) < 2:

@@ -19,12 +19,14 @@ from hil.archive import open_archive
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import InputError
-from hil.identify import Identification, identify_archives
-from hil.identify.sources import Source, Sources, cell_of, gather_sources
+from hil.identify.estimating import estimate_with
+from hil.identify.options import FIXED
+from hil.identify.prepared import Prepared, prepare_sources
+from hil.identify.settings import samples_of
+from hil.identify.sources import cell_of, gather_sources
 from hil.progress import Reporter
 from hil.reading import digest_of
 from identification.excitation import SAMPLE_PERIOD
-from identification.preprocessing import prepare
 
 from .fingerprint import fingerprint
 from .knowledge import Knowledge
@@ -48,11 +50,13 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
     """
     archives = _archives(paths)
     _refuse_another_robot(archives, cell)
-    found = identify_archives(archives, reporter)
-    # The whole of a single recording: nothing has to be predicted here.
-    sources = gather_sources(archives, split=1.0)
-    pooled, weights = found.estimate.pooled, _weights(found, cell, reporter)
-    gram, samples = _information(sources, weights, reporter)
+    # Of all that was recorded: nothing has to be predicted here. The law is that of the cell, whose
+    # parameters the design is for.
+    sources = gather_sources(archives, FIXED.split, in_sample=True)
+    prepared = prepare_sources(sources, FIXED, reporter)
+    pooled = estimate_with(prepared, FIXED, reporter).result.pooled
+    weights = _weights(pooled.noise_std, cell, reporter)
+    gram, samples = _information(prepared, weights, reporter)
     return Knowledge(
         names=pooled.names,
         values=pooled.values,
@@ -67,33 +71,25 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
     )
 
 
-def _information(sources: Sources, weights: Array, reporter: Reporter) -> tuple[Array, int]:
+def _information(prepared: Prepared, weights: Array, reporter: Reporter) -> tuple[Array, int]:
     """Return the information (p, p) of all motions as if sampled every SAMPLE_PERIOD, and their N.
 
     It is that of the motion itself, as that of a motion to be designed: what the torque's channel
     does to it (delay, filter) has no part in it.
     """
-    model = sources.cell.model
+    cell = prepared.sources.cell
+    model, motions = cell.model, prepared.sources.training
+    settings = prepared.settings.preprocessed(torque_delay=0.0, torque_bandwidth=None)
     gram, samples = np.zeros((model.n_parameters, model.n_parameters)), 0.0
-    motions = [source for source in (*sources.training, *sources.held_out) if _any(source)]
     with reporter.task("adding up earlier information", len(motions)) as task:
         for source in motions:
-            recording = source.recording
-            prepared = prepare(
-                recording, model, noise_variance=sources.noise_variance, origin=source.origin
-            )
             # A second is to count alike, whatever the rate of an archive.
-            share = float(np.median(np.diff(recording.time))) / SAMPLE_PERIOD
-            factor = prepared.factor(model)
+            share = float(np.median(np.diff(source.recording.time))) / SAMPLE_PERIOD
+            factor = samples_of(source, cell, settings).factor(model)
             gram += share * factor.weighted(weights).A
             samples += share * float(factor.samples.max())
             task.advance(1, source.name)
     return gram, max(1, round(samples))
-
-
-def _any(source: Source) -> bool:
-    """Whether there is anything in it; nothing is left where all of a recording is fitted."""
-    return source.recording.n_samples > 1
 
 
 def _archives(paths: Sequence[Path]) -> list[Path]:
@@ -129,13 +125,13 @@ def _refuse_another_robot(archives: Sequence[Path], cell: Cell) -> None:
             )
 
 
-def _weights(found: Identification, cell: Cell, reporter: Reporter) -> Array:
+def _weights(noise_std: Array, cell: Cell, reporter: Reporter) -> Array:
     """Return 1 / variance of each joint's torque residual (n,).
 
     Of a joint that stood in all archives no residual tells. It is taken to be as noisy as the
     others: by the median, as a share of the torque that its motors can give.
     """
-    noise = np.array(found.estimate.pooled.noise_std)
+    noise = noise_std.copy()
     known = np.isfinite(noise) & (noise > 0.0)
     if not known.all():
         strength = _strength(cell)

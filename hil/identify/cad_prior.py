@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from hil.cell import Cell
 from hil.cell.schema import NominalTable
+from hil.errors import InputError
 from identification import IdentificationError, RobotModel
 from identification.nominal_prior import nominal_prior
 from identification.prior import GaussianPrior
@@ -28,6 +29,22 @@ def cad_prior(cell: Cell) -> GaussianPrior | str:
         return nominal_prior(cell.model, table.uncertainty, known)
     except IdentificationError as error:
         return str(error)
+
+
+def required(prior: GaussianPrior | str) -> GaussianPrior:
+    """The prior of a cell, for an estimator that needs one.
+
+    Raises:
+        InputError: there is none.
+    """
+    if isinstance(prior, str):
+        raise InputError(
+            None,
+            f"there is no prior to be had: {prior}",
+            field="--estimator prior",
+            remedy="give inertias in the URDF, or use --estimator wls",
+        )
+    return prior
 
 
 def _known(

@@ -50,7 +50,7 @@ def _fold_estimator(prepared: Prepared, estimation: Estimation) -> Shrinkage:
     """
     if estimation.estimator == "consistent":
         return Shrinkage(strength=math.inf)
-    return prepared.shrinkage if estimation.estimator == "auto" else Shrinkage()
+    return prepared.settings.shrinkage if estimation.estimator == "auto" else Shrinkage()
 
 
 def _result(found: Calibration) -> CalibrationResult:

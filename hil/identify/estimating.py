@@ -14,7 +14,7 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
 from identification.consistent import consistent_estimate
-from identification.delay_compensation import delay_sensitivity, with_delay_uncertainty
+from identification.delay_compensation import rate_products, with_uncertain_delay
 from identification.endogeneity import EndogeneityTest
 from identification.estimation import Estimate, joint_weights, nothing_usable
 from identification.least_squares import Weighting, fit_least_squares
@@ -27,7 +27,7 @@ from identification.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.robust import RobustEstimate, robust_estimate
 from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 
-from .cad_prior import cad_prior
+from .cad_prior import cad_prior, required
 from .instruments import InstrumentalFit, fit_instrumental, widely_smoothed
 from .options import Estimator, Options
 from .prepared import Prepared
@@ -95,11 +95,11 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         instrumental = fit_instrumental(model, prepared, fitted)
         task.advance(1, options.estimator)
         prior = cad_prior(prepared.sources.cell)
-        case = _Case(model, fitted, prior, instrumental, prepared.shrinkage)
+        case = _Case(model, fitted, prior, instrumental, prepared.settings.shrinkage)
         result, doubts = _ESTIMATORS[options.estimator](case)
         if prepared.sources.same_motion:
             result = result.with_scatter()
-        result = _with_delay_uncertainty(case, result, prepared.delay_variance)
+        result = _with_delay_uncertainty(case, result, prepared.settings.delay_variance)
         task.advance(1, "prior")
         posterior = _posterior(case, result.phase)
         task.advance(1, "held-out motion")
@@ -123,10 +123,9 @@ def _with_delay_uncertainty(
     """The result with what an uncertain delay of the torque adds to its intervals."""
     if variance == 0.0:
         return result
-    pooled = result.pooled
-    weights = np.where(np.isfinite(pooled.noise_std), pooled.noise_std, np.inf) ** -2.0
-    moved = delay_sensitivity(case.model, case.fitted, weights, pooled.values)
-    return replace(result, pooled=with_delay_uncertainty(pooled, moved, variance))
+    products = sum(rate_products(case.model, samples) for samples in case.fitted)
+    pooled = with_uncertain_delay(result.pooled, result.factor, np.asarray(products), variance)
+    return replace(result, pooled=pooled)
 
 
 def _require_usable(prepared: Prepared, model: RobotModel) -> None:
@@ -195,14 +194,7 @@ def _robust_doubts(model: RobotModel, found: RobustEstimate) -> list[str]:
 
 
 def _with_prior(case: _Case) -> _Found:
-    prior = case.prior
-    if isinstance(prior, str):
-        raise InputError(
-            None,
-            f"there is no prior to be had: {prior}",
-            field="--estimator prior",
-            remedy="give inertias in the URDF, or use --estimator wls",
-        )
+    prior = required(case.prior)
     fits: list[PosteriorEstimate] = []
 
     def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:

@@ -13,18 +13,16 @@ from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
-from hil.recordings import recording_of
 from identification.gain_factor import GainFactor
 from identification.gains import GainMethod, Gains, identify_gains
 from identification.model import RobotModel
 from identification.payload import Payload
-from identification.preprocessing import Preprocessing, prepare
 from identification.recording import Recording, RecordingError
-from identification.resampling import without_repeats
 
 from .currents import motor_from_joint
-from .prepared import current_limit
-from .sources import cell_of, useful_part
+from .options import FIXED
+from .settings import samples_of, stated_settings
+from .sources import Source, cell_of, source_of
 
 Array = NDArray[np.float64]
 
@@ -74,6 +72,7 @@ def find_gains(
         raise InputError(
             None, "there is no archive", remedy="name recordings with and without load"
         )
+    options = replace(FIXED, delay="stated" if delay is None else delay)
     total: GainFactor | None = None
     loads: dict[str, Payload | None] = {}
     first: tuple[Cell, RobotModel, Array] | None = None
@@ -82,19 +81,23 @@ def find_gains(
             archive = open_archive(path)
             cell = cell_of(archive)
             payload = loaded.get(path, cell.model.payload)
-            recording = _recording(archive)
-            turns = _turns(cell, recording)
+            source = _source(archive, cell)
+            turns = _turns(cell, source.recording)
             if first is None:
                 first = cell, replace(cell.model, payload=None), turns
             _refuse_stranger(archive, cell, turns, first)
-            factor = _factor(
-                archive,
+            settings = stated_settings(cell, options)
+            try:
+                samples = samples_of(source, cell, settings, first[1])
+            except RecordingError as error:
+                raise ArchiveError(path, str(error), remedy="leave it out") from error
+            assert source.recording.motor_current is not None
+            factor = GainFactor.from_samples(
                 first[1],
-                recording,
-                payload,
-                turns,
-                delay=_delay(cell, delay),
-                limit=current_limit(cell),
+                samples,
+                source.recording.motor_current,
+                payload=payload,
+                transmission=turns,
             )
             total = factor if total is None else total + factor
             loads[path.name] = payload
@@ -105,14 +108,15 @@ def find_gains(
     return GainsFound(gains, cell, loads, not np.array_equal(turns, np.eye(len(turns))))
 
 
-def _recording(archive: Archive) -> Recording:
-    recording = recording_of(archive)
-    if recording.motor_current is None:
+def _source(archive: Archive, cell: Cell) -> Source:
+    """Motion and currents of an archive, and no torque: one in the log may be of other gains."""
+    source = source_of(archive, cell)
+    current = source.recording.motor_current
+    if current is None:
         raise ArchiveError(
             archive.path, "holds no motor currents", remedy="import them as motor_current"
         )
-    part = useful_part(archive, recording)
-    return recording if part is None else recording.between(part.start, part.stop)
+    return source.changed(lambda one: replace(one, torque=np.zeros_like(current)))
 
 
 def _turns(cell: Cell, recording: Recording) -> Array:
@@ -120,13 +124,6 @@ def _turns(cell: Cell, recording: Recording) -> Array:
     if cell.file.drive_train is not None:
         return np.asarray(cell.drive_train.motor_from_joint)
     return motor_from_joint(recording)
-
-
-def _delay(cell: Cell, delay: float | None) -> float:
-    if delay is not None:
-        return delay
-    controller = cell.file.controller
-    return controller.current_delay_cycles * cell.period if controller else 0.0
 
 
 def _refuse_stranger(
@@ -140,30 +137,3 @@ def _refuse_stranger(
             f"is of another robot, friction law or drive train than {first[0].path}",
             remedy="identify the gains of each robot by themselves",
         )
-
-
-def _factor(
-    archive: Archive,
-    model: RobotModel,
-    recording: Recording,
-    payload: Payload | None,
-    turns: Array,
-    *,
-    delay: float,
-    limit: Array | None,
-) -> GainFactor:
-    current = recording.motor_current
-    assert current is not None
-    # Only the motion and its rows are wanted: a torque in the log may be of other gains.
-    bare = replace(recording, torque=np.zeros_like(current))
-    try:
-        single = without_repeats(bare)
-        samples = prepare(
-            single, model, options=Preprocessing(torque_delay=delay), current_limit=limit
-        )
-    except RecordingError as error:
-        raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
-    assert single.motor_current is not None
-    return GainFactor.from_samples(
-        model, samples, single.motor_current, payload=payload, transmission=turns
-    )

@@ -17,7 +17,8 @@ from identification.instrument_motion import planned_motion, same_plan
 from identification.instrumental import InstrumentalEstimate, estimate_instrumental
 from identification.preprocessing import Samples
 
-from .prepared import Prepared, samples_of
+from .prepared import Prepared
+from .settings import samples_of
 
 # Hz. A narrower smoother takes part of the motion out of the regressor, which instruments cannot
 # mend. On simulated NS 16 logs with a hundred to a thousand times the encoders' noise, instrumental
@@ -54,12 +55,12 @@ class InstrumentalFit:
 
 def widely_smoothed(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...]:
     """What is fitted, smoothed no narrower than `NARROWEST`, however noisy the positions are."""
-    how = replace(prepared.preprocessing, rigid_bandwidth=NARROWEST)
-    noiseless = replace(prepared.sources, noise_variance=np.zeros(model.n_joints))
+    wide = prepared.settings.preprocessed(rigid_bandwidth=NARROWEST)
+    noiseless = replace(wide, noise_variance=(0.0,) * model.n_joints)
     return tuple(
         samples
         if float(samples.position_bandwidth.min()) >= NARROWEST
-        else samples_of(source, noiseless, how)
+        else samples_of(source, prepared.sources.cell, noiseless)
         for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True)
     )
 

@@ -37,8 +37,8 @@ class Options:
             filters the regressor alike.
         split: share of a single recording that is fitted; the rest is predicted. Used only where
             there are no validation runs.
-        delay: time by which the torque lags the position [s]; None takes it from the cell, "auto"
-            estimates it per axis and compensates it.
+        delay: time by which the torque lags the position [s]; "stated" takes it from the cell, None
+            likewise unless another one is found; "auto" estimates it per axis and compensates it.
         torque_bandwidth: low-pass [Hz] the torque has come through before it was recorded; None
             for none. "auto" looks for one in imported torques; a controller's own currents are
             known to have come through none.
@@ -60,7 +60,7 @@ class Options:
 
     method: Method = "default"
     split: float = 0.7
-    delay: float | Literal["auto"] | None = None
+    delay: float | Literal["auto", "stated"] | None = None
     torque_bandwidth: float | Literal["auto"] | None = "auto"
     smoother: Smoother = "spline"
     estimator: Estimator = "auto"
@@ -146,6 +146,12 @@ def _positive(term: str, figure: str) -> float:
 
 
 FIXED: Final = Options(
-    estimator="wls", bandwidth=RIGID_BANDWIDTH, velocity="position", friction={}, standstill=None
+    delay="stated",
+    torque_bandwidth=None,
+    estimator="wls",
+    bandwidth=RIGID_BANDWIDTH,
+    velocity="position",
+    friction={},
+    standstill=None,
 )
-"""Nothing chosen by inner prediction: the cell's own friction law, weighted least squares."""
+"""Nothing is decided: delay and friction law of the cell, no low-pass, weighted least squares."""

@@ -153,7 +153,12 @@ def gather_sources(
         )
     cell = cell_of(fitted[0])
     _refuse_strangers(archives)
-    training = [source_of(archive, cell) for archive in fitted]
+    rest = [source_of(archive, cell, to_fit=False) for archive in by_kind.get("standstill", [])]
+    every = all_fitted(
+        cell,
+        [(archive, source_of(archive, cell)) for archive in fitted],
+        rest[0].recording if rest else None,
+    )
     held_out = [source_of(archive, cell) for archive in by_kind.get("validation", [])]
     doubts = [*known_doubts(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
     doubts += [
@@ -162,43 +167,66 @@ def gather_sources(
         for doubt in Findings.of(archive.metadata).warnings
     ]
     doubts += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
-    plan = _plan_of(fitted[0])
-    same_motion = plan is not None and (
-        len({archive.attachments.get("plan.json") for archive in fitted}) == 1
-    )
-    if plan is None:
-        training, same_motion = _aligned(training)
-    tested_on = "unseen motion"
     if in_sample:
-        held_out, tested_on = training, "the motion that was fitted"
-    elif not held_out:
+        return replace(every, doubts=tuple(doubts))
+    training, tested_on = every.training, "unseen motion"
+    if not held_out:
         whole = len(training) == 1
         tested_on = (
             "the rest of the same motion"
             if whole
             else "a repetition of the fitted motion"
-            if same_motion
+            if every.same_motion
             else "another recording"
         )
         training, held_out, doubt = _split(training, split)
         doubts.append(doubt)
-    rest = [source_of(archive, cell, to_fit=False) for archive in by_kind.get("standstill", [])]
-    return Sources(
-        cell=cell,
-        metadata=dict(fitted[0].metadata),
-        plan=plan,
-        training=tuple(training),
-        same_motion=same_motion,
+    return replace(
+        every,
+        training=training,
         held_out=tuple(held_out),
-        noise_variance=position_noise(cell, rest[0].recording) if rest else None,
-        torque_variance=_torque_variance(rest[0].recording) if rest else None,
         doubts=tuple(doubts),
         tested_on=tested_on,
-        in_sample=in_sample,
+        in_sample=False,
     )
 
 
-def _aligned(sources: list[Source]) -> tuple[list[Source], bool]:
+def all_fitted(
+    cell: Cell, fitted: Sequence[tuple[Archive, Source]], rest: Recording | None
+) -> Sources:
+    """Sources of which nothing is held out.
+
+    Args:
+        cell: whose they are.
+        fitted: archives and what is of use in each.
+        rest: a recording at standstill, if there is one.
+
+    Raises:
+        ArchiveError: the plan in the first archive is none.
+    """
+    archives, found = zip(*fitted, strict=True)
+    training, plan = tuple(found), _plan_of(archives[0])
+    same_motion = plan is not None and (
+        len({archive.attachments.get("plan.json") for archive in archives}) == 1
+    )
+    if plan is None:
+        training, same_motion = _aligned(training)
+    return Sources(
+        cell=cell,
+        metadata=dict(archives[0].metadata),
+        plan=plan,
+        training=training,
+        same_motion=same_motion,
+        held_out=training,
+        noise_variance=None if rest is None else position_noise(cell, rest),
+        torque_variance=None if rest is None else _torque_variance(rest),
+        doubts=(),
+        tested_on="the motion that was fitted",
+        in_sample=True,
+    )
+
+
+def _aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
     """Imported recordings with one origin if they show one motion, and whether they do."""
     offsets = offsets_of_repetitions([source.recording for source in sources])
     if offsets is None:
@@ -207,10 +235,10 @@ def _aligned(sources: list[Source]) -> tuple[list[Source], bool]:
         source.recording.time[0] - offset for source, offset in zip(sources, offsets, strict=True)
     ]
     latest = max(starts)
-    return [
+    return tuple(
         replace(source, origin=float(latest + offset))
         for source, offset in zip(sources, offsets, strict=True)
-    ], True
+    ), True
 
 
 def _plan_of(archive: Archive) -> dict[str, Any] | None:
@@ -371,11 +399,13 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     return range(int(commanded[0]), int(commanded[-1]) + 1)
 
 
-def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Source], str]:
+def _split(
+    sources: tuple[Source, ...], share: float
+) -> tuple[tuple[Source, ...], list[Source], str]:
     if len(sources) > 1:
         return (
             sources[:-1],
-            sources[-1:],
+            [sources[-1]],
             f"no validation run: the last recording, {sources[-1].name}, was held out instead",
         )
     whole = sources[0]
@@ -386,7 +416,7 @@ def _split(sources: list[Source], share: float) -> tuple[list[Source], list[Sour
         f"a temporal split: the first {share:.0%} of one recording were fitted, the rest of the "
         "same motion was predicted; other motions would be a harder test"
     )
-    return [first], [last], doubt
+    return (first,), [last], doubt
 
 
 def _part(whole: Source, words: str, start: int, stop: int) -> Source:

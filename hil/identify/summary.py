@@ -109,7 +109,7 @@ def summarise(
                 errors=[error if np.isfinite(error) else None for error in choice.errors],
                 chosen=choice.chosen,
             )
-            for choice in prepared.choices
+            for choice in prepared.settings.choices
         ],
         coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
         verdict=VerdictResult(
@@ -300,7 +300,9 @@ def _fitted(model: RobotModel, values: Array, prepared: Prepared) -> FittedResul
     moving = error(prepared.training, all_rows=False)
     everywhere = error(prepared.training, all_rows=True)
     smoothed = (
-        error(prepared.fitted, all_rows=True) if prepared.preprocessing.smooth_torque else None
+        error(prepared.fitted, all_rows=True)
+        if prepared.settings.preprocessing.smooth_torque
+        else None
     )
     return FittedResult(
         relative_error=moving.relative.tolist(),

@@ -75,8 +75,8 @@ def _clock(prepared: Prepared) -> Iterator[Finding]:
 
 def _low_pass(prepared: Prepared) -> Iterator[Finding]:
     """A low-pass of the torque that was found, and not stated."""
-    found = any(one.name == LOW_PASS and one.chosen for one in prepared.choices)
-    how = prepared.preprocessing
+    found = any(one.name == LOW_PASS and one.chosen for one in prepared.settings.choices)
+    how = prepared.settings.preprocessing
     width = how.torque_bandwidth
     if found and width is not None:
         yield Finding(

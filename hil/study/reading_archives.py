@@ -182,7 +182,7 @@ def _prepared(reading: Reading) -> Prepared:
     paths = [*reading.archives, *reading.standstill]
     options = replace(FIXED, in_sample=True)
     sources = gather_sources(paths, options.split, in_sample=True)
-    return prepare_sources(sources, options, Silent(), look_for_delay=False)
+    return prepare_sources(sources, options, Silent())
 
 
 def _example(

@@ -20,6 +20,7 @@ from hil.batch.workers import Workers
 from hil.compare import gather
 from hil.errors import HilError, InputError
 from hil.identify import Identification, identify_archives, identify_campaign
+from hil.identify.options import FIXED
 from hil.plots.archive_view import view_of
 from hil.progress import Silent
 
@@ -199,7 +200,7 @@ def _by_archive(
     root: Path, workers: Workers
 ) -> tuple[dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], list[str]]:
     """Estimates of a batch by archive or "" for all, and what it says."""
-    result = reidentify([str(root)], Plan(keep=False), workers, Silent())
+    result = reidentify([str(root)], Plan(FIXED, keep=False), workers, Silent())
     found = {Path(one.archive).name: (one.values, one.std) for one in result.repetitions}
     found[""] = (result.pooled[0].values, result.pooled[0].std)
     said = [f"{one.path}: {one.reason}" for one in (*result.broken, *result.skipped)]

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Final
 
 from hil.batch.on_workers import ArchiveTask, Part, Summed, run_task
 from hil.batch.places import Place
 from hil.batch.types import ArchiveRef, Broken
 from hil.batch.workers import Workers, summed
+
+NOTHING_OPEN: Final = (
+    *("--bandwidth", "40", "--velocity", "position", "--friction", "coulomb,viscous"),
+    *("--standstill", "slow", "--delay", "stated", "--estimator", "wls"),
+)
+"""Options of `hil reidentify` that leave nothing to be chosen of a controller's archives."""
 
 
 class Here(Workers):

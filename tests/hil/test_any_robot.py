@@ -34,7 +34,7 @@ UR5 = "ur5_robot.urdf"
 EPOCH_MS = 1_700_000_000_000
 
 
-PLAIN = replace(FIXED, torque_bandwidth=None)
+PLAIN = replace(FIXED, delay=None)
 """Nothing chosen automatically, for a plain estimate."""
 
 

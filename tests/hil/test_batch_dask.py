@@ -33,6 +33,7 @@ from hil.batch.tree import FAN_IN, runs, sum_run, sum_tree
 from hil.batch.types import BatchResult, Broken
 from hil.campaign import Campaign
 from hil.errors import InputError
+from hil.identify.options import FIXED
 from hil.progress import Silent
 from tests.hil import batch_work as work
 from tests.hil.dask_cluster import Cluster, running
@@ -274,7 +275,7 @@ def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
     """Two campaigns, told apart by a record that no estimate reads."""
     for number in range(2):
         _copy_with_mark(campaign.folder.root, tmp_path / "data" / f"{number}", f"copy {number}")
-    plan, roots = run.Plan(keep=False), [str(tmp_path / "data")]
+    plan, roots = run.Plan(FIXED, keep=False), [str(tmp_path / "data")]
     hands = DaskWorkers(pair.address, identity=code_digest, patience=PATIENCE)
     with _KillsOne(hands, pair.workers[0]) as workers:
         found = run.reidentify(roots, plan, workers, Silent())
@@ -291,7 +292,7 @@ def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
 def test_archives_behind_a_web_server_are_read_by_the_workers(
     campaign: Campaign, cluster: Cluster
 ) -> None:
-    plan = run.Plan(keep=False)
+    plan = run.Plan(FIXED, keep=False)
     with (
         served(campaign.folder.root) as address,
         DaskWorkers(cluster.address, identity=code_digest, patience=PATIENCE) as workers,

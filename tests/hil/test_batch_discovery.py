@@ -8,6 +8,7 @@ import shutil
 import time
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import fsspec
@@ -24,17 +25,20 @@ from hil.batch.keeping import bundle_with_cache, kept_bundle
 from hil.batch.keys import code_digest
 from hil.batch.local import LocalWorkers
 from hil.batch.run import Plan, reidentify
-from hil.batch.types import ArchiveRef, Settings
+from hil.batch.types import ArchiveRef
 from hil.campaign import Campaign
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.identify.options import FIXED
+from hil.identify.settings import Settings
 from hil.progress import Silent
+from identification.preprocessing import Preprocessing
 
 from .archive_edits import with_attachment
 from .batch_workers import Here
 from .conftest import small
 
-SETTINGS = Settings("spline", 0.0, None, None, "code")
+SETTINGS = Settings(Preprocessing())
 PAYLOAD = "[robot.payload]\nmass = 3.0\ncentre = [0.02, 0.0, 0.08]\n\n[robot.friction]"
 
 
@@ -176,11 +180,11 @@ def test_delays_of_one_folder_are_each_taken_for_their_own(
     reduce_one = factors.archive_factor
 
     def spied(ref: ArchiveRef, settings: Settings):
-        used[ref.name] = settings.torque_delay
+        used[ref.name] = settings.preprocessing.torque_delay
         return reduce_one(ref, settings)
 
     monkeypatch.setattr(factors, "archive_factor", spied)
-    result = reidentify([str(folder)], Plan(keep=False), Here(), Silent())
+    result = reidentify([str(folder)], Plan(FIXED, keep=False), Here(), Silent())
     assert not result.broken
     assert [one.repetitions for one in result.campaigns] == [2, 1]
     assert used.pop(victim.name) == pytest.approx(0.0042)
@@ -197,8 +201,10 @@ def test_a_prior_that_the_archives_of_an_arm_state_differently_is_refused(
     )
     other.replace(victim)
     with pytest.raises(InputError, match=rf"{victim.name}.*another \[nominal\]"):
-        reidentify([str(folder)], Plan("prior", keep=False), Here(), Silent())
-    (level,) = reidentify([str(folder)], Plan(keep=False), Here(), Silent()).campaigns
+        reidentify(
+            [str(folder)], Plan(replace(FIXED, estimator="prior"), keep=False), Here(), Silent()
+        )
+    (level,) = reidentify([str(folder)], Plan(FIXED, keep=False), Here(), Silent()).campaigns
     assert level.repetitions == 3  # a belief is nothing to least squares
 
 
@@ -418,7 +424,7 @@ def test_a_whole_batch_reads_from_a_store(folder: Path, tmp_path: Path) -> None:
     store = fsspec.filesystem("memory")
     for path in sorted((folder / "archives").glob("*.mcap")):
         store.pipe(f"memory://{tmp_path.name}/archives/{path.name}", path.read_bytes())
-    plan = Plan(cache=tmp_path / "cache")
+    plan = Plan(FIXED, cache=tmp_path / "cache")
     far = reidentify([f"memory://{tmp_path.name}"], plan, Here(), Silent())
     near = reidentify([str(folder)], plan, Here(), Silent())
     assert not far.broken

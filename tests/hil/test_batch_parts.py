@@ -16,14 +16,20 @@ from hypothesis import strategies as st
 from hil.batch.cache import Store, Where, decoded, encoded
 from hil.batch.errors import CacheError
 from hil.batch.keeping import BUNDLE, bundles
+from hil.batch.kept_forms import settings_from, settings_header
 from hil.batch.keys import arm_digest, settings_digest, sum_key
 from hil.batch.local import LocalWorkers
 from hil.batch.on_workers import ArchiveTask, Part
 from hil.batch.tree import sum_tree
 from hil.batch.tree_sum import TreeSum
-from hil.batch.types import ArchiveRef, Broken, Settings
+from hil.batch.types import ArchiveRef, Broken
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
+from hil.identify.settings import Settings
+from identification.inner_prediction import Choice
+from identification.low_passes import LowPassShape
+from identification.preprocessing import Preprocessing
+from identification.shrinkage import Shrinkage
 from sim_fixtures.ns16 import CELL_PATH
 
 KEY = "0123456789abcdef"
@@ -121,20 +127,39 @@ def test_an_arm_is_its_links_friction_and_drives_and_not_its_payload_or_campaign
 
 
 def test_factors_are_known_by_everything_they_depend_on() -> None:
-    plain = Settings("spline", 0.002, None, (1e-9,) * 6, "code", "words")
-    same = Settings("spline", 0.002, None, (1e-9,) * 6, "code", "other words")
-    assert settings_digest(plain) == settings_digest(same)
+    plain = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
+    for_the_estimate = replace(
+        plain, shrinkage=Shrinkage(0.1), choices=(Choice("rows", (), (), 0),)
+    )
+    assert settings_digest(plain) == settings_digest(for_the_estimate)
     others = [
-        Settings("butterworth", 0.002, None, (1e-9,) * 6, "code"),
-        Settings("spline", 0.004, None, (1e-9,) * 6, "code"),
-        Settings("spline", 0.002, 30.0, (1e-9,) * 6, "code"),
-        Settings("spline", 0.002, None, (1e-9 * (1 + 2e-16),) * 6, "code"),
-        Settings("spline", 0.002, None, None, "code"),
-        Settings("spline", 0.002, None, (1e-9,) * 6, "other code"),
+        plain.preprocessed(smoother="butterworth"),
+        plain.preprocessed(torque_delay=0.004),
+        plain.preprocessed(torque_bandwidth=30.0),
+        replace(plain, noise_variance=(1e-9 * (1 + 2e-16),) * 6),
+        replace(plain, noise_variance=None),
+        replace(plain, friction={"presliding": 1e-4}),
+        replace(plain, axis_delays=(0.001,) * 6),
+        replace(plain, delay_variance=1e-9),
     ]
     assert len({settings_digest(one) for one in (plain, *others)}) == 1 + len(others)
     digest = settings_digest(plain)
     assert sum_key([a_ref(0), a_ref(1)], digest) != sum_key([a_ref(1), a_ref(0)], digest)
+
+
+def test_settings_are_kept_to_the_last_bit() -> None:
+    settings = Settings(
+        Preprocessing(torque_bandwidth=1.0 / 3.0, torque_shape=LowPassShape(2, causal=True)),
+        friction={"presliding": 1e-4, "third": "none"},
+        noise_variance=(1e-9 / 3.0,) * 6,
+        shrinkage=Shrinkage(np.inf),
+        choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
+    )
+    entry = decoded(encoded(KEY, settings_header(settings), {}), KEY)
+    assert entry is not None
+    assert settings_from(entry.header) == settings
+    assert settings_from(entry.header | {"preprocessing": {"smoother": "none"}}) is None
+    assert settings_from({"smoother": "spline", "torque_delay": 0.0}) is None
 
 
 # Who does the work

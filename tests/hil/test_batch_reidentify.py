@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +21,20 @@ from hil.batch.cache import Store, decoded
 from hil.batch.errors import NothingToFitError
 from hil.batch.local import LocalWorkers
 from hil.batch.run import Plan, reidentify
-from hil.batch.types import ESTIMATORS, BatchEstimator, BatchResult, Choices
+from hil.batch.types import ESTIMATORS, BatchEstimator, BatchResult
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import InputError
 from hil.identify import Options, identify_campaign
+from hil.identify.deciding import Decided, decide
 from hil.identify.estimating import estimate_with
 from hil.identify.options import FIXED
 from hil.identify.prepared import prepare_sources
-from hil.identify.sources import gather_sources
-from hil.progress import Silent
+from hil.identify.sources import Sources, gather_sources
+from hil.progress import Reporter, Silent
+from identification.shrinkage import Shrinkage
 
-from .batch_workers import Here
+from .batch_workers import NOTHING_OPEN, Here
 
 EXACT = {"rtol": 1e-9, "atol": 0.0}
 
@@ -39,7 +42,9 @@ EXACT = {"rtol": 1e-9, "atol": 0.0}
 def batch(
     *places: Path, plan: Plan | None = None, workers: Here | LocalWorkers | None = None
 ) -> BatchResult:
-    return reidentify([str(place) for place in places], plan or Plan(), workers or Here(), Silent())
+    return reidentify(
+        [str(place) for place in places], plan or Plan(FIXED), workers or Here(), Silent()
+    )
 
 
 def archives(campaign: Campaign) -> list[Path]:
@@ -57,7 +62,7 @@ def folder(campaign: Campaign, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def found(campaign: Campaign, tmp_path_factory: pytest.TempPathFactory) -> BatchResult:
-    return batch(campaign.folder.root, plan=Plan(cache=tmp_path_factory.mktemp("cache")))
+    return batch(campaign.folder.root, plan=Plan(FIXED, cache=tmp_path_factory.mktemp("cache")))
 
 
 def same_bits(first: BatchResult, second: BatchResult) -> bool:
@@ -71,16 +76,17 @@ def same_bits(first: BatchResult, second: BatchResult) -> bool:
 # The numbers
 
 
-def test_campaign_and_repetitions_are_those_of_hil_identify(
-    campaign: Campaign, found: BatchResult
-) -> None:
-    one = identify_campaign(campaign.folder.root, Silent(), FIXED).estimate
+def test_campaign_and_repetitions_are_those_of_hil_identify(campaign: Campaign) -> None:
+    """With the options that either has by default, which choose the settings."""
+    one = identify_campaign(campaign.folder.root, Silent()).estimate
+    found = batch(campaign.folder.root, plan=Plan(keep=False))
     (level,) = found.campaigns
     np.testing.assert_allclose(level.values, one.pooled.values, **EXACT)
     np.testing.assert_allclose(level.covariance, one.pooled.covariance, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(level.noise_std, one.pooled.noise_std, **EXACT)
     assert level.interval_factor == one.pooled.interval_factor
     assert level.method == one.pooled.method
+    assert level.names == one.pooled.names
     assert list(level.samples) == list(one.pooled.samples)
     assert len(found.repetitions) == len(one.repetitions) == 3
     for mine, own in zip(found.repetitions, one.repetitions, strict=True):
@@ -88,13 +94,37 @@ def test_campaign_and_repetitions_are_those_of_hil_identify(
         np.testing.assert_allclose(mine.std, own.std, **EXACT)
 
 
+def test_what_is_drawn_towards_a_machine_is_that_of_hil_identify(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Repetitions too, towards the machine of all; of their intervals only the words."""
+
+    def drawn(sources: Sources, options: Options, reporter: Reporter) -> Decided:
+        found = decide(sources, FIXED, reporter)
+        return found._replace(settings=replace(found.settings, shrinkage=Shrinkage(0.1)))
+
+    monkeypatch.setattr("hil.identify.prepared.decide", drawn)
+    monkeypatch.setattr("hil.batch.settling.decide", drawn)
+    options = replace(FIXED, estimator="auto")
+    prepared = prepare_sources(gather_sources(archives(campaign), 0.7), options, Silent())
+    one = estimate_with(prepared, options, Silent()).result
+    found = batch(campaign.folder.root, plan=Plan(options, keep=False))
+    np.testing.assert_allclose(found.campaigns[0].values, one.pooled.values, **EXACT)
+    np.testing.assert_allclose(found.campaigns[0].std, one.pooled.std, **EXACT)
+    for mine, own in zip(found.repetitions, one.repetitions, strict=True):
+        np.testing.assert_allclose(mine.values, own.values, **EXACT)
+        assert mine.method == own.method
+
+
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_gives_what_it_gives_with_samples(
     name: BatchEstimator, campaign: Campaign, tmp_path: Path
 ) -> None:
     prepared = prepare_sources(gather_sources(archives(campaign), 0.7), FIXED, Silent())
-    one = estimate_with(prepared, Options(estimator=name), Silent()).result
-    (level,) = batch(campaign.folder.root, plan=Plan(name, cache=tmp_path)).campaigns
+    one = estimate_with(prepared, replace(FIXED, estimator=name), Silent()).result
+    (level,) = batch(
+        campaign.folder.root, plan=Plan(replace(FIXED, estimator=name), cache=tmp_path)
+    ).campaigns
     # The program of the consistent estimate stops at its own tolerance.
     close = {"rtol": 1e-4, "atol": 1e-4} if name == "consistent" else {"rtol": 1e-8, "atol": 1e-12}
     np.testing.assert_allclose(level.values, one.pooled.values, **close)
@@ -129,7 +159,7 @@ def test_campaigns_of_an_arm_are_pooled(
         for pattern in (wanted, "standstill"):
             for path in campaign.folder.archives.glob(f"{pattern}*.mcap"):
                 shutil.copy(path, tmp_path / name / path.name)
-    result = batch(tmp_path, plan=Plan(keep=False))
+    result = batch(tmp_path, plan=Plan(FIXED, keep=False))
     assert [one.repetitions for one in result.campaigns] == [1, 2]
     assert [one.repetitions for one in result.pooled] == [3]
     # Other sums of the same terms: rounding, in parameters that are hardly known.
@@ -138,12 +168,40 @@ def test_campaigns_of_an_arm_are_pooled(
     np.testing.assert_allclose(result.pooled[0].std, found.pooled[0].std, rtol=1e-6)
 
 
+def test_settings_are_decided_once_for_each_arm(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the first campaign that can be read; the noise of the positions is each one's own."""
+    names = ("excitation_000", "excitation_001", "excitation_002", "standstill")
+    for folder, wanted in (("a", names[:1]), ("b", names[1:2]), ("c", names[2:])):
+        (tmp_path / folder).mkdir()
+        for name in wanted:
+            (path,) = campaign.folder.archives.glob(f"{name}*.mcap")
+            shutil.copy(path, tmp_path / folder / path.name)
+    damaged = bytearray((tmp_path / "a" / "excitation_000_a1.mcap").read_bytes())
+    middle = len(damaged) // 2
+    damaged[middle : middle + 2000] = bytes(2000)
+    (tmp_path / "a" / "excitation_000_a1.mcap").write_bytes(damaged)
+    read: list[list[str]] = []
+
+    def spied(sources: Sources, options: Options, reporter: Reporter) -> Decided:
+        read.append([source.name for source in sources.training])
+        return decide(sources, options, reporter)
+
+    monkeypatch.setattr("hil.batch.settling.decide", spied)
+    found = batch(tmp_path, plan=Plan(replace(FIXED, friction="auto"), keep=False))
+    assert read == [["excitation_001_a1.mcap"]]
+    assert [Path(one.campaign).name for one in found.campaigns] == ["b", "c"]
+    assert found.campaigns[0].settings != found.campaigns[1].settings
+    assert found.pooled[0].repetitions == 2
+
+
 def test_a_copy_counts_once(campaign: Campaign, tmp_path: Path) -> None:
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         for path in campaign.folder.completed("excitation"):
             shutil.copy(path, tmp_path / name / path.name)
-    result = batch(tmp_path, plan=Plan(keep=False))
+    result = batch(tmp_path, plan=Plan(FIXED, keep=False))
     assert result.pooled[0].repetitions == 3
     assert len([one for one in result.skipped if "holds the same" in one.reason]) == 3
 
@@ -153,11 +211,11 @@ def test_workers_order_and_cache_make_no_difference_to_the_last_bit(
     folder: Path, tmp_path: Path
 ) -> None:
     with LocalWorkers(2) as workers:
-        alone = batch(folder, plan=Plan(keep=False), workers=workers)
+        alone = batch(folder, plan=Plan(FIXED, keep=False), workers=workers)
     files = sorted((folder / "archives").glob("*.mcap"), reverse=True)
-    assert same_bits(alone, batch(*files, plan=Plan(keep=False)))
-    assert same_bits(alone, batch(folder, plan=Plan(keep=False), workers=Here(near=False)))
-    cached = Plan(cache=tmp_path / "cache")
+    assert same_bits(alone, batch(*files, plan=Plan(FIXED, keep=False)))
+    assert same_bits(alone, batch(folder, plan=Plan(FIXED, keep=False), workers=Here(near=False)))
+    cached = Plan(FIXED, cache=tmp_path / "cache")
     assert same_bits(alone, batch(folder, plan=cached))
     assert same_bits(alone, batch(folder, plan=cached))
 
@@ -187,7 +245,7 @@ class Listening(Silent):
 @pytest.mark.parametrize("near", [True, False])
 def test_all_work_on_archives_is_reported_to_its_end(near: bool, folder: Path) -> None:
     told = Listening()
-    reidentify([str(folder)], Plan(keep=False), Here(near=near), told)
+    reidentify([str(folder)], Plan(FIXED, keep=False), Here(near=near), told)
     reading = "reading archives" if near else "reading archives and estimating"
     assert told.done == pytest.approx(told.totals)
     assert told.totals["looking into archives"] == len(list(folder.rglob("*.mcap")))
@@ -199,7 +257,7 @@ def test_a_crash_far_away_is_told_below_the_one_bar(folder: Path) -> None:
     names = [path.name for path in sorted((folder / "archives").glob("excitation*"))]
     told = Listening()
     workers = Here(names[1], near=False)
-    assert reidentify([str(folder)], Plan(keep=False), workers, told).broken
+    assert reidentify([str(folder)], Plan(FIXED, keep=False), workers, told).broken
 
 
 # What is kept
@@ -221,7 +279,7 @@ def test_a_second_run_with_another_estimator_opens_no_archive(
     monkeypatch.setattr(factors, "open_archive", never)
     monkeypatch.setattr("hil.batch.examining.open_archive", never)
     workers = Here()
-    second = batch(folder, plan=Plan("ols"), workers=workers)
+    second = batch(folder, plan=Plan(replace(FIXED, estimator="ols")), workers=workers)
     assert (second.read, second.cached, workers.tasks) == (0, 5, [])
     assert "ordinary" in second.campaigns[0].method
 
@@ -234,12 +292,12 @@ def test_a_longer_campaign_reads_only_what_is_new(folder: Path) -> None:
     away.rename(archive)
     longer = batch(folder)
     assert longer.read == 1
-    assert same_bits(longer, batch(folder, plan=Plan(keep=False)))
+    assert same_bits(longer, batch(folder, plan=Plan(FIXED, keep=False)))
 
 
 def test_other_settings_are_other_factors(folder: Path) -> None:
     batch(folder)
-    assert batch(folder, plan=Plan(choices=Choices(delay=0.002))).read == 5
+    assert batch(folder, plan=Plan(replace(FIXED, delay=0.002))).read == 5
 
 
 def test_damaged_entries_are_made_anew_and_never_believed(folder: Path) -> None:
@@ -307,7 +365,7 @@ def test_a_read_only_folder_is_kept_elsewhere(
 
 def test_nothing_is_left_behind_without_a_cache(folder: Path) -> None:
     before = sorted(folder.rglob("*"))
-    batch(folder, plan=Plan(keep=False))
+    batch(folder, plan=Plan(FIXED, keep=False))
     assert sorted(folder.rglob("*")) == before
 
 
@@ -315,7 +373,7 @@ def test_nothing_is_left_behind_without_a_cache(folder: Path) -> None:
 
 
 def test_broken_archives_are_listed_and_cost_only_themselves(folder: Path) -> None:
-    whole = batch(folder, plan=Plan(keep=False))
+    whole = batch(folder, plan=Plan(FIXED, keep=False))
     names = [path.name for path in sorted((folder / "archives").glob("excitation*"))]
     loose = folder / "loose"
     loose.mkdir()
@@ -331,7 +389,7 @@ def test_broken_archives_are_listed_and_cost_only_themselves(folder: Path) -> No
     middle = len(flipped) // 2
     flipped[middle : middle + 2000] = bytes(2000)
     (loose / names[2]).write_bytes(flipped)
-    for plan in (Plan(), Plan(), Plan(keep=False)):
+    for plan in (Plan(FIXED), Plan(FIXED), Plan(FIXED, keep=False)):
         result = batch(folder, plan=plan)
         reasons = {Path(one.path).name: one.reason for one in result.broken}
         assert set(reasons) == {names[1], names[2], "nothing.mcap", "other.mcap"}
@@ -348,7 +406,7 @@ def test_a_broken_first_excitation_costs_only_itself(folder: Path) -> None:
     damaged[middle : middle + 2000] = bytes(2000)
     first.write_bytes(damaged)
 
-    result = batch(folder, plan=Plan(keep=False))
+    result = batch(folder, plan=Plan(FIXED, keep=False))
 
     assert [Path(one.path).name for one in result.broken] == [first.name]
     assert len(result.repetitions) == len(others)
@@ -367,7 +425,7 @@ def test_a_repaired_copy_is_not_fitted_beside_its_original(folder: Path) -> None
     repair(whole[0])
     assert repaired_name(whole[0]).read_bytes() != bytes(data)
 
-    result = batch(folder, plan=Plan(keep=False))
+    result = batch(folder, plan=Plan(FIXED, keep=False))
 
     assert not result.broken
     assert len(result.repetitions) == len(whole)
@@ -376,7 +434,7 @@ def test_a_repaired_copy_is_not_fitted_beside_its_original(folder: Path) -> None
 def test_a_file_that_is_not_what_was_recorded_is_not_used(folder: Path) -> None:
     victim, other = sorted((folder / "archives").glob("excitation*"))[:2]
     shutil.copy(other, victim)
-    result = batch(folder, plan=Plan(keep=False))
+    result = batch(folder, plan=Plan(FIXED, keep=False))
     assert [Path(one.path).name for one in result.broken] == [victim.name]
     assert "manifest" in result.broken[0].reason
 
@@ -386,16 +444,18 @@ def test_an_archive_that_ends_its_process_costs_itself(
     near: bool, folder: Path, tmp_path: Path
 ) -> None:
     names = [path.name for path in sorted((folder / "archives").glob("excitation*"))]
-    result = batch(folder, plan=Plan(cache=tmp_path / "cache"), workers=Here(names[1], near=near))
+    result = batch(
+        folder, plan=Plan(FIXED, cache=tmp_path / "cache"), workers=Here(names[1], near=near)
+    )
     assert [Path(one.path).name for one in result.broken] == [names[1]]
     assert [Path(one.archive).name for one in result.repetitions] == [names[0], names[2]]
     left = [path for path in (folder / "archives").glob("*.mcap") if path.name != names[1]]
-    assert same_bits(result, batch(*left, plan=Plan(keep=False)))
+    assert same_bits(result, batch(*left, plan=Plan(FIXED, keep=False)))
 
 
 def test_a_standstill_that_ends_its_process_costs_itself(folder: Path, tmp_path: Path) -> None:
     (name,) = [path.name for path in (folder / "archives").glob("standstill*")]
-    result = batch(folder, plan=Plan(cache=tmp_path), workers=Here(name))
+    result = batch(folder, plan=Plan(FIXED, cache=tmp_path), workers=Here(name))
     assert name in [Path(one.path).name for one in result.broken]
     assert len(result.repetitions) == 3
 
@@ -432,6 +492,7 @@ def test_the_command_lists_what_is_broken_and_says_so_in_its_status(
     folder: Path, tmp_path: Path
 ) -> None:
     command = ["reidentify", str(folder), "--workers", "1", "-o", str(tmp_path / "out")]
+    command += NOTHING_OPEN
     ran = CliRunner().invoke(app, command)
     assert ran.exit_code == 0, ran.output
     assert "3 repetitions in 1 campaign of 1 arm; 5 archives read" in ran.output

@@ -22,10 +22,11 @@ from hil.batch.types import ArchiveRef, BatchResult, Broken, Summary
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli.reidentify_words import alarm_lines, skipped_line
+from hil.identify.options import FIXED
 from hil.progress import Silent
 
 from .arm_histories import Load, steady, trend_of
-from .batch_workers import Here
+from .batch_workers import NOTHING_OPEN, Here
 
 SLIP = "the clock falls back 2 times; cut the log where it does"
 ASSUMED = "the torque constants are assumed"
@@ -62,7 +63,7 @@ def record(monkeypatch: pytest.MonkeyPatch) -> Record:
 
 
 def batch(folder: Path) -> BatchResult:
-    return reidentify([str(folder)], Plan(keep=False), Here(), Silent())
+    return reidentify([str(folder)], Plan(FIXED, keep=False), Here(), Silent())
 
 
 def test_doubts_of_import_and_of_torque_constants_stand_with_every_estimate(
@@ -72,7 +73,7 @@ def test_doubts_of_import_and_of_torque_constants_stand_with_every_estimate(
     findings = json.dumps({"lines": [], "doubts": [SLIP]})
     record(tmp_path / "slipped", 2, first=2, metadata={"findings": findings})
     command = ["reidentify", str(tmp_path), "--workers", "1", "-o", str(tmp_path / "out")]
-    ran = CliRunner().invoke(app, [*command, "--cache", "none"])
+    ran = CliRunner().invoke(app, [*command, "--cache", "none", *NOTHING_OPEN])
     assert ran.exit_code == 0, ran.output
     assert f"note: {ASSUMED}" in ran.output
     told = f"2 of 4 archives, such as slipped/excitation_000_a1.mcap: {SLIP}"
@@ -103,7 +104,8 @@ def test_one_folder_in_which_a_payload_is_stated_halfway_is_two_campaigns(
     (pooled,) = found.pooled
     assert (pooled.repetitions, pooled.setup, pooled.payload) == (2, "", None)
     assert "cells state different things" in pooled.doubts[0]
-    ran = CliRunner().invoke(app, ["reidentify", str(tmp_path), "--cache", "none", "--json"])
+    command = ["reidentify", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
+    ran = CliRunner().invoke(app, command)
     (arm,) = json.loads(ran.stdout)["arms"].values()
     assert len(arm["campaigns"]) == 2
     assert sum("carries 3 kg" in one["setup"] for one in arm["campaigns"].values()) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from hil.design import preset, problem_of
 from hil.design.earlier import known_from
 from hil.design.knowledge import Knowledge
 from hil.errors import InputError
-from hil.identify import identify_campaign
+from hil.identify import identify_archives
+from hil.identify.options import FIXED
 from hil.plots import design_picture
 from hil.progress import Silent
 from identification.excitation import Criteria, Excitation, midpoints
@@ -34,7 +36,10 @@ def known(campaign, cell) -> Knowledge:
 
 @pytest.mark.slow
 def test_joints_count_by_the_noise_of_their_torque(known, campaign):
-    pooled = identify_campaign(campaign.folder.root, Silent()).estimate.pooled
+    kinds = ("excitation", "validation", "standstill")
+    paths = [path for kind in kinds for path in campaign.folder.completed(kind)]
+    options = replace(FIXED, in_sample=True)
+    pooled = identify_archives(paths, Silent(), options).estimate.pooled
     np.testing.assert_allclose(known.joint_weights, 1.0 / pooled.noise_std**2)
     np.testing.assert_array_equal(known.values, pooled.values)
     np.testing.assert_array_equal(known.std, pooled.std)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt, sosfiltfilt
 
-from hil.identify.options import FIXED
+from hil.identify.options import FIXED, Options
 from hil.identify.prepared import Prepared, prepare_sources
+from hil.identify.settings import stated_settings
 from hil.identify.sources import gather_sources
 from hil.importers import ColumnMap, Quantity, Robot, TimeColumn, import_log
 from hil.progress import Silent
@@ -19,7 +20,7 @@ from tests.hil.simulated_logs import simulate
 
 RATE = 125.0  # Hz
 BANDWIDTH = 4.0  # Hz
-OPTIONS = replace(FIXED, torque_bandwidth="auto")
+OPTIONS = replace(FIXED, delay=None, torque_bandwidth="auto")
 COLUMNS = ColumnMap(
     time=TimeColumn(column="time"),
     position=Quantity(columns="position", joints_along="columns"),
@@ -27,7 +28,9 @@ COLUMNS = ColumnMap(
 )
 
 
-def prepared(folder: Path, order: int | None, *, causal: bool = False) -> Prepared:
+def prepared(
+    folder: Path, order: int | None, *, causal: bool = False, options: Options = OPTIONS
+) -> Prepared:
     """A log of a UR5, its torque through a Butterworth low-pass."""
     log = simulate("ur5_robot.urdf", np.arange(0.0, 24.0, 1.0 / RATE), pace=2.0)
     torque = log.torque
@@ -39,7 +42,7 @@ def prepared(folder: Path, order: int | None, *, causal: bool = False) -> Prepar
         log.urdf, friction=FrictionLaw(third=None, offset=True, standstill=0.02)
     )
     archive = import_log(folder / "log.npz", folder / "log.mcap", robot=robot, columns=COLUMNS)
-    return prepare_sources(gather_sources([archive], 0.7), OPTIONS, Silent())
+    return prepare_sources(gather_sources([archive], 0.7), options, Silent())
 
 
 def held_out_error(found: Prepared) -> float:
@@ -56,20 +59,31 @@ def unfiltered(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
 
 class TestFilteredTorque:
     def test_none_is_claimed_without_one(self, unfiltered: Prepared) -> None:
-        assert unfiltered.preprocessing.torque_bandwidth is None
+        assert unfiltered.settings.preprocessing.torque_bandwidth is None
 
     @pytest.mark.parametrize("order", [1, 4])
     def test_without_phase(self, tmp_path: Path, order: int, unfiltered: Prepared) -> None:
         found = prepared(tmp_path, order)
-        assert found.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert found.settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
         assert held_out_error(found) < 1.3 * held_out_error(unfiltered)
 
     @pytest.mark.parametrize("order", [1, 2])
     def test_a_lag_is_no_delay(self, tmp_path: Path, order: int, unfiltered: Prepared) -> None:
         """A low-pass that runs forwards lags by some ten ms, which are not taken for a delay."""
         found = prepared(tmp_path, order, causal=True)
-        assert found.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
-        assert found.preprocessing.torque_shape.causal
-        assert found.preprocessing.torque_delay == 0.0
+        assert found.settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert found.settings.preprocessing.torque_shape.causal
+        assert found.settings.preprocessing.torque_delay == 0.0
         assert found.delays is None
         assert held_out_error(found) < 1.3 * held_out_error(unfiltered)
+
+
+class TestFixedOptions:
+    def test_nothing_is_decided(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def never(*_: object, **__: object) -> None:
+            raise AssertionError("something was asked")
+
+        for name in ("choose_settings", "estimate_delays", "possible_low_passes"):
+            monkeypatch.setattr(f"hil.identify.deciding.{name}", never)
+        found = prepared(tmp_path, 2, causal=True, options=FIXED)
+        assert found.settings == stated_settings(found.sources.cell, FIXED)

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from identification.delay_compensation import (
     compensate,
     delay_sensitivity,
-    with_delay_uncertainty,
+    rate_products,
+    with_uncertain_delay,
 )
 from identification.errors import IdentificationError, ShapeError
 from identification.estimation import Estimate, estimate
@@ -69,30 +70,32 @@ class TestDelayUncertainty:
             return prepare(recording, model, options=options)
 
         fitted = self.fit(model, samples(0.004))
-        slope = delay_sensitivity(model, [samples(0.004)], np.array([1.0, 25.0]), fitted.values)
+        middle, weights = samples(0.004), np.array([1.0, 25.0])
+        slope = delay_sensitivity(
+            middle.factor(model), rate_products(model, middle), weights, fitted.values
+        )
         ends = [self.fit(model, samples(0.004 + side)).values for side in (-5e-4, 5e-4)]
         assert slope == pytest.approx((ends[1] - ends[0]) / 1e-3, rel=0.03)
 
     def test_variances_grow_by_the_square_of_the_sensitivity(
         self, model: RobotModel, truth: Array
     ) -> None:
-        fitted = self.fit(model, prepare(a_recording(model, truth, 0.0), model))
-        sensitivity = np.arange(model.n_parameters, dtype=np.float64)
-        wider = with_delay_uncertainty(fitted, sensitivity, 0.25)
+        samples = prepare(a_recording(model, truth, 0.0), model)
+        fitted, factor = self.fit(model, samples), samples.factor(model)
+        products = rate_products(model, samples)
+        weights = fitted.noise_std**-2.0
+        sensitivity = delay_sensitivity(factor, products, weights, fitted.values)
+        wider = with_uncertain_delay(fitted, factor, products, 0.25)
         np.testing.assert_allclose(wider.std**2, fitted.std**2 + 0.25 * sensitivity**2)
         np.testing.assert_array_equal(wider.values, fitted.values)
 
     def test_what_is_undetermined_stays_so(self, model: RobotModel, truth: Array) -> None:
-        fitted = self.fit(model, prepare(a_recording(model, truth, 0.0), model))
+        samples = prepare(a_recording(model, truth, 0.0), model)
+        fitted, products = self.fit(model, samples), rate_products(model, samples)
         covariance = fitted.covariance.copy()
         covariance[0, :] = covariance[:, 0] = 0.0
         covariance[0, 0] = np.inf
         unknown = replace(fitted, covariance=covariance)
-        wider = with_delay_uncertainty(unknown, np.ones(model.n_parameters), 1.0)
+        wider = with_uncertain_delay(unknown, samples.factor(model), products, 1.0)
         assert np.isinf(wider.covariance[0, 0])
         np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)
-
-    def test_one_sensitivity_per_parameter(self, model: RobotModel, truth: Array) -> None:
-        fitted = self.fit(model, prepare(a_recording(model, truth, 0.0), model))
-        with pytest.raises(ShapeError, match="sensitivity"):
-            with_delay_uncertainty(fitted, np.ones(2), 1.0)

@@ -18,8 +18,8 @@ from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from identification.motion import Motion
 from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Preprocessing, Samples, prepare
-from identification.torque_channel import find_torque_bandwidth
+from identification.preprocessing import Samples, prepare
+from identification.torque_channel import possible_low_passes
 from identification.validation import prediction_error
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.ur10_bag import ur10
@@ -252,7 +252,7 @@ def test_a_real_ur10_needs_20_to_30_of_58_parameters(shared_data: Path) -> None:
     model, recording = ur10(shared_data, FrictionLaw(third=None, offset=True))
     cut = round(0.7 * recording.n_samples)
     fitted, rest = recording.between(0, cut), recording.between(cut, recording.n_samples)
-    options = Preprocessing(torque_bandwidth=find_torque_bandwidth(fitted, model))
+    options = possible_low_passes(fitted, model)[0]
     training, unseen = (
         PhaseFactor.from_samples(model, prepare(part, model, options=options))
         for part in (fitted, rest)
@@ -275,7 +275,7 @@ def test_the_essential_parameters_of_the_ur10_predict_a_stretch_that_did_not_cho
     model, recording = ur10(shared_data)
     edges = [round(share * recording.n_samples) for share in (0.0, 0.6, 0.8, 1.0)]
     parts = [recording.between(a, b) for a, b in pairwise(edges)]
-    options = Preprocessing(torque_bandwidth=find_torque_bandwidth(parts[0], model))
+    options = possible_low_passes(parts[0], model)[0]
     runs = [prepare(part, model, options=options) for part in parts]
     training, chooser = (PhaseFactor.from_samples(model, run) for run in runs[:2])
     result = eliminate(model, training, chooser)

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from identification.delay import DelayEstimate, estimate_delays
-from identification.delay_compensation import delay_sensitivity, with_delay_uncertainty
+from identification.delay_compensation import rate_products, with_uncertain_delay
 from identification.friction import FrictionLaw
-from identification.least_squares import fit_least_squares, weights_of
+from identification.least_squares import fit_least_squares
 from identification.model import RobotModel
 from identification.phase_factor import PhaseFactor
 from identification.preprocessing import Preprocessing, prepare
@@ -48,8 +48,8 @@ def coverage(
     samples = prepare(recording, model, options=options)
     phase = PhaseFactor.from_samples(model, samples)
     fitted = fit_least_squares(model, [samples], phase=phase)
-    slope = delay_sensitivity(model, [samples], weights_of(phase.total), fitted.values)
-    fitted = with_delay_uncertainty(fitted, slope, found.variance)
+    products = rate_products(model, samples)
+    fitted = with_uncertain_delay(fitted, phase.total, products, found.variance)
     known = np.isfinite(fitted.std)
     inside = np.abs(fitted.values - truth) <= fitted.interval_factor * fitted.std
     return float(np.mean(inside[known]))

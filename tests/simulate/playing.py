@@ -172,7 +172,7 @@ def estimated(root: Path) -> tuple[Estimated | None, str]:
     paths = [path for kind in kinds for path in folder.completed(kind)]
     try:
         sources = gather_sources(paths, FIXED.split, ())
-        prepared = prepare_sources(sources, FIXED, Silent(), look_for_delay=False)
+        prepared = prepare_sources(sources, FIXED, Silent())
         result = estimate_repetitions(sources.cell.model, prepared.fitted)
     except (HilError, IdentificationError) as error:
         return None, f"{type(error).__name__}: {error}"

@@ -18,8 +18,9 @@ from hil.batch.cache import Where
 from hil.batch.keeping import _Shelf, kept_bundle
 from hil.batch.kept_forms import phase_entry, summary_entry
 from hil.batch.keys import settings_digest, sum_key, summary_key
-from hil.batch.types import ArchiveRef, Bundle, Fit, Settings, Summary
+from hil.batch.types import ArchiveRef, Bundle, Fit, Summary
 from hil.errors import ArchiveError
+from hil.identify.settings import Settings
 from hil.results.frozen import Frozen
 from hil.study.analysis import class_in
 from hil.study.forms import MotionForm, packed
@@ -28,12 +29,13 @@ from hil.study.stages import TIMES, Stages
 from identification.estimation import Estimate
 from identification.excitation import Journal, SearchSettings
 from identification.phase_factor import PhaseFactor
+from identification.preprocessing import Preprocessing
 from tests.identification.searching import problem
 
 # What a batch keeps
 
 NAMES = ("a", "b", "c")
-SETTINGS = Settings("spline", 0.0, None, None, "code")
+SETTINGS = Settings(Preprocessing())
 Doctored = Callable[[dict[str, Any], dict[str, Any]], object]
 
 

@@ -1,0 +1,141 @@
+"""Options of an identification, as every command that identifies has them."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Final, Literal
+
+import typer
+
+from hil.errors import InputError
+from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator
+from identification.preprocessing import Smoother
+
+LONGEST_DELAY: Final = 0.5
+"""s; what lags by more belongs to another recording."""
+_DELAY_WORDS: Final[dict[str, Literal["auto", "stated"]]] = {"auto": "auto", "stated": "stated"}
+
+EstimatorOption = Annotated[
+    Estimator,
+    typer.Option(help="; ".join(f"{name}: {words}" for name, words in ESTIMATORS.items()) + "."),
+]
+BandwidthOption = Annotated[
+    str,
+    typer.Option(
+        metavar="HZ|auto",
+        help="Widest bandwidth of the smoothed positions; auto: the one with which parts of "
+        "the fitted recordings are best predicted from the rest.",
+    ),
+]
+VelocityOption = Annotated[
+    Literal["auto", "position", "measured"],
+    typer.Option(help="Slope of the smoothed positions, or the measured velocity, if any."),
+]
+FrictionOption = Annotated[
+    str,
+    typer.Option(
+        metavar="TERMS|auto",
+        help=f"Friction law, whatever the archive says: some of {FRICTION_TERMS}, with commas "
+        "between them. auto: the archive's, with what predicts best at reversals (and, of "
+        "imported recordings, at speed).",
+    ),
+]
+StandstillOption = Annotated[
+    Literal["auto", "rests", "slow", "none"],
+    typer.Option(
+        help="Rows that are not fitted: rests longer than 0.25 s; all slow rows and those near "
+        "a velocity reversal; or none. auto: slow rows, or rests where that predicts parts of the "
+        "fitted recordings better."
+    ),
+]
+DelayOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SECONDS|auto|stated",
+        help="Time by which the torque lags the position; stated: the cell's. If left out: "
+        "the cell's, unless the recordings show another one. auto: estimated for each axis and "
+        "compensated.",
+        show_default=False,
+    ),
+]
+SmootherOption = Annotated[
+    Smoother,
+    typer.Option(
+        help="spline: a smoothing spline as close as the measured noise allows; butterworth: a "
+        "low-pass without phase."
+    ),
+]
+TorqueBandwidthOption = Annotated[
+    str,
+    typer.Option(
+        help="Bandwidth in Hz of a low-pass the torque came through before it was recorded; "
+        'the model is then filtered alike. "none", or "auto": estimated, of imported torques.',
+    ),
+]
+
+
+def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
+    """Delay in s as the option says it.
+
+    Raises:
+        InputError: it is none.
+    """
+    if text is None:
+        return None
+    if text in _DELAY_WORDS:
+        return _DELAY_WORDS[text]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= LONGEST_DELAY:
+        raise InputError(
+            None,
+            f"{text!r} is no delay",
+            field="--delay",
+            remedy=f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, auto or stated",
+        )
+    return value
+
+
+def bandwidth_from(text: str) -> float | Literal["auto"]:
+    """Bandwidth of the positions in Hz as the option says it.
+
+    Raises:
+        InputError: it is none.
+    """
+    found = None if text == "none" else torque_bandwidth_from(text, "--bandwidth")
+    if found is None:
+        raise InputError(
+            None,
+            "the positions have to be smoothed",
+            field="--bandwidth",
+            remedy='give a frequency above 0 Hz, or "auto"',
+        )
+    return found
+
+
+def torque_bandwidth_from(
+    text: str, option: str = "--torque-bandwidth"
+) -> float | Literal["auto"] | None:
+    """Bandwidth in Hz as the option says it.
+
+    Raises:
+        InputError: it is none.
+    """
+    if text == "auto":
+        return "auto"
+    if text == "none":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise InputError(
+            None,
+            f"{text!r} is no bandwidth",
+            field=option,
+            remedy='give a frequency above 0 Hz, "none" or "auto"',
+        )
+    return value

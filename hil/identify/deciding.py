@@ -1,0 +1,268 @@
+"""Settings decided from sources: noise, delay, and what inner prediction chooses.
+
+Only what is fitted is looked at, and of very many recordings the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.progress import Reporter
+from identification.delay import DelayEstimate, estimate_delays
+from identification.errors import IdentificationError
+from identification.inner_prediction import Question, choose_settings
+from identification.inner_prediction import Settings as Candidate
+from identification.model import RobotModel
+from identification.preprocessing import Preprocessing, Samples
+from identification.repetition_noise import repetition_noise
+from identification.thresholds import Thresholds
+from identification.torque_channel import possible_low_passes
+
+from .options import Options
+from .settings import Settings, samples_of, signals_of, stated_delay, stated_settings
+from .sources import Source, Sources
+
+MOST_READ: Final = 32
+"""Recordings that settings are decided on: more say the same again."""
+# Repetitions of one motion that settings are chosen on, likewise.
+_REPETITIONS: Final = 1
+# Where the delay is stated it is looked for all the same, to be reported: in so many samples.
+_DELAY_SAMPLES: Final = 8000
+
+
+class Decided(NamedTuple):
+    """Settings, and what was found on the way.
+
+    Attributes:
+        settings: to be applied.
+        delays: of the torque behind the position, as the longest of the recordings has them; None
+            where that cannot be told.
+        notes: about them, in sentences.
+    """
+
+    settings: Settings
+    delays: DelayEstimate | None
+    notes: tuple[str, ...]
+
+
+def with_noise(sources: Sources) -> tuple[Sources, str]:
+    """Noise of the positions from repetitions, where no standstill was recorded; and in words."""
+    recordings = [source.recording for source in sources.training[:MOST_READ]]
+    if sources.noise_variance is not None:
+        return sources, "the noise of the positions was measured at standstill"
+    if sources.same_motion and len(recordings) > 1:
+        try:
+            noise = repetition_noise(recordings)
+        except IdentificationError:
+            pass  # no two that could be compared
+        else:
+            torque = None if noise.torque is None else noise.torque.white
+            return (
+                replace(sources, noise_variance=noise.position.white, torque_variance=torque),
+                "no standstill was recorded: the noise of the positions was measured on what "
+                f"differs between {noise.repetitions} repetitions at equal times",
+            )
+    return sources, "the noise of the positions was taken from their own fast part"
+
+
+def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
+    """Decide on everything that options leave open.
+
+    Args:
+        sources: with torques, and with the noise that was measured.
+        options: what is stated, and what is open.
+        reporter: of progress.
+
+    Raises:
+        RecordingError: a recording cannot be prepared.
+        IdentificationError: a delay was asked for and there is not one usable row.
+    """
+    sources = replace(sources, training=sources.training[:MOST_READ])
+    stated = _with_noise_of(stated_settings(sources.cell, options), sources)
+    sources = replace(sources, cell=stated.law(sources.cell))
+    notes: list[str] = []
+    settings, found = stated, _delays(sources, stated, options, reporter)
+    by_axis = options.delay == "auto"
+    if found is not None and (by_axis or (options.delay is None and _other(sources, found))):
+        settings, notes = _compensated(stated, found, by_axis=by_axis)
+    undelayed = (settings if by_axis else stated).preprocessing.torque_delay
+    chosen = _chosen(sources, settings, undelayed, options, reporter)
+    how = chosen.preprocessing
+    lags = how.torque_bandwidth is not None and how.torque_shape.causal
+    if found is not None and (lags or how.torque_delay != settings.preprocessing.torque_delay):
+        # It was found without the low-pass, and may be nothing but the lag of that.
+        found, notes = (
+            None,
+            [
+                f"no other delay than the assumed {undelayed * 1e3:.3g} ms was applied beside the"
+                " low-pass of the torque"
+            ],
+        )
+    variance = found.variance if found is not None and notes else 0.0
+    return Decided(replace(chosen, delay_variance=variance), found, tuple(notes))
+
+
+def carried_over(settings: Settings, sources: Sources, options: Options) -> Settings:
+    """Settings for another campaign of the arm that they were decided on.
+
+    Its noise is its own, and so is the delay that its cell states.
+    """
+    own = _with_noise_of(settings, sources)
+    if isinstance(options.delay, float):
+        return own
+    stated = stated_delay(sources.cell)
+    delay = settings.preprocessing.torque_delay + (stated - settings.stated_delay)
+    return replace(own, stated_delay=stated).preprocessed(torque_delay=delay)
+
+
+def _with_noise_of(settings: Settings, sources: Sources) -> Settings:
+    return replace(
+        settings,
+        noise_variance=_figures(sources.noise_variance),
+        torque_variance=_figures(sources.torque_variance),
+    )
+
+
+def _figures(values: NDArray[np.float64] | None) -> tuple[float, ...] | None:
+    return None if values is None else tuple(values.tolist())
+
+
+def _questions(sources: Sources, options: Options) -> set[Question]:
+    """What inner prediction has to decide."""
+    recorded = [source.recording for source in sources.training]
+    asked: dict[Question, bool] = {
+        "bandwidth": options.bandwidth == "auto",
+        "velocity": options.velocity == "auto"
+        and options.smoother == "spline"
+        and all(one.velocity is not None for one in recorded),
+        "presliding": options.friction == "auto",
+        "rows": options.standstill == "auto",
+        # A cell file with a drive train says which terms are wanted.
+        "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
+        # A controller's own currents come through no low-pass.
+        "low-pass": options.torque_bandwidth == "auto"
+        and options.method == "default"
+        and recorded[0].motor_current is None,
+        "estimator": options.estimator == "auto",
+    }
+    return {question for question, wanted in asked.items() if wanted}
+
+
+def _chosen(
+    sources: Sources, settings: Settings, undelayed: float, options: Options, reporter: Reporter
+) -> Settings:
+    """Choose what is automatic.
+
+    Args:
+        sources: the recordings, with the stated friction law.
+        settings: what is known, and the delay that was found.
+        undelayed: delay of the torque beside a causal low-pass [s].
+        options: what is automatic.
+        reporter: of progress.
+    """
+    cell, questions = sources.cell, _questions(sources, options)
+    if not questions:
+        return settings
+    read = [signals_of(source, settings) for source in _read_to_choose(sources)]
+
+    def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+        trial = replace(settings, preprocessing=how)
+        return [samples_of(source, cell, trial, model) for source in read]
+
+    def low_passes(model: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
+        return possible_low_passes(
+            read[0].recording,
+            model,
+            noise_variance=sources.noise_variance,
+            options=how,
+            undelayed=undelayed,
+        )
+
+    start = Candidate(cell.model, settings.preprocessing)
+    with reporter.task("choosing settings by inner prediction", 1) as task:
+        best, choices = choose_settings(ready, start, questions, low_passes)
+        task.advance(1)
+    law, friction = best.model.friction.laws[0], dict(settings.friction)
+    if "presliding" in questions:
+        friction |= {"presliding": law.presliding}
+    if "friction" in questions:
+        friction |= {"third": law.third or "none", "stribeck": law.stribeck or 0.0}
+    return replace(
+        settings,
+        preprocessing=best.preprocessing,
+        friction=friction,
+        shrinkage=best.shrinkage,
+        choices=choices,
+    )
+
+
+def _read_to_choose(sources: Sources) -> Sequence[Source]:
+    """Recordings that settings are chosen on."""
+    return sources.training[:_REPETITIONS] if sources.same_motion else sources.training
+
+
+def _delays(
+    sources: Sources, stated: Settings, options: Options, reporter: Reporter
+) -> DelayEstimate | None:
+    """Delays in the longest of the fitted recordings, or in its beginning if nobody asked.
+
+    Raises:
+        IdentificationError: they were asked for, and there is not one usable row.
+    """
+    if options.delay == "stated":
+        return None
+    recording = max((source.recording for source in sources.training), key=lambda r: r.n_samples)
+    wanted = options.delay == "auto"
+    if not wanted:
+        recording = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
+    with reporter.task("looking for a delay", 1) as task:
+        try:
+            found = estimate_delays(
+                recording,
+                sources.cell.model,
+                noise_variance=sources.noise_variance,
+                options=replace(stated.preprocessing, smooth_torque=False),
+            )
+        except IdentificationError:
+            if wanted:
+                raise
+            return None
+        task.advance(1)
+    return found
+
+
+def _compensated(
+    stated: Settings, found: DelayEstimate, *, by_axis: bool
+) -> tuple[Settings, list[str]]:
+    """Settings that compensate the delays that were found, and words.
+
+    One delay of all axes moves the time at which the motion is read; delays axis by axis, where
+    somebody asked for them, move the torques.
+    """
+    notes = [f"delay of the torque behind the position, {line}" for line in found.describe()]
+    if not found.significant:
+        notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")
+        return stated, notes
+    if found.agree or not by_axis:
+        notes.append(f"a delay of {found.common * 1e3:.3g} ms of all axes was compensated")
+        return stated.preprocessed(torque_delay=found.common), notes
+    notes.append("each axis was compensated by its own delay")
+    applied = tuple(found.applied.tolist())
+    return replace(stated, axis_delays=applied).preprocessed(torque_delay=0.0), notes
+
+
+def _other(sources: Sources, found: DelayEstimate) -> bool:
+    """Whether a delay that was found replaces the cell's.
+
+    That of a controller is known: only what is well determined and differs by more than the
+    estimate errs in closed loop is another one.
+    """
+    if sources.cell.file.controller is None:
+        return True
+    apart = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
+    return apart and bool(found.determined.all())
