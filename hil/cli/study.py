@@ -17,7 +17,7 @@ from hil.cell import Cell
 from hil.errors import InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.study import run_study, study_campaigns, study_settings
-from hil.study.reading import answer_of
+from hil.study.sentences import answer_of
 
 _DEFAULT: Final = signal.SIG_DFL
 
@@ -119,7 +119,7 @@ def study(
                 )
     except KeyboardInterrupt:
         raise OperatorStopError(
-            f"stopped; what is whole is kept in {output}: the same command goes on there"
+            f"stopped; what is complete stays in {output}: the same command resumes there"
         ) from None
     answer = answer_of(found)
     typer.echo(json_format.dumps(answer, indent=1) if json else answer["line"])

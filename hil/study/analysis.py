@@ -18,10 +18,17 @@ from hil.progress import Reporter
 from planner import FlyDistance, FlyPercent, InvalidPlanFile
 from planner.commands import Fly
 
-from .motions import CLASSES, MotionClass
+from .campaigns import Workers
 from .reading_archives import Reading, fit, score
-from .records import FitRecord, ScoreRecord, digest, keep, kept
-from .workers import Workers
+from .records import (
+    CLASSES,
+    FitRecord,
+    MotionClass,
+    ScoreRecord,
+    digest,
+    read_record,
+    write_record,
+)
 
 Array = NDArray[np.float64]
 
@@ -39,6 +46,11 @@ class Run:
     key: str
     label: str
     root: Path
+
+    @property
+    def folder(self) -> CampaignFolder:
+        """The same, to be read."""
+        return CampaignFolder(self.root)
 
     def archives(self, kind: str) -> tuple[tuple[str, str], ...]:
         """Names and checksums of its whole archives of one kind.
@@ -76,7 +88,9 @@ def fit_all(
         if not archives:
             raise InputError(run.root, "holds no whole excitation", remedy="run the campaign first")
         inputs[run.key] = digest([*archives, *run.archives("standstill")], {})
-    found = {run.key: kept(_place(fits, run.key), FitRecord, inputs[run.key]) for run in runs}
+    found = {
+        run.key: read_record(_place(fits, run.key), FitRecord, inputs[run.key]) for run in runs
+    }
     missing = [run for run in runs if found[run.key] is None]
     with reporter.task("estimating (excitations)", len(runs)) as task:
         task.advance(len(runs) - len(missing))
@@ -112,11 +126,10 @@ def score_all(
             )
             tasks.append((run, motion_class, names, inputs))
     places = [_place(fits, f"{run.key}-{motion_class}") for run, motion_class, _, _ in tasks]
-    found: list[ScoreRecord | None] = []
-    for place, (_, _, names, inputs) in zip(places, tasks, strict=True):
-        record = kept(place, ScoreRecord, inputs)
-        known = record is not None and record.tells_of(names, estimates)
-        found.append(record if known else None)
+    found = [
+        read_record(place, ScoreRecord, inputs)
+        for place, (_, _, _, inputs) in zip(places, tasks, strict=True)
+    ]
     missing = [k for k, record in enumerate(found) if record is None]
     with reporter.task("predicting (classes of motion)", len(tasks)) as task:
         task.advance(len(tasks) - len(missing))
@@ -148,7 +161,7 @@ def score_all(
 def fit_and_keep(reading: Reading, inputs: str, place: Path) -> FitRecord:
     """In a child: estimate, and write it down before anything else can go wrong."""
     record = fit(reading, inputs)
-    keep(place, record)
+    write_record(place, record)
     return record
 
 
@@ -161,7 +174,7 @@ def score_and_keep(
 ) -> ScoreRecord:
     """In a child: predict, and write it down."""
     record = score(reading, inputs, estimates, shown)
-    keep(place, record)
+    write_record(place, record)
     return record
 
 

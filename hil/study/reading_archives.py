@@ -24,8 +24,15 @@ from identification.preprocessing import Samples
 from identification.repetitions import estimate_repetitions
 from identification.validation import PredictionError, for_figure
 
-from .forms import low_passed, motion_form
-from .records import PLANTED, ExampleRecord, FitRecord, MotionScore, ScoreRecord
+from .records import (
+    PLANTED,
+    ExampleRecord,
+    FitRecord,
+    MotionScore,
+    ScoreRecord,
+    low_passed,
+    motion_form,
+)
 
 Array = NDArray[np.float64]
 
@@ -165,9 +172,7 @@ def _score(
         own=None
         if best is None
         else PredictionError.between(run.torque, run.torque - (left - best), run.usable).overall,
-        relative=error.relative.tolist(),
         mean_abs=error.mean_absolute.tolist(),
-        mean=error.mean.tolist(),
     )
 
 

@@ -7,8 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.study.forms import ClassForms, MotionForm, packed
-from hil.study.records import FitRecord, MotionScore, ScoreRecord
+from hil.study.records import (
+    ClassForms,
+    FitRecord,
+    MotionForm,
+    MotionScore,
+    ScoreRecord,
+    packed,
+)
 
 Array = NDArray[np.float64]
 
@@ -62,9 +68,7 @@ def scored(errors: Mapping[str, Array]) -> ScoreRecord:
                     unfiltered=value,
                     all_rows=2.0 * value,
                     own=None,
-                    relative=[value] * 2,
                     mean_abs=[value, 2.0 * value],
-                    mean=[0.0, 0.0],
                 )
                 for k, value in enumerate(values.tolist())
             ]
