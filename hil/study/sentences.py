@@ -5,22 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-import numpy as np
-
 from hil.report.numbers import fixed, significant
 
-from .records import CLASSES, PLANTED
-from .results import (
-    ALPHA,
-    SMALL,
-    AblationResult,
-    ComparisonResult,
-    ConditionResult,
-    Paragraph,
-    StudyResults,
-)
+from .results import AblationResult, ComparisonResult, ConditionResult, Paragraph, StudyResults
 from .searches import AP, B0, A, B
 
+_NONE: Final = "no significant difference"
 TOO_FEW: Final = "too few repetitions or motions for a conclusion"
 OWN_CLASS: Final = {A: "sinusoid", B: "fly-by", B0: "stop-to-stop"}
 """Class of motion by the method whose excitation is of it."""
@@ -33,19 +23,14 @@ def reading_of(results: StudyResults) -> list[Paragraph]:
         _prediction(results),
         _classes(results),
         _effects(results),
-        _criteria(results),
-        _parameters(results),
         *(_ablation(one) for one in results.ablations),
-        _limits(results),
     ]
-    return [one for one in paragraphs if one.sentences]
+    return [one for one in paragraphs if one is not None]
 
 
 def answer_of(results: StudyResults) -> dict[str, Any]:
     """The conclusions for a script, and in one line: `line`, and the ratios that it rests on."""
-    fields = {
-        *("motion_class", "first", "second", "ratio", "level", "verdict", "p_corrected"),
-    }
+    fields = {"motion_class", "first", "second", "ratio", "level", "verdict", "p_corrected"}
     conclusions = [f"{one.heading} {one.verdict}" for one in results.reading if one.verdict]
     return {
         "name": results.name,
@@ -67,28 +52,21 @@ def answer_of(results: StudyResults) -> dict[str, Any]:
     }
 
 
-def _prediction(results: StudyResults) -> Paragraph:
+def _prediction(results: StudyResults) -> Paragraph | None:
     """The first two methods on the robot's own motions: the paper's Fig. 3."""
-    labels = results.conditions[0].labels
+    labels = list(results.conditions[0].labels.values())
     if len(labels) < 2:
-        return Paragraph(key="prediction", heading="", sentences=[])
-    first, second = list(labels)[:2]
+        return None
     pairs = [(one, row) for one in results.conditions if (row := _main(one)) is not None]
     kind = pairs[0][1].motion_class if pairs else "held-out"
-    heading = f"Does {labels[second]} predict {kind} motions better than {labels[first]}?"
     if not pairs:
-        return Paragraph(
-            key="prediction",
-            heading=heading,
-            verdict="There is no held-out motion, so nothing can be predicted.",
-            sentences=["The tables and figures below are of the excitations and the parameters."],
-        )
-    sentences = [f"{_where(one)}, {_ratio(row, one.labels)}." for one, row in pairs]
-    printed = [
-        (one, row)
-        for one in results.conditions
-        if (row := one.compared("fly-by", AP, B)) is not None
-    ]
+        verdict = "There is no held-out motion, so nothing can be predicted."
+        sentences = ["The tables and figures below are of the excitations and the parameters."]
+    else:
+        verdict = _each(pairs)
+        sentences = [f"{_where(one)}, {_ratio(row, one.labels)}." for one, row in pairs]
+    conditions = results.conditions
+    printed = [(one, row) for one in conditions if (row := one.compared("fly-by", AP, B))]
     if printed:
         sentences.append(
             "A is its best search here, beyond the frequencies that the paper prints. Compared"
@@ -101,67 +79,27 @@ def _prediction(results: StudyResults) -> Paragraph:
             "The same motions, run in each campaign, lead to opposite conclusions: the state of"
             " the arm differs from one campaign to the other.",
         )
-    more = [text for one, _ in pairs for text in _details(one)]
-    return Paragraph(
-        key="prediction", heading=heading, verdict=_each(pairs), sentences=sentences, more=more
-    )
+    heading = f"Does {labels[1]} predict {kind} motions better than {labels[0]}?"
+    return Paragraph(key="prediction", heading=heading, verdict=verdict, sentences=sentences)
 
 
-def _details(condition: ConditionResult) -> list[str]:
-    """Errors of the estimates themselves, and the comparison with equal data."""
-    labels, where, equal = condition.labels, _where(condition), condition.equal_data
-    sentences = [
-        f"{where}, without the noise that every estimate leaves, {_ratio(row, labels)}."
-        for row in condition.own_comparisons
-        if row.motion_class == "fly-by"
-    ]
-    if equal is not None:
-        data = (
-            f"{where}, with as much motion of each ({equal.repetitions} repetitions of"
-            f" {labels[equal.cut]}, {equal.seconds:.0f} s, and {equal.other_seconds:.0f} s of"
-            f" {labels[equal.other]})"
-        )
-        labels = labels | {equal.name: labels[equal.cut]}
-        rows = (row for row in equal.comparisons if row.motion_class == "fly-by")
-        sentences += [f"{data}, {_ratio(row, labels)}." for row in rows]
-    return sentences
-
-
-def _classes(results: StudyResults) -> Paragraph:
+def _classes(results: StudyResults) -> Paragraph | None:
     """Whether estimates predict their own class of motion best: the paper's main argument."""
-    counts, sentences, best, total = [], [], 0, 0
+    counts, best, total = [], 0, 0
     for condition in results.conditions:
-        present = {one.motion_class for one in condition.classes}
-        own = {
-            k: name for k, name in OWN_CLASS.items() if k in condition.labels and name in present
-        }
-        if len(own) < 2:  # of one class there is nothing to compare it with
-            continue
-        upheld = sum(_best(condition, key, name) for key, name in own.items())
-        best, total = best + upheld, total + len(own)
-        counts.append(f"{upheld} of {len(own)} {_WHERE.get(condition.key, condition.words)}")
-        medians = {
-            name: [one.median for one in condition.cross
-                   if one.motion_class == name and one.method in condition.labels]
-            for name in present
-        }  # fmt: skip
-        widest = max(
-            CLASSES, key=lambda c: max(medians[c]) / min(medians[c]) if c in medians else 0
-        )
-        factor = max(medians[widest]) / min(medians[widest])
-        sentences.append(
-            f"{_where(condition)}, the choice of the estimate changes the median error within a"
-            f" class by a factor of {factor:.2f} at most ({widest})."
-        )
+        present = [one.motion_class for one in condition.classes]
+        own = [k for k, name in OWN_CLASS.items() if k in condition.labels and name in present]
+        if len(own) > 1:  # of one class there is nothing to compare it with
+            upheld = sum(_best(condition, key, OWN_CLASS[key]) for key in own)
+            best, total = best + upheld, total + len(own)
+            counts.append(f"{upheld} of {len(own)} {_lower(_where(condition))}")
     if not counts:
-        return Paragraph(key="classes", heading="", sentences=[])
-    answer = "Yes" if best == total else "In part" if best else "No"
+        return None
     return Paragraph(
         key="classes",
         heading="Do estimates predict their own class of motion best?",
-        verdict=f"{answer}: {', '.join(counts)}.",
-        sentences=sentences,
-        more=["Best means significantly better than every other estimate."],
+        verdict=f"{'Yes' if best == total else 'In part' if best else 'No'}: {', '.join(counts)}.",
+        sentences=["Best means significantly better than every other estimate."],
     )
 
 
@@ -175,139 +113,46 @@ def _best(condition: ConditionResult, key: str, motion_class: str) -> bool:
     return bool(rows) and all(rows)
 
 
-def _effects(results: StudyResults) -> Paragraph:
+def _effects(results: StudyResults) -> Paragraph | None:
     """How the conclusion depends on what the model leaves out."""
-    heading = "Does that depend on the unmodelled effects?"
-    rows = {one.key: _main(one) for one in results.conditions}
-    before, after = rows.get("plain"), rows.get("effects")
+    by_key = {one.key: one for one in results.conditions}
+    if not {"plain", "effects"} <= by_key.keys():
+        return None
+    before, after = _main(by_key["plain"]), _main(by_key["effects"])
     if before is None or after is None:
-        return Paragraph(key="effects", heading=heading, sentences=[])
-    with_effects = next(one for one in results.conditions if one.key == "effects")
+        return None
     same = (before.differs, before.ratio < 1.0) == (after.differs, after.ratio < 1.0)
     same = same or not (before.differs or after.differs)
-    sentences = [
-        f"The effects change the ratio of the errors from {fixed(before.ratio, 3)} to"
-        f" {fixed(after.ratio, 3)} on {after.motion_class} motions."
-    ]
-    planted = [c for c in with_effects.cross if (c.method, c.motion_class) == (PLANTED, "fly-by")]
-    if planted:
-        sentences.append(
-            "With them, the error of the planted values themselves is"
-            f" {_percent(planted[0].median)}: an estimate that includes part of the effects may be"
-            " below that."
-        )
     return Paragraph(
         key="effects",
-        heading=heading,
-        verdict="No." if same else f"Yes: {_each([(with_effects, after)])}",
-        sentences=sentences,
-        more=[f"Effects: {'; '.join(with_effects.effects)}."],
+        heading="Does that depend on the unmodelled effects?",
+        verdict="No." if same else f"Yes: {_each([(by_key['effects'], after)])}",
+        sentences=[
+            f"The effects change the ratio of the errors from {fixed(before.ratio, 3)} to"
+            f" {fixed(after.ratio, 3)} on {after.motion_class} motions."
+        ],
+        more=[f"Effects: {'; '.join(by_key['effects'].effects)}."],
     )
 
 
-def _criteria(results: StudyResults) -> Paragraph:
-    """Table 1."""
-    ours, paper = ({r.key: r for r in results.table1 if r.printed is p} for p in (False, True))
-    if not {A, B} <= ours.keys():
-        return Paragraph(key="criteria", heading="The two excitations", sentences=[])
-    a, b = ours[A], ours[B]
-    sentences = [
-        f"A reaches log det {fixed(a.log10_det, 1)} with I_c {fixed(a.coupling_index, 1)},"
-        f" B {fixed(b.log10_det, 1)} with {fixed(b.coupling_index, 1)}."
-    ]
-    if {A, B} <= paper.keys():
-        det = (a.log10_det > b.log10_det) == (paper[A].log10_det > paper[B].log10_det)
-        print_a, print_b = paper[A].coupling_index, paper[B].coupling_index
-        index = (a.coupling_index < b.coupling_index) == (print_a < print_b)
-        sentences += [
-            f"The order of {what} is {'as' if alike else 'not as'} in the paper."
-            for what, alike in (("the determinants", det), ("the coupling indices", index))
-        ]
-    return Paragraph(key="criteria", heading="The two excitations", sentences=sentences)
-
-
-def _parameters(results: StudyResults) -> Paragraph:
-    """Table 2."""
-    sentences = []
-    for condition in results.conditions:
-        labels, methods = condition.labels, condition.methods[:2]
-        stds = [np.array(one.std) for one in methods]
-        if len(methods) > 1 and all(np.any(std) for std in stds):
-            usable = (stds[0] > 0.0) & (stds[1] > 0.0)
-            ratio = float(np.exp(np.mean(np.log(stds[1][usable] / stds[0][usable]))))
-            sentences.append(
-                f"{_where(condition)}, the standard deviation over the repetitions with"
-                f" {methods[1].label} is {fixed(ratio, 2)} times that with {methods[0].label}"
-                " (geometric mean of the parameters)."
-            )
-        if condition.closeness:
-            one = condition.closeness[0]
-            sentences.append(
-                f"{_where(condition)}, {labels[one.second]} is closer to π_C than"
-                f" {labels[one.first]} in "
-                + "; ".join(
-                    f"{row.second_closer} of {row.parameters} in {row.group}"
-                    for row in condition.closeness
-                )
-                + "."
-            )
-    return Paragraph(key="parameters", heading="The parameters", sentences=sentences)
-
-
-def _ablation(ablation: AblationResult) -> Paragraph:
+def _ablation(ablation: AblationResult) -> Paragraph | None:
     """Which settings lie beyond what other repetitions of the study's own motion would give."""
-    sentences = [ablation.words]
-    bands = [
-        one
-        for one in ablation.bands
-        if one.motion_class == "fly-by" and ablation.key in ("fly", "n_via", "weight")
+    bands = [one for one in ablation.bands if one.motion_class == "fly-by" and one.method == B]
+    if not bands or ablation.key not in ("fly", "n_via", "weight"):
+        return None
+    band = bands[-1]  # that of the estimate itself, where it is known
+    outside = [
+        point.name
+        for point in ablation.points
+        for value in [getattr(point, band.quantity).get("fly-by", band.low)]
+        if not (point.base or band.low <= value <= band.high)
     ]
-    for band in bands[-1:]:  # the last is of the estimate itself, where that is known
-        outside = [
-            point.name
-            for point in ablation.points
-            if not point.base
-            and (point.method, point.repetitions) == (band.method, band.repetitions)
-            for value in [(point.own if band.quantity == "own" else point.error).get("fly-by")]
-            if value is not None and not band.low <= value <= band.high
-        ]
-        sentences.append(
-            f"Other repetitions of the study's own B have a fly-by error of"
-            f" {_percent(band.low)} to {_percent(band.high)}: outside that range:"
-            f" {', '.join(outside) or 'no setting'}."
-        )
-    if ablation.key in ("n_via", "weight"):
-        sentences.append("Each setting is one search: differences may be chance of the search.")
-    return Paragraph(
-        key=f"ablation-{ablation.key}",
-        heading=ablation.title,
-        sentences=[*sentences, *ablation.missing],
+    low, high = (significant(100.0 * bound, 3) for bound in (band.low, band.high))
+    text = (
+        f"The fly-by error for other repetitions of the study's own B ranges from {low} % to"
+        f" {high} %; outside: {', '.join(outside) or 'no setting'}."
     )
-
-
-def _limits(results: StudyResults) -> Paragraph:
-    """How differences are judged, and what the numbers cannot show."""
-    sentences = []
-    if any(one.comparisons for one in results.conditions):
-        sentences += [
-            "Intervals treat the held-out motions and the repetitions of each estimate as random"
-            f" samples, and hold together in {100.0 * (1.0 - ALPHA):g} % of cases for all"
-            " comparisons of their table. A difference is significant where the interval excludes"
-            f" 1, and called slight below {100.0 * SMALL:g} %.",
-            "Each excitation is the result of one search: another search, or another arm, may lead"
-            " to another conclusion.",
-        ]
-    if results.simulated:
-        sentences.append(
-            "The arm is simulated: it is rigid with exactly the model's friction, and has the"
-            " effects that are named and no others."
-        )
-    if results.quick:
-        sentences.append(
-            "This is the quick setting: short searches, few repetitions and few motions. It shows"
-            " how the study works and supports no conclusion."
-        )
-    return Paragraph(key="limits", heading="What this does not show", sentences=sentences)
+    return Paragraph(key=f"ablation-{ablation.key}", heading=ablation.title, sentences=[text])
 
 
 def _main(condition: ConditionResult) -> ComparisonResult | None:
@@ -326,9 +171,6 @@ def _each(pairs: Sequence[tuple[ConditionResult, ComparisonResult]]) -> str:
         return f"{_upper(texts[0]) if texts[0] in (TOO_FEW, _NONE) else texts[0]}."
     named = [f"{_lower(_where(one))} {text}" for (one, _), text in zip(pairs, texts, strict=True)]
     return _upper("; ".join(named) + ".")
-
-
-_NONE: Final = "no significant difference"
 
 
 def _outcome(condition: ConditionResult, row: ComparisonResult) -> str:
@@ -355,10 +197,6 @@ def _ratio(row: ComparisonResult, labels: dict[str, str]) -> str:
 
 def _where(condition: ConditionResult) -> str:
     return _upper(_WHERE.get(condition.key, condition.words))
-
-
-def _percent(share: float) -> str:
-    return f"{significant(100.0 * share, 3)} %"
 
 
 def _upper(words: str) -> str:

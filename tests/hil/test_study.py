@@ -306,7 +306,9 @@ def test_effects_together_and_one_at_a_time(
     again = tmp_path / "study"
     shutil.copytree(root / "designs", again / "designs")
     some = small.model_copy(update={"effects": True, "repetitions": 4, "ablation_repetitions": 3})
-    some = some.model_copy(update={"cell": StudySettings.model_validate_json((root / "study.json").read_text()).cell})
+    some = some.model_copy(
+        update={"cell": StudySettings.model_validate_json((root / "study.json").read_text()).cell}
+    )
     (again / "study.json").write_text(some.to_json())
     found = run_study(again, some, Silent(), workers=2, cell=arm)
     assert [one.key for one in found.conditions] == ["plain", "effects"]
