@@ -73,17 +73,9 @@ class Evidence:
         label: str = "",
         forms: Mapping[str, ClassForms] | None = None,
     ) -> AblationPoint:
-        """One setting.
+        """One setting: estimates (r, p) of its repetitions beside a reference (p,).
 
-        Args:
-            value: of what is varied.
-            record: of its excitation, for the criteria.
-            values: of its repetitions (r, p).
-            reference: estimate (p,) whose distance from the planted values is 1.
-            method: whose excitation it is.
-            base: whether it is the setting of the study itself.
-            label: where `value` only counts.
-            forms: of the motions that are predicted, by class, if not those of the study.
+        `forms` are the motions that are predicted, by class, if not those of the study.
         """
         own, truth = values.mean(axis=0), self.truth
         predicted = self.forms if forms is None else forms

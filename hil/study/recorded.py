@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -50,35 +51,21 @@ SUBSETS: Final = (1, 2, 5, 10, 20, 30, 50, 100)
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """One campaign.
+    """One campaign by its first excitation.
 
     Attributes:
         run: its folder under a key, which is "a", "b" or "b0" where no other one holds an
             excitation of that method, and never otherwise.
-        archive: its first excitation.
-        cell: as it travels in its archives.
-        excitation: as it was planned, if that is known.
-        planted: parameters (p,) of its simulated arm; None of a real one.
+        archive: the first excitation.
     """
 
     run: Run
     archive: Archive
-    cell: Cell
-    excitation: Excitation | None
-    planted: Array | None
 
-    @classmethod
-    def of(cls, run: Run) -> Recorded:
-        """Read the first excitation of a campaign."""
-        archive = open_archive(run.folder.archives / run.archives("excitation")[0][0])
-        cell = cell_of(archive)
-        try:
-            excitation = Excitation.from_dict(plan_in(archive)["excitation"])
-        except (KeyError, TypeError, ValueError):
-            excitation = None
-        simulated = archive.metadata.get("simulated") == "yes"
-        planted = planted_in(cell, archive.metadata) if simulated else None
-        return cls(run, archive, cell, excitation, planted)
+    @cached_property
+    def cell(self) -> Cell:
+        """As it travels in the archive."""
+        return cell_of(self.archive)
 
     @property
     def simulated(self) -> bool:
@@ -89,6 +76,19 @@ class Recorded:
     def effects(self) -> tuple[str, ...]:
         """Unmodelled effects of its simulated arm."""
         return foreign_json.names(self.archive.metadata.get("effects", "[]")) or ()
+
+    @property
+    def planted(self) -> Array | None:
+        """Parameters (p,) of its simulated arm; None of a real one."""
+        return planted_in(self.cell, self.archive.metadata) if self.simulated else None
+
+    @cached_property
+    def excitation(self) -> Excitation | None:
+        """As it was planned, if that is known."""
+        try:
+            return Excitation.from_dict(plan_in(self.archive)["excitation"])
+        except (KeyError, TypeError, ValueError):
+            return None
 
     @property
     def method(self) -> str:
@@ -205,7 +205,8 @@ def recorded_runs(campaigns: Sequence[Path]) -> list[Recorded]:
             raise InputError(
                 path, "holds no whole excitation", remedy="run the campaign first (hil run)"
             )
-        found.append(Recorded.of(run))
+        name, _ = run.archives("excitation")[0]
+        found.append(Recorded(run, open_archive(run.folder.archives / name)))
     for one in found[1:]:
         _require_alike(one, found[0])
     methods = {
@@ -256,24 +257,13 @@ def _missing(
     recorded: Sequence[Recorded], truth: Array | None, classes: Sequence[str]
 ) -> list[str]:
     """What the recordings do not allow, in sentences."""
-    found = [
-        "Searches, fly-by share, K, λ and noise cannot be varied with recorded campaigns; only the "
-        "number of repetitions is."
-    ]
-    if len(recorded) < 2:
-        found.append(
-            "One campaign was given, so that nothing is compared: give another one of the same "
-            "arm, with the other method's excitation (--campaign again)."
-        )
-    if recorded[0].planted is not None and truth is None:
-        found.append(
-            "The simulated arms were planted with different values: distances from them are "
-            "left out."
-        )
     absent = [name for name in CLASSES if name not in classes]
-    if absent:
-        found.append(
-            f"No held-out motion is {' or '.join(absent)}: these columns of the cross table are "
-            "missing."
-        )
-    return found
+    sentences = {
+        "Searches, fly-by share, K, λ and noise cannot be varied with recorded campaigns.": True,
+        "One campaign was given, so that nothing is compared: give another one of the same arm,"
+        " with the other method's excitation (--campaign again).": len(recorded) < 2,
+        "The simulated arms were planted with different values: distances from them are left"
+        " out.": recorded[0].planted is not None and truth is None,
+        f"No held-out motion is {' or '.join(absent)}: these columns are missing.": bool(absent),
+    }
+    return [sentence for sentence, applies in sentences.items() if applies]

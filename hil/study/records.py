@@ -42,26 +42,32 @@ class Record(Frozen):
     inputs: str
 
 
-class FitRecord(Record):
-    """Estimates from the repetitions of one excitation; lists are in the model's order."""
+class Fitted(Frozen):
+    """Estimate from all repetitions of one excitation; lists are in the model's order."""
 
-    repetitions: list[str]
-    values: list[list[float]]
-    """Of each repetition by itself (eq. 4)."""
     pooled: list[float]
     pooled_std: list[float]
     undetermined: list[str]
     noise_std: list[float]
     log10_det: float
+    """Of the motion as it was executed, as the next ones."""
     coupling_index: float
-    n_samples: int
-    """Of one repetition, as it was executed."""
     correlation: list[list[float]]
-    duration: float
     time: list[float]
     position: list[list[float]]
     """Joint by joint, of the first repetition."""
     velocity: list[list[float]]
+
+
+class FitRecord(Record, Fitted):
+    """Estimates from the repetitions of one excitation."""
+
+    repetitions: list[str]
+    values: list[list[float]]
+    """Of each repetition by itself (eq. 4)."""
+    n_samples: int
+    """Of one repetition, as it was executed."""
+    duration: float
 
 
 class MotionScore(Frozen):

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from hil.results.frozen import Frozen
 
-from .records import ExampleRecord
+from .records import ExampleRecord, Fitted
 from .settings import StudySettings, load_json
 
 SCHEMA_VERSION: Final = 1
@@ -70,7 +70,7 @@ class MotionRow(Frozen):
     printed: bool = False
 
 
-class MethodResult(Frozen):
+class MethodResult(Fitted):
     """What one excitation gave under one condition."""
 
     key: str
@@ -82,17 +82,6 @@ class MethodResult(Frozen):
     """Over the repetitions' own estimates: the paper's Table 2."""
     std: list[float]
     """Over the repetitions, of one of them."""
-    pooled: list[float]
-    pooled_std: list[float]
-    undetermined: list[str]
-    noise_std: list[float]
-    log10_det: float
-    """Of the motion as it was executed, as the next ones."""
-    coupling_index: float
-    correlation: list[list[float]]
-    time: list[float]
-    position: list[list[float]]
-    velocity: list[list[float]]
 
 
 class CrossCell(Frozen):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
 
-from .records import ClassForms, FitRecord, ScoreRecord
+from .records import ClassForms, FitRecord, Fitted, ScoreRecord
 from .results import (
     ClassResult,
     ClosenessResult,
@@ -200,7 +200,6 @@ def _with_equal(
 
 def _method(key: str, label: str, record: FitRecord) -> MethodResult:
     values = np.array(record.values)
-    shared = MethodResult.model_fields.keys() & FitRecord.model_fields.keys() - {"repetitions"}
     return MethodResult(
         key=key,
         label=label,
@@ -208,7 +207,7 @@ def _method(key: str, label: str, record: FitRecord) -> MethodResult:
         seconds=record.duration * len(values),
         mean=values.mean(axis=0).tolist(),
         std=(values.std(axis=0, ddof=1) if len(values) > 1 else 0.0 * values[0]).tolist(),
-        **record.model_dump(include=set(shared)),
+        **record.model_dump(include=set(Fitted.model_fields)),
     )
 
 
