@@ -90,7 +90,7 @@ def run_study(
         simulated_link(cell)  # refuses real hardware before anything is searched
         digest = hashlib.sha256((cell.text + cell.urdf).encode()).hexdigest()
         settings = settings.model_copy(update={"cell": digest})
-    with folder.locked(), workers_of(workers) as processes:
+    with folder.locked():
         folder.begin(settings)
         stages = Stages(root)
         wanted = searches(settings, len(cell.joint_names))
@@ -98,9 +98,9 @@ def run_study(
             found = run_searches(folder, cell, wanted, reporter, workers=workers)
         with stages.stage("plans"):
             plans = plan_study(folder, cell, settings, found)
-        with stages.stage("campaigns"):
+        with stages.stage("campaigns"), workers_of(workers) as processes:
             plans = plans.without(execute_all(plans.all, reporter, processes))
-        with stages.stage("estimates and predictions"):
+        with stages.stage("estimates and predictions"), workers_of(workers) as processes:
             study = _Analysis(folder, cell, settings, plans, found, reporter, processes)
             results = study.results()
         times = stages.times

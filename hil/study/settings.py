@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
-import psutil
 from pydantic import Field
 
 from hil.errors import InputError, OutputError
@@ -199,7 +198,7 @@ class Times(Frozen):
 
     wall: dict[str, Seconds] = Field(default_factory=dict)
     processor: dict[str, Seconds] = Field(default_factory=dict)
-    """Of this process and its children."""
+    """Of this process and its children that ended within the stage."""
     whole: bool = True
     """False once a session was killed within a stage, whose time is then missing."""
 
@@ -225,7 +224,7 @@ class Stages:
             self._write(before.model_copy(update={"whole": False}))  # what a kill leaves
 
         def end() -> None:
-            added = time.perf_counter() - wall, max(0.0, _processor() - processor)
+            added = time.perf_counter() - wall, _processor() - processor
             self.times = Times(
                 wall=before.wall | {name: round(before.wall.get(name, 0.0) + added[0], 1)},
                 processor=before.processor
@@ -247,10 +246,6 @@ class Stages:
 
 
 def _processor() -> float:
-    """Seconds of processor of this process and of all its children, ended or not."""
-    own, total = psutil.Process(), 0.0
-    for process in (own, *own.children(recursive=True)):
-        with suppress(psutil.Error):  # it has just ended
-            times = process.cpu_times()
-            total += times.user + times.system + times.children_user + times.children_system
-    return total
+    """Seconds of processor of this process and of its children that have ended."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
