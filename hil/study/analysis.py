@@ -155,7 +155,7 @@ def make_record(place: Path, function: Callable[..., R], *arguments: Any) -> R:
 
 
 def classes_of(run: Run) -> dict[MotionClass, list[str]]:
-    """Names of the held-out archives of a run by the class that their own plan tells."""
+    """Names of the held-out archives of a run by the class of their planned motion."""
     found: dict[MotionClass, list[str]] = {}
     for name, _ in run.archives("validation"):
         motion_class = class_in(open_archive(run.folder.archives / name))
@@ -184,7 +184,7 @@ def class_in(archive: Archive) -> MotionClass:
 def class_of(plan: Mapping[str, Any]) -> MotionClass:
     """Class of a planned motion: what an archive's `plan.json` says of it.
 
-    A motion in pieces whose moves were not kept is taken for fly-by, the interpolator's own way.
+    A motion in pieces without its moves counts as fly-by, as the interpolator runs it.
 
     Raises:
         InvalidPlanFile: the moves that it lists are none.

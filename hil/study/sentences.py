@@ -18,7 +18,7 @@ _WHERE: Final = {"plain": "without unmodelled effects", "effects": "with unmodel
 
 
 def reading_of(results: StudyResults) -> list[Paragraph]:
-    """All paragraphs, the answer to the paper's question first."""
+    """All paragraphs, the paper's question first."""
     paragraphs = [
         _prediction(results),
         _classes(results),
@@ -28,7 +28,7 @@ def reading_of(results: StudyResults) -> list[Paragraph]:
     return [one for one in paragraphs if one is not None]
 
 
-def answer_of(results: StudyResults) -> dict[str, Any]:
+def summary_of(results: StudyResults) -> dict[str, Any]:
     """The conclusions for a script, and in one line: `line`, and the ratios that it rests on."""
     fields = {"motion_class", "first", "second", "ratio", "level", "verdict", "p_corrected"}
     conclusions = [f"{one.heading} {one.verdict}" for one in results.reading if one.verdict]

@@ -170,7 +170,7 @@ def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> Spread | 
     A hierarchical bootstrap: repetitions of the first, repetitions of the second and motions are
     resampled together. What is scored is the mean of the repetitions' own estimates (the paper's
     Table 2), so a resampled estimate is the mean of the resampled repetitions. Of n units n - 1
-    are drawn: a mean of n would scatter by (n - 1) / n too little.
+    are sampled: a mean of n would scatter by (n - 1) / n too little.
 
     Args:
         first: inner products of the errors of the first's repetitions, by motion (m, r, r).

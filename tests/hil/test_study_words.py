@@ -26,7 +26,7 @@ from hil.study.results import (
     StudyParameter,
     StudyResults,
 )
-from hil.study.sentences import answer_of, reading_of
+from hil.study.sentences import reading_of, summary_of
 from hil.study.tables import Condition, condition_result
 
 from .fast_cell import fast_cell
@@ -95,20 +95,20 @@ class TestConclusion:
         assert f"{one.ratio:.3f} times" in answer.sentences[0]
         assert f"(interval {one.low:.3f} to {one.high:.3f})" in answer.sentences[0]
         assert f"{loser} is better" not in text_of(results)
-        assert answer_of(results)["line"] == f"{answer.heading} {answer.verdict}"
-        (ratios,) = answer_of(results)["ratios"]
+        assert summary_of(results)["line"] == f"{answer.heading} {answer.verdict}"
+        (ratios,) = summary_of(results)["ratios"]
         assert (ratios["condition"], ratios["interval"]) == ("plain", [one.low, one.high])
 
     def test_what_may_be_chance_is_never_better(self) -> None:
         results = study(condition(1.0, scatter=0.3))
         assert results.reading[0].verdict == "No significant difference."
         assert "better" not in text_of(results)
-        assert not answer_of(results)["ratios"][0]["differs"]
+        assert not summary_of(results)["ratios"][0]["differs"]
 
     def test_a_small_difference_is_slight(self) -> None:
         slight = study(condition(0.99, scatter=0.002, noise=1e-3))
-        assert "B is slightly better" in answer_of(slight)["line"]
-        assert "slightly" not in answer_of(study(condition(0.8)))["line"]
+        assert "B is slightly better" in summary_of(slight)["line"]
+        assert "slightly" not in summary_of(study(condition(0.8)))["line"]
 
     def test_it_names_the_conditions_where_they_differ(self) -> None:
         turned = study(condition(0.8), condition(1.25, named=EFFECTS))
@@ -141,7 +141,7 @@ class TestConclusion:
 
     def test_without_held_out_motions_there_is_none(self) -> None:
         results = study(condition(0.8, classes=()))
-        assert "no held-out motion" in answer_of(results)["line"]
+        assert "no held-out motion" in summary_of(results)["line"]
         study_page(results)
 
     def test_of_unknown_methods_it_names_neither_a_nor_b(self) -> None:
