@@ -148,8 +148,9 @@ def _ablation(ablation: AblationResult) -> Paragraph | None:
         if not (point.base or band.low <= value <= band.high)
     ]
     low, high = (significant(100.0 * bound, 3) for bound in (band.low, band.high))
+    own = "own " if band.quantity == "own" else ""
     text = (
-        f"The fly-by error for other repetitions of the study's own B ranges from {low} % to"
+        f"The {own}fly-by error for other repetitions of the study's own B ranges from {low} % to"
         f" {high} %; outside: {', '.join(outside) or 'no setting'}."
     )
     return Paragraph(key=f"ablation-{ablation.key}", heading=ablation.title, sentences=[text])
