@@ -141,7 +141,7 @@ def study_campaigns(
     runs, first = [one.run for one in recorded], recorded[0]
     keys, labels, cell = [run.key for run in runs], {run.key: run.label for run in runs}, first.cell
     truth = first.planted
-    if any(not np.array_equal(one.planted, truth) for one in recorded):  # type: ignore[arg-type]
+    if truth is None or not all(_equal(one.planted, truth) for one in recorded):
         truth = None
     with folder.locked(), workers_of(workers) as processes:
         fits = fit_all(runs, folder.fits, reporter, processes)
@@ -181,6 +181,10 @@ def study_campaigns(
         results = results.model_copy(update={"reading": reading_of(results)})
         write_outcome(root, results, reporter)
     return results
+
+
+def _equal(values: Array | None, others: Array) -> bool:
+    return values is not None and np.array_equal(values, others)
 
 
 def recorded_runs(campaigns: Sequence[Path]) -> list[Recorded]:
