@@ -231,13 +231,9 @@ def repetition_ablation(
 
 @dataclass(frozen=True, eq=False)
 class EffectSetting:
-    """What A and B gave with some of the effects on.
+    """Fits of A and B with some of the effects on, and fly-by motions of an arm with the same.
 
-    Attributes:
-        label: which effects.
-        fits: of both methods, by method.
-        forms: of the held-out fly-by motions of an arm with the same effects.
-        base: whether it is a condition of the study itself.
+    `base` marks a condition of the study itself.
     """
 
     label: str
@@ -251,10 +247,7 @@ def effect_ablation(
 ) -> AblationResult:
     """A and B with one effect at a time, on fly-by motions of an arm with the same effect.
 
-    Args:
-        evidence: of the study without effects.
-        settings: in the order they are shown in, that without effects first.
-        repetitions: the first so many of each fit.
+    The first of the settings is that without effects; of each fit so many repetitions are used.
     """
 
     def values(one: EffectSetting, method: str) -> Array:

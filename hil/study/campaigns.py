@@ -82,13 +82,9 @@ class StudyError(HilError):
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """One campaign to be run.
+    """One campaign to be run: its folder, the cell with the number of repetitions, and its plan.
 
-    Attributes:
-        root: its folder.
-        cell: the simulated cell, with the number of repetitions.
-        plan: what is run.
-        effects: whether the unmodelled effects are switched on.
+    With `effects`, the unmodelled effects are switched on.
     """
 
     root: Path
@@ -410,10 +406,7 @@ class Workers:
     ) -> list[T]:
         """Call a function of a module with each of the arguments; results in order.
 
-        Args:
-            function: to be called.
-            arguments: of each call; the longest calls first.
-            done: called with a number of calls whenever so many more have ended.
+        The longest calls come first; `done` gets the number of calls that have ended.
 
         Raises:
             StudyError: a call was refused, ended its process, or lasted too long.

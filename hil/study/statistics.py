@@ -107,13 +107,8 @@ def compared_on(
 ) -> ComparisonResult:
     """Errors with `second` over errors with `first`, motion by motion; a table of one.
 
-    Args:
-        motion_class: of the motions.
-        first: estimate.
-        second: estimate.
-        kernels: inner products (m, r, r) of the errors that r estimates leave.
-        joint: that the errors are of; None for all together.
-        drifts: whether repetitions may resemble their neighbours.
+    `kernels` are the inner products (m, r, r) of the errors that r estimates leave, of one joint or
+    of all together; with `drifts`, repetitions may resemble their neighbours.
     """
     inner = [kernels(one.values) for one in (first, second)]
     # The sum of a mean's squared errors: weights 1 / r on either side.
@@ -170,16 +165,11 @@ def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> Spread | 
     A hierarchical bootstrap: repetitions of the first, repetitions of the second and motions are
     resampled together. What is scored is the mean of the repetitions' own estimates (the paper's
     Table 2), so a resampled estimate is the mean of the resampled repetitions. Of n units n - 1
-    are sampled: a mean of n would scatter by (n - 1) / n too little.
+    are sampled: a mean of n would scatter by (n - 1) / n too little. With `drifts`, blocks of
+    consecutive repetitions are resampled, which may resemble their neighbours.
 
-    Args:
-        first: inner products of the errors of the first's repetitions, by motion (m, r, r).
-        second: those of the second's repetitions on the same motions (m, s, s).
-        drifts: resample blocks of consecutive repetitions, which may resemble their neighbours.
-        seed: of the random numbers.
-
-    Returns:
-        None where the scatter cannot be known: fewer than `FEWEST` repetitions, or one motion.
+    `first` and `second` are inner products of the errors of the repetitions, by motion (m, r, r)
+    and (m, s, s). None with fewer than `FEWEST` repetitions, or one motion.
     """
     motions = len(first)
     if motions < 2 or min(first.shape[1], second.shape[1]) < FEWEST:
@@ -283,13 +273,8 @@ def bands_of(
 ) -> list[AblationBand]:
     """Where an ablation's figures lie for other repetitions of the very same motion.
 
-    Args:
-        method: whose repetitions they are.
-        values: estimates of all its repetitions (r, p).
-        size: repetitions of a point of the ablation; without more of them there is no band.
-        forms: of the held-out motions, by class.
-        truth: planted parameters (p,), if known.
-        reference: estimate (p,) whose distance from the planted values is 1.
+    They are of all subsets of so many (`size`) of a method's repetitions (r, p); without more of
+    them there is no band. `reference` (p,) is the estimate whose distance from `truth` is 1.
     """
     if not 1 <= size < len(values):
         return []

@@ -129,14 +129,8 @@ def condition_result(
 ) -> ConditionResult:
     """All tables of one condition.
 
-    Args:
-        condition: its names.
-        labels: of the methods, by key, in the order of the tables.
-        fits: of the methods.
-        scores: by class of motion.
-        parameters: of the model, with the print.
-        joint_names: of the arm.
-        others: further estimates in the cross table, such as the planted parameters.
+    `labels` of the methods are in the order of the tables, `scores` by class of motion, `others`
+    further estimates in the cross table, such as the planted parameters.
     """
     keys, equal = list(labels), equal_data(fits, list(labels))
     estimates = {key: np.array(fits[key].values) for key in keys}
