@@ -218,9 +218,13 @@ def _named(record: ScoreRecord, key: str) -> ScoreRecord:
 
 def _together(first: ScoreRecord, second: ScoreRecord) -> ScoreRecord:
     """Two records of the same estimates on different motions."""
-    lists = ("durations", "samples", "left_out", "forms", "examples")
-    scores = {name: [*some, *second.scores[name]] for name, some in first.scores.items()}
+
+    def joined(name: str) -> Any:
+        some, more = getattr(first, name), getattr(second, name)
+        if isinstance(some, dict):
+            return {key: [*values, *more[key]] for key, values in some.items()}
+        return [*some, *more]
+
     return first.model_copy(
-        update={name: [*getattr(first, name), *getattr(second, name)] for name in lists}
-        | {"scores": scores}
+        update={name: joined(name) for name in ScoreRecord.model_fields if name != "inputs"}
     )

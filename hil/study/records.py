@@ -29,7 +29,7 @@ from identification.validation import FIGURE_BANDWIDTH
 Array = NDArray[np.float64]
 MotionClass = Literal["fly-by", "stop-to-stop", "sinusoid"]
 
-VERSION: Final = 3
+VERSION: Final = 4
 """Counted up when the same archives come to give other numbers, or a record another form."""
 PLANTED: Final = "planted"
 """Name of the planted parameters among the estimates."""
@@ -70,24 +70,23 @@ class FitRecord(Record, Fitted):
     duration: float
 
 
-class MotionScore(Frozen):
-    """Relative errors ||e|| / ||tau|| of one estimate on one motion, low-passed at 30 Hz.
+class ClassErrors(Frozen):
+    """Relative errors ||e|| / ||tau|| of estimates on the motions of a class, over all joints.
 
-    The paper's Fig. 4 is low-passed so: what remains is the error of the model, and not the noise
-    of the currents, which is the same for every estimate.
+    They are low-passed at 30 Hz as the paper's Fig. 4 is: what remains is the error of the model,
+    and not the noise of the currents, which is the same for every estimate.
     """
 
-    archive: str
-    overall: float
-    """Over all joints."""
-    unfiltered: float
+    durations: list[float]
+    overall: dict[str, list[float]]
+    unfiltered: dict[str, list[float]]
     """The same without the low-pass."""
-    all_rows: float
-    """The same, low-passed, with the rows at rest and at reversals."""
-    own: float | None
-    """||Phi (pi - planted)|| / ||tau||, the error of the estimate itself."""
-    mean_abs: list[float]
-    """Mean |e| per joint, N·m."""
+    own: dict[str, list[float]]
+    """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, where that is known."""
+    mean_abs: dict[str, list[list[float]]]
+    """Motion by motion, mean |e| per joint, N·m: the paper's Fig. 3."""
+    all_rows: dict[str, list[float]]
+    """As `overall`, over the whole motion: rows at rest, near ends and at reversals included."""
 
 
 class ExampleRecord(Frozen):
@@ -113,16 +112,14 @@ class MotionForm(Frozen):
     """Of Phi as it is, all joints together (p, p)."""
 
 
-class ScoreRecord(Record):
+class ScoreRecord(Record, ClassErrors):
     """How well several estimates predict the motions of one class."""
 
-    durations: list[float]
     samples: list[int]
     """Of each motion, from the first to the last at which a joint moves."""
     left_out: list[list[int]]
     """How many of them the errors leave out, each per joint: at rest, near ends, at reversals."""
     forms: list[MotionForm]
-    scores: dict[str, list[MotionScore]]
     examples: list[ExampleRecord]
 
 

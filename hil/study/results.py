@@ -13,7 +13,7 @@ from pydantic import Field
 
 from hil.results.frozen import Frozen
 
-from .records import ExampleRecord, Fitted
+from .records import ClassErrors, ExampleRecord, Fitted
 from .settings import StudySettings, load_json
 
 SCHEMA_VERSION: Final = 1
@@ -144,20 +144,11 @@ class ComparisonResult(Frozen):
         return self.verdict not in ("none", "too few")
 
 
-class ClassResult(Frozen):
+class ClassResult(ClassErrors):
     """The motions of one class, and the errors of every estimate on each of them."""
 
     motion_class: str
     archives: list[str]
-    durations: list[float]
-    overall: dict[str, list[float]]
-    unfiltered: dict[str, list[float]]
-    own: dict[str, list[float]]
-    """Error of each estimate itself, where that is known."""
-    mean_abs: dict[str, list[list[float]]]
-    """Motion by motion, each per joint, N·m: the paper's Fig. 3."""
-    all_rows: dict[str, list[float]]
-    """As `overall`, over the whole motion."""
     left_out: list[float]
     """Share of the samples of the motions that all other errors leave out, per joint."""
     left_out_share: float

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
 
-from .records import ClassForms, FitRecord, Fitted, ScoreRecord
+from .records import ClassErrors, ClassForms, FitRecord, Fitted, ScoreRecord
 from .results import (
     ClassResult,
     ClosenessResult,
@@ -137,7 +137,7 @@ def condition_result(
     if equal is not None:
         estimates[equal.name] = estimates[equal.cut][: equal.repetitions]
     wanted = [*estimates, *others]
-    classes = [_class_result(name, one, wanted, condition) for name, one in scores.items()]
+    classes = [_class_result(name, one, condition) for name, one in scores.items()]
     forms = {name: ClassForms.of(one.forms) for name, one in scores.items()}
     truth = None
     if parameters and all(one.truth is not None for one in parameters):
@@ -205,23 +205,15 @@ def _method(key: str, label: str, record: FitRecord) -> MethodResult:
     )
 
 
-def _class_result(
-    name: str, record: ScoreRecord, wanted: Sequence[str], condition: Condition
-) -> ClassResult:
-    scores = {key: record.scores[key] for key in wanted if key in record.scores}
+def _class_result(name: str, record: ScoreRecord, condition: Condition) -> ClassResult:
     left_out, samples = np.sum(record.left_out, axis=0), sum(record.samples)
-    own = {key: [one.own for one in some if one.own] for key, some in scores.items()}
+    errors = record.model_dump(include=set(ClassErrors.model_fields))
     return ClassResult(
         motion_class=name,
         archives=[one.archive for one in record.forms],
-        durations=record.durations,
-        overall={key: [one.overall for one in some] for key, some in scores.items()},
-        unfiltered={key: [one.unfiltered for one in some] for key, some in scores.items()},
-        own={} if condition.effects else {key: values for key, values in own.items() if values},
-        mean_abs={key: [one.mean_abs for one in some] for key, some in scores.items()},
-        all_rows={key: [one.all_rows for one in some] for key, some in scores.items()},
         left_out=(left_out / samples).tolist(),
         left_out_share=float(left_out.sum() / (samples * left_out.size)),
+        **errors | ({"own": {}} if condition.effects else {}),
     )
 
 
