@@ -17,7 +17,7 @@ from hil.cell import Cell
 from hil.errors import InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.study import run_study, study_campaigns, study_settings
-from hil.study.reading import answer_of
+from hil.study.sentences import summary_of
 
 _DEFAULT: Final = signal.SIG_DFL
 
@@ -73,21 +73,22 @@ def study(
         int | None,
         typer.Option(min=1, max=256, help="Processes; one for each processor if left out."),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the answer.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print only the conclusion.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Reproduce the paper: A (sines) against B (via points), on the simulated COMAU NS 16.
 
     Both are designed, executed, and asked to predict motions they have never seen, of three
     classes; then one thing after another is varied. Leaves `report.html` and `results.json` in
-    OUTPUT, with every archive they rest on. Ctrl-C at any time: the same command goes on there,
-    and does nothing whole again.
+    OUTPUT, with every archive they rest on. After Ctrl-C the same command resumes there.
 
     **Examples:**
 
     - `hil study --quick --output runs/quick`: the whole way in minutes
     - `hil study --output runs/study`: as the paper's, some 40 minutes on two free processors
-    - `hil study --campaign runs/a --campaign runs/b`: what two recorded campaigns tell
+    - `hil study --campaign runs/a --campaign runs/b`: two recorded campaigns
     """
     reporter = make_reporter(quiet=quiet or json)
     count = workers or len(os.sched_getaffinity(0))
@@ -119,10 +120,10 @@ def study(
                 )
     except KeyboardInterrupt:
         raise OperatorStopError(
-            f"stopped; what is whole is kept in {output}: the same command goes on there"
+            f"stopped; what is complete stays in {output}: the same command resumes there"
         ) from None
-    answer = answer_of(found)
-    typer.echo(json_format.dumps(answer, indent=1) if json else answer["line"])
+    summary = summary_of(found)
+    typer.echo(json_format.dumps(summary, indent=1) if json else summary["line"])
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The paper's study: methods A and B, what they find, and what it predicts."""
+"""The paper's study: methods A and B designed, executed, identified and compared."""
 
 from .recorded import study_campaigns
 from .results import StudyResults

@@ -1,27 +1,35 @@
-"""What becomes of method B when one thing is changed and everything else kept."""
+"""Method B, and where it matters A, with one thing changed and everything else unchanged."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.design import preset
-
-from .bands import bands_of
-from .comparing import Estimated, compared_on, corrected, torque_kernels
-from .designs import SINES, SINES_LABELS, A, B, fly_key, via_key, weight_key
-from .forms import ClassForms
-from .plans import SINES_ABLATION, noise_key
-from .records import FitRecord, ScoreRecord
+from .campaigns import noise_key
+from .records import ClassForms, FitRecord, ScoreRecord
 from .results import AblationBand, AblationPoint, AblationResult
+from .searches import SINES, A, B, fly_key, via_key, weight_key
 from .settings import StudySettings
-from .summary import parameter_error
+from .statistics import (
+    Estimated,
+    bands_of,
+    compared_on,
+    corrected,
+    parameter_error,
+    torque_kernels,
+)
 
 Array = NDArray[np.float64]
+Setting = tuple[float, str, str, bool]
+"""Value, method, key of its fit, and whether it is the setting of the study itself."""
+
+_SINES_LABELS: Final = ("middle, printed", "home, printed", "middle, fast", "home, fast")
+_LABELS: Final = dict(zip(SINES, _SINES_LABELS, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,92 +61,145 @@ class Evidence:
         """Estimates (r, p) of the repetitions of an ablation's own campaign."""
         return np.array(self.fits[key].values)
 
+    def point(
+        self,
+        value: float,
+        record: FitRecord,
+        values: Array,
+        reference: Array,
+        *,
+        method: str,
+        base: bool,
+        label: str = "",
+        forms: Mapping[str, ClassForms] | None = None,
+    ) -> AblationPoint:
+        """One setting: estimates (r, p) of its repetitions beside a reference (p,).
+
+        `forms` are the motions that are predicted, by class, if not those of the study.
+        """
+        own, truth = values.mean(axis=0), self.truth
+        predicted = self.forms if forms is None else forms
+        return AblationPoint(
+            value=value,
+            label=label,
+            method=method,
+            base=base,
+            repetitions=len(values),
+            log10_det=record.log10_det,
+            coupling_index=record.coupling_index,
+            duration=record.duration,
+            parameter_error=None if truth is None else parameter_error(own, reference, truth),
+            error={name: float(np.median(one.overall(own))) for name, one in predicted.items()},
+            own={}
+            if truth is None
+            else {name: float(np.median(one.own(own, truth))) for name, one in self.forms.items()},
+        )
+
+    def bands(self, methods: Sequence[str], size: int, reference: Array) -> list[AblationBand]:
+        """Where the figures lie for other repetitions of the study's own motions."""
+        main = {method: np.array(self.main[method].values) for method in methods}
+        return [
+            band
+            for method, values in main.items()
+            for band in bands_of(method, values, size, self.forms, self.truth, reference)
+        ]
+
 
 def ablations(settings: StudySettings, evidence: Evidence) -> list[AblationResult]:
-    """All of a simulated study."""
-    base = preset("b")
-    assert base.via_points is not None
-    n_via, fly, weight = base.via_points.n_via, base.via_points.fly, base.search.weights[1]
+    """All of a simulated study but for the effects one at a time."""
     few = settings.ablation_repetitions
+    times = "once" if few == 1 else f"{few} times"
+
+    def one(
+        key: str,
+        title: str,
+        variable: str,
+        words: str,
+        wanted: Sequence[Setting],
+        methods: Sequence[str] = (B,),
+    ) -> AblationResult:
+        reference = evidence.executed(B).mean(axis=0)
+        return AblationResult(
+            key=key,
+            title=title,
+            variable=variable,
+            words=words,
+            points=[
+                evidence.point(
+                    value,
+                    evidence.fits[fit],
+                    evidence.executed(fit),
+                    reference,
+                    method=method,
+                    base=base,
+                    label=_LABELS[fit] if key == "sines" else "",
+                )
+                for value, method, fit, base in wanted
+                if fit in evidence.fits
+            ],
+            bands=evidence.bands(methods, len(evidence.executed(B)), reference),
+            missing=list(evidence.missing.get(key, ())),
+        )
+
+    def of_b(keys: Mapping[float, str]) -> list[Setting]:
+        return [(float(value), B, key, key == B) for value, key in keys.items()]
+
+    sines = [key for key in SINES if key in evidence.fits]
+    b, fly_by = Estimated(B, evidence.executed(B)), torque_kernels(evidence.forms["fly-by"])
+    beside_b = corrected(
+        [
+            compared_on("fly-by", Estimated(key, evidence.executed(key)), b, fly_by, drifts=False)
+            for key in sines
+        ]
+    )
     return [
-        _sines(evidence, few),
-        _varied(
-            evidence,
+        one(
+            "sines",
+            "What method A may choose",
+            "sines of method A",
+            "What the paper leaves open of method A, a search each: sines about the middle of the"
+            " ranges or about the home posture, with the frequencies of Table 1 or with those that"
+            f" the appendix's bound allows. Each best motion was run {times}, and so was B.",
+            [(float(k), A, key, key == evidence.sines) for k, key in enumerate(sines)],
+            (),
+        ).model_copy(update={"comparisons": beside_b}),
+        one(
             "fly",
             "Fly-by share",
             "fly-by share of B's via points",
             "B's own via points and speeds, planned again with another fly-by share and run: the "
             "corners change, the search does not.",
-            [(value, fly_key(value), value == fly) for value in settings.fly],
+            of_b({value: fly_key(value) for value in settings.fly}),
         ),
-        _varied(
-            evidence,
+        one(
             "n_via",
             "Number of via points",
             "via points K",
             "A search like B's, as long as B's, for each number of via points; more of them make a "
             "longer motion.",
-            [(float(value), via_key(value), value == n_via) for value in settings.n_via],
+            of_b({value: via_key(value) for value in settings.n_via}),
         ),
-        _varied(
-            evidence,
+        one(
             "weight",
             "Weight of the coupling index",
             "λ2 of the coupling index in eq. 7",
             "A search like B's for each weight; λ1 = 1 − λ2 is that of log det.",
-            [(value, weight_key(value), value == weight) for value in settings.coupling_weight],
+            of_b({value: weight_key(value) for value in settings.coupling_weight}),
         ),
         repetition_ablation(evidence, settings.subsets, (A, B)),
-        AblationResult(
-            key="noise",
-            title="Noise of the currents",
-            variable="multiple of the cell's current noise",
-            words=f"A and B run {_times(few)} at each level; the held-out motions stay those of "
-            "the study.",
-            points=[
-                _executed(evidence, factor, method, noise_key(method, factor), base=factor == 1.0)
+        one(
+            "noise",
+            "Noise of the currents",
+            "multiple of the cell's current noise",
+            f"A and B run {times} at each level; the held-out motions stay those of the study.",
+            [
+                (factor, method, noise_key(method, factor), factor == 1.0)
                 for method in (A, B)
                 for factor in settings.noise
-                if noise_key(method, factor) in evidence.fits
             ],
-            bands=_bands(evidence, (A, B), few),
-            missing=list(evidence.missing.get("noise", ())),
+            (A, B),
         ),
     ]
-
-
-def _sines(evidence: Evidence, few: int) -> AblationResult:
-    """What method A is left free to choose, each beside B."""
-    keys = [key for key in SINES if key in evidence.fits]
-    forms = evidence.forms["fly-by"]
-    b = Estimated(B, evidence.executed(B))
-    return AblationResult(
-        key=SINES_ABLATION,
-        title="What method A may choose",
-        variable="sines of method A",
-        words="What the paper leaves open of method A: a search each for sines about the middle of"
-        " the ranges or about the home posture, with the frequencies of Table 1 or with those that"
-        f" the appendix's bound allows. Each best motion was run {_times(few)}, and so was B.",
-        points=[
-            _executed(evidence, float(k), A, key, base=key == evidence.sines).model_copy(
-                update={"label": SINES_LABELS[key]}
-            )
-            for k, key in enumerate(keys)
-        ],
-        comparisons=corrected(
-            [
-                compared_on(
-                    "fly-by",
-                    Estimated(key, evidence.executed(key)),
-                    b,
-                    torque_kernels(forms),
-                    drifts=False,
-                )
-                for key in keys
-            ]
-        ),
-        missing=list(evidence.missing.get(SINES_ABLATION, ())),
-    )
 
 
 def repetition_ablation(
@@ -151,98 +212,84 @@ def repetition_ablation(
         record = evidence.main[method]
         values = np.array(record.values)
         for size in (one for one in sizes if one <= len(values)):
-            reference = last[:size].mean(axis=0)
-            base = size == len(values)
+            reference, base = last[:size].mean(axis=0), size == len(values)
+            some = values[:size]
             points.append(
-                _point(evidence, float(size), method, record, (values[:size], reference), base=base)
+                evidence.point(float(size), record, some, reference, method=method, base=base)
             )
-            bands += bands_of(method, values, size, evidence.forms, evidence.truth, reference)
+            bands += evidence.bands((method,), size, reference)
     return AblationResult(
         key="repetitions",
         title="Number of repetitions",
         variable="repetitions that are fitted",
-        words="The first so many repetitions of the study itself; nothing is run again.",
+        words="The first repetitions of the study itself; nothing is run again.",
         points=points,
         bands=bands,
         missing=[],
     )
 
 
-def _varied(
-    evidence: Evidence,
-    key: str,
-    title: str,
-    variable: str,
-    words: str,
-    wanted: Sequence[tuple[float, str, bool]],
+@dataclass(frozen=True, eq=False)
+class EffectSetting:
+    """Fits of A and B with some of the effects on, and fly-by motions of an arm with the same.
+
+    `base` marks a condition of the study itself.
+    """
+
+    label: str
+    fits: Mapping[str, FitRecord]
+    forms: ClassForms
+    base: bool = False
+
+
+def effect_ablation(
+    evidence: Evidence, settings: Sequence[EffectSetting], repetitions: int
 ) -> AblationResult:
+    """A and B with one effect at a time, on fly-by motions of an arm with the same effect.
+
+    The first of the settings is that without effects; of each fit so many repetitions are used.
+    """
+
+    def values(one: EffectSetting, method: str) -> Array:
+        return np.array(one.fits[method].values[:repetitions])
+
+    reference = values(settings[0], B).mean(axis=0)
     return AblationResult(
-        key=key,
-        title=title,
-        variable=variable,
-        words=words,
+        key="effects",
+        title="One effect at a time",
+        variable="effects that are on",
+        words=f"A and B run {repetitions} times on an arm with only one of the unmodelled effects,"
+        " and fly-by motions of the same arm predicted.",
         points=[
-            _executed(evidence, value, B, name, base=base)
-            for value, name, base in wanted
-            if name in evidence.fits
+            evidence.point(
+                float(k),
+                one.fits[method],
+                values(one, method),
+                reference,
+                method=method,
+                base=one.base,
+                label=one.label,
+                forms={"fly-by": one.forms},
+            )
+            for method in (A, B)
+            for k, one in enumerate(settings)
         ],
-        bands=_bands(evidence, (B,), len(evidence.executed(B))),
-        missing=list(evidence.missing.get(key, ())),
+        comparisons=corrected(
+            [
+                compared_on(
+                    "fly-by",
+                    Estimated(A, values(one, A)),
+                    Estimated(B, values(one, B)),
+                    torque_kernels(one.forms),
+                    drifts=True,
+                ).model_copy(update={"setting": one.label})
+                for one in settings
+            ]
+        ),
+        bands=[
+            band
+            for band in evidence.bands((A, B), repetitions, reference)
+            if band.quantity != "error"
+        ],
+        missing=[],
     )
-
-
-def _executed(
-    evidence: Evidence, value: float, method: str, key: str, *, base: bool
-) -> AblationPoint:
-    """A setting that was run for the ablation, beside B run as often."""
-    values = evidence.executed(key), evidence.executed(B).mean(axis=0)
-    return _point(evidence, value, method, evidence.fits[key], values, base=base)
-
-
-def _bands(evidence: Evidence, methods: Sequence[str], size: int) -> list[AblationBand]:
-    """Where the figures lie for other repetitions of the study's own motions."""
-    reference = evidence.executed(B).mean(axis=0)
-    return [
-        band
-        for method in methods
-        for band in bands_of(
-            method,
-            np.array(evidence.main[method].values),
-            size,
-            evidence.forms,
-            evidence.truth,
-            reference,
-        )
-    ]
-
-
-def _point(
-    evidence: Evidence,
-    value: float,
-    method: str,
-    record: FitRecord,
-    values: tuple[Array, Array],
-    *,
-    base: bool,
-) -> AblationPoint:
-    """One setting; `values` are its repetitions (r, p) and the estimate it is set beside (p,)."""
-    repetitions, reference = values
-    own, truth = repetitions.mean(axis=0), evidence.truth
-    return AblationPoint(
-        value=value,
-        method=method,
-        base=base,
-        repetitions=len(repetitions),
-        log10_det=record.log10_det,
-        coupling_index=record.coupling_index,
-        duration=record.duration,
-        parameter_error=None if truth is None else parameter_error(own, reference, truth),
-        error={name: float(np.median(one.overall(own))) for name, one in evidence.forms.items()},
-        own={}
-        if truth is None
-        else {name: float(np.median(one.own(own, truth))) for name, one in evidence.forms.items()},
-    )
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"

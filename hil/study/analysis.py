@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,21 @@ from hil.progress import Reporter
 from planner import FlyDistance, FlyPercent, InvalidPlanFile
 from planner.commands import Fly
 
-from .motions import CLASSES, MotionClass
+from .campaigns import Workers
 from .reading_archives import Reading, fit, score
-from .records import FitRecord, ScoreRecord, digest, keep, kept
-from .workers import Workers
+from .records import (
+    CLASSES,
+    FitRecord,
+    MotionClass,
+    Record,
+    ScoreRecord,
+    digest,
+    read_record,
+    write_record,
+)
 
 Array = NDArray[np.float64]
+R = TypeVar("R", bound=Record)
 
 
 @dataclass(frozen=True)
@@ -40,23 +49,26 @@ class Run:
     label: str
     root: Path
 
+    @property
+    def folder(self) -> CampaignFolder:
+        """The same, to be read."""
+        return CampaignFolder(self.root)
+
     def archives(self, kind: str) -> tuple[tuple[str, str], ...]:
         """Names and checksums of its whole archives of one kind.
 
         Raises:
             CampaignFolderError: there is no manifest that can be read.
         """
-        folder = CampaignFolder(self.root)
-        names = [path.name for path in folder.completed(kind)]
-        sums = {entry.name: entry.sha256 for entry in folder.manifest()}
+        names = [path.name for path in self.folder.completed(kind)]
+        sums = {entry.name: entry.sha256 for entry in self.folder.manifest()}
         return tuple((name, sums[name]) for name in names)
 
     def reading(self, kind: str, names: Sequence[str] | None = None) -> Reading:
         """Its archives of one kind, all or those named."""
-        folder = CampaignFolder(self.root)
 
         def paths(chosen: Sequence[str]) -> tuple[Path, ...]:
-            return tuple(folder.archives / name for name in chosen)
+            return tuple(self.folder.archives / name for name in chosen)
 
         chosen = [name for name, _ in self.archives(kind)] if names is None else names
         return Reading(paths(chosen), paths([name for name, _ in self.archives("standstill")]))
@@ -70,26 +82,16 @@ def fit_all(
     Raises:
         InputError: a run has no whole excitation.
     """
-    inputs = {}
+    tasks: list[_Task[FitRecord]] = []
     for run in runs:
         archives = run.archives("excitation")
         if not archives:
             raise InputError(run.root, "holds no whole excitation", remedy="run the campaign first")
-        inputs[run.key] = digest([*archives, *run.archives("standstill")], {})
-    found = {run.key: kept(_place(fits, run.key), FitRecord, inputs[run.key]) for run in runs}
-    missing = [run for run in runs if found[run.key] is None]
-    with reporter.task("estimating (excitations)", len(runs)) as task:
-        task.advance(len(runs) - len(missing))
-        made = workers.map(
-            fit_and_keep,
-            [
-                (run.reading("excitation"), inputs[run.key], _place(fits, run.key))
-                for run in missing
-            ],
-            done=lambda count: task.advance(count),
-        )
-    found |= {run.key: record for run, record in zip(missing, made, strict=True)}
-    return {key: record for key, record in found.items() if record is not None}
+        inputs = digest([*archives, *run.archives("standstill")], {})
+        place = fits / f"{run.key}.json"
+        tasks.append(_Task(place, inputs, FitRecord, fit, (run.reading("excitation"), inputs)))
+    found = _all(tasks, "estimating (excitations)", reporter, workers)
+    return {run.key: record for run, record in zip(runs, found, strict=True)}
 
 
 def score_all(
@@ -101,76 +103,62 @@ def score_all(
     workers: Workers,
 ) -> dict[str, ScoreRecord]:
     """Predict the held-out motions of all runs, class by class; by class."""
-    tasks = []
+    tasks: list[_Task[ScoreRecord]] = []
     values = {name: estimate.tolist() for name, estimate in estimates.items()}
-    for run in runs:
-        for motion_class, names in classes_of(run).items():
-            sums = dict(run.archives("validation"))
-            archives = [(name, sums[name]) for name in names]
-            inputs = digest(
-                [*archives, *run.archives("standstill")], {"estimates": values, "shown": [*shown]}
-            )
-            tasks.append((run, motion_class, names, inputs))
-    places = [_place(fits, f"{run.key}-{motion_class}") for run, motion_class, _, _ in tasks]
-    found: list[ScoreRecord | None] = []
-    for place, (_, _, names, inputs) in zip(places, tasks, strict=True):
-        record = kept(place, ScoreRecord, inputs)
-        known = record is not None and record.tells_of(names, estimates)
-        found.append(record if known else None)
-    missing = [k for k, record in enumerate(found) if record is None]
-    with reporter.task("predicting (classes of motion)", len(tasks)) as task:
-        task.advance(len(tasks) - len(missing))
-        made = workers.map(
-            score_and_keep,
-            [
-                (
-                    tasks[k][0].reading("validation", tasks[k][2]),
-                    tasks[k][3],
-                    values,
-                    list(shown),
-                    places[k],
-                )
-                for k in missing
-            ],
-            done=lambda count: task.advance(count),
-        )
-    for k, made_now in zip(missing, made, strict=True):
-        found[k] = made_now
+    classes = [(run, name, names) for run in runs for name, names in classes_of(run).items()]
+    for run, name, names in classes:
+        sums = dict(run.archives("validation"))
+        archives = [(one, sums[one]) for one in names] + [*run.archives("standstill")]
+        inputs = digest(archives, {"estimates": values, "shown": [*shown]})
+        arguments = (run.reading("validation", names), inputs, values, list(shown))
+        place = fits / f"{run.key}-{name}.json"
+        tasks.append(_Task(place, inputs, ScoreRecord, score, arguments))
+    found = _all(tasks, "predicting (classes of motion)", reporter, workers)
     by_class: dict[str, ScoreRecord] = {}
-    for (run, motion_class, _, _), record in zip(tasks, found, strict=True):
-        assert record is not None
+    for (run, name, _), record in zip(classes, found, strict=True):
         named = _named(record, run.key)
-        there = by_class.get(motion_class)
-        by_class[motion_class] = named if there is None else _together(there, named)
+        by_class[name] = _together(by_class[name], named) if name in by_class else named
     return {name: by_class[name] for name in CLASSES if name in by_class}
 
 
-def fit_and_keep(reading: Reading, inputs: str, place: Path) -> FitRecord:
-    """In a child: estimate, and write it down before anything else can go wrong."""
-    record = fit(reading, inputs)
-    keep(place, record)
-    return record
+@dataclass(frozen=True, eq=False)
+class _Task(Generic[R]):
+    """A record, and how to make it from archives."""
+
+    place: Path
+    inputs: str
+    kind: type[R]
+    function: Callable[..., R]
+    arguments: tuple[Any, ...]
 
 
-def score_and_keep(
-    reading: Reading,
-    inputs: str,
-    estimates: Mapping[str, Sequence[float]],
-    shown: Sequence[str],
-    place: Path,
-) -> ScoreRecord:
-    """In a child: predict, and write it down."""
-    record = score(reading, inputs, estimates, shown)
-    keep(place, record)
+def _all(tasks: Sequence[_Task[R]], title: str, reporter: Reporter, workers: Workers) -> list[R]:
+    """The records; those that are missing, or rest on other archives, are made."""
+    found = {k: read_record(one.place, one.kind, one.inputs) for k, one in enumerate(tasks)}
+    missing = [k for k, record in found.items() if record is None]
+    with reporter.task(title, len(tasks)) as task:
+        task.advance(len(tasks) - len(missing))
+        made = workers.map(
+            make_record,
+            [(tasks[k].place, tasks[k].function, *tasks[k].arguments) for k in missing],
+            done=lambda count: task.advance(count),
+        )
+    found |= dict(zip(missing, made, strict=True))
+    return [record for record in found.values() if record is not None]
+
+
+def make_record(place: Path, function: Callable[..., R], *arguments: Any) -> R:
+    """In a child: read archives, and write the record before anything else can fail."""
+    record = function(*arguments)
+    write_record(place, record)
     return record
 
 
 def classes_of(run: Run) -> dict[MotionClass, list[str]]:
-    """Names of the held-out archives of a run by the class that their own plan tells."""
+    """Names of the held-out archives of a run by the class of their planned motion."""
     found: dict[MotionClass, list[str]] = {}
-    folder = CampaignFolder(run.root)
     for name, _ in run.archives("validation"):
-        motion_class = class_in(open_archive(folder.archives / name))
+        motion_class = class_in(open_archive(run.folder.archives / name))
         found.setdefault(motion_class, []).append(name)
     return found
 
@@ -196,7 +184,7 @@ def class_in(archive: Archive) -> MotionClass:
 def class_of(plan: Mapping[str, Any]) -> MotionClass:
     """Class of a planned motion: what an archive's `plan.json` says of it.
 
-    A motion in pieces whose moves were not kept is taken for fly-by, the interpolator's own way.
+    A motion in pieces without its moves counts as fly-by, as the interpolator runs it.
 
     Raises:
         InvalidPlanFile: the moves that it lists are none.
@@ -221,35 +209,22 @@ def _rounds(fly: Fly) -> bool:
 
 def _named(record: ScoreRecord, key: str) -> ScoreRecord:
     """The same with archives named after their run, since every campaign counts from 0."""
-    return record.model_copy(
-        update={
-            "scores": {
-                name: [one.model_copy(update={"archive": f"{key}/{one.archive}"}) for one in some]
-                for name, some in record.scores.items()
-            },
-            "forms": [
-                one.model_copy(update={"archive": f"{key}/{one.archive}"}) for one in record.forms
-            ],
-            "examples": [
-                one.model_copy(update={"archive": f"{key}/{one.archive}"})
-                for one in record.examples
-            ],
-        }
+    forms, examples = (
+        [one.model_copy(update={"archive": f"{key}/{one.archive}"}) for one in some]
+        for some in (record.forms, record.examples)
     )
+    return record.model_copy(update={"forms": forms, "examples": examples})
 
 
 def _together(first: ScoreRecord, second: ScoreRecord) -> ScoreRecord:
+    """Two records of the same estimates on different motions."""
+
+    def joined(name: str) -> Any:
+        some, more = getattr(first, name), getattr(second, name)
+        if isinstance(some, dict):
+            return {key: [*values, *more[key]] for key, values in some.items()}
+        return [*some, *more]
+
     return first.model_copy(
-        update={
-            "durations": [*first.durations, *second.durations],
-            "samples": [*first.samples, *second.samples],
-            "left_out": [*first.left_out, *second.left_out],
-            "forms": [*first.forms, *second.forms],
-            "scores": {k: [*first.scores[k], *second.scores[k]] for k in first.scores},
-            "examples": [*first.examples, *second.examples],
-        }
+        update={name: joined(name) for name in ScoreRecord.model_fields if name != "inputs"}
     )
-
-
-def _place(fits: Path, key: str) -> Path:
-    return fits / f"{key}.json"

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,14 @@ from identification.preprocessing import Samples
 from identification.repetitions import estimate_repetitions
 from identification.validation import PredictionError, for_figure
 
-from .forms import low_passed, motion_form
-from .records import PLANTED, ExampleRecord, FitRecord, MotionScore, ScoreRecord
+from .records import (
+    PLANTED,
+    ExampleRecord,
+    FitRecord,
+    ScoreRecord,
+    low_passed,
+    motion_form,
+)
 
 Array = NDArray[np.float64]
 
@@ -97,15 +103,19 @@ def score(
     model, runs = prepared.sources.cell.model, prepared.fitted
     table = np.array(list(estimates.values()), dtype=np.float64)
     truth = list(estimates).index(PLANTED) if PLANTED in estimates else None
-    by_motion = [
-        _scored(model, table, source.name, run, truth)
-        for source, run in zip(prepared.sources.training, runs, strict=True)
-    ]
+    by_motion = [_scored(model, table, run, truth) for run in runs]
     usable = [run.usable[_motion_rows(run)] for run in runs]
-    scores = {name: [some[k] for some in by_motion] for k, name in enumerate(estimates)}
+    errors = {
+        quantity: {
+            name: [some[k][quantity] for some in by_motion]
+            for k, name in enumerate(estimates)
+            if quantity in by_motion[0][k]
+        }
+        for quantity in ("overall", "unfiltered", "all_rows", "own", "mean_abs")
+    }
     examples = []
     if shown:
-        every = np.mean([[one.overall for one in scores[name]] for name in shown], axis=0)
+        every = np.mean([errors["overall"][name] for name in shown], axis=0)
         typical = int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])
         series = {name: np.asarray(estimates[name]) for name in shown}
         examples.append(_example(prepared, runs[typical], typical, series))
@@ -118,15 +128,15 @@ def score(
             motion_form(model, source.name, run)
             for source, run in zip(prepared.sources.training, runs, strict=True)
         ],
-        scores=scores,
         examples=examples,
+        **errors,
     )
 
 
 def _scored(
-    model: RobotModel, table: Array, name: str, run: Samples, truth: int | None
-) -> list[MotionScore]:
-    """Scores of every row of a table of estimates (k, p) on one motion; one may be the truth.
+    model: RobotModel, table: Array, run: Samples, truth: int | None
+) -> list[dict[str, Any]]:
+    """Errors of every row of a table of estimates (k, p) on one motion; one may be the truth.
 
     The regressor and the low-pass, which cost most, are made once for all of them.
     """
@@ -139,15 +149,15 @@ def _scored(
     slow = low_passed(run, left.reshape(len(left), -1)).reshape(left.shape)
     best = None if truth is None else left[..., truth]
     return [
-        _score(name, run, left[..., k], slow[..., k], everywhere[..., k], best)
+        _errors(run, left[..., k], slow[..., k], everywhere[..., k], None if k == truth else best)
         for k in range(len(table))
     ]
 
 
-def _score(
-    name: str, run: Samples, left: Array, slow: Array, everywhere: Array, best: Array | None
-) -> MotionScore:
-    """Score of what an estimate leaves of the torque (m, n), as it is and low-passed.
+def _errors(
+    run: Samples, left: Array, slow: Array, everywhere: Array, best: Array | None
+) -> dict[str, Any]:
+    """Errors of what an estimate leaves of the torque (m, n), as it is and low-passed.
 
     `everywhere` is low-passed with the rows that are not usable, `best` is what the planted values
     leave: the noise, and what the model leaves out.
@@ -155,20 +165,17 @@ def _score(
     whole = _motion_rows(run)
     error = PredictionError.between(run.torque, run.torque - slow, run.usable)
     raw = PredictionError.between(run.torque, run.torque - left, run.usable)
-    return MotionScore(
-        archive=name,
-        overall=error.overall,
-        unfiltered=raw.overall,
-        all_rows=PredictionError.between(
-            run.torque[whole], run.torque[whole] - everywhere[whole]
-        ).overall,
-        own=None
-        if best is None
-        else PredictionError.between(run.torque, run.torque - (left - best), run.usable).overall,
-        relative=error.relative.tolist(),
-        mean_abs=error.mean_absolute.tolist(),
-        mean=error.mean.tolist(),
-    )
+    all_rows = PredictionError.between(run.torque[whole], run.torque[whole] - everywhere[whole])
+    found = {
+        "overall": error.overall,
+        "unfiltered": raw.overall,
+        "all_rows": all_rows.overall,
+        "mean_abs": error.mean_absolute.tolist(),
+    }
+    if best is not None:
+        own = PredictionError.between(run.torque, run.torque - (left - best), run.usable)
+        found["own"] = own.overall
+    return found
 
 
 def _motion_rows(run: Samples) -> slice:

@@ -1,30 +1,39 @@
-"""What is kept of the archives that were read, one file each, so that nothing is read twice."""
+"""Records of the archives that were read, one JSON file each, so that none is read twice.
+
+The error that parameters leave is linear in them, Phi pi - tau, and so is a low-pass. Its squared
+length is therefore y' G y with y = [-pi; 1] and G the Gram matrix of the low-passed [Phi | tau]:
+one matrix for each motion gives the error of every estimate, without its archive.
+"""
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Self, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
-from pydantic import Field, model_validator
+import numpy as np
+from numpy.typing import NDArray
 
 from hil.files import make_folder, write_or_tell
 from hil.reading import text_of
 from hil.results.frozen import Frozen
+from identification import RobotModel
+from identification.preprocessing import Samples
+from identification.smoothing_spline import low_pass
+from identification.validation import FIGURE_BANDWIDTH
 
-from .forms import MotionForm
+Array = NDArray[np.float64]
+MotionClass = Literal["fly-by", "stop-to-stop", "sinusoid"]
 
-VERSION = 2
-"""Counted up when the same archives come to give other numbers."""
-
+VERSION: Final = 4
+"""Counted up when the same archives come to give other numbers, or a record another form."""
 PLANTED: Final = "planted"
 """Name of the planted parameters among the estimates."""
-
-
-Count = Annotated[int, Field(ge=0, lt=2**53)]
-"""What a float holds exactly: counts are averaged."""
+CLASSES: Final[tuple[MotionClass, ...]] = ("fly-by", "stop-to-stop", "sinusoid")
 
 
 class Record(Frozen):
@@ -33,123 +42,92 @@ class Record(Frozen):
     inputs: str
 
 
-class FitRecord(Record):
-    """Estimates from the repetitions of one excitation; lists are in the model's order."""
+class Fitted(Frozen):
+    """Estimate from all repetitions of one excitation; lists are in the model's order."""
 
-    repetitions: list[str]
-    values: list[list[float]]
-    """Of each repetition by itself (eq. 4)."""
     pooled: list[float]
     pooled_std: list[float]
     undetermined: list[str]
     noise_std: list[float]
     log10_det: float
+    """Of the motion as it was executed, as the next ones."""
     coupling_index: float
-    n_samples: Count
-    """Of one repetition, as it was executed."""
     correlation: list[list[float]]
-    duration: float
     time: list[float]
     position: list[list[float]]
     """Joint by joint, of the first repetition."""
     velocity: list[list[float]]
 
-    @model_validator(mode="after")
-    def _of_one_model(self) -> Self:
-        p, n = len(self.pooled), len(self.noise_std)
-        _require(p > 0 and n > 0 and len(self.repetitions) > 0, "pooled, noise_std, repetitions")
-        _require(_shaped(self.values, len(self.repetitions), p), "values")
-        _require(len(self.pooled_std) == p, "pooled_std")
-        _require(_shaped(self.correlation, p, p), "correlation")
-        _require(_shaped(self.position, n, len(self.time)), "position")
-        _require(_shaped(self.velocity, n, len(self.time)), "velocity")
-        return self
+
+class FitRecord(Record, Fitted):
+    """Estimates from the repetitions of one excitation."""
+
+    repetitions: list[str]
+    values: list[list[float]]
+    """Of each repetition by itself (eq. 4)."""
+    n_samples: int
+    """Of one repetition, as it was executed."""
+    duration: float
 
 
-class MotionScore(Frozen):
-    """How well one estimate predicts one motion; lists are per joint.
+class ClassErrors(Frozen):
+    """Relative errors ||e|| / ||tau|| of estimates on the motions of a class, over all joints.
 
-    Errors are low-passed at 30 Hz, as the paper's Fig. 4 is: what is left is the model's, and not
-    the noise of the currents, which is the same for every estimate.
+    They are low-passed at 30 Hz as the paper's Fig. 4 is: what remains is the error of the model,
+    and not the noise of the currents, which is the same for every estimate.
     """
 
-    archive: str
-    overall: float
-    """||e|| / ||tau|| over all joints."""
-    unfiltered: float
+    durations: list[float]
+    overall: dict[str, list[float]]
+    unfiltered: dict[str, list[float]]
     """The same without the low-pass."""
-    all_rows: float
-    """The same, low-passed, over the whole motion: rows at rest and at reversals are in it."""
-    own: float | None
-    """||Phi (pi - planted)|| / ||tau||: what the estimate itself is off by; null where nothing is
-    planted."""
-    relative: list[float]
-    mean_abs: list[float]
-    mean: list[float]
-
-    @model_validator(mode="after")
-    def _of_one_arm(self) -> Self:
-        _require(len(self.relative) == len(self.mean_abs) == len(self.mean) > 0, "mean")
-        return self
+    own: dict[str, list[float]]
+    """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, where that is known."""
+    mean_abs: dict[str, list[list[float]]]
+    """Motion by motion, mean |e| per joint, N·m: the paper's Fig. 3."""
+    all_rows: dict[str, list[float]]
+    """As `overall`, over the whole motion: rows at rest, near ends and at reversals included."""
 
 
 class ExampleRecord(Frozen):
-    """One motion in time, low-passed for the eye; lists are joint by joint."""
+    """One motion in time, low-passed for the figure; lists are joint by joint."""
 
     archive: str
     time: list[float]
     measured: list[list[float]]
     predicted: dict[str, list[list[float]]]
 
-    @model_validator(mode="after")
-    def _of_one_motion(self) -> Self:
-        for name, joints in {"measured": self.measured, **self.predicted}.items():
-            _require(_shaped(joints, len(self.measured), len(self.time)), name)
-        return self
+
+class MotionForm(Frozen):
+    """Gram matrices of one held-out motion, over its usable rows; p parameters, n joints."""
+
+    archive: str
+    torque_squared: list[float]
+    """Sum of the measured torque², per joint."""
+    columns: list[list[int]]
+    """Parameters that each joint's torque depends on."""
+    slow: list[str]
+    """Of the low-passed [Phi | tau] of each joint, in these columns: packed lower triangles."""
+    whole: str
+    """Of Phi as it is, all joints together (p, p)."""
 
 
-class ScoreRecord(Record):
+class ScoreRecord(Record, ClassErrors):
     """How well several estimates predict the motions of one class."""
 
-    durations: list[float]
-    samples: list[Count]
+    samples: list[int]
     """Of each motion, from the first to the last at which a joint moves."""
-    left_out: list[list[Count]]
+    left_out: list[list[int]]
     """How many of them the errors leave out, each per joint: at rest, near ends, at reversals."""
     forms: list[MotionForm]
-    """Of each motion: the error of any other estimate."""
-    scores: dict[str, list[MotionScore]]
     examples: list[ExampleRecord]
-
-    @model_validator(mode="after")
-    def _of_the_same_motions(self) -> Self:
-        motions = len(self.durations)
-        _require(motions == len(self.samples) == len(self.forms) > 0, "samples, forms")
-        n = len(self.forms[0].columns)
-        _require(all(len(one.columns) == n for one in self.forms), "forms")
-        _require(len({one.n_parameters for one in self.forms}) == 1, "forms")
-        _require(_shaped(self.left_out, motions, n), "left_out")
-        for name, scores in self.scores.items():
-            each = [one.relative for one in scores]
-            _require(_shaped(each, motions, n), f"scores of {name}")
-        _require(all(len(one.measured) == n for one in self.examples), "examples")
-        return self
-
-    def tells_of(self, archives: Sequence[str], estimates: Mapping[str, Sized]) -> bool:
-        """Whether it is about these motions and estimates, by name and number of parameters."""
-        sizes = {len(one) for one in estimates.values()}
-        return (
-            [one.archive for one in self.forms] == list(archives)
-            and self.scores.keys() == estimates.keys()
-            and sizes <= {self.forms[0].n_parameters}
-        )
 
 
 R = TypeVar("R", bound=Record)
 
 
-def kept(path: Path, kind: type[R], inputs: str) -> R | None:
-    """A record that rests on these inputs, if there is one that can be read."""
+def read_record(path: Path, kind: type[R], inputs: str) -> R | None:
+    """The record in a file, if it rests on these inputs."""
     try:
         record = kind.model_validate_json(text_of(path))
     except (OSError, ValueError):
@@ -157,7 +135,7 @@ def kept(path: Path, kind: type[R], inputs: str) -> R | None:
     return record if record.inputs == inputs else None
 
 
-def keep(path: Path, record: Record) -> None:
+def write_record(path: Path, record: Record) -> None:
     """Write a record."""
     make_folder(path.parent)
     write_or_tell(path, record.model_dump_json() + "\n")
@@ -169,20 +147,102 @@ def digest(archives: Sequence[tuple[str, str]], others: Mapping[str, Any]) -> st
     return hashlib.sha256(content.encode()).hexdigest()
 
 
-def read_or_make(path: Path, kind: type[R], inputs: str, make: Callable[[], R]) -> R:
-    """The record in a file if it rests on the same, else a new one, which is written."""
-    record = kept(path, kind, inputs)
-    if record is None:
-        record = make()
-        keep(path, record)
-    return record
+def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:
+    """Form of one motion; rows that are not usable count as zero, as in the errors."""
+    blocks, columns = run.regressor(model)
+    n = model.n_parameters
+    whole, slow = np.zeros((n, n)), []
+    for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
+        usable = run.usable[:, j]
+        table = np.column_stack([block, run.torque[:, j]]) * usable[:, None]
+        whole[np.ix_(used, used)] += table[:, :-1].T @ table[:, :-1]
+        passed = low_passed(run, table)[usable]
+        slow.append(packed(passed.T @ passed))
+    return MotionForm(
+        archive=archive,
+        torque_squared=(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0).tolist(),
+        columns=[[int(k) for k in used] for used in columns],
+        slow=slow,
+        whole=packed(whole),
+    )
 
 
-def _shaped(rows: Sequence[Sequence[Any]], count: int, length: int) -> bool:
-    """Whether there are so many rows of one length."""
-    return len(rows) == count and all(len(row) == length for row in rows)
+def low_passed(run: Samples, values: Array) -> Array:
+    """Values (m, c) low-passed as the paper's Fig. 4 is, each segment of a recording by itself.
+
+    A segment without a usable row stays zero.
+    """
+    slow = np.zeros_like(values)
+    for part in run.segments:
+        if run.usable[part].any():
+            slow[part] = low_pass(run.motion.time[part], values[part], FIGURE_BANDWIDTH)
+    return slow
 
 
-def _require(fits: bool, field: str) -> None:
-    if not fits:
-        raise ValueError(f"{field}: lengths that do not belong together")
+@dataclass(frozen=True, eq=False)
+class ClassForms:
+    """The forms of all motions of one class; m motions, n joints, p parameters.
+
+    Attributes:
+        slow: of the low-passed [Phi | tau] (m, n, p + 1, p + 1).
+        whole: of Phi, all joints together (m, p, p).
+        torque_squared: (m, n).
+    """
+
+    slow: Array
+    whole: Array
+    torque_squared: Array
+
+    @classmethod
+    def of(cls, forms: Sequence[MotionForm]) -> ClassForms:
+        """Unpack the forms of the motions."""
+        whole = np.array([unpacked(one.whole) for one in forms])
+        size = whole.shape[1] + 1
+        slow = np.zeros((len(forms), len(forms[0].columns), size, size))
+        for m, one in enumerate(forms):
+            for j, (used, text) in enumerate(zip(one.columns, one.slow, strict=True)):
+                index = [*used, size - 1]
+                slow[m, j][np.ix_(index, index)] = unpacked(text)
+        return cls(slow, whole, np.array([one.torque_squared for one in forms]))
+
+    def torque_kernels(self, values: Array, joint: int | None = None) -> Array:
+        """Inner products (m, r, r) of the low-passed errors that r estimates (r, p) leave.
+
+        The error of a weighted mean of estimates is the same mean of their errors. All joints
+        together, or one of them.
+        """
+        gram = self.slow.sum(axis=1) if joint is None else self.slow[:, joint]
+        left = np.column_stack([-values, np.ones(len(values))])
+        return np.asarray(left @ gram @ left.T)
+
+    def own_kernels(self, values: Array, truth: Array) -> Array:
+        """The same (m, r, r) of Phi (pi - truth), the errors of the estimates themselves."""
+        away = values - truth
+        return np.asarray(away @ self.whole @ away.T)
+
+    def overall(self, estimate: Array) -> Array:
+        """||e|| / ||tau|| of one estimate (p,) on each motion (m,), low-passed."""
+        return self._relative(self.torque_kernels(estimate[None]))
+
+    def own(self, estimate: Array, truth: Array) -> Array:
+        """||Phi (pi - truth)|| / ||tau|| of one estimate (p,) on each motion (m,)."""
+        return self._relative(self.own_kernels(estimate[None], truth))
+
+    def _relative(self, kernels: Array) -> Array:
+        squared = np.maximum(kernels[:, 0, 0], 0.0)
+        return np.asarray(np.sqrt(squared / self.torque_squared.sum(axis=1)))
+
+
+def packed(gram: Array) -> str:
+    """The lower triangle of a symmetric matrix as text."""
+    triangle = gram[np.tril_indices(len(gram))].astype("<f8")
+    return base64.b64encode(triangle.tobytes()).decode("ascii")
+
+
+def unpacked(text: str) -> Array:
+    """The symmetric matrix that `packed` made a text of."""
+    triangle = np.frombuffer(base64.b64decode(text), dtype="<f8")
+    size = round((np.sqrt(8.0 * len(triangle) + 1.0) - 1.0) / 2.0)
+    gram = np.zeros((size, size))
+    gram[np.tril_indices(size)] = triangle
+    return gram + np.tril(gram, -1).T

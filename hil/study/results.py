@@ -7,33 +7,36 @@ low-passed at 30 Hz unless they say otherwise.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal, Self
 
 from pydantic import Field
 
-from hil.errors import InputError
-from hil.reading import text_of
 from hil.results.frozen import Frozen
 
-from .records import ExampleRecord
-from .settings import StudySettings
-from .verdict import Verdict
+from .records import ClassErrors, ExampleRecord, Fitted
+from .settings import StudySettings, load_json
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION: Final = 1
+ALPHA: Final = 0.05
+"""How often, at most, a table shows any difference where there is none."""
+SMALL: Final = 0.02
+"""A difference of errors below this share exists and does not matter."""
+
+Verdict = Literal["better", "slightly better", "none", "slightly worse", "worse", "too few"]
 
 
 class StudyParameter(Frozen):
-    """One parameter, and what the paper prints about it."""
+    """One parameter, and what the paper prints about it (null for another arm)."""
 
     name: str
     unit: str
     truth: float | None
     """Planted value; only a simulated arm has one."""
     printed_id: int | None = None
-    """Row of the paper's Table 2; null for another arm."""
+    """Row of the paper's Table 2."""
     printed_symbol: str | None = None
     printed_factor: float = 1.0
-    """What a value is multiplied with to stand beside the print."""
+    """What a value is multiplied with to compare it with the print."""
     printed_a: float | None = None
     printed_b: float | None = None
     printed_c: float | None = None
@@ -67,7 +70,7 @@ class MotionRow(Frozen):
     printed: bool = False
 
 
-class MethodResult(Frozen):
+class MethodResult(Fitted):
     """What one excitation gave under one condition."""
 
     key: str
@@ -79,17 +82,6 @@ class MethodResult(Frozen):
     """Over the repetitions' own estimates: the paper's Table 2."""
     std: list[float]
     """Over the repetitions, of one of them."""
-    pooled: list[float]
-    pooled_std: list[float]
-    undetermined: list[str]
-    noise_std: list[float]
-    log10_det: float
-    """Of the motion as it was executed, as the next ones."""
-    coupling_index: float
-    correlation: list[list[float]]
-    time: list[float]
-    position: list[list[float]]
-    velocity: list[list[float]]
 
 
 class CrossCell(Frozen):
@@ -102,19 +94,18 @@ class CrossCell(Frozen):
     upper: float
     """Quartiles over the motions."""
     unfiltered_median: float
-    """Without the low-pass: the noise of the currents is in it."""
+    """With the noise of the currents."""
     all_rows_median: float
-    """Over the whole motion: rows at rest, near ends and at reversals are in it."""
+    """Over the whole motion: rows at rest, near ends and at reversals are included."""
     own_median: float | None
-    """Of ||Phi (pi - planted)|| / ||tau||, which has no noise in it; null where nothing is
-    planted, or where the arm does what the model leaves out."""
+    """Of ||Phi (pi - planted)|| / ||tau||; null with effects, or where nothing is planted."""
 
 
 class ComparisonResult(Frozen):
     """Two estimates on the same motions: errors with `second` over errors with `first`.
 
-    The interval takes motions and repetitions as drawn; the verdict rests on it alone. Signed
-    ranks are over the motions, for these two estimates as they are.
+    The interval treats motions and repetitions as random samples; the verdict rests on it alone.
+    The signed-rank test is over the motions, for these two estimates as they are.
     """
 
     motion_class: str
@@ -126,12 +117,11 @@ class ComparisonResult(Frozen):
     setting: str = ""
     """What was varied, in an ablation."""
     repetitions: list[int]
-    """That `first` and `second` were made from."""
+    """Of `first` and `second`."""
     ratio: float
     """Geometric mean over the motions."""
     error: float | None
-    """Standard error of the log ratio, motions and repetitions drawn anew; null where fewer than
-    three repetitions, or one motion, do not tell it."""
+    """Standard error of the log ratio; null with fewer than three repetitions, or one motion."""
     freedom: float | None
     """Its degrees of freedom."""
     level: float
@@ -140,34 +130,25 @@ class ComparisonResult(Frozen):
     high: float | None
     """Interval of the ratio at that level."""
     verdict: Verdict
-    """On `second`: where the interval leaves out 1."""
+    """On `second`: whether the interval excludes 1."""
     wins: int
     """Motions that `second` predicts better."""
     p_value: float
-    """Wilcoxon's signed-rank test, two-sided, over the motions, given these estimates."""
+    """Wilcoxon's signed-rank test, two-sided."""
     p_corrected: float
     """The same after Holm, for all comparisons of its table."""
 
     @property
     def differs(self) -> bool:
-        """Whether a difference is told."""
+        """Whether the difference is significant."""
         return self.verdict not in ("none", "too few")
 
 
-class ClassResult(Frozen):
+class ClassResult(ClassErrors):
     """The motions of one class, and the errors of every estimate on each of them."""
 
     motion_class: str
     archives: list[str]
-    durations: list[float]
-    overall: dict[str, list[float]]
-    unfiltered: dict[str, list[float]]
-    own: dict[str, list[float]]
-    """What each estimate itself is off by, where that is known."""
-    mean_abs: dict[str, list[list[float]]]
-    """Motion by motion, each per joint, N·m: the paper's Fig. 3."""
-    all_rows: dict[str, list[float]]
-    """As `overall`, over the whole motion: rows at rest, near ends and at reversals are in it."""
     left_out: list[float]
     """Share of the samples of the motions that all other errors leave out, per joint."""
     left_out_share: float
@@ -175,7 +156,7 @@ class ClassResult(Frozen):
 
 
 class ClosenessResult(Frozen):
-    """How many parameters of a group two estimates bring closer to the reference."""
+    """How many parameters of a group the second of two estimates brings closer to a reference."""
 
     group: str
     reference: str
@@ -188,10 +169,10 @@ class ClosenessResult(Frozen):
 
 
 class EqualDataResult(Frozen):
-    """The first two methods with as much motion of each."""
+    """The first two methods with as much motion of each: the longer one cut."""
 
     cut: str
-    """Key of the method of which only the first repetitions are taken."""
+    """Key of the method of which only the first repetitions are used."""
     name: str
     """Of that estimate in the cross table."""
     repetitions: int
@@ -213,12 +194,23 @@ class ConditionResult(Frozen):
     cross: list[CrossCell]
     comparisons: list[ComparisonResult]
     own_comparisons: list[ComparisonResult]
-    """The first two, class by class, in what the estimates themselves are off by."""
+    """The first two, class by class, in the errors of the estimates themselves."""
     joint_comparisons: list[ComparisonResult]
     equal_data: EqualDataResult | None
     """Null where both have as much motion anyway."""
     closeness: list[ClosenessResult]
     examples: list[ExampleRecord]
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Labels of the methods by key, in the order of the tables."""
+        return {one.key: one.label for one in self.methods}
+
+    def compared(self, motion_class: str, first: str, second: str) -> ComparisonResult | None:
+        """One pair of methods, in this order, on one class."""
+        wanted = (motion_class, first, second)
+        rows = (c for c in self.comparisons if (c.motion_class, c.first, c.second) == wanted)
+        return next(rows, None)
 
 
 class AblationPoint(Frozen):
@@ -226,7 +218,7 @@ class AblationPoint(Frozen):
 
     value: float
     label: str = ""
-    """Where the setting is no number, which `value` then only counts."""
+    """Where the setting is not a number, which `value` then only counts."""
     method: str
     base: bool
     """Whether it is the setting of the study itself."""
@@ -235,21 +227,20 @@ class AblationPoint(Frozen):
     coupling_index: float | None
     duration: float | None
     parameter_error: float | None
-    """Geometric mean over the parameters of the distance to the planted value, that of the study's
-    B being 1."""
+    """Geometric mean over the parameters of distance to the planted value, the study's B = 1."""
     error: dict[str, float]
     """Median over the motions of each class of ||e|| / ||tau||."""
     own: dict[str, float]
-    """The same of what the estimate itself is off by; empty where nothing is planted."""
+    """The same of the estimate itself; empty where nothing is planted."""
 
     @property
     def name(self) -> str:
-        """The setting for people."""
+        """The setting as text."""
         return self.label or f"{self.value:g}"
 
 
 class AblationBand(Frozen):
-    """What chance alone does to a figure: subsets of the study's own repetitions of one method."""
+    """Range of a figure over subsets of the study's own repetitions of one method."""
 
     method: str
     repetitions: int
@@ -261,11 +252,10 @@ class AblationBand(Frozen):
     high: float
     """2.5 and 97.5 % of the subsets."""
     subsets: int
-    """How many were looked at."""
 
 
 class AblationResult(Frozen):
-    """One thing varied, everything else kept."""
+    """One thing varied, everything else unchanged."""
 
     key: str
     title: str
@@ -280,15 +270,15 @@ class AblationResult(Frozen):
 
 
 class Paragraph(Frozen):
-    """What the numbers say, in sentences made from them."""
+    """What the numbers say."""
 
     key: str
     heading: str
     verdict: str = ""
-    """The answer to the heading in one line, where it is a question."""
+    """The conclusion in one line, where the heading is a question."""
     sentences: list[str]
     more: list[str] = Field(default_factory=list)
-    """For those who want to know it more closely."""
+    """Details."""
 
 
 class StudyResults(Frozen):
@@ -313,26 +303,21 @@ class StudyResults(Frozen):
     missing: list[str]
     """What of the paper's study is not in this one, and why."""
     times: dict[str, float]
-    """s that each step took by the clock, over all sessions of a study that was ended."""
+    """Wall time [s] of each stage, over all sessions."""
     processor_times: dict[str, float] = Field(default_factory=dict)
-    """s of processor, this process and its children, likewise."""
+    """Processor time [s], this process and its children, likewise."""
     times_whole: bool = True
-    """False where a part was done before times were kept: they are then at least so long."""
+    """False where a session was killed: the times are then at least so long."""
 
     def to_json(self) -> str:
         """As indented JSON, the text of `results.json`."""
         return self.model_dump_json(indent=1) + "\n"
 
     @classmethod
-    def load(cls, path: Path) -> StudyResults:
+    def load(cls, path: Path) -> Self:
         """Read and check a study's `results.json`.
 
         Raises:
             InputError: the file is none.
         """
-        try:
-            return cls.model_validate_json(text_of(path))
-        except (OSError, ValueError) as error:
-            raise InputError(
-                path, f"is not the result of a study ({error})", remedy="run the study again"
-            ) from error
+        return load_json(cls, path, "is not the result of a study", "run the study again")

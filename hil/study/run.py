@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -18,35 +19,40 @@ from hil.simulation import planted_values, simulated_link, simulated_provenance
 from hil.version import software
 from sim_fixtures.ns16 import CELL_PATH
 
-from .ablations import Evidence, ablations
+from .ablations import EffectSetting, Evidence, ablations, effect_ablation
 from .analysis import Run, fit_all, score_all
-from .designs import AP, B0, A, B, Found, notes_of, run_searches, searches
-from .equal_data import EqualData
-from .execution import execute_all
-from .folder import StudyFolder
-from .forms import ClassForms
-from .one_effect import ALL, NONE, EffectSetting, effect_ablation, effect_key, effects_of
-from .outcome import parameters_of, printed_rows, write_outcome
-from .plans import ABLATION, EFFECTS, PLAIN, Plans, plan_study, with_single_effects
-from .reading import reading_of
-from .records import PLANTED, FitRecord, ScoreRecord
-from .results import (
-    ConditionResult,
-    MotionRow,
-    SearchResult,
-    StudyResults,
+from .campaigns import (
+    ABLATION,
+    EFFECTS,
+    PLAIN,
+    Plans,
+    Workers,
+    effect_key,
+    effects_of,
+    execute_all,
+    plan_study,
+    workers_of,
 )
-from .settings import StudySettings
-from .stages import Stages
-from .summary import Named, condition_result, estimates_of
-from .workers import Workers, workers_of
+from .page import write_outcome
+from .records import PLANTED, ClassForms, FitRecord, ScoreRecord
+from .results import ConditionResult, MotionRow, StudyResults
+from .searches import AP, B0, LABELS, A, B, Found, run_searches, searches
+from .sentences import reading_of
+from .settings import Stages, StudyFolder, StudySettings
+from .tables import (
+    Condition,
+    condition_result,
+    cut_estimate,
+    estimates_of,
+    parameters_of,
+    printed_rows,
+)
 
 Array = NDArray[np.float64]
 
-LABELS: Final = {A: "A", B: "B", B0: "B, fly 0", AP: "A as printed"}
-_CONDITION_WORDS: Final = {
+_WORDS: Final = {
     PLAIN: "the arm is what the model says",
-    EFFECTS: "the arm does what the model leaves out",
+    EFFECTS: "the arm has the effects that the model leaves out",
 }
 
 
@@ -60,20 +66,20 @@ def run_study(
 ) -> StudyResults:
     """Reproduce the paper on a simulated cell, and write results and page into a folder.
 
-    What is whole in the folder is kept: a study that was ended goes on where it was, and one that
-    is done is only written again.
+    What is complete in the folder is reused: a study that was interrupted resumes there, and of
+    one that is done only the results are written again.
 
     Args:
         root: the folder; new, empty, or that of a study with the same settings.
         settings: what is searched and run.
-        reporter: told of the progress.
+        reporter: of the progress.
         workers: processes at work; no number in the results depends on them but the times.
         cell: a simulated cell; the NS 16 of the paper if left out.
 
     Raises:
         CellError: the cell is one of real hardware.
-        InputError: the folder holds something else, or another study is at work in it.
-        StudyError: a part did not come to its end; starting again goes on there.
+        InputError: the folder holds something else, or another study is running in it.
+        StudyError: a part was not completed; starting again resumes there.
         NoExcitationError: a search found no motion.
         OutputError: the results cannot be written.
     """
@@ -82,188 +88,160 @@ def run_study(
         cell = Cell.load(CELL_PATH)
     else:
         simulated_link(cell)  # refuses real hardware before anything is searched
-        settings = settings.model_copy(update={"cell": _digest(cell)})
-    with folder.held(), workers_of(workers) as processes:
-        begun = folder.settings.exists()
+        digest = hashlib.sha256((cell.text + cell.urdf).encode()).hexdigest()
+        settings = settings.model_copy(update={"cell": digest})
+    with folder.locked():
         folder.begin(settings)
-        stages = Stages(root, begun=begun)
+        stages = Stages(root)
         wanted = searches(settings, len(cell.joint_names))
         with stages.stage("searches"):
             found = run_searches(folder, cell, wanted, reporter, workers=workers)
         with stages.stage("plans"):
             plans = plan_study(folder, cell, settings, found)
-        with stages.stage("campaigns"):
+        with stages.stage("campaigns"), workers_of(workers) as processes:
             plans = plans.without(execute_all(plans.all, reporter, processes))
-        with stages.stage("estimates and predictions"):
-            results = _analysed(folder, cell, settings, plans, found, reporter, processes)
+        with stages.stage("estimates and predictions"), workers_of(workers) as processes:
+            study = _Analysis(folder, cell, settings, plans, found, reporter, processes)
+            results = study.results()
         times = stages.times
-        results = results.model_copy(
-            update={
-                "times": times.wall,
-                "processor_times": times.processor,
-                "times_whole": times.whole,
-            }
-        )
+        spent = {
+            "times": times.wall,
+            "processor_times": times.processor,
+            "times_whole": times.whole,
+        }
+        results = results.model_copy(update=spent)
         with stages.stage("page"):
             write_outcome(root, results, reporter)
     return results
 
 
-def _analysed(
-    folder: StudyFolder,
-    cell: Cell,
-    settings: StudySettings,
-    plans: Plans,
-    found: Mapping[str, Found],
-    reporter: Reporter,
-    workers: Workers,
-) -> StudyResults:
-    truth = planted_values(cell)
-    parameters = parameters_of(cell, truth)
-    conditions: list[ConditionResult] = []
-    fits: dict[str, dict[str, FitRecord]] = {}
-    for condition, executions in plans.executions.items():
-        runs = [Run(key, LABELS.get(key, key), one.root) for key, one in executions.items()]
-        fits[condition] = fit_all(runs, folder.fits / condition, reporter, workers)
-    scores: dict[str, dict[str, ScoreRecord]] = {}
-    for condition in plans.executions:
-        if condition == ABLATION:
-            continue
-        labels = {key: name for key, name in LABELS.items() if key in plans.executions[condition]}
-        runs = [Run(key, label, folder.campaign(condition, key)) for key, label in labels.items()]
-        methods = {key: fits[condition][key] for key in labels}
-        estimates = estimates_of(methods) | {PLANTED: truth}
-        equal = EqualData.of(methods, list(labels))
-        estimates |= {} if equal is None else equal.estimate(methods)
-        scores[condition] = score_all(
-            runs, folder.fits / condition, estimates, (A, B), reporter, workers
-        )
-        on = condition == EFFECTS
-        named = Named(condition, _CONDITION_WORDS[condition], _effects(cell, on), drifts=on)
-        conditions.append(
-            condition_result(
-                named, labels, methods, scores[condition], parameters, cell.joint_names, [PLANTED]
-            )
-        )
-    evidence = Evidence(
-        fits[ABLATION], fits[PLAIN], scores[PLAIN], truth, plans.missing, plans.sines
-    )
-    varied = ablations(settings, evidence)
-    if with_single_effects(settings):
-        one_effect = _effect_settings(
-            folder, cell, settings, plans, fits, scores, reporter, workers
-        )
-        varied.append(effect_ablation(one_effect, fits[PLAIN], evidence.forms, truth))
-    results = StudyResults(
-        name=folder.root.resolve().name,
-        cell=cell.name,
-        simulated=True,
-        quick=settings.effort_b.tried < _printed_effort(),
-        settings=settings,
-        software=software(),
-        joint_names=list(cell.joint_names),
-        n_base=len(cell.model.base.names),
-        parameters=parameters,
-        searches=[_search(one, plans.sines) for one in found.values()],
-        table1=_table1(plans, found, fits[PLAIN]) + printed_rows(cell),
-        conditions=conditions,
-        ablations=varied,
-        reading=[],
-        missing=_missing(settings),
-        times={},
-    )
-    return results.model_copy(update={"reading": reading_of(results)})
+@dataclass(frozen=True, eq=False)
+class _Analysis:
+    """Estimates and predictions of all campaigns of a study, and their tables."""
 
+    folder: StudyFolder
+    cell: Cell
+    settings: StudySettings
+    plans: Plans
+    found: Mapping[str, Found]
+    reporter: Reporter
+    workers: Workers
+    fits: dict[str, dict[str, FitRecord]] = field(default_factory=dict)
+    scores: dict[str, dict[str, ScoreRecord]] = field(default_factory=dict)
 
-def _effect_settings(
-    folder: StudyFolder,
-    cell: Cell,
-    settings: StudySettings,
-    plans: Plans,
-    fits: Mapping[str, Mapping[str, FitRecord]],
-    scores: Mapping[str, Mapping[str, ScoreRecord]],
-    reporter: Reporter,
-    workers: Workers,
-) -> list[EffectSetting]:
-    """What A and B gave without effects, with each by itself, and with all."""
-    few, forms = settings.ablation_repetitions, "fly-by"
-    plain, every = (ClassForms.of(scores[one][forms].forms) for one in (PLAIN, EFFECTS))
-    bases = {A: fits[PLAIN][A], B: fits[PLAIN][B]}, {A: fits[EFFECTS][A], B: fits[EFFECTS][B]}
-    found = [EffectSetting(NONE, bases[0], plain, few, base=True)]
-    for effect in effects_of(cell):
-        keys = {method: effect_key(method, effect) for method in (A, B)}
-        if not fits[ABLATION].keys() >= set(keys.values()):
-            continue  # the arm did not bear one of them, which is told
-        own = {method: fits[ABLATION][key] for method, key in keys.items()}
-        root = plans.executions[ABLATION][keys[B]].root
-        scored = score_all(
-            [Run(keys[B], keys[B], root)],
-            folder.fits / ABLATION,
-            estimates_of(own),
-            (),
-            reporter,
-            workers,
-        )
-        found.append(EffectSetting(effect, own, ClassForms.of(scored[forms].forms), few))
-    return [*found, EffectSetting(ALL, bases[1], every, few, base=True)]
-
-
-def _digest(cell: Cell) -> str:
-    return hashlib.sha256((cell.text + cell.urdf).encode()).hexdigest()
-
-
-def _missing(settings: StudySettings) -> list[str]:
-    if not settings.effects:
-        return ["The effects that the model leaves out were not run."]
-    if not with_single_effects(settings):
-        return [
-            "The effects that the model leaves out were not tried one at a time: each setting is"
-            f" run too few times here ({settings.ablation_repetitions}) to tell anything."
+    def results(self) -> StudyResults:
+        """Read all archives that were not read before, and make the tables."""
+        cell, settings, truth = self.cell, self.settings, planted_values(self.cell)
+        for condition, executions in self.plans.executions.items():
+            runs = [Run(key, LABELS.get(key, key), one.root) for key, one in executions.items()]
+            place = self.folder.fits / condition
+            self.fits[condition] = fit_all(runs, place, self.reporter, self.workers)
+        conditions = [
+            self._condition(one, truth) for one in self.plans.executions if one != ABLATION
         ]
-    return []
+        evidence = Evidence(
+            self.fits[ABLATION],
+            self.fits[PLAIN],
+            self.scores[PLAIN],
+            truth,
+            self.plans.missing,
+            self.plans.sines,
+        )
+        varied = ablations(settings, evidence)
+        missing = []
+        if settings.single_effects:
+            few = settings.ablation_repetitions
+            varied.append(effect_ablation(evidence, self._effect_settings(), few))
+        elif settings.effects:
+            missing = [
+                "The unmodelled effects were not tried one at a time: each setting is run too few"
+                f" times ({settings.ablation_repetitions}) for a conclusion."
+            ]
+        else:
+            missing = ["The unmodelled effects were not run."]
+        sizes = preset("b").search
+        results = StudyResults(
+            name=self.folder.root.resolve().name,
+            cell=cell.name,
+            simulated=True,
+            quick=settings.effort_b.tried < sizes.population * sizes.generations,
+            settings=settings,
+            software=software(),
+            joint_names=list(cell.joint_names),
+            n_base=len(cell.model.base.names),
+            parameters=parameters_of(cell, truth),
+            searches=[
+                one.result(chosen=key in (self.plans.sines, B, B0))
+                for key, one in self.found.items()
+            ],
+            table1=self._table1() + printed_rows(cell),
+            conditions=conditions,
+            ablations=varied,
+            reading=[],
+            missing=missing,
+            times={},
+        )
+        return results.model_copy(update={"reading": reading_of(results)})
 
+    def _scored(
+        self, runs: list[Run], place: str, estimates: Mapping[str, Array], shown: tuple[str, ...]
+    ) -> dict[str, ScoreRecord]:
+        fits = self.folder.fits / place
+        return score_all(runs, fits, estimates, shown, self.reporter, self.workers)
 
-def _printed_effort() -> int:
-    """Motions that the paper's method B looks at."""
-    search = preset("b").search
-    return search.population * search.generations
+    def _condition(self, condition: str, truth: Array) -> ConditionResult:
+        executions, fits = self.plans.executions[condition], self.fits[condition]
+        labels = {key: label for key, label in LABELS.items() if key in executions}
+        methods = {key: fits[key] for key in labels}
+        estimates = estimates_of(methods) | {PLANTED: truth} | cut_estimate(methods)
+        runs = [Run(key, label, executions[key].root) for key, label in labels.items()]
+        self.scores[condition] = scores = self._scored(runs, condition, estimates, (A, B))
+        on = condition == EFFECTS
+        effects = tuple(json.loads(simulated_provenance(self.cell, on)["effects"]))
+        return condition_result(
+            Condition(condition, _WORDS[condition], effects, drifts=on),
+            labels,
+            methods,
+            scores,
+            parameters_of(self.cell, truth),
+            self.cell.joint_names,
+            [PLANTED],
+        )
 
+    def _effect_settings(self) -> list[EffectSetting]:
+        """What A and B gave without effects, with each by itself, and with all."""
+        found, ablation = [], self.fits[ABLATION]
+        for effect in effects_of(self.cell):
+            keys = {method: effect_key(method, effect) for method in (A, B)}
+            if not ablation.keys() >= set(keys.values()):
+                continue  # the arm did not bear one of them, which the page says
+            fits = {method: ablation[key] for method, key in keys.items()}
+            run = Run(keys[B], keys[B], self.plans.executions[ABLATION][keys[B]].root)
+            scored = self._scored([run], ABLATION, estimates_of(fits), ())
+            found.append(EffectSetting(effect, fits, ClassForms.of(scored["fly-by"].forms)))
+        none, every = (
+            EffectSetting(
+                label, self.fits[one], ClassForms.of(self.scores[one]["fly-by"].forms), base=True
+            )
+            for label, one in (("none", PLAIN), ("all", EFFECTS))
+        )
+        return [none, *found, every]
 
-def _effects(cell: Cell, on: bool) -> tuple[str, ...]:
-    return tuple(json.loads(simulated_provenance(cell, on)["effects"]))
-
-
-def _search(found: Found, sines: str) -> SearchResult:
-    one, search = found.excitation, found.search
-    return SearchResult(
-        key=search.key,
-        words=search.words,
-        chosen=search.key in (sines, B, B0),
-        tried=0 if one is None else one.tried,
-        infeasible={} if one is None else {name: int(n) for name, n in one.rejected.items()},
-        log10_det=None if one is None else one.criteria.log10_det,
-        coupling_index=None if one is None else one.criteria.coupling_index,
-        duration=None if one is None else float(one.trajectory.duration),
-    )
-
-
-def _table1(
-    plans: Plans, found: Mapping[str, Found], fits: Mapping[str, FitRecord]
-) -> list[MotionRow]:
-    rows, searched = [], {A: plans.sines, AP: plans.printed or plans.sines}
-    for key, excitation in plans.excitations.items():
-        if key not in fits:
-            continue  # the arm did not bear it, which is told
-        rows.append(
+    def _table1(self) -> list[MotionRow]:
+        """Of the excitations that the arm bore."""
+        plans, fits = self.plans, self.fits[PLAIN]
+        searched = {A: plans.sines, AP: plans.printed or plans.sines}
+        return [
             MotionRow(
                 key=key,
-                words=notes_of(found[searched.get(key, key)].search),
-                n_samples=excitation.criteria.n_samples,
-                log10_det=excitation.criteria.log10_det,
-                coupling_index=excitation.criteria.coupling_index,
+                words=self.found[searched.get(key, key)].search.notes,
+                n_samples=one.criteria.n_samples,
+                log10_det=one.criteria.log10_det,
+                coupling_index=one.criteria.coupling_index,
                 executed_log10_det=fits[key].log10_det,
                 executed_coupling_index=fits[key].coupling_index,
-                duration=float(excitation.trajectory.duration),
+                duration=float(one.trajectory.duration),
             )
-        )
-    return rows
+            for key, one in plans.excitations.items()
+            if key in fits
+        ]

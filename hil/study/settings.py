@@ -1,28 +1,37 @@
-"""What a study is asked for: how much is searched, run and predicted; the full and the quick."""
+"""What a study is asked for, the folder it lies in, and how long its stages took."""
 
 from __future__ import annotations
 
+import fcntl
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final, Self
+from typing import Annotated, Final, TypeVar
 
 from pydantic import Field
 
-from hil.errors import InputError
+from hil.errors import InputError, OutputError
+from hil.files import make_folder, write_or_tell
 from hil.reading import text_of
 from hil.results.frozen import Frozen
 
+M = TypeVar("M", bound=Frozen)
 Count = Annotated[int, Field(strict=True, ge=1)]
+Seconds = Annotated[float, Field(ge=0.0, le=1e9)]
 
 
 class Effort(Frozen):
-    """How hard a search tries: individuals in a generation, and generations."""
+    """Size of a search: individuals in a generation, and generations."""
 
     population: int = Field(ge=4)
     generations: Count
 
     @property
     def tried(self) -> int:
-        """Motions that are looked at."""
+        """Motions that are scored."""
         return self.population * self.generations
 
 
@@ -32,7 +41,7 @@ class StudySettings(Frozen):
     seed: int = Field(ge=0, description="of searches, held-out motions and the simulated cell")
     repetitions: int = Field(ge=2, description="executions of each excitation")
     motions: int = Field(ge=2, description="held-out motions of each class")
-    effects: bool = Field(description="whether all is run again with what the model leaves out")
+    effects: bool = Field(description="whether all is run again with the unmodelled effects")
     effort_a: Effort = Field(description="of each search of method A")
     effort_b: Effort = Field(description="of each search of method B, the ablations' too")
     ablation_repetitions: Count
@@ -41,23 +50,12 @@ class StudySettings(Frozen):
     coupling_weight: tuple[float, ...] = Field(description="lambda_2 of searches like B's")
     subsets: tuple[int, ...] = Field(description="numbers of repetitions that are fitted")
     noise: tuple[float, ...] = Field(description="multiples of the cell's current noise")
-    cell: str = Field(
-        default="", description="digest of the simulated cell, empty for the NS 16 of the paper"
-    )
+    cell: str = Field(default="", description="digest of the cell, empty for the paper's NS 16")
 
-    @classmethod
-    def load(cls, path: Path) -> Self:
-        """Read settings that `to_json` wrote.
-
-        Raises:
-            InputError: they cannot be read.
-        """
-        try:
-            return cls.model_validate_json(text_of(path))
-        except (OSError, ValueError) as error:
-            raise InputError(
-                path, "is not the settings of a study", remedy="name another folder (--output)"
-            ) from error
+    @property
+    def single_effects(self) -> bool:
+        """Whether the effects are tried one by one: fewer than 3 repetitions show nothing."""
+        return self.effects and self.ablation_repetitions >= 3
 
     def to_json(self) -> str:
         """As indented JSON."""
@@ -95,7 +93,7 @@ QUICK: Final = StudySettings(
     subsets=(1, 2, 4),
     noise=(0.0, 1.0, 16.0),
 )
-"""The same way in minutes: it shows how the study works, and little about the methods."""
+"""The same procedure in minutes: it shows how the study works, and little about the methods."""
 
 
 def study_settings(
@@ -106,8 +104,148 @@ def study_settings(
     seed: int | None = None,
     effects: bool = True,
 ) -> StudySettings:
-    """The full or the quick study with some settings replaced; None keeps a setting."""
-    base = QUICK if quick else FULL
+    """The full or the quick study with some settings replaced; None leaves a setting as it is."""
     given = {"repetitions": repetitions, "motions": motions, "seed": seed}
     changes = {name: value for name, value in given.items() if value is not None}
-    return StudySettings.model_validate(base.model_dump() | changes | {"effects": effects})
+    base = (QUICK if quick else FULL).model_dump()
+    return StudySettings.model_validate(base | changes | {"effects": effects})
+
+
+def load_json(kind: type[M], path: Path, problem: str, remedy: str) -> M:
+    """Read a file of the study's folder.
+
+    Raises:
+        InputError: it cannot be read, or is not of this kind.
+    """
+    try:
+        return kind.model_validate_json(text_of(path))
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"{problem} ({error})", remedy=remedy) from error
+
+
+@dataclass(frozen=True)
+class StudyFolder:
+    """Paths below one folder; what is complete in it is never made again."""
+
+    root: Path
+
+    def design(self, key: str) -> Path:
+        """Folder of one search."""
+        return self.root / "designs" / key
+
+    def campaign(self, condition: str, key: str) -> Path:
+        """Campaign folder of one excitation under one condition."""
+        return self.root / "campaigns" / condition / key
+
+    @property
+    def fits(self) -> Path:
+        """Records of the archives that were read, one file each."""
+        return self.root / "fits"
+
+    @property
+    def settings(self) -> Path:
+        """What was asked for."""
+        return self.root / "study.json"
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Make the folder, and keep every other study out of it until this is left.
+
+        Raises:
+            InputError: another study is running in it, or it cannot be made.
+        """
+        make_folder(self.root)
+        descriptor = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise InputError(
+                    self.root,
+                    "another study is running in it",
+                    remedy="wait for its end, stop it (Ctrl-C), or name another folder (--output)",
+                ) from error
+            yield
+        finally:
+            os.close(descriptor)
+
+    def begin(self, settings: StudySettings) -> None:
+        """Write down what is asked for, or resume a study that was asked for the same.
+
+        Raises:
+            InputError: the folder holds something else, or a study with other settings.
+        """
+        remedy = "name another folder (--output)"
+        if not self.settings.exists():
+            if any(self.root.iterdir()):
+                raise InputError(self.root, "is not empty and holds no study", remedy=remedy)
+            write_or_tell(self.settings, settings.to_json())
+            return
+        there = load_json(StudySettings, self.settings, "is not the settings of a study", remedy)
+        for name in StudySettings.model_fields:
+            asked, begun = getattr(settings, name), getattr(there, name)
+            if asked != begun:
+                raise InputError(
+                    self.settings,
+                    f"the study in this folder was begun with {begun!s}, not {asked!s}",
+                    field=name,
+                    remedy=f"ask for the same to resume it, or {remedy}",
+                )
+
+
+class Times(Frozen):
+    """Duration [s] of each stage, over all sessions."""
+
+    wall: dict[str, Seconds] = Field(default_factory=dict)
+    processor: dict[str, Seconds] = Field(default_factory=dict)
+    """Of this process and its children that ended within the stage."""
+    whole: bool = True
+    """False once a session was killed within a stage, whose time is then missing."""
+
+
+class Stages:
+    """Adds up in `times.json` what the stages take."""
+
+    def __init__(self, root: Path) -> None:
+        """Continue from the file in the folder, if there is one."""
+        self._path, self.times = root / "times.json", Times()
+        with suppress(OSError, ValueError):
+            self.times = Times.model_validate_json(text_of(self._path))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the time until this is left.
+
+        Raises:
+            OutputError: the time cannot be written; an error of the stage itself goes first.
+        """
+        before, wall, processor = self.times, time.perf_counter(), _processor()
+        with suppress(OutputError):  # the end of the stage tries again
+            self._write(before.model_copy(update={"whole": False}))  # what a kill leaves
+
+        def end() -> None:
+            added = time.perf_counter() - wall, _processor() - processor
+            self.times = Times(
+                wall=before.wall | {name: round(before.wall.get(name, 0.0) + added[0], 1)},
+                processor=before.processor
+                | {name: round(before.processor.get(name, 0.0) + added[1], 1)},
+                whole=before.whole,
+            )
+            self._write(self.times)
+
+        try:
+            yield
+        except BaseException:
+            with suppress(OutputError):
+                end()
+            raise
+        end()
+
+    def _write(self, times: Times) -> None:
+        write_or_tell(self._path, times.model_dump_json(indent=1) + "\n")
+
+
+def _processor() -> float:
+    """Seconds of processor of this process and of its children that have ended."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system

@@ -7,8 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.study.forms import ClassForms, MotionForm, packed
-from hil.study.records import FitRecord, MotionScore, ScoreRecord
+from hil.study.records import (
+    ClassForms,
+    FitRecord,
+    MotionForm,
+    ScoreRecord,
+    packed,
+)
 
 Array = NDArray[np.float64]
 
@@ -54,20 +59,12 @@ def scored(errors: Mapping[str, Array]) -> ScoreRecord:
             form(f"validation_{k:03d}_a1.mcap", np.diag([*column, 0.0]) ** 2)
             for k, column in enumerate(table.T)
         ],
-        scores={
-            name: [
-                MotionScore(
-                    archive=f"validation_{k:03d}_a1.mcap",
-                    overall=value,
-                    unfiltered=value,
-                    all_rows=2.0 * value,
-                    own=None,
-                    relative=[value] * 2,
-                    mean_abs=[value, 2.0 * value],
-                    mean=[0.0, 0.0],
-                )
-                for k, value in enumerate(values.tolist())
-            ]
+        overall={name: values.tolist() for name, values in errors.items()},
+        unfiltered={name: values.tolist() for name, values in errors.items()},
+        all_rows={name: (2.0 * values).tolist() for name, values in errors.items()},
+        own={},
+        mean_abs={
+            name: [[value, 2.0 * value] for value in values.tolist()]
             for name, values in errors.items()
         },
         examples=[],

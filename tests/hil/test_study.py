@@ -23,19 +23,19 @@ from hil.progress import Silent
 from hil.simulation import planted_values
 from hil.study import StudyResults, StudySettings, run_study, study_campaigns, study_settings
 from hil.study.analysis import Run, class_of, classes_of
-from hil.study.designs import SINES, run_searches, searches
-from hil.study.equal_data import EqualData
-from hil.study.execution import Execution, execute
-from hil.study.folder import StudyFolder
-from hil.study.forms import ClassForms
-from hil.study.one_effect import effects_of
-from hil.study.paired import compare, holm
-from hil.study.plans import plan_study
-from hil.study.printed import printed_parameters
-from hil.study.records import ScoreRecord
-from hil.study.settings import Effort
-from hil.study.summary import parameter_error
-from hil.study.workers import StudyError, workers_of
+from hil.study.campaigns import (
+    Execution,
+    StudyError,
+    effects_of,
+    execute,
+    plan_study,
+    workers_of,
+)
+from hil.study.records import ClassForms, ScoreRecord
+from hil.study.searches import SINES, run_searches, searches
+from hil.study.settings import Effort, StudyFolder
+from hil.study.statistics import compare, equal_data, holm, parameter_error
+from hil.study.tables import cut_estimate, parameters_of
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 from tests.hil.study_numbers import fitted
@@ -57,21 +57,14 @@ def test_comparing_the_other_way_round_inverts_the_ratio_and_keeps_the_p_value(
     pair: tuple[Array, Array],
 ) -> None:
     there, back = compare(*pair), compare(*reversed(pair))
-    assert there.ratio * back.ratio == pytest.approx(1.0)
-    assert there.p_value == pytest.approx(back.p_value)
-    assert there.wins + back.wins + int(np.sum(pair[0] == pair[1])) == there.motions
+    assert there[0] * back[0] == pytest.approx(1.0)
+    assert there[2] == pytest.approx(back[2])
+    assert there[1] + back[1] + int(np.sum(pair[0] == pair[1])) == len(pair[0])
 
 
 def test_equal_errors_are_no_difference() -> None:
     same = np.array([0.1, 0.2, 0.3])
-    found = compare(same, same)
-    assert (found.ratio, found.wins, found.p_value) == (1, 0, 1)
-
-
-@pytest.mark.parametrize("second", [[0.1], [0.1, 0.0], [[0.1], [0.2]]])
-def test_what_is_no_pair_is_refused(second: Sequence[float]) -> None:
-    with pytest.raises(ValueError, match=r"pairs|above zero"):
-        compare(np.array([0.1, 0.2]), np.array(second))
+    assert compare(same, same) == (1, 0, 1)
 
 
 @given(p_values)
@@ -94,13 +87,13 @@ def test_holm_on_the_example_of_every_textbook() -> None:
 def test_with_as_much_motion_of_each_the_longer_one_is_cut() -> None:
     long, short = fitted(np.arange(24.0).reshape(6, 4)), fitted(np.ones((6, 4)))
     fits = {"a": long.model_copy(update={"duration": 20.0}), "b": short}  # 120 s and 48 s
-    equal = EqualData.of(fits, ["a", "b"])
+    equal = equal_data(fits, ["a", "b"])
     assert equal is not None
     assert (equal.cut, equal.repetitions, equal.seconds) == ("a", 2, 40.0)
     assert (equal.other, equal.other_seconds) == ("b", 48.0)
-    assert equal.estimate(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
-    assert EqualData.of({"a": short, "b": short}, ["a", "b"]) is None
-    assert EqualData.of({"a": long}, ["a"]) is None
+    assert cut_estimate(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
+    assert equal_data({"a": short, "b": short}, ["a", "b"]) is None
+    assert equal_data({"a": long}, ["a"]) is None
 
 
 def test_the_distance_to_the_truth_is_one_for_the_base_itself() -> None:
@@ -111,11 +104,10 @@ def test_the_distance_to_the_truth_is_one_for_the_base_itself() -> None:
 
 
 def test_the_planted_values_in_the_units_of_the_print_are_the_manufacturers() -> None:
-    from hil.study.outcome import parameters_of
-
     cell = Cell.load(CELL_PATH)
-    known = [one for one in parameters_of(cell, planted_values(cell)) if one.printed_c is not None]
-    assert len(printed_parameters(cell)) == 58 and len(known) == 52
+    printed = [one for one in parameters_of(cell, planted_values(cell)) if one.printed_id]
+    known = [one for one in printed if one.printed_c is not None]
+    assert len(printed) == 58 and len(known) == 52
     for one in known:
         assert one.truth is not None and one.printed_c is not None
         assert one.printed_factor * one.truth == pytest.approx(one.printed_c, abs=6e-4), one.name
@@ -178,7 +170,7 @@ def whole(
 @pytest.fixture
 def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures take seconds, and some tests do not look at them."""
-    monkeypatch.setattr("hil.study.outcome.study_page", lambda _: b"")
+    monkeypatch.setattr("hil.study.page.study_page", lambda _: b"")
 
 
 @pytest.mark.slow
@@ -314,7 +306,9 @@ def test_effects_together_and_one_at_a_time(
     again = tmp_path / "study"
     shutil.copytree(root / "designs", again / "designs")
     some = small.model_copy(update={"effects": True, "repetitions": 4, "ablation_repetitions": 3})
-    some = some.model_copy(update={"cell": StudySettings.load(root / "study.json").cell})
+    some = some.model_copy(
+        update={"cell": StudySettings.model_validate_json((root / "study.json").read_text()).cell}
+    )
     (again / "study.json").write_text(some.to_json())
     found = run_study(again, some, Silent(), workers=2, cell=arm)
     assert [one.key for one in found.conditions] == ["plain", "effects"]
@@ -390,7 +384,7 @@ def test_ctrl_c_leaves_with_one_sentence_and_its_exit_status(
     ended = CliRunner().invoke(app, ["study", "--quick", "-o", str(tmp_path)])
     assert isinstance(ended.exception, OperatorStopError)
     assert ended.exception.exit_code == 130
-    assert f"what is whole is kept in {tmp_path}" in str(ended.exception)
+    assert f"what is complete stays in {tmp_path}" in str(ended.exception)
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -13,18 +13,23 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hil.cell import Cell
-from hil.study.bands import bands_of
-from hil.study.comparing import Estimated, compared_on, corrected, own_kernels, torque_kernels
-from hil.study.designs import AP, B0, A, B, Found, printed_sines
-from hil.study.drawn import FEWEST, spread
-from hil.study.execution import Execution
-from hil.study.forms import packed, unpacked
-from hil.study.one_effect import EFFECT_SETTINGS, effects_of, with_only
-from hil.study.plans import Plans
+from hil.study.campaigns import EFFECT_SETTINGS, Execution, Plans, effects_of, with_only
+from hil.study.records import packed, unpacked
 from hil.study.results import ComparisonResult
-from hil.study.stages import Stages, Times
-from hil.study.summary import compared_pairs
-from hil.study.verdict import verdict_of
+from hil.study.searches import AP, B0, A, B, Found, printed_sines
+from hil.study.settings import Stages, Times
+from hil.study.statistics import (
+    FEWEST,
+    Estimated,
+    bands_of,
+    compared_on,
+    corrected,
+    own_kernels,
+    spread,
+    torque_kernels,
+    verdict_of,
+)
+from hil.study.tables import compared_pairs
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.study_numbers import flagged, forms_of
 
@@ -249,20 +254,28 @@ def test_an_arm_that_does_not_bear_the_papers_sines_still_has_a_study(tmp_path: 
 
 
 def test_times_of_sessions_add_up_however_they_end(tmp_path: Path) -> None:
-    first = Stages(tmp_path, begun=False)
+    first = Stages(tmp_path)
     with pytest.raises(KeyboardInterrupt), first.stage("searches"):
         time.sleep(0.2)
         raise KeyboardInterrupt
-    second = Stages(tmp_path, begun=True)
+    second = Stages(tmp_path)
     with second.stage("searches"):
         time.sleep(0.2)
     with second.stage("campaigns"):
         pass
-    kept = Times.model_validate_json((tmp_path / "times.json").read_bytes())
-    assert kept == second.times and kept.whole
-    assert kept.wall["searches"] >= 0.4
-    assert list(kept.wall) == list(kept.processor) == ["searches", "campaigns"]
+    found = Times.model_validate_json((tmp_path / "times.json").read_bytes())
+    assert found == second.times and found.whole
+    assert found.wall["searches"] >= 0.4
+    assert list(found.wall) == list(found.processor) == ["searches", "campaigns"]
 
 
-def test_a_study_begun_before_times_were_kept_says_so(tmp_path: Path) -> None:
-    assert not Stages(tmp_path, begun=True).times.whole
+def test_a_session_that_was_killed_leaves_times_that_are_not_whole(tmp_path: Path) -> None:
+    with Stages(tmp_path).stage("searches"):
+        assert not Stages(tmp_path).times.whole  # what a kill at this moment leaves
+    assert Stages(tmp_path).times.whole
+
+
+@pytest.mark.parametrize("seconds", ["Infinity", "NaN", "-1.0", "1e300", '"inf"'])
+def test_times_that_are_none_are_begun_anew(seconds: str, tmp_path: Path) -> None:
+    (tmp_path / "times.json").write_text(f'{{"wall": {{"fitting": {seconds}}}}}')
+    assert not Stages(tmp_path).times.wall

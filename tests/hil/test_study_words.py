@@ -16,8 +16,7 @@ from hil.cell import Cell
 from hil.errors import InputError
 from hil.progress import Silent
 from hil.study.page import study_page
-from hil.study.reading import answer_of, reading_of
-from hil.study.recorded_runs import homes, recorded_runs
+from hil.study.recorded import homes, recorded_runs
 from hil.study.results import (
     AblationBand,
     AblationPoint,
@@ -27,23 +26,23 @@ from hil.study.results import (
     StudyParameter,
     StudyResults,
 )
-from hil.study.summary import Named, condition_result
-from hil.study.wording import effect_words
+from hil.study.sentences import reading_of, summary_of
+from hil.study.tables import Condition, condition_result
 
 from .fast_cell import fast_cell
 from .study_numbers import fitted, flagged, scored
 
 Array = NDArray[np.float64]
 
-PLAIN = Named("plain", "the arm is what the model says", (), drifts=False)
-EFFECTS = Named("effects", "the arm does what the model leaves out", ("ripple",), drifts=False)
+PLAIN = Condition("plain", "the arm is what the model says", (), drifts=False)
+EFFECTS = Condition("effects", "the arm does what the model leaves out", ("ripple",), drifts=False)
 PARAMETERS = [StudyParameter(name=f"p{k}", unit="kg", truth=0.0) for k in range(2)]
 
 
 def condition(
     ratio: float,
     *,
-    named: Named = PLAIN,
+    named: Condition = PLAIN,
     scatter: float = 0.05,
     motions: int = 30,
     repetitions: int = 5,
@@ -82,116 +81,96 @@ def text_of(results: StudyResults) -> str:
     )
 
 
-@pytest.mark.parametrize(("ratio", "winner", "loser"), [(0.8, "B", "A"), (1.25, "A", "B")])
-def test_a_clear_difference_is_told_with_its_direction_and_size(
-    ratio: float, winner: str, loser: str
-) -> None:
-    results = study(condition(ratio))
-    (one,) = results.conditions[0].comparisons
-    answer = results.reading[0]
-    assert one.low is not None and one.high is not None
-    saved = 100.0 * (1.0 - min(one.ratio, 1.0 / one.ratio))
-    assert answer.verdict == f"{winner} is better, its error {saved:.0f} % smaller."
-    assert f"{one.ratio:.3f} times" in answer.sentences[0]
-    assert f"(interval {one.low:.3f} to {one.high:.3f})" in answer.sentences[0]
-    # Each axis is told on the side it is better for, and none on the other.
-    assert f"{winner} is better on hip" in answer.more[0]
-    assert f"{loser} is better" not in text_of(results)
-    assert answer_of(results)["line"] == f"{answer.heading} {answer.verdict}"
+class TestConclusion:
+    @pytest.mark.parametrize(("ratio", "winner", "loser"), [(0.8, "B", "A"), (1.25, "A", "B")])
+    def test_a_clear_difference_has_direction_and_size(
+        self, ratio: float, winner: str, loser: str
+    ) -> None:
+        results = study(condition(ratio))
+        (one,) = results.conditions[0].comparisons
+        answer = results.reading[0]
+        assert one.low is not None and one.high is not None
+        saved = 100.0 * (1.0 - min(one.ratio, 1.0 / one.ratio))
+        assert answer.verdict == f"{winner} is better, its error {saved:.0f} % smaller."
+        assert f"{one.ratio:.3f} times" in answer.sentences[0]
+        assert f"(interval {one.low:.3f} to {one.high:.3f})" in answer.sentences[0]
+        assert f"{loser} is better" not in text_of(results)
+        assert summary_of(results)["line"] == f"{answer.heading} {answer.verdict}"
+        (ratios,) = summary_of(results)["ratios"]
+        assert (ratios["condition"], ratios["interval"]) == ("plain", [one.low, one.high])
+
+    def test_what_may_be_chance_is_never_better(self) -> None:
+        results = study(condition(1.0, scatter=0.3))
+        assert results.reading[0].verdict == "No significant difference."
+        assert "better" not in text_of(results)
+        assert not summary_of(results)["ratios"][0]["differs"]
+
+    def test_a_small_difference_is_slight(self) -> None:
+        slight = study(condition(0.99, scatter=0.002, noise=1e-3))
+        assert "B is slightly better" in summary_of(slight)["line"]
+        assert "slightly" not in summary_of(study(condition(0.8)))["line"]
+
+    def test_it_names_the_conditions_where_they_differ(self) -> None:
+        turned = study(condition(0.8), condition(1.25, named=EFFECTS))
+        verdicts = {one.key: one.verdict for one in turned.reading}
+        assert verdicts["prediction"].startswith("Without unmodelled effects B is better")
+        assert "; with unmodelled effects A is better" in verdicts["prediction"]
+        assert verdicts["effects"].startswith("Yes: A is better")
+        same = study(condition(0.8), condition(0.8, named=EFFECTS))
+        assert {one.key: one.verdict for one in same.reading}["effects"] == "No."
+
+    @pytest.mark.parametrize(("ratio", "gone"), [(1.0, True), (1.25, False)])
+    def test_more_motion_alone_is_no_better_method(self, ratio: float, gone: bool) -> None:
+        """A's motion is the longer one; `ratio` is that of B over as much motion of A."""
+        cut = condition(ratio, scatter=0.3 if gone else 0.05).comparisons
+        equal = EqualDataResult(
+            cut="a", name="a-equal", repetitions=2, seconds=40.0, other="b", other_seconds=38.0,
+            comparisons=[one.model_copy(update={"first": "a-equal"}) for one in cut],
+        )  # fmt: skip
+        uneven = condition(1.25).model_copy(update={"equal_data": equal})
+        verdict = study(uneven).reading[0].verdict
+        assert verdict.startswith("A is better")
+        assert ("% smaller, but not with as much motion of each." in verdict) is gone
+
+    def test_one_repetition_is_too_few_and_has_no_scatter(self) -> None:
+        results = study(condition(0.8, repetitions=1))
+        assert results.reading[0].verdict.startswith("Too few repetitions or motions")
+        assert "nan" not in text_of(results)
+        page = study_page(results).decode()
+        assert "± –" in page and "± 0<" not in page
+
+    def test_without_held_out_motions_there_is_none(self) -> None:
+        results = study(condition(0.8, classes=()))
+        assert "no held-out motion" in summary_of(results)["line"]
+        study_page(results)
+
+    def test_of_unknown_methods_it_names_neither_a_nor_b(self) -> None:
+        printed = [
+            one.model_copy(
+                update={"printed_id": k + 1, "printed_a": 1.0, "printed_b": 2.0, "printed_c": 0.5}
+            )
+            for k, one in enumerate(PARAMETERS)
+        ]
+        labels = {"march": "march", "june": "june"}
+        recorded = Condition("recorded", "as recorded", ())
+        found = condition(0.8, named=recorded, labels=labels, parameters=printed)
+        results = study(found)
+        text = text_of(results)
+        assert "with june is closer to π_C than that with march" in study_page(results).decode()
+        assert re.search(r"\b(than|with|of|and) [AB]\b|\b[AB]'s", text) is None
+
+    def test_campaigns_that_contradict_each_other_are_named(self) -> None:
+        homes_ = [
+            condition(ratio, named=Condition(f"recorded-{key}", f"on the motions of {key}", ()))
+            for key, ratio in (("march", 1.3), ("june", 0.7))
+        ]
+        answer = study(*homes_).reading[0]
+        assert answer.verdict.startswith("On the motions of march A is better")
+        assert "on the motions of june B is better" in answer.verdict
+        assert "opposite conclusions" in answer.sentences[0]
 
 
-def test_what_may_be_chance_is_never_called_better() -> None:
-    results = study(condition(1.0, scatter=0.3))
-    assert results.reading[0].verdict == "No difference is shown."
-    assert "better" not in text_of(results)
-    assert not answer_of(results)["ratios"][0]["differs"]
-
-
-def test_a_difference_of_next_to_nothing_is_told_to_be_slight() -> None:
-    assert (
-        "B is slightly better"
-        in answer_of(study(condition(0.99, scatter=0.002, noise=1e-3)))["line"]
-    )
-    assert "slightly" not in answer_of(study(condition(0.8)))["line"]
-
-
-def test_the_answer_says_how_it_turns_with_effects() -> None:
-    turned = study(condition(0.8), condition(1.25, named=EFFECTS))
-    verdicts = {one.key: one.verdict for one in turned.reading}
-    assert verdicts["prediction"].startswith("Without unmodelled effects B is better")
-    assert "; with unmodelled effects A is better" in verdicts["prediction"]
-    assert verdicts["effects"].startswith("On fly-by motions it does: without them B is better")
-    same = study(condition(0.8), condition(0.8, named=EFFECTS))
-    assert {one.key: one.verdict for one in same.reading}["effects"].startswith(
-        "On fly-by motions it does not: B is better"
-    )
-
-
-@pytest.mark.parametrize(("ratio", "gone"), [(1.0, True), (1.25, False)])
-def test_a_difference_that_is_only_more_motion_is_told_to_be_that(ratio: float, gone: bool) -> None:
-    """A's motion is the longer one; `ratio` is that of B over as much motion of A."""
-    cut = condition(ratio, scatter=0.3 if gone else 0.05).comparisons
-    equal = EqualDataResult(
-        cut="a", name="a, cut", repetitions=2, seconds=40.0, other="b", other_seconds=38.0,
-        comparisons=[one.model_copy(update={"first": "a, cut"}) for one in cut],
-    )  # fmt: skip
-    uneven = condition(1.25, named=EFFECTS).model_copy(update={"equal_data": equal})
-    told = study(condition(1.0, scatter=0.3), uneven).reading
-    for one in (told[0], next(each for each in told if each.key == "effects")):
-        assert "with unmodelled effects A is better" in one.verdict or "them A is" in one.verdict
-        assert ("% smaller, but not with as much motion of each." in one.verdict) is gone
-
-
-def test_every_answer_is_short() -> None:
-    answers = study(condition(0.8), condition(1.25, named=EFFECTS)).reading
-    for one in [each for each in answers if each.verdict]:
-        assert len(" ".join(one.sentences).split()) <= 80
-
-
-def test_one_repetition_of_each_tells_nothing_and_shows_no_scatter() -> None:
-    results = study(condition(0.8, repetitions=1))
-    text = text_of(results)
-    assert "oo few repetitions or motions to tell" in results.reading[0].verdict
-    assert "nan" not in text and "scatter over the repetitions" not in text
-    page = study_page(results).decode()
-    assert "± –" in page and "± 0<" not in page
-
-
-def test_campaigns_without_held_out_motions_say_so() -> None:
-    results = study(condition(0.8, classes=()))
-    assert "no held-out motion" in answer_of(results)["line"]
-    study_page(results)
-
-
-def test_of_campaigns_of_no_known_method_nothing_is_said_of_a_b_or_the_paper() -> None:
-    printed = [
-        one.model_copy(
-            update={"printed_id": k + 1, "printed_a": 1.0, "printed_b": 2.0, "printed_c": 0.5}
-        )
-        for k, one in enumerate(PARAMETERS)
-    ]
-    labels = {"march": "march", "june": "june"}
-    found = condition(
-        0.8, named=Named("recorded", "as recorded", ()), labels=labels, parameters=printed
-    )
-    text = text_of(study(found))
-    assert "june lies closer to π_C than march" in text
-    assert "in print" not in text and "the paper" not in text
-    assert re.search(r"\b(than|with|of|and) [AB]\b|\b[AB]'s", text) is None
-
-
-def test_the_same_motions_in_two_campaigns_that_contradict_each_other_are_told_to() -> None:
-    homes_ = [
-        condition(ratio, named=Named(f"recorded-{key}", f"on the motions of {key}", ()))
-        for key, ratio in (("march", 1.3), ("june", 0.7))
-    ]
-    answer = study(*homes_).reading[0]
-    assert answer.verdict.startswith("On the motions of march A is better")
-    assert "on the motions of june B is better" in answer.verdict
-    assert "opposite answers" in answer.sentences[0]
-
-
-def test_settings_beyond_chance_are_named_and_no_others() -> None:
+def test_settings_outside_the_range_of_chance_are_named() -> None:
     def point(value: float, own: float) -> AblationPoint:
         return AblationPoint(
             value=value, method="b", base=value == 0.5, repetitions=3, log10_det=1.0,
@@ -207,15 +186,8 @@ def test_settings_beyond_chance_are_named_and_no_others() -> None:
         key="fly", title="Fly-by share", variable="fly-by share", words="Varied.",
         points=[point(0.0, 1.5e-3), point(0.5, 5e-3), point(1.0, 2.5e-3)], bands=[band], missing=[],
     )  # fmt: skip
-    (told,) = (one for one in study(condition(1.0), ablations=[fly]).reading if "fly" in one.key)
-    assert any(text.endswith("0.10 to 0.20 %: beyond that lies 1.") for text in told.sentences)
-
-
-def test_effects_are_told_with_the_joints_that_have_them() -> None:
-    told = effect_words(
-        ["torque ripple of 10% of it", "elasticity of 5e-07, 0 rad/(N·m)"], ["a", "b"]
-    )
-    assert told == ["torque ripple of 10 % of it", "elasticity of 0.5 µrad/(N·m) in a"]
+    (found,) = (one for one in study(condition(1.0), ablations=[fly]).reading if "fly" in one.key)
+    assert any(text.endswith("0.100 % to 0.200 %; outside: 1.") for text in found.sentences)
 
 
 # Recorded campaigns

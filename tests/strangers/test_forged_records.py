@@ -21,11 +21,8 @@ from hil.batch.keys import settings_digest, sum_key, summary_key
 from hil.batch.types import ArchiveRef, Bundle, Fit, Summary
 from hil.errors import ArchiveError
 from hil.identify.settings import Settings
-from hil.results.frozen import Frozen
 from hil.study.analysis import class_in
-from hil.study.forms import MotionForm, packed
-from hil.study.records import ExampleRecord, FitRecord, MotionScore, ScoreRecord, keep, kept
-from hil.study.stages import TIMES, Stages
+from hil.study.records import Record, read_record, write_record
 from identification.estimation import Estimate
 from identification.excitation import Journal, SearchSettings
 from identification.phase_factor import PhaseFactor
@@ -170,129 +167,17 @@ def test_what_is_no_folder_keeps_nothing_and_stops_nothing(tmp_path: Path) -> No
     assert tmp_path not in store.folder.parents
 
 
-# What a study keeps
-
-FIT: dict[str, Any] = {
-    "inputs": "digest",
-    "repetitions": ["one", "two"],
-    "values": [[1.0, 2.0, 3.0], [1.0, 2.0, 3.0]],
-    "pooled": [1.0, 2.0, 3.0],
-    "pooled_std": [0.1, 0.1, 0.1],
-    "undetermined": [],
-    "noise_std": [1.0, 1.0],
-    "log10_det": 3.0,
-    "coupling_index": 0.1,
-    "n_samples": 100,
-    "correlation": np.eye(3).tolist(),
-    "duration": 1.0,
-    "time": [0.0, 1.0],
-    "position": [[0.0, 1.0], [0.0, 1.0]],
-    "velocity": [[0.0, 1.0], [0.0, 1.0]],
-}
-FORM: dict[str, Any] = {
-    "archive": "one",
-    "torque_squared": [1.0, 1.0],
-    "columns": [[2, 0], [1]],
-    "slow": [packed(np.eye(3)), packed(np.eye(2))],
-    "whole": packed(np.eye(3)),
-}
-RATIO: dict[str, Any] = {
-    "archive": "one",
-    "overall": 0.1,
-    "unfiltered": 0.1,
-    "all_rows": 0.1,
-    "own": None,
-    "relative": [0.1, 0.1],
-    "mean_abs": [0.1, 0.1],
-    "mean": [0.0, 0.0],
-}
-EXAMPLE: dict[str, Any] = {
-    "archive": "one",
-    "time": [0.0, 1.0],
-    "measured": [[0.0, 1.0], [0.0, 1.0]],
-    "predicted": {"A": [[0.0, 1.0], [0.0, 1.0]]},
-}
-SCORE: dict[str, Any] = {
-    "inputs": "digest",
-    "durations": [1.0],
-    "samples": [10],
-    "left_out": [[1, 2]],
-    "forms": [FORM],
-    "scores": {"A": [RATIO]},
-    "examples": [EXAMPLE],
-}
-RECORDS: dict[type[Frozen], dict[str, Any]] = {
-    FitRecord: FIT,
-    ScoreRecord: SCORE,
-    MotionForm: FORM,
-    MotionScore: RATIO,
-    ExampleRecord: EXAMPLE,
-}
-LISTS = [
-    (kind, name)
-    for kind, record in RECORDS.items()
-    for name, value in record.items()
-    # Names of what is undetermined and examples are as many as there are.
-    if isinstance(value, list) and name not in ("undetermined", "examples")
-]
-
-
-@pytest.mark.parametrize("kind", RECORDS)
-def test_a_record_that_fits_is_read(kind: type[Frozen]) -> None:
-    assert kind.model_validate(RECORDS[kind]).model_dump() == RECORDS[kind]
-
-
-@pytest.mark.parametrize(("kind", "name"), LISTS)
-@pytest.mark.parametrize("change", [lambda a: a[:-1], lambda a: a + a[:1]], ids=["less", "more"])
-def test_a_record_with_a_list_of_another_length_is_none(
-    kind: type[Frozen], name: str, change: Callable[[list[Any]], list[Any]]
-) -> None:
-    record = RECORDS[kind]
-    with pytest.raises(ValueError, match=r"belong together|one entry|parameters"):
-        kind.model_validate(record | {name: change(record[name])})
-
-
-ODD_FORMS: dict[str, dict[str, Any]] = {
-    "a column that is no parameter": {"columns": [[3, 0], [1]]},
-    "a column before the first": {"columns": [[-1, 0], [1]]},
-    "a sum over another joint's columns": {"slow": [packed(np.eye(2)), packed(np.eye(3))]},
-    "no base64": {"whole": "%%%"},
-    "half a number": {"whole": "AAAA"},
-    "no triangle": {"whole": packed(np.eye(3))[:-12]},
-}
-
-
-@pytest.mark.parametrize("how", ODD_FORMS)
-def test_a_form_that_is_none_is_refused(how: str) -> None:
-    with pytest.raises(ValueError, match=r"\S"):
-        MotionForm.model_validate(FORM | ODD_FORMS[how])
-
-
-def test_a_record_tells_of_its_own_motions_and_estimates_only() -> None:
-    record = ScoreRecord.model_validate(SCORE)
-    assert record.tells_of(["one"], {"A": np.ones(3)})
-    assert not record.tells_of(["another"], {"A": np.ones(3)})
-    assert not record.tells_of(["one"], {"B": np.ones(3)})
-    assert not record.tells_of(["one"], {"A": np.ones(4)})
-    assert not record.model_copy(update={"scores": {}}).tells_of(["one"], {"A": np.ones(3)})
+# Records of a study
 
 
 def test_a_study_reads_its_archives_again_where_a_record_does_not_fit(tmp_path: Path) -> None:
     path = tmp_path / "run.json"
-    keep(path, FitRecord.model_validate(FIT))
-    assert kept(path, FitRecord, "digest") is not None
-    path.write_text(json.dumps(FIT | {"noise_std": [1.0]}))
-    assert kept(path, FitRecord, "digest") is None
-
-
-@pytest.mark.parametrize("seconds", ["Infinity", "NaN", "-1.0", "1e300", '"inf"'])
-def test_times_that_are_none_are_begun_anew(seconds: str, tmp_path: Path) -> None:
-    (tmp_path / TIMES).write_text('{"wall": {"fitting": 5.0}, "processor": {}}')
-    assert Stages(tmp_path, begun=True).times.wall == {"fitting": 5.0}
-    (tmp_path / TIMES).write_text(f'{{"wall": {{"fitting": {seconds}}}, "processor": {{}}}}')
-    found = Stages(tmp_path, begun=True).times
-    assert not found.wall
-    assert not found.whole
+    write_record(path, Record(inputs="digest"))
+    assert read_record(path, Record, "digest") is not None
+    assert read_record(path, Record, "another digest") is None
+    for content in ('{"inputs": 1}', '{"inputs": "digest", "more": 1}', "[" * 10_000, "\0"):
+        path.write_text(content)
+        assert read_record(path, Record, "digest") is None
 
 
 def test_a_plan_whose_moves_are_none_is_told_with_its_archive(tmp_path: Path) -> None:

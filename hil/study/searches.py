@@ -16,10 +16,11 @@ from hil.progress import Reporter
 from identification.excitation import RESCORE_PERIOD, Excitation, Objective
 from planner import PlannerError, plan_in_child
 
-from .folder import StudyFolder
-from .settings import Effort, StudySettings
+from .results import SearchResult
+from .settings import Effort, StudyFolder, StudySettings
 
 A, B, B0, AP = "a", "b", "b0", "a-printed"
+LABELS: Final = {A: "A", B: "B", B0: "B, fly 0", AP: "A as printed"}
 SINES: Final = {
     "a-middle": ("about the middle of the ranges, frequencies as printed", {}),
     "a-home": ("about the home posture, frequencies as printed", {"offset": "home"}),
@@ -32,41 +33,51 @@ SINES: Final = {
         {"offset": "home", "fastest": "from limits"},
     ),
 }
-"""Method A gets a search for each choice that the paper leaves open, and keeps the best."""
-SINES_LABELS: Final = {
-    "a-middle": "middle, printed",
-    "a-home": "home, printed",
-    "a-middle-fast": "middle, fast",
-    "a-home-fast": "home, fast",
-}
-AS_PRINTED: Final = ("a-middle", "a-home")
-"""Those with the frequencies of the paper's Table 1."""
-
-
+"""Method A has a search for each choice that the paper leaves open, and uses the best."""
 _PRINTED_JOINTS: Final = 6
 
 
 @dataclass(frozen=True)
 class Search:
-    """One search.
-
-    Attributes:
-        key: names its folder.
-        words: what is searched.
-        settings: of the search.
-    """
+    """One search: the key names its folder, `words` say what is searched."""
 
     key: str
     words: str
     settings: DesignSettings
 
+    @property
+    def notes(self) -> str:
+        """What is searched and how long, as the notes of the paper's Table 1."""
+        search, via, sines = self.settings.search, self.settings.via_points, self.settings.sines
+        effort = f"{search.population} individuals, {search.generations} generations"
+        if via is not None:
+            one, two = search.weights
+            fly = f"{100.0 * via.fly:.0f} %"
+            return f"K = {via.n_via}, fly {fly}, λ1 = {one:g}, λ2 = {two:g}; {effort}"
+        harmonics = "" if sines is None else f"W = {sines.harmonics}, "
+        return f"{harmonics}{self.words.removeprefix('method A, ')}; {effort}"
+
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a search found; `excitation` is None where nothing kept the constraints."""
+    """What a search found; `excitation` is None where no motion satisfied the constraints."""
 
     search: Search
     excitation: Excitation | None
+
+    def result(self, *, chosen: bool) -> SearchResult:
+        """The same for `results.json`."""
+        one = self.excitation
+        return SearchResult(
+            key=self.search.key,
+            words=self.search.words,
+            chosen=chosen,
+            tried=0 if one is None else one.tried,
+            infeasible={} if one is None else {name: int(n) for name, n in one.rejected.items()},
+            log10_det=None if one is None else one.criteria.log10_det,
+            coupling_index=None if one is None else one.criteria.coupling_index,
+            duration=None if one is None else float(one.trajectory.duration),
+        )
 
 
 def searches(settings: StudySettings, n_joints: int) -> list[Search]:
@@ -77,45 +88,26 @@ def searches(settings: StudySettings, n_joints: int) -> list[Search]:
     """
     a = preset("a").replaced(seed=settings.seed, search=_effort(settings.effort_a))
     b = preset("b").replaced(seed=settings.seed, search=_effort(settings.effort_b))
-    assert b.via_points is not None
-    _, weight = b.search.weights
-    return [
-        *(
-            Search(key, f"method A, sines {words}", a.replaced(sines=sines))
-            for key, (words, sines) in SINES.items()
-            if n_joints == _PRINTED_JOINTS or "fastest" in sines
-        ),
+    found = [
+        Search(key, f"method A, sines {words}", a.replaced(sines=sines))
+        for key, (words, sines) in SINES.items()
+        if n_joints == _PRINTED_JOINTS or "fastest" in sines
+    ]
+    found += [
         Search(B, "method B", b),
         Search(B0, "method B with fly 0", b.replaced(via_points={"fly": 0.0})),
-        *(
-            Search(via_key(n_via), f"B with K = {n_via}", b.replaced(via_points={"n_via": n_via}))
-            for n_via in settings.n_via
-            if n_via != b.via_points.n_via
-        ),
-        *(
-            Search(
-                weight_key(own),
-                f"B with a weight of {own:g} on the coupling index",
-                b.replaced(search={"weights": [1.0 - own, own]}),
-            )
-            for own in settings.coupling_weight
-            if own != weight
-        ),
     ]
-
-
-def notes_of(search: Search) -> str:
-    """What is searched and how long, as the notes of the paper's Table 1."""
-    settings = search.settings.search
-    effort = f"{settings.population} individuals, {settings.generations} generations"
-    via, weights = search.settings.via_points, settings.weights
-    if via is None:
-        sines = search.settings.sines
-        harmonics = "" if sines is None else f"W = {sines.harmonics}, "
-        return f"{harmonics}{search.words.removeprefix('method A, ')}; {effort}"
-    return (
-        f"K = {via.n_via}, fly {via.fly:.0%}, λ1 = {weights[0]:g}, λ2 = {weights[1]:g}; {effort}"
-    ).replace("%", " %")
+    varied = [
+        (via_key(n), f"B with K = {n}", b.replaced(via_points={"n_via": n})) for n in settings.n_via
+    ] + [
+        (
+            weight_key(own),
+            f"B with a weight of {own:g} on the coupling index",
+            b.replaced(search={"weights": [1.0 - own, own]}),
+        )
+        for own in settings.coupling_weight
+    ]
+    return found + [Search(*one) for one in varied if one[0] != B]
 
 
 def via_key(n_via: int) -> str:
@@ -143,7 +135,7 @@ def run_searches(
     *,
     workers: int,
 ) -> dict[str, Found]:
-    """Search what was not found yet; an interrupted search goes on from its journal.
+    """Search what was not found yet; an interrupted search resumes from its journal.
 
     Raises:
         HilError: see :func:`hil.design.run.run_design`; that a search finds nothing is no error.
@@ -151,20 +143,16 @@ def run_searches(
     found = {}
     for number, one in enumerate(wanted, 1):
         place = DesignFolder(folder.design(one.key))
-        done = _whole(place, one.settings)
+        done = _complete(place, one.settings)
         if done is None:
             reporter.say(f"search {number} of {len(wanted)}: {one.words}")
+            resume = place.settings.exists()
             try:
                 done = run_design(
-                    place,
-                    cell,
-                    one.settings,
-                    reporter,
-                    workers=workers,
-                    resume=place.settings.exists(),
+                    place, cell, one.settings, reporter, workers=workers, resume=resume
                 ).result
             except NoExcitationError as error:
-                reporter.say(f"nothing was found: {error}")
+                reporter.say(f"no motion was found: {error}")
         found[one.key] = Found(one, None if done is None else done.excitation)
     return found
 
@@ -175,11 +163,10 @@ def best_sines(found: Mapping[str, Found]) -> str:
     Raises:
         NoExcitationError: no search of method A found anything.
     """
-    known = {key: found[key].excitation for key in SINES if key in found}
-    able = {key: one.criteria.log10_det for key, one in known.items() if one is not None}
+    able = _determinants(found, tuple(SINES))
     if not able:
         raise NoExcitationError(
-            "no sum of sines keeps all constraints of the cell; search longer (without --quick)"
+            "no sum of sines satisfies all constraints of the cell; search longer (without --quick)"
         )
     return max(able, key=lambda key: able[key])
 
@@ -189,11 +176,15 @@ def printed_sines(found: Mapping[str, Found]) -> str | None:
 
     None where method A's best search has these frequencies itself, or none of them was found.
     """
-    known = {key: found[key].excitation for key in AS_PRINTED if key in found}
-    able = {key: one.criteria.log10_det for key, one in known.items() if one is not None}
+    able = _determinants(found, ("a-middle", "a-home"))
     if not able or best_sines(found) in able:
         return None
     return max(able, key=lambda key: able[key])
+
+
+def _determinants(found: Mapping[str, Found], keys: Sequence[str]) -> dict[str, float]:
+    known = {key: found[key].excitation for key in keys if key in found}
+    return {key: one.criteria.log10_det for key, one in known.items() if one is not None}
 
 
 def with_fly(cell: Cell, excitation: Excitation, fly: float, checks: MotionChecks) -> Excitation:
@@ -216,8 +207,8 @@ def with_fly(cell: Cell, excitation: Excitation, fly: float, checks: MotionCheck
     return replace(excitation, trajectory=trajectory, criteria=criteria, fly=fly)
 
 
-def _whole(place: DesignFolder, settings: DesignSettings) -> DesignResult | None:
-    """The design in a folder, where it came to its end under these settings."""
+def _complete(place: DesignFolder, settings: DesignSettings) -> DesignResult | None:
+    """The design in a folder, where it was completed under these settings."""
     if not place.result.exists():
         return None
     there = DesignResult.load(place.result)

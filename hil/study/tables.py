@@ -1,0 +1,266 @@
+"""From fits and scores to the tables of a study, beside what the paper prints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from math import pi
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
+
+from .records import ClassErrors, ClassForms, FitRecord, Fitted, ScoreRecord
+from .results import (
+    ClassResult,
+    ClosenessResult,
+    ComparisonResult,
+    ConditionResult,
+    CrossCell,
+    EqualDataResult,
+    MethodResult,
+    MotionRow,
+    StudyParameter,
+)
+from .searches import AP, B
+from .statistics import (
+    Estimated,
+    Kernels,
+    compared_on,
+    corrected,
+    equal_data,
+    own_kernels,
+    torque_kernels,
+)
+
+Array = NDArray[np.float64]
+
+GROUPS: Final = {
+    "rows 1 to 22": range(1, 23),
+    "rows 23 to 32, the aggregates": range(23, 33),
+    "rows 33 to 40": range(33, 41),
+    "rows 41 to 52, friction": range(41, 53),
+}
+"""Groups of rows of Table 2 as section 4.2 of the paper reads them."""
+TABLE1: Final = (
+    ("a", 2000, 90.5, 127.9, "W = 3, own frequencies; 100 individuals"),
+    ("b", 15996, 30.9, 101.2, "K = 6, λ1 = 0.7, λ2 = 0.3; 150 individuals"),
+)
+"""The paper's Table 1: method, N, log det in units that are not named, I_c, notes."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a condition is called, and whether its repetitions may resemble their neighbours."""
+
+    key: str
+    words: str
+    effects: tuple[str, ...]
+    drifts: bool = True
+
+
+def is_printed(cell: Cell) -> bool:
+    """Whether a cell has the arm of the paper, the NS 16."""
+    return cell.urdf == URDF_PATH.read_text(encoding="utf-8")
+
+
+def printed_rows(cell: Cell) -> list[MotionRow]:
+    """The paper's own rows of Table 1; none for another arm than its NS 16."""
+    names = ("key", "n_samples", "log10_det", "coupling_index", "words")
+    return [
+        MotionRow.model_validate(dict(zip(names, row, strict=True)) | {"printed": True})
+        for row in (TABLE1 if is_printed(cell) else ())
+    ]
+
+
+def parameters_of(cell: Cell, truth: Array | None) -> list[StudyParameter]:
+    """The model's parameters with the print; `truth` (p,) is planted.
+
+    Rows 41 to 52 are read as interleaved. The print's viscous and third friction terms are read as
+    per degree and per degree², an assumption: per radian the viscous friction would be negligible.
+    """
+    model, printed = cell.model, dict[str, dict[str, Any]]()
+    for row in TABLE2 if is_printed(cell) else ():
+        order = {"f1": 1, "f2": 2}.get(row.parameter[:2], 0) if row.id > N_ESSENTIAL else 0
+        printed[row.pivot or row.parameter] = {
+            "printed_id": row.id,
+            "printed_symbol": row.parameter,
+            "printed_factor": row.sign * (pi / 180.0) ** order,
+            "printed_a": row.pi_a,
+            "printed_b": row.pi_b,
+            "printed_c": row.pi_c,
+        }
+    return [
+        StudyParameter(
+            name=name,
+            unit=model.units[k],
+            truth=None if truth is None else float(truth[k]),
+            **printed.get(name, {}),
+        )
+        for k, name in enumerate(model.parameter_names)
+    ]
+
+
+def estimates_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
+    """The paper's estimate of each: the mean over the repetitions' own estimates (p,)."""
+    return {key: np.mean(one.values, axis=0) for key, one in fits.items()}
+
+
+def cut_estimate(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
+    """Estimate of the longer of the first two methods from as much motion as the other has."""
+    equal = equal_data(fits, list(fits))
+    if equal is None:
+        return {}
+    return {equal.name: np.mean(fits[equal.cut].values[: equal.repetitions], axis=0)}
+
+
+def condition_result(
+    condition: Condition,
+    labels: Mapping[str, str],
+    fits: Mapping[str, FitRecord],
+    scores: Mapping[str, ScoreRecord],
+    parameters: Sequence[StudyParameter],
+    joint_names: Sequence[str],
+    others: Sequence[str] = (),
+) -> ConditionResult:
+    """All tables of one condition.
+
+    `labels` of the methods are in the order of the tables, `scores` by class of motion, `others`
+    further estimates in the cross table, such as the planted parameters.
+    """
+    keys, equal = list(labels), equal_data(fits, list(labels))
+    estimates = {key: np.array(fits[key].values) for key in keys}
+    if equal is not None:
+        estimates[equal.name] = estimates[equal.cut][: equal.repetitions]
+    wanted = [*estimates, *others]
+    classes = [_class_result(name, one, condition) for name, one in scores.items()]
+    forms = {name: ClassForms.of(one.forms) for name, one in scores.items()}
+    truth = None
+    if parameters and all(one.truth is not None for one in parameters):
+        truth = np.array([one.truth for one in parameters], dtype=np.float64)
+
+    def pair(
+        name: str, first: str, second: str, kernels: Kernels, joint: str | None = None
+    ) -> ComparisonResult:
+        one, other = (Estimated(key, estimates[key]) for key in (first, second))
+        return compared_on(name, one, other, kernels, joint=joint, drifts=condition.drifts)
+
+    two = keys[:2] if len(keys) > 1 else None
+    own = truth if two and not condition.effects else None
+    by_joint = enumerate(joint_names if two and "fly-by" in forms else ())
+    example = scores.get("fly-by") or next(iter(scores.values()), None)
+    return ConditionResult(
+        key=condition.key,
+        words=condition.words,
+        effects=list(condition.effects),
+        methods=[_method(key, labels[key], fits[key]) for key in keys],
+        classes=classes,
+        cross=[_cell(one, key) for one in classes for key in wanted if key in one.overall],
+        comparisons=corrected(
+            [
+                pair(name, first, second, torque_kernels(one))
+                for name, one in forms.items()
+                for first, second in compared_pairs(keys)
+            ]
+        ),
+        own_comparisons=[]
+        if own is None or two is None
+        else corrected(
+            [pair(name, two[0], two[1], own_kernels(one, own)) for name, one in forms.items()]
+        ),
+        joint_comparisons=corrected(
+            [
+                pair("fly-by", keys[0], keys[1], torque_kernels(forms["fly-by"], j), joint)
+                for j, joint in by_joint
+            ]
+        ),
+        equal_data=None if equal is None else _with_equal(equal, keys, forms, pair),
+        closeness=_closeness(fits, keys, parameters),
+        examples=[] if example is None else example.examples,
+    )
+
+
+def _with_equal(
+    equal: EqualDataResult, keys: Sequence[str], forms: Mapping[str, ClassForms], pair: Any
+) -> EqualDataResult:
+    first, second = (equal.name if key == equal.cut else key for key in keys[:2])
+    rows = [pair(name, first, second, torque_kernels(one)) for name, one in forms.items()]
+    return equal.model_copy(update={"comparisons": corrected(rows)})
+
+
+def _method(key: str, label: str, record: FitRecord) -> MethodResult:
+    values = np.array(record.values)
+    return MethodResult(
+        key=key,
+        label=label,
+        repetitions=len(values),
+        seconds=record.duration * len(values),
+        mean=values.mean(axis=0).tolist(),
+        std=(values.std(axis=0, ddof=1) if len(values) > 1 else 0.0 * values[0]).tolist(),
+        **record.model_dump(include=set(Fitted.model_fields)),
+    )
+
+
+def _class_result(name: str, record: ScoreRecord, condition: Condition) -> ClassResult:
+    left_out, samples = np.sum(record.left_out, axis=0), sum(record.samples)
+    errors = record.model_dump(include=set(ClassErrors.model_fields))
+    return ClassResult(
+        motion_class=name,
+        archives=[one.archive for one in record.forms],
+        left_out=(left_out / samples).tolist(),
+        left_out_share=float(left_out.sum() / (samples * left_out.size)),
+        **errors | ({"own": {}} if condition.effects else {}),
+    )
+
+
+def _cell(result: ClassResult, key: str) -> CrossCell:
+    lower, middle, upper = np.percentile(result.overall[key], (25.0, 50.0, 75.0)).tolist()
+    return CrossCell(
+        method=key,
+        motion_class=result.motion_class,
+        median=middle,
+        lower=lower,
+        upper=upper,
+        unfiltered_median=float(np.median(result.unfiltered[key])),
+        all_rows_median=float(np.median(result.all_rows[key])),
+        own_median=float(np.median(own)) if (own := result.own.get(key)) else None,
+    )
+
+
+def compared_pairs(keys: Sequence[str]) -> list[tuple[str, str]]:
+    """Pairs of methods: all, but for the printed sines, which the paper compares with B alone."""
+    pairs = list(combinations([key for key in keys if key != AP], 2))
+    return [*pairs, (AP, B)] if AP in keys and B in keys else pairs
+
+
+def _closeness(
+    fits: Mapping[str, FitRecord], keys: Sequence[str], parameters: Sequence[StudyParameter]
+) -> list[ClosenessResult]:
+    """How often the second of the first two methods comes closer to the manufacturer's column."""
+    if len(keys) < 2 or not any(one.printed_id for one in parameters):
+        return []
+    factor = np.array([one.printed_factor for one in parameters])
+    columns = [factor * np.mean(fits[key].values, axis=0) for key in keys[:2]]
+    prints = ([getattr(one, f"printed_{name}") for one in parameters] for name in ("a", "b", "c"))
+    paper_a, paper_b, c = (np.array(values, dtype=np.float64) for values in prints)
+    closer = np.abs(columns[1] - c) < np.abs(columns[0] - c)
+    printed = np.abs(paper_b - c) < np.abs(paper_a - c)
+    found = []
+    for group, rows in GROUPS.items():
+        members = [one.printed_id in rows for one in parameters] & np.isfinite(c)
+        found.append(
+            ClosenessResult(
+                group=group,
+                reference="pi_C",
+                first=keys[0],
+                second=keys[1],
+                parameters=int(members.sum()),
+                second_closer=int(closer[members].sum()),
+                printed_second_closer=int(printed[members].sum()),
+            )
+        )
+    return found

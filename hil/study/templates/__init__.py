@@ -1,1 +1,0 @@
-"""Template of a study's page; a package so that it is installed with it."""
