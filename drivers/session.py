@@ -51,7 +51,7 @@ import numpy as np
 from drivers.answers import Answers
 from drivers.arm_wire import Ages
 from drivers.drive_train import DriveTrain
-from drivers.errors import PacketError, RefusalError, RequestError, as_refusal
+from drivers.errors import ModeRefused, PacketError, RefusalError, RequestError, as_refusal
 from drivers.events import Counters, Event, InitReceived, LinkLost, Refused
 from drivers.execution import execution_of
 from drivers.guard import Guard
@@ -368,7 +368,10 @@ class Session:
         try:
             machine.note_gap(missed, unanswered, self._max_gap)
             machine.require_axes(reading, self._mode)
+            before = machine.state
             machine.take(reading.input)
+            if machine.state is State.FAULTED and before is not State.FAULTED:
+                refusal = ModeRefused(*reading.faulty, machine.cycle)
             answers.note_gap(unanswered, paused, machine, reading)
             measured, commanded = ring.measured[row], ring.commanded[row]
             status = answers.answer(machine, reading, words, measured, commanded)

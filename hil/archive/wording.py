@@ -53,7 +53,7 @@ def describe(event: ExchangeEvent) -> str:
         case PacketRejected():
             return f"{counted(event.count, f'{event.kind} packet')} got no answer"
         case Refused():
-            return str(event.error)
+            return f"{event.error}; {event.error.remedy}"
         case LinkLost():
             return f"nothing heard for {event.silence:.3f} s in state {event.state.name}"
         case InitReceived():

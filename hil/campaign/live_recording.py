@@ -115,6 +115,16 @@ class LiveRecording:
         failure = self._view.failure()
         self._view.look()
         status, period = self._view.status, self._link.cell.period
+        over = (
+            restarted,
+            status.state is State.ENDED,
+            failure,
+            self._view.lost,
+            self._stop.requested,
+        )
+        asked = duration is not None and (status.cycle + 1) * period >= duration
+        if self._view.refused is not None and (asked or any(over)):
+            return "refused", str(self._view.refused.error)
         if restarted:
             return "stopped", "the controller began a new session"
         if duration is not None and (status.cycle + 1) * period >= duration:

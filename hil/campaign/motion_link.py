@@ -18,6 +18,7 @@ from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
+from hil.archive.wording import describe
 from hil.cell import Cell
 from hil.errors import ControllerFault
 
@@ -91,6 +92,10 @@ def unwatched(_progress: Progress) -> None:
     """Nobody looks."""
 
 
+def _unsaid(_text: str) -> None:
+    """Nobody listens."""
+
+
 @dataclass(eq=False)
 class Connection:
     """What has become known of the controller since the link was opened.
@@ -100,7 +105,8 @@ class Connection:
         unusable: why the arm cannot be moved, None if it can.
         differences: what it says otherwise than the cell.
         adopted: whether its figures are used instead of the cell's.
-        refused: the last refusal of the guard.
+        refused: the last refusal of the session.
+        say: tells a person at once of each refusal.
     """
 
     init: InitPacket | None = None
@@ -108,6 +114,7 @@ class Connection:
     differences: tuple[str, ...] = ()
     adopted: bool = False
     refused: Refused | None = None
+    say: Callable[[str], None] = _unsaid
 
     def note(self, event: ExchangeEvent) -> None:
         """Take in an event."""
@@ -116,6 +123,7 @@ class Connection:
             self.differences, self.adopted = event.differences, event.adopted
         elif isinstance(event, Refused):
             self.refused = event
+            self.say(f"REFUSED: {describe(event)}")
 
     def require_usable(self, cell: Cell | None) -> None:
         """Refuse a controller that is not the cell's.

@@ -135,7 +135,8 @@ class Played:
 def _sent_again(position: Array, velocity: Array) -> NDArray[np.bool_]:
     """(m - 1,) whether a set-point of (m, n) that moves on is followed by itself."""
     same = (position[1:] == position[:-1]).all(axis=1)
-    return np.asarray(same & (velocity[:-1] != 0.0).any(axis=1))
+    same &= (velocity[1:] == velocity[:-1]).all(axis=1)
+    return np.asarray(same & (velocity[1:] != 0.0).any(axis=1))
 
 
 def problem_of(

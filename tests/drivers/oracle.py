@@ -142,5 +142,6 @@ def sent_once(q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
     A set-point that moves on, and is followed by itself, was not taken; one at rest is a new one.
     """
-    same = (q[1:] == q[:-1]).all(axis=1) & (velocity[:-1] != 0.0).any(axis=1)
+    same = (q[1:] == q[:-1]).all(axis=1) & (velocity[1:] == velocity[:-1]).all(axis=1)
+    same &= (velocity[1:] != 0.0).any(axis=1)
     return np.append(~same, True)[: len(q)]
