@@ -263,10 +263,11 @@ class Session:
         if now < self.deadline or self.state is State.ENDED:
             return
         assert self._heard_at is not None
-        self._machine.events.append(LinkLost(now - self._heard_at, self.state))
+        self._machine.events.append(LinkLost(now - self._heard_at, self.state, self._unanswered))
         self.deadline = math.inf
         self._sequence.broken = True
-        self._machine.take(Input.SILENCE)
+        stale = f"only packets that do not follow the last one came ({self._unanswered})"
+        self._machine.take(Input.SILENCE, stale if self._unanswered else "")
 
     def reply(self, packet: bytes, now: float, ages: Ages | None = None) -> bytes | None:
         """The answer to a packet that arrived at `now` (s, any monotonic clock), if it gets one.
@@ -292,8 +293,8 @@ class Session:
                 if self._expects_sync(number, powered):
                     return self._sync(packet, number, now, powered)
                 return self._cyclic(packet, number, now, ages)
-        except PacketError:
-            self._tally.malformed()
+        except PacketError as error:
+            self._tally.malformed(packet, error)
             return None
 
     def _start_over(self, packet: bytes, now: float) -> bytes:
@@ -349,7 +350,7 @@ class Session:
             return self._last_reply
         if self._sequence.is_stale(number):
             self._unanswered += 1
-            self._tally.stale()
+            self._tally.stale(number, self._sequence.last)
             return None
         missed = self._sequence.accept(number)
         machine.cycle = self._sequence.cycle

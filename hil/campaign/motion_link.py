@@ -71,6 +71,7 @@ class Progress:
         untaken: answers that the controller did not take.
         foreign: packets from elsewhere; they got no answer.
         heard: whether any packet of the controller was answered yet.
+        not_understood: of packets that got no answer, how many came and why; "" without any.
         over: why nothing is recorded any more though answers go on; "" while it is recorded.
     """
 
@@ -82,6 +83,7 @@ class Progress:
     untaken: int = 0
     foreign: int = 0
     heard: bool = True
+    not_understood: str = ""
     over: str = ""
 
 

@@ -208,7 +208,10 @@ class View:
         if not progress.heard:
             table = self._cell.controller
             who = table.host if table.transport == "udp" else "the controller"
-            return f"nothing heard from {who} ({progress.foreign} packets from elsewhere)"
+            elsewhere = f"({progress.foreign} packets from elsewhere)"
+            if progress.not_understood:
+                return f"{who}: {progress.not_understood} {elsewhere}"
+            return f"nothing heard from {who} {elsewhere}"
         parts = [
             progress.state.name.lower().replace("_", " "),
             f"{progress.cycles * self._cell.period:.1f} s",
