@@ -136,5 +136,5 @@ def _waited(control: list[tuple[int, int, bytes]]) -> float:
     for _, kind, data in control:
         if kind == _SO_TIMESTAMPNS and len(data) == _TIMESPEC.size:
             seconds, nanoseconds = _TIMESPEC.unpack(data)
-            return max(0.0, time() - seconds - 1e-9 * nanoseconds)
+            return max(0.0, time() - float(seconds) - 1e-9 * float(nanoseconds))
     return 0.0

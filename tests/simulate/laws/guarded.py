@@ -137,8 +137,8 @@ def _rates(
             more = allowed[-1:].repeat(len(found) - len(allowed), axis=0)
             allowed = np.concatenate((allowed, more))
         over = found > allowed + 2.0**order * worst / period**order
-        for row in np.flatnonzero(across):
-            over[row : row + order] = False
+        for beyond in np.flatnonzero(across):
+            over[beyond : beyond + order] = False
         if over.any():
             row, joint = (int(index[0]) for index in np.nonzero(over))
             yield (
