@@ -403,7 +403,7 @@ class Session:
         self._heard(now)
 
     def _cycles_since_answer(self, now: float) -> float:
-        return 0.0 if self._heard_at is None else (now - self._heard_at) / self.period
+        return 0.0 if self._heard_at is None else (now - self._heard_at) / self._guard.period
 
     def _heard(self, now: float) -> None:
         self._heard_at = now
