@@ -159,18 +159,24 @@ def _too_far_off(ours: DriveTrain, theirs: DriveTrain) -> tuple[str, ...]:
     A calibration more than one turn of the joint away is that of another arm, or none.
     """
     share = theirs.gear_ratio / ours.gear_ratio
-    names = [
-        f"gear ratio of axis {axis + 1}"
+    found = [
+        f"gear ratio of axis {axis + 1} is {share[axis]:.4g} times the cell's, and a factor of "
+        f"{_FACTOR:g} is the most"
         for axis in np.flatnonzero(~((share >= 1.0 / _FACTOR) & (share <= _FACTOR)))
     ]
-    turned = np.abs(theirs.calibration - ours.calibration)
-    names += [
-        f"calibration of axis {axis + 1}"
-        for axis in np.flatnonzero(~(turned <= np.abs(ours.gear_ratio)))
+    moved = np.abs(theirs.calibration - ours.calibration)
+    found += [
+        f"calibration of axis {axis + 1} is {moved[axis]:.4g} motor revolutions from the cell's, "
+        f"and {abs(ours.gear_ratio[axis]):.4g}, one turn of the joint, are the most"
+        for axis in np.flatnonzero(~(moved <= np.abs(ours.gear_ratio)))
     ]
     couplings = (("k54", theirs.k54), ("k64", theirs.k64), ("k65", theirs.k65))
-    names += [name for name, value in couplings if not abs(value) <= _COUPLING]
-    return tuple(f"{name} is too far off to be accepted; correct the cell file" for name in names)
+    found += [
+        f"{name} is {value:.4g}, and {_COUPLING:g} is the most"
+        for name, value in couplings
+        if not abs(value) <= _COUPLING
+    ]
+    return tuple(f"{text}: too far off to be accepted; correct the cell file" for text in found)
 
 
 def _values(drive_train: DriveTrain, init: InitPacket, arm: int) -> tuple[str, ...]:

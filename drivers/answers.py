@@ -9,17 +9,17 @@ error and current are watched, and that the controller takes the set-points: the
 (D1) is within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent, or of
 the last carried on by as many steps as packets were missed, and within 25 % of the last. An older
 one than the last is an answer lost, which is counted and told; more than `max_gap` of them in 100
-cycles bring a motion to rest on its path.
+cycles bring a motion to rest on its path. What was lost is sent again instead of the next.
 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave
 open mode, move the arm and come back; one set-point further at full speed would then be a jump.
-Hence, after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the
-set-point sent last, and its velocity (D2) within half the velocity sent last or what counts as
-standstill; an arm that itself stands (D4) is held against the latter too. Corrections of targets
-that the controller generates (modes 2, 7, 8, 9) are refused after such a gap unless they were
-zero. A link may say how old each value is: one that is needed for such a decision, for the first
-set-point, or to be given back to an open axis, and was not sent in this very packet counts as
-unknown and refuses.
+Hence, after a gap longer than `max_gap` and after a pause by the clock, open mode goes on only if
+D1 is within those 10 % of the set-point sent last, and its velocity (D2) within half the velocity
+sent last or what counts as standstill; an arm that itself stands (D4) is held against the latter
+too. Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such
+a gap unless they were zero. A link may say how old each value is: one that is needed for such a
+decision, for the first set-point, or to be given back to an open axis, and was not sent in this
+very packet counts as unknown and refuses.
 
 After the motion the end is held for `settle_cycles`; the next answer asks for the end of open mode
 (status byte 1), and asks again every `EXIT_RETRY_CYCLES` in case that answer was lost; after
@@ -234,11 +234,13 @@ class Answers:
             machine.entering = False
             open_mode.enter(measured, commanded, cycle)
         else:
-            if execution is not None and moving and machine.stop_reason is not None:
-                execution.stop(machine.stop_reason, cycle)
-            elif execution is not None and not moving:
+            if execution is not None and not moving:
                 open_mode.require_start(cycle)
-            open_mode.next(execution if moving else None, measured, commanded, cycle)
+            begun = execution if moving else None
+            open_mode.observe(begun, cycle)
+            if begun is not None and machine.stop_reason is not None:
+                begun.stop(machine.stop_reason, cycle)
+            open_mode.next(begun, measured, commanded, cycle)
             machine.note_answers(open_mode.lost, self._max_gap)
         if execution is None:
             return machine.stop_reason is not None
@@ -270,11 +272,11 @@ class Answers:
         ring.age[row] = 0 if ages is None else ages[self.wire.joint_slots].max(axis=0)
         self.wire.read(words.view(np.float32), ring.measured[row], ages)
 
-    def note_gap(self, unanswered: int, machine: Machine, reading: Reading) -> None:
-        """So many packets before this one were not answered.
+    def note_gap(self, unanswered: int, paused: bool, machine: Machine, reading: Reading) -> None:
+        """So many packets before this one were not answered, or it came late by the clock.
 
-        After a long gap open mode goes on only where the controller carried it on, moving, at
-        rest or on the way out: meanwhile it may have left, moved the arm, come back.
+        After a long gap or a pause open mode goes on only where the controller carried it on,
+        moving, at rest or on the way out: meanwhile it may have left, moved the arm, come back.
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: it did not.
@@ -282,7 +284,7 @@ class Answers:
         if self._open_mode is None:
             return
         self._open_mode.missed = unanswered
-        if unanswered <= self._max_gap:
+        if unanswered <= self._max_gap and not paused:
             return
         in_open = machine.state in (State.OPEN, State.EXITING) and machine.in_interval
         if in_open and not machine.entering:

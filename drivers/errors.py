@@ -12,6 +12,7 @@
     └── RefusalError         a set-point that never left, and why
         ├── SourceFailed     the motion source raised, or gave arrays of the wrong shape
         ├── AxisLeft         an axis is not in the open mode that the motion needs
+        ├── ModeRefused      an axis is in a mode unknown here, or open before it was seen closed
         ├── ExitNotGranted   the controller does not leave open mode although asked to
         ├── SessionFailed    something here raised that must not: a defect, with its cause
         └── GuardError       a number outside its bound: joint, value, bound, unit, cycle
@@ -115,7 +116,10 @@ class RefusalError(DriverError):
 
     Attributes:
         cycle: the controller's cycle in which it would have left.
+        remedy: what to do about it, for a person at the controller.
     """
+
+    remedy = "look at the arm, close open mode and switch the drive on again at the controller"
 
     def __init__(self, message: str, cycle: int) -> None:
         super().__init__(f"{message} (cycle {cycle})")
@@ -140,6 +144,23 @@ class AxisLeft(RefusalError):
         self.joint = joint
         self.mode = mode
         self.wanted = wanted
+
+
+class ModeRefused(RefusalError):
+    """An axis is in a mode that no answer is known to, or open before it was seen closed.
+
+    Attributes:
+        joint: index from 0.
+        mode: mode that the controller reports for it.
+    """
+
+    remedy = "have the controller's program go from mode 0 to the open mode of the cell file"
+
+    def __init__(self, joint: int, mode: int, known: bool, cycle: int) -> None:
+        why = "was not seen closed before" if known else "no answer is known to that mode"
+        super().__init__(f"joint {joint + 1} is in mode {mode}: {why}", cycle)
+        self.joint = joint
+        self.mode = mode
 
 
 class SessionFailed(RefusalError):
@@ -275,12 +296,16 @@ class VelocityMismatch(GuardError):
 class FollowingError(GuardError):
     """The axis does not follow; the controller is told with mode 508 in this axis."""
 
+    remedy = "see whether the axis is free, then its following_error in [drive_train]"
+
     check = "following error"
     unit = "motor revolutions"
 
 
 class CurrentLimit(GuardError):
     """The servo asks for more current than the narrower of cell and controller allows."""
+
+    remedy = "see whether the arm is free and what it carries, then go slower"
 
     check = "target current"
     unit = "A"
@@ -307,6 +332,8 @@ class CorrectionNotEnded(GuardError):
 class FirstSetPoint(GuardError):
     """The first set-point is not where the arm is, or the arm is not at rest."""
 
+    remedy = "let the arm come to rest before open mode is asked for"
+
     check = "distance between received target and actual position"
     unit = "motor revolutions"
 
@@ -327,6 +354,8 @@ class FirstSetPointUnknown(FirstSetPoint):
 
 class MotionNotCarriedOn(GuardError):
     """The controller's target is none of the set-points sent last: it does not take them."""
+
+    remedy = "look for lost packets: the cable, other traffic, hil doctor"
 
     check = "distance between received target and the set-points sent last"
     unit = "motor revolutions"

@@ -132,10 +132,12 @@ class PacketRejected:
     Attributes:
         kind: "malformed", "stale" or "ended", or what the link discarded them for.
         count: how many.
+        why: of the last one, in words: its length, and what was not understood; "" if unknown.
     """
 
     kind: str
     count: int
+    why: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +155,14 @@ class Refused:
 
 @dataclass(frozen=True)
 class LinkLost:
-    """Nothing was heard for `silence` s; `state` is the state in which that happened."""
+    """Nothing was heard for `silence` s; `state` is the state in which that happened.
+
+    Or nothing new: `stale` packets came meanwhile that cannot follow the last one.
+    """
 
     silence: float
     state: State
+    stale: int = 0
 
 
 Event = (

@@ -207,8 +207,13 @@ class Machine:
         self.execution.begin(position, self.cycle)
         self.events.append(MotionStarted(self.interval, self.cycle))
 
-    def take(self, what: Input) -> None:
-        """Go to the state that follows, and end a motion that does not survive it."""
+    def take(self, what: Input, why: str = "") -> None:
+        """Go to the state that follows, and end a motion that does not survive it.
+
+        Args:
+            what: happened.
+            why: more exactly, in words; "" for the words that every such input has.
+        """
         before, after = self.state, TRANSITIONS[self.state][what]
         if after is not before:
             self._enter(before, after)
@@ -220,12 +225,12 @@ class Machine:
         if not execution.started:
             # Whatever a controller does that was silent for so long, nobody waits for it now.
             if what is Input.SILENCE or not keeps_request(before, after):
-                self.end("lost", _LOSS[what])
+                self.end("lost", why or _LOSS[what])
         elif after not in HAS_SET_POINTS:
             if execution.leaving:
                 self.end(execution.outcome, execution.reason)
             else:
-                self.end("lost", _LOSS[what])
+                self.end("lost", why or _LOSS[what])
 
     def _enter(self, before: State, after: State) -> None:
         self.state = after

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
 from drivers.replies import SafeAnswer, Words, safe_answer
-from drivers.states import HOLDABLE, OPEN_MODES, Input, read_input
+from drivers.states import HOLDABLE, KNOWN_MODES, OPEN_MODES, Input, read_input
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,13 @@ class Reading:
     any_open: bool
     strayed: int | None
     others: tuple[int, ...]
+
+    @property
+    def faulty(self) -> tuple[int, int, bool]:
+        """Joint, mode and whether that is known: the first unknown mode, else the first open."""
+        known = np.isin(self.modes, list(KNOWN_MODES))
+        joint = int(np.argmax(np.isin(self.modes, list(OPEN_MODES)) if known.all() else ~known))
+        return joint, int(self.modes[joint]), bool(known.all())
 
 
 class Reader:

@@ -30,8 +30,10 @@ controller has to report closed axes first, and a new motion has to be requested
 Every fresh, well-formed packet gets exactly one answer, a duplicate (the same bytes) the same
 bytes again; stale and malformed ones get none and are counted. Motion advances one period per
 answered packet, whatever was missed; more than `max_gap` missed in a row, stale ones among them,
-bring it to rest on its path, if the controller carried it on. What is watched meanwhile, and when
-open mode is left, stands at the head of `drivers.answers`.
+bring it to rest on its path, if the controller carried it on. Time counts as well as numbers: a
+packet that comes `PAUSE_CYCLES` later by the clock than they account for is answered by a further
+set-point only if the arm moves as it was commanded to. What is watched meanwhile, and when open
+mode is left, stands at the head of `drivers.answers`.
 
 In every state an axis that is open with its drive on, of whichever arm, is answered by its target
 only if that is a number; if it is none, drive-off is asked for. In a pause a wanted axis that is
@@ -49,7 +51,7 @@ import numpy as np
 from drivers.answers import Answers
 from drivers.arm_wire import Ages
 from drivers.drive_train import DriveTrain
-from drivers.errors import PacketError, RefusalError, RequestError, as_refusal
+from drivers.errors import ModeRefused, PacketError, RefusalError, RequestError, as_refusal
 from drivers.events import Counters, Event, InitReceived, LinkLost, Refused
 from drivers.execution import execution_of
 from drivers.guard import Guard
@@ -81,6 +83,8 @@ MAX_GAP: Final = 100
 """Largest `max_gap`."""
 SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
 """Open modes a motion can run in."""
+PAUSE_CYCLES: Final = 2.0
+"""Cycles that a packet may come later, by the clock, than its number and `max_gap` account for."""
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
 
 
@@ -259,10 +263,11 @@ class Session:
         if now < self.deadline or self.state is State.ENDED:
             return
         assert self._heard_at is not None
-        self._machine.events.append(LinkLost(now - self._heard_at, self.state))
+        self._machine.events.append(LinkLost(now - self._heard_at, self.state, self._unanswered))
         self.deadline = math.inf
         self._sequence.broken = True
-        self._machine.take(Input.SILENCE)
+        stale = f"only packets that do not follow the last one came ({self._unanswered})"
+        self._machine.take(Input.SILENCE, stale if self._unanswered else "")
 
     def reply(self, packet: bytes, now: float, ages: Ages | None = None) -> bytes | None:
         """The answer to a packet that arrived at `now` (s, any monotonic clock), if it gets one.
@@ -288,8 +293,8 @@ class Session:
                 if self._expects_sync(number, powered):
                     return self._sync(packet, number, now, powered)
                 return self._cyclic(packet, number, now, ages)
-        except PacketError:
-            self._tally.malformed()
+        except PacketError as error:
+            self._tally.malformed(packet, error)
             return None
 
     def _start_over(self, packet: bytes, now: float) -> bytes:
@@ -345,10 +350,11 @@ class Session:
             return self._last_reply
         if self._sequence.is_stale(number):
             self._unanswered += 1
-            self._tally.stale()
+            self._tally.stale(number, self._sequence.last)
             return None
         missed = self._sequence.accept(number)
         machine.cycle = self._sequence.cycle
+        paused = self._cycles_since_answer(now) > max(missed, self._max_gap) + PAUSE_CYCLES
         words = words_of(decoded)
         # After a corrupted number the controller's own look stale for a while.
         unanswered, self._unanswered = missed + self._unanswered, 0
@@ -363,8 +369,11 @@ class Session:
         try:
             machine.note_gap(missed, unanswered, self._max_gap)
             machine.require_axes(reading, self._mode)
+            before = machine.state
             machine.take(reading.input)
-            answers.note_gap(unanswered, machine, reading)
+            if machine.state is State.FAULTED and before is not State.FAULTED:
+                refusal = ModeRefused(*reading.faulty, machine.cycle)
+            answers.note_gap(unanswered, paused, machine, reading)
             measured, commanded = ring.measured[row], ring.commanded[row]
             status = answers.answer(machine, reading, words, measured, commanded)
         except BaseException as error:
@@ -388,6 +397,13 @@ class Session:
         self._last_reply = reply
         self._heard(now)
         return reply
+
+    def sent(self, now: float) -> None:
+        """The answer given last left at `now`: silence counts from there, not from the packet."""
+        self._heard(now)
+
+    def _cycles_since_answer(self, now: float) -> float:
+        return 0.0 if self._heard_at is None else (now - self._heard_at) / self._guard.period
 
     def _heard(self, now: float) -> None:
         self._heard_at = now

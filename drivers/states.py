@@ -76,7 +76,8 @@ CORRECTION_MODES: Final = frozenset(
 """Open modes in which the PC corrects targets that the controller generates."""
 CLOSED_MODES: Final = frozenset({Mode.CLOSED, Mode.CLOSED_MIRRORED})
 PAUSE_MODES: Final = frozenset({Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER})
-_KNOWN: Final = OPEN_MODES | CLOSED_MODES | PAUSE_MODES | {Mode.DRIVING_ON}
+KNOWN_MODES: Final = OPEN_MODES | CLOSED_MODES | PAUSE_MODES | {Mode.DRIVING_ON}
+"""Modes that an answer is known to."""
 
 
 def read_input(
@@ -96,7 +97,7 @@ def read_input(
         return Input.OFF
     if not wanted_modes:
         return Input.CLOSED
-    if any(m not in _KNOWN for m in wanted_modes):
+    if any(m not in KNOWN_MODES for m in wanted_modes):
         return Input.UNAVAILABLE
     if any(m in PAUSE_MODES for m in wanted_modes):
         return Input.PAUSE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drivers.errors import PacketError
 from drivers.events import Counters, PacketRejected
 
 
@@ -15,16 +16,19 @@ class Tally:
     def __init__(self) -> None:
         self.counters = Counters()
         self._untold: dict[str, int] = {}
+        self._why: dict[str, str] = {}
 
-    def malformed(self) -> None:
+    def malformed(self, packet: bytes, error: PacketError) -> None:
         """One was not the packet it should be."""
         self.counters.malformed += 1
         self._tell("malformed", 1)
+        self._why["malformed"] = f"{len(packet)} bytes: {error}"
 
-    def stale(self) -> None:
+    def stale(self, number: int, last: int) -> None:
         """One cannot be a later packet of this session."""
         self.counters.stale += 1
         self._tell("stale", 1)
+        self._why["stale"] = f"number {number} does not follow {last}"
 
     def ended(self) -> None:
         """One came after the end of the session."""
@@ -40,7 +44,8 @@ class Tally:
 
     def drain(self) -> list[PacketRejected]:
         """One event per kind since the last call."""
-        events = [PacketRejected(kind, count) for kind, count in self._untold.items()]
+        why = self._why
+        events = [PacketRejected(kind, n, why.get(kind, "")) for kind, n in self._untold.items()]
         self._untold.clear()
         return events
 

@@ -7,13 +7,18 @@ end's business: UDP here, CAN in `sim_fixtures.can_end`.
 from __future__ import annotations
 
 import socket
+import struct
+from contextlib import suppress
 from select import select
-from time import monotonic
+from time import monotonic, time
 from typing import Final, Protocol
 
 from sim_fixtures.errors import SimulationError
 
 LARGEST_DATAGRAM: Final = 65536
+_SO_TIMESTAMPNS: Final = 35  # of asm-generic/socket.h, which the socket module does not name
+_TIMESPEC: Final = struct.Struct("@ll")
+_CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 
 
 class FarEnd(Protocol):
@@ -58,6 +63,7 @@ class UdpFarEnd:
     Attributes:
         foreign: datagrams that came from elsewhere.
         last_foreign: where the last of them came from, "host:port"; "" if there was none.
+        waited: s that the packet received last lay in the kernel's queue; 0 where that is unknown.
         unsent: packets that the network refused to carry.
         trouble: why it refused the last one, in words; "" if it never did.
 
@@ -68,6 +74,7 @@ class UdpFarEnd:
     def __init__(self, host: str, port: int, *, source_port: int | None = None) -> None:
         self.foreign = 0
         self.last_foreign = ""
+        self.waited = 0.0
         self.unsent = 0
         self.trouble = ""
         try:
@@ -75,6 +82,8 @@ class UdpFarEnd:
         except (OSError, UnicodeError) as error:
             raise FarEndError(f"{host}:{port}", f"no such IPv4 host ({error})") from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        with suppress(OSError):  # not every system has it; nothing needs it
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         try:
             self._socket.setblocking(False)
             self._socket.bind(("", source_port or 0))
@@ -106,10 +115,11 @@ class UdpFarEnd:
             if not select([self._socket], [], [], max(0.0, until - monotonic()))[0]:
                 return None
             try:
-                packet, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
+                packet, control, _, sender = self._socket.recvmsg(LARGEST_DATAGRAM, _CONTROL_SPACE)
             except OSError:  # reported ready, then dropped for a bad checksum; or an ICMP notice
                 continue
             if sender == self._pc:
+                self.waited = _waited(control)
                 return packet
             self.foreign += 1
             self.last_foreign = f"{sender[0]}:{sender[1]}"
@@ -119,3 +129,12 @@ class UdpFarEnd:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
+
+
+def _waited(control: list[tuple[int, int, bytes]]) -> float:
+    """How long ago the kernel had a datagram [s], by its time stamp."""
+    for _, kind, data in control:
+        if kind == _SO_TIMESTAMPNS and len(data) == _TIMESPEC.size:
+            seconds, nanoseconds = _TIMESPEC.unpack(data)
+            return max(0.0, time() - float(seconds) - 1e-9 * float(nanoseconds))
+    return 0.0

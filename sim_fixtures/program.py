@@ -103,7 +103,7 @@ class LoopProgram:
         open_axes: which axes stand in open mode in the packet of this cycle, (n,).
         reason: why the drive was last lost or the session ended, in words; "" if neither.
         intervals: how often all axes have been open.
-        openings_lost: openings in a row that ended because replies were missing.
+        openings_lost: openings in a row that ended because replies were missing, or by 508.
         gave_up: the session ends because there were too many of these.
         pause_mode: mode of every axis in phase PAUSED.
     """
@@ -241,11 +241,9 @@ class LoopProgram:
             self._stays_off = True
             self._enter(Phase.DRIVE_OFF)
         elif answer.following_error:
-            self.openings_lost = 0
-            self.reason = "the PC reported a following error (508)"
-            self._enter(Phase.CLOSED)
+            self._lose_opening("the PC reported a following error (508)")
         elif self._missed >= settings.missed_replies:
-            self._lose_opening()
+            self._miss_replies()
         elif answer.exit or (self._finishing and standing):
             self.openings_lost = 0
             self._enter(Phase.CLOSING)
@@ -256,18 +254,22 @@ class LoopProgram:
             else:
                 self._open_due_axes()
 
-    def _lose_opening(self) -> None:
-        """End open mode because replies are missing; for good, if that happened too often."""
-        settings = self._settings
+    def _miss_replies(self) -> None:
+        """End open mode because replies are missing."""
         reason = f"no valid reply in {_cycles(self._missed)} of open mode"
         if self._missed_open < self._missed:
             reason = (
                 f"no valid reply in {_cycles(self._missed)} in a row, "
                 f"the last {self._missed_open} of them in open mode"
             )
-        if settings.while_silent == "drive_off":
+        if self._settings.while_silent == "drive_off":
             self.trip(reason)
-            return
+        else:
+            self._lose_opening(reason)
+
+    def _lose_opening(self, reason: str) -> None:
+        """End open mode, and open again after a while; not where that happened too often."""
+        settings = self._settings
         self.openings_lost += 1
         if settings.lost_openings is not None and self.openings_lost >= settings.lost_openings:
             self.gave_up = True

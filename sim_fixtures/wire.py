@@ -80,6 +80,12 @@ class Wire:
             elif now >= until:
                 return None
 
+    @property
+    def waited(self) -> float:
+        """S that the packet received last lay in the kernel's queue, as far as is known."""
+        # What is held back by a fault arrives when its time has come.
+        return 0.0 if self._faults is not None else float(getattr(self._far_end, "waited", 0.0))
+
     def sleep_until(self, moment: float) -> None:
         """Wait; what is due meanwhile leaves."""
         while True:

@@ -16,15 +16,19 @@ import pytest
 
 from drivers import CyclicPacket, State
 from tests.fault_matrix.faulty_runs import (
+    BEHAVIOURS,
     FAULTS,
+    FAULTS_AT_SPEED,
     SITUATIONS,
+    SPEEDS,
     behaviours,
     cases,
     cycles_without_a_fault,
     play,
+    play_at,
 )
 from tests.fault_matrix.laws import broken_in_records, broken_on_the_wire
-from tests.fault_matrix.outcomes import EXPECTED, HEADING, row
+from tests.fault_matrix.outcomes import AT_SPEED, EXPECTED, HEADING, at_speed, row
 
 
 def test_the_table_has_every_fault_in_every_situation() -> None:
@@ -58,6 +62,23 @@ def test_fault(fault: str, situation: str, while_silent: str) -> None:
     assert run.broken == []
     if expected != "no start":
         assert run.recovery.startswith("completed")
+
+
+def test_the_document_shows_the_table_of_speeds() -> None:
+    document = Path(__file__).parents[1] / "docs" / "fault-matrix.md"
+    assert at_speed() in document.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("while_silent", BEHAVIOURS)
+@pytest.mark.parametrize("speed", SPEEDS)
+@pytest.mark.parametrize("fault", FAULTS_AT_SPEED)
+def test_fault_at_speed(fault: str, speed: float, while_silent: str) -> None:
+    """A stop is one on the path at any speed, whatever the controller did meanwhile."""
+    run = play_at(fault, speed, while_silent)
+    expected = AT_SPEED[fault].split(" / ")
+    assert run.outcome.partition(" (")[0] == expected[BEHAVIOURS.index(while_silent)]
+    assert run.broken == []
+    assert run.recovery.startswith("completed")
 
 
 @pytest.fixture(scope="module")

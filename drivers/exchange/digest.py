@@ -61,7 +61,7 @@ def _sort(event: _Counted) -> str:
 def _sum(earlier: _Counted, later: _Counted) -> _Counted:
     """Of two of the same sort."""
     if isinstance(earlier, PacketRejected) and isinstance(later, PacketRejected):
-        return PacketRejected(later.kind, earlier.count + later.count)
+        return PacketRejected(later.kind, earlier.count + later.count, later.why)
     if isinstance(earlier, GapSeen) and isinstance(later, GapSeen):
         return GapSeen(earlier.missed + later.missed, later.cycle)
     assert isinstance(earlier, AnswersLost) and isinstance(later, AnswersLost)

@@ -58,7 +58,7 @@ def exchange(
                     now = transport.now
                     # Silence is counted from the answer: the packet may have waited long for it.
                     if session.deadline != deadline:
-                        session.deadline += now - arrived
+                        session.sent(now)
                     # Before it leaves: a controller that waits for it may be faster than we are.
                     punctuality.answered(arrived, now)
                     send(answer)

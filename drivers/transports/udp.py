@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import TransportClosed
-from drivers.packets import cyclic_length
+from drivers.packets import HEADER_LENGTH
 from drivers.transports.base import TransportError
 
 LONGEST: Final = 1500
@@ -30,7 +30,7 @@ TYPE_OF_SERVICE: Final = 0x28
 """IP_TOS of the makers' library (class AF11)."""
 BUSY_POLL: Final = 50
 """Microseconds the kernel may poll the network device before it sleeps."""
-_SHORTEST_PLAUSIBLE: Final = cyclic_length(1)
+_SHORTEST_PLAUSIBLE: Final = HEADER_LENGTH
 # Numbers of asm-generic/socket.h that the socket module does not name.
 _SO_TIMESTAMPNS: Final = 35
 _SO_BUSY_POLL: Final = 46

@@ -24,6 +24,7 @@ from drivers.events import (
     Outcome,
     OverrideChanged,
     PacketRejected,
+    Refused,
 )
 from drivers.exchange import EventsLost, ExchangeEvent
 from hil.archive.events import Level
@@ -99,6 +100,7 @@ class Recorder:
         ended: how the motion ended, None as long as it goes on.
         restarted: whether the controller began a new session meanwhile.
         link_lost: whether the link fell silent meanwhile.
+        refused: the last refusal of the session meanwhile, None without one.
         records: how many were archived.
         records_lost: how many were overwritten before they could be archived.
         events_lost: likewise of the events.
@@ -114,6 +116,7 @@ class Recorder:
         self.ended: MotionEnded | None = None
         self.restarted = False
         self.link_lost = False
+        self.refused: Refused | None = None
         self.records = 0
         self.records_lost = 0
         self.events_lost = 0
@@ -182,6 +185,8 @@ class Recorder:
                 self.ended = event
             self.restarted = self.restarted or isinstance(event, InitReceived)
             self.link_lost = self.link_lost or isinstance(event, LinkLost)
+            if isinstance(event, Refused):
+                self.refused = event
 
     def _tell(self, event: ExchangeEvent) -> None:
         self.writer.event(

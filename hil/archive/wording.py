@@ -51,9 +51,13 @@ def describe(event: ExchangeEvent) -> str:
         case PacketRejected(kind="answered late"):
             return f"{counted(event.count, 'answer')} left more than a cycle after their packet"
         case PacketRejected():
-            return f"{counted(event.count, f'{event.kind} packet')} got no answer"
+            why = f" ({event.why})" if event.why else ""
+            return f"{counted(event.count, f'{event.kind} packet')} got no answer{why}"
         case Refused():
-            return str(event.error)
+            return f"{event.error}; {event.error.remedy}"
+        case LinkLost(stale=stale) if stale:
+            packets = f"{counted(stale, 'packet')} that cannot follow the last one"
+            return f"only {packets} for {event.silence:.3f} s in state {event.state.name}"
         case LinkLost():
             return f"nothing heard for {event.silence:.3f} s in state {event.state.name}"
         case InitReceived():

@@ -29,6 +29,8 @@ class Beginning:
         """Why a motion that has not begun will not begin any more, in words; None while it may."""
         if state not in _WITHOUT_DRIVE:
             self._driven = now
+        if now - self._driven > OFF_TIMEOUT and state is State.FAULTED:
+            return "a refusal came before the motion began"
         if now - self._driven > OFF_TIMEOUT:
             return "the drive went off before the motion began"
         if now - self._asked > BEGIN_TIMEOUT:

@@ -6,7 +6,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.events import InitReceived, LinkLost, MotionEnded, MotionStarted, Refused
+from drivers.events import (
+    InitReceived,
+    LinkLost,
+    MotionEnded,
+    MotionStarted,
+    PacketRejected,
+    Refused,
+)
 from drivers.exchange import (
     ControlBlock,
     EventsLost,
@@ -19,6 +26,7 @@ from drivers.exchange import (
 )
 from drivers.exchange.pulse import Pulse
 from drivers.states import State
+from hil.counted import counted
 
 from .beginning import Beginning
 from .motion_link import Connection
@@ -40,6 +48,7 @@ class ExchangeView:
         ended: the end of the motion asked for last, if its event came.
         inits: init packets so far.
         refused: the refusal since a motion was asked for last.
+        not_understood: of packets that came last and got no answer, how many and why.
         began: whether the motion asked for last has sent anything, or may have.
     """
 
@@ -51,7 +60,9 @@ class ExchangeView:
     inits: int = 0
     began: bool = False
     refused: Refused | None = None
+    not_understood: str = ""
     _beginning: Beginning = field(default_factory=lambda: Beginning(time.monotonic()))
+    _rejected: int = 0
     _said: str = ""
     _ended_for: str = ""
     _ended_before: int = 0
@@ -74,6 +85,10 @@ class ExchangeView:
                 self.ended = event
             elif isinstance(event, Refused):
                 self.refused = event
+            elif isinstance(event, PacketRejected) and event.why:
+                self._rejected += event.count
+                packets = counted(self._rejected, "packet")
+                self.not_understood = f"{packets} came and got no answer: {event.why}"
             elif isinstance(event, MotionStarted | EventsLost):
                 self.began = True
             elif isinstance(event, ExchangeFailed):

@@ -214,6 +214,7 @@ class _Run:
         warming: list[Interval],
         archives: list[str],
     ) -> None:
+        link.connection.say = self._reporter.say
         if isinstance(link, LiveLink):
             for note in link.notes():
                 self._reporter.say(f"note: {note}")

@@ -311,6 +311,8 @@ class Link:
 
 def how_recording_ended(recorder: Recorder, stop: Stop, limit: int | None) -> tuple[str, str]:
     """Outcome and reason of a recording; `limit` is how many records were asked for."""
+    if recorder.refused is not None:
+        return "refused", str(recorder.refused.error)
     if recorder.restarted:
         return "stopped", "the controller began a new session"
     if recorder.link_lost:

@@ -12,6 +12,7 @@ from drivers.exchange import RingReader
 from drivers.exchange.pulse import Pulse
 from drivers.states import State
 from hil.archive import ArchiveSpec
+from hil.archive.wording import describe
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 
 from .errors import write_error
@@ -77,10 +78,12 @@ class LiveRecording:
                 status = self._view.status
                 table = self._link.cell.controller
                 who = table.host if table.transport == "udp" else "the controller"
-                what = "no init packet" if status.answered else "nothing"
+                some = status.answered > 0 or self._view.not_understood
+                what = "no init packet" if some else "nothing"
+                also = f"; {self._view.not_understood}" if self._view.not_understood else ""
                 raise ControllerFault(
                     f"{what} heard from {who} within {wait:g} s ({status.foreign} packets from "
-                    "elsewhere): nothing was recorded"
+                    f"elsewhere{also}): nothing was recorded"
                 )
             time.sleep(POLL)
 
@@ -115,6 +118,16 @@ class LiveRecording:
         failure = self._view.failure()
         self._view.look()
         status, period = self._view.status, self._link.cell.period
+        over = (
+            restarted,
+            status.state is State.ENDED,
+            failure,
+            self._view.lost,
+            self._stop.requested,
+        )
+        asked = duration is not None and (status.cycle + 1) * period >= duration
+        if self._view.refused is not None and (asked or any(over)):
+            return "refused", str(self._view.refused.error)
         if restarted:
             return "stopped", "the controller began a new session"
         if duration is not None and (status.cycle + 1) * period >= duration:
@@ -124,7 +137,7 @@ class LiveRecording:
         if failure is not None:
             return "lost", failure
         if self._view.lost is not None:
-            return "lost", "nothing was heard from the controller any more"
+            return "lost", describe(self._view.lost)
         if self._stop.requested:
             return ("completed" if duration is None else "stopped"), "ended by the operator"
         return None
@@ -168,6 +181,7 @@ class LiveRecording:
                 untaken=status.unanswered,
                 foreign=status.foreign,
                 heard=status.answered > 0,
+                not_understood=self._view.not_understood,
                 over=over,
             )
         )

@@ -18,6 +18,7 @@ from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
+from hil.archive.wording import describe
 from hil.cell import Cell
 from hil.errors import ControllerFault
 
@@ -70,6 +71,7 @@ class Progress:
         untaken: answers that the controller did not take.
         foreign: packets from elsewhere; they got no answer.
         heard: whether any packet of the controller was answered yet.
+        not_understood: of packets that got no answer, how many came and why; "" without any.
         over: why nothing is recorded any more though answers go on; "" while it is recorded.
     """
 
@@ -81,6 +83,7 @@ class Progress:
     untaken: int = 0
     foreign: int = 0
     heard: bool = True
+    not_understood: str = ""
     over: str = ""
 
 
@@ -89,6 +92,10 @@ Watch = Callable[[Progress], None]
 
 def unwatched(_progress: Progress) -> None:
     """Nobody looks."""
+
+
+def _unsaid(_text: str) -> None:
+    """Nobody listens."""
 
 
 @dataclass(eq=False)
@@ -100,7 +107,8 @@ class Connection:
         unusable: why the arm cannot be moved, None if it can.
         differences: what it says otherwise than the cell.
         adopted: whether its figures are used instead of the cell's.
-        refused: the last refusal of the guard.
+        refused: the last refusal of the session.
+        say: tells a person at once of each refusal.
     """
 
     init: InitPacket | None = None
@@ -108,6 +116,7 @@ class Connection:
     differences: tuple[str, ...] = ()
     adopted: bool = False
     refused: Refused | None = None
+    say: Callable[[str], None] = _unsaid
 
     def note(self, event: ExchangeEvent) -> None:
         """Take in an event."""
@@ -116,6 +125,7 @@ class Connection:
             self.differences, self.adopted = event.differences, event.adopted
         elif isinstance(event, Refused):
             self.refused = event
+            self.say(f"REFUSED: {describe(event)}")
 
     def require_usable(self, cell: Cell | None) -> None:
         """Refuse a controller that is not the cell's.

@@ -6,6 +6,7 @@ import json as json_format
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,7 @@ from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
+from hil.lines import say
 from hil.move import THERE, Way, posture, send, straight_way, turned
 from hil.printable import printable
 from hil.progress import Task
@@ -114,6 +116,7 @@ def move(
         start_of = campaign.plan.excitation.trajectory.sample(np.array([0.0]))[0][0]
     wanted = None if to is None else posture(cell, to, start_of)
     with _reserved(campaign), cell_link(cell, accept_init=accept_init) as link:
+        link.connection.say = partial(say, err=True)
         if yes and not link.only_simulated:
             _require_slow(cell, speed)
         with stop_on_interrupt() as stop:

@@ -85,9 +85,10 @@ def record(
     off or the session has ended; Ctrl-C (a second one, where the first ended the recording) leaves
     at once.
 
-    Exit status 0 when the recording is complete, 4 when the link or the controller failed, did not
-    come within --wait or ended before --duration was over, 130 when Ctrl-C cut short what
-    --duration asked for, or the wait for the controller.
+    Exit status 0 when the recording is complete, 4 when the link or the controller failed, a packet
+    was refused (the line that begins with REFUSED says why), the controller did not come within
+    --wait or ended before --duration was over, 130 when Ctrl-C cut short what --duration asked for,
+    or the wait for the controller.
     """
     loaded = Cell.load(cell)
     path = archive_path(output, kind)
@@ -98,6 +99,7 @@ def record(
         ) as link,
         View(loaded, stop, quiet=quiet or json) as view,
     ):
+        link.connection.say = view.warn
         view.say(f"waiting for the controller; recording to {path}. Ctrl-C ends it")
         if link.live is not None:
             view.say(link.live.invitation)
@@ -182,6 +184,10 @@ class View:
             typer.echo(printable(text))
             sys.stdout.flush()
 
+    def warn(self, text: str) -> None:
+        """A line that is said in any case."""
+        say(text, err=True)
+
     def show(self, progress: Progress) -> None:
         """The state of the recording."""
         if progress.over != self._over:
@@ -202,7 +208,10 @@ class View:
         if not progress.heard:
             table = self._cell.controller
             who = table.host if table.transport == "udp" else "the controller"
-            return f"nothing heard from {who} ({progress.foreign} packets from elsewhere)"
+            elsewhere = f"({progress.foreign} packets from elsewhere)"
+            if progress.not_understood:
+                return f"{who}: {progress.not_understood} {elsewhere}"
+            return f"nothing heard from {who} {elsewhere}"
         parts = [
             progress.state.name.lower().replace("_", " "),
             f"{progress.cycles * self._cell.period:.1f} s",

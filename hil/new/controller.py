@@ -67,6 +67,7 @@ def _waited_for(view: ExchangeView, wait: float, stop: Stop) -> InitPacket:
             raise ControllerFault(
                 f"no init packet came within {wait:g} s"
                 + (", though packets did: a session was running already" if heard else "")
+                + (f"; {view.not_understood}" if view.not_understood else "")
                 + "; start this command first, then the controller's Open program"
                 + (
                     f" ({view.status.foreign} packets came from elsewhere)"

@@ -74,7 +74,7 @@ class TestTooFarOff:
         ours = arm(6)
         theirs = adopted(ours, gear_ratio=np.where(self.ONE, factor, 1.0) * ours.gear_ratio)
         assert theirs.adopted == fits
-        assert fits or "gear ratio of axis 3 is too far off" in theirs.unusable
+        assert fits or f"gear ratio of axis 3 is {factor:g} times the cell's" in theirs.unusable
 
     @pytest.mark.parametrize(("turns", "fits"), [(1.0, True), (-1.0, True), (1.01, False)])
     def test_a_calibration(self, turns, fits):
@@ -82,7 +82,7 @@ class TestTooFarOff:
         turned = ours.calibration + np.where(self.ONE, turns * ours.gear_ratio, 0.0)
         theirs = adopted(ours, calibration=turned)
         assert theirs.adopted == fits
-        assert fits or "calibration of axis 3 is too far off" in theirs.unusable
+        assert fits or "calibration of axis 3 is" in theirs.unusable
 
     @pytest.mark.parametrize(("value", "fits"), [(1.0, True), (-1.0, True), (1.01, False)])
     @pytest.mark.parametrize(("entry", "name"), [(0, "k54"), (1, "k64"), (2, "k65")])
@@ -91,7 +91,7 @@ class TestTooFarOff:
         told[3 + entry] = value
         theirs = adopted(arm(6), kinematic_influence=told)
         assert theirs.adopted == fits
-        assert fits or f"{name} is too far off" in theirs.unusable
+        assert fits or f"{name} is {value:g}, and 1 is the most" in theirs.unusable
 
 
 def test_limits_are_those_of_the_arm_and_of_its_joints():

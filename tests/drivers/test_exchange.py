@@ -217,6 +217,12 @@ class TestHeldUp:
         rig.cycle(300)
         return rig, source
 
+    def on_time(self, rig):
+        """The next packet; those after it report the set-point that answers it."""
+        packet = rig.packet()
+        rig.axes["d"][0, [0, 2]] += rig.axes["d"][0, 1]
+        return packet
+
     def serve(self, rig, on_time, late):
         """One packet when it is due, so that the exchange knows what that is; then a pile."""
         link = Piled([[on_time], late])
@@ -226,7 +232,7 @@ class TestHeldUp:
 
     def test_what_was_left_unanswered_is_counted_and_seen_as_a_gap(self):
         rig, source = self.moving()
-        on_time = rig.packet()
+        on_time = self.on_time(rig)
         late = [rig.packet() for _ in range(3)]
         advances = source.advances
         sent = self.serve(rig, on_time, late)
@@ -331,7 +337,7 @@ class TestHeldUp:
     def test_a_garbled_number_does_not_take_the_place_of_the_newest(self, place, garbled):
         """Seed 1667: it passed for the newest, and the session would have none of it."""
         rig, source = self.moving()
-        on_time = rig.packet()
+        on_time = self.on_time(rig)
         late = [rig.packet() for _ in range(3)]
         wrong = bytearray(late[min(place, 2)])
         wrong[1] ^= garbled

@@ -219,24 +219,27 @@ class TestAcceptedInit:
             rig.session.request(still(3))
 
     @pytest.mark.parametrize(
-        ("field", "axis", "value", "name"),
+        ("field", "axis", "value", "text"),
         [
-            ("gear_ratio", 2, 111.5, "gear ratio of axis 3"),
-            ("gear_ratio", 2, -220.1, "gear ratio of axis 3"),
-            ("gear_ratio", 2, -54.9, "gear ratio of axis 3"),
-            ("gear_ratio", 2, -1e38, "gear ratio of axis 3"),
-            ("kinematic_influence", 3, 1.01, "k54"),
-            ("kinematic_influence", 4, -1.01, "k64"),
-            ("kinematic_influence", 5, 1e9, "k65"),
-            ("calibration", 2, 112.1, "calibration of axis 3"),
-            ("calibration", 2, -108.1, "calibration of axis 3"),
+            ("gear_ratio", 2, 111.5, "gear ratio of axis 3 is -1.014 times the cell's"),
+            ("gear_ratio", 2, -220.1, "gear ratio of axis 3 is 2.001 times the cell's"),
+            ("gear_ratio", 2, -54.9, "gear ratio of axis 3 is 0.4991 times the cell's"),
+            ("gear_ratio", 2, -1e38, "gear ratio of axis 3 is 9.091e+35 times the cell's"),
+            ("kinematic_influence", 3, 1.01, "k54 is 1.01, and 1 is the most"),
+            ("kinematic_influence", 4, -1.01, "k64 is -1.01, and 1 is the most"),
+            ("kinematic_influence", 5, 1e9, "k65 is 1e+09, and 1 is the most"),
+            ("calibration", 2, 112.1, "calibration of axis 3 is 110.1 motor revolutions from"),
+            ("calibration", 2, -108.1, "calibration of axis 3 is 110.1 motor revolutions from"),
         ],
     )
-    def test_what_is_far_off_cannot_be_accepted(self, field, axis, value, name):
+    def test_what_is_far_off_cannot_be_accepted(self, field, axis, value, text):
+        """By how much it is, and how much may be accepted, stands in the refusal."""
         rig = self.other(**{field: (axis, value)})
         rig.start()
         event = rig.seen(InitReceived)[0]
-        assert event.unusable == f"{name} is too far off to be accepted; correct the cell file"
+        assert event.unusable.startswith(text)
+        assert event.unusable.endswith("most: too far off to be accepted; correct the cell file")
+        assert ("a factor of 2" in event.unusable) is (field == "gear_ratio")
         assert not event.adopted
         assert rig.session.drive_train is rig.train
 

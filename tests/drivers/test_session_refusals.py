@@ -12,8 +12,10 @@ from drivers import (
     FollowingError,
     JerkLimit,
     Mode,
+    ModeRefused,
     NotFinite,
     PositionLimit,
+    RefusalError,
     Refused,
     RequestError,
     SourceFailed,
@@ -398,3 +400,35 @@ class TestAfterARefusal:
         assert np.isfinite(recorder["commanded_position"][:-1]).all()
         assert np.isnan(recorder["commanded_position"][-1]).all()
         assert recorder["state"][-1] == State.FAULTED
+
+
+class TestModesRefused:
+    """A mode that ends a session's trust in its axes is a refusal like any other: seen, counted."""
+
+    def test_one_packet_of_a_mode_unknown_here_while_closed(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.close()
+        rig.modes[2] = 3
+        rig.cycle(3)
+        assert [type(event.error) for event in rig.seen(Refused)] == [ModeRefused]
+        assert (rig.refusal.joint, rig.refusal.mode) == (2, 3)
+        assert "joint 3 is in mode 3: no answer is known to that mode" in str(rig.refusal)
+        assert rig.session.counters.refused == 1
+        assert (rig.state, rig.ended.outcome) == (State.FAULTED, "lost")
+
+    def test_axes_that_are_open_before_they_were_seen_closed(self):
+        rig = Rig()
+        rig.start()
+        rig.modes = Mode.POSITION
+        answer = rig.cycle()
+        assert all_drive_off(answer)
+        assert type(rig.refusal) is ModeRefused
+        assert "joint 1 is in mode 4: was not seen closed before" in str(rig.refusal)
+
+    def test_every_refusal_has_a_remedy(self):
+        def leaves(kind):
+            return [kind, *(leaf for one in kind.__subclasses__() for leaf in leaves(one))]
+
+        for kind in leaves(RefusalError):
+            assert len(kind.remedy) > 10

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers import PacketRejected
-from tests.drivers.rig import Rig
+from drivers import LinkLost, PacketRejected
+from tests.drivers.rig import Rig, still
 
 
 def test_what_the_link_discarded_is_counted_and_told_once():
@@ -48,3 +48,33 @@ def test_it_is_told_together_with_what_the_session_rejected():
         PacketRejected("malformed", 1), PacketRejected("malformed", 1),
         PacketRejected("malformed", 3),
     ]  # fmt: skip
+
+
+class TestReasons:
+    """What arrived and was not understood says why it got no answer."""
+
+    def test_a_packet_that_is_none(self):
+        rig = Rig()
+        for _ in range(40):
+            rig.send(bytes(12))
+        whys = {event.why for event in rig.seen(PacketRejected)}
+        assert whys == {"12 bytes: packet number is 0; expected 1..32767"}
+
+    def test_a_packet_of_a_session_that_began_before(self):
+        rig = Rig()
+        rig.number = 500
+        rig.cycle()
+        assert "no drive on before init" in rig.seen(PacketRejected)[-1].why
+
+    def test_packets_that_do_not_follow_are_not_silence(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.close()
+        for _ in range(30):
+            rig.number = 3
+            assert rig.cycle() is None
+        rig.session.tick(rig.now + 2.0)
+        rig.events += rig.session.events()
+        assert [event.stale for event in rig.seen(LinkLost)] == [30]
+        assert rig.ended.reason == "only packets that do not follow the last one came (30)"
+        assert rig.seen(PacketRejected)[-1].why.endswith("does not follow 11")

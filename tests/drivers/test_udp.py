@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import socket
+import struct
 import time
 from unittest.mock import patch
 
@@ -24,7 +25,7 @@ from drivers.exchange import listening
 from drivers.transports import TransportError, UdpSpec, UdpTransport
 from drivers.transports.base import Stamped
 from drivers.transports.udp import MOST_PASSED_OVER
-from tests.drivers.rig import N, drive_train, init_packet, limits
+from tests.drivers.rig import N, Rig, drive_train, init_packet, limits
 from tests.drivers.transport_contract import TransportContract
 
 HOST = "127.0.0.1"
@@ -130,7 +131,7 @@ class TestPeer:
         near.send(bytes(48))
         assert controller.heard_nothing()
 
-    @pytest.mark.parametrize("length", [0, 12, 47, 1501, 9000])
+    @pytest.mark.parametrize("length", [0, 11, 1501, 9000])
     def test_an_implausible_datagram_does_not_become_the_peer(
         self, near, controller, another, length
     ):
@@ -138,6 +139,15 @@ class TestPeer:
         controller.send(b"x" * 48)
         assert near.receive(PATIENCE) == b"x" * 48
         assert near.rejected() == {"malformed": 1}
+
+    @pytest.mark.parametrize("length", [12, 47])
+    def test_a_header_alone_is_answered(self, near, controller, length):
+        """Of sync packets nothing is known but that they are shorter than the init packet."""
+        rig = Rig()
+        controller.send(struct.pack("<i", 3) + bytes(length - 4))
+        exchange(near, rig.session, until=lambda: rig.session.counters.answered > 0)
+        controller.wait()
+        assert controller.replies == [struct.pack("<i", 4) + bytes(length - 4)]
 
     def test_longer_than_any_packet_is_malformed_and_not_answered(self, near, controller):
         controller.send(bytes(1500))

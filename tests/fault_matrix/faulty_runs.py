@@ -9,7 +9,7 @@ laws that hold without exception was broken: it has to be empty.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Final
 
@@ -111,6 +111,8 @@ ANSWER_MISSING: Final = frozenset(
     name for name in FAULTS if "lost" in name or "past" in name or "swap" in name or "dead" in name
 ) | {"number a little ahead", "answer's number corrupted"}
 """Faults after which the controller is without an answer, so that what it does then matters."""
+BEHAVIOURS: Final = ("hold", "continue", "drive_off")
+"""What the controller may do while it is without an answer."""
 HAS_OPEN_AXES: Final = ("opening", "open at rest", "moving", "exiting")
 
 
@@ -126,8 +128,9 @@ _SHORT: Final[Mapping[str, str]] = {
 }
 
 
-def motion(start: Array, way: Array) -> TrajectoryPlayer:
-    path = plan(np.vstack((start, start + way)), LIMITS, fly=0.0)
+def motion(start: Array, way: Array, share: float = 1.0) -> TrajectoryPlayer:
+    limits = replace(LIMITS, velocity=share * LIMITS.velocity)
+    path = plan(np.vstack((start, start + way)), limits, fly=0.0)
     return TrajectoryPlayer(path, PERIOD, LIMITS, start_tolerance=5e-3)
 
 
@@ -183,11 +186,14 @@ class Run:
         recovery: what came of a motion requested after it, once the drive was on again.
         broken: laws that were broken, in words.
         cycles: first cycle of each situation.
+        speed: share of full speed that the first motion is planned with.
     """
 
     controller: SimulatedController
     requested_first: bool
     current_share: float = 1.0
+    speed: float = 1.0
+    moving: float = 0.75
     outcome: str = ""
     recovery: str = ""
     broken: list[str] = field(default_factory=list)
@@ -205,7 +211,7 @@ class Run:
         self.transport = SimulatedTransport(self.controller, faults)
         self.link = Watched(self.transport)
         if self.requested_first:
-            self.session.request(motion(np.array(small_cell.HOME), WAY))
+            self.session.request(motion(np.array(small_cell.HOME), WAY, self.speed))
         patience = fault_cycle + 150
         self._go_on(lambda: self.transport.cycle > patience and self._calm(), 1500)
         self.outcome = self._describe()
@@ -245,7 +251,7 @@ class Run:
         if state is State.OPEN:
             if self.session.requested:
                 speed = np.abs(self.session._ring.last(1)["commanded_velocity"][0])
-                name = "moving" if np.all(speed > 0.75 * LIMITS.velocity) else "under way"
+                name = "moving" if np.all(speed > self.moving * LIMITS.velocity) else "under way"
             else:
                 name = "open at rest"
         self.cycles.setdefault(name, self.transport.cycle)
@@ -274,8 +280,6 @@ class Run:
                 return "silence"
             if not self.requested_first and _leaves_open(event):
                 return "closed"
-        if not self.requested_first and any(map(_unknown_mode, self.events)):
-            return "505: mode"
         return "waits" if self.session.requested else "open"
 
     def _asked_for(self) -> str:
@@ -337,15 +341,11 @@ def _leaves_open(event: Any) -> bool:
     return by_itself and event.before is State.OPEN
 
 
-def _unknown_mode(event: Any) -> bool:
-    """Where no set-point was refused: that comes first."""
-    faulted = isinstance(event, StateChanged) and event.after is State.FAULTED
-    return faulted and event.before is State.OPEN
-
-
-def controller(while_silent: str, **changes: Any) -> SimulatedController:
+def controller(
+    while_silent: str, tolerated: int = TOLERATED, **changes: Any
+) -> SimulatedController:
     return small_cell.controller(
-        missed_replies=TOLERATED + 1,
+        missed_replies=tolerated + 1,
         while_silent=while_silent,
         ramp_time=0.1,
         boot_time=1.5 * SILENCE,
@@ -386,7 +386,7 @@ def play(fault: str, situation: str, while_silent: str = "hold") -> Run:
 def behaviours(fault: str, situation: str) -> tuple[str, ...]:
     """What the controller may do meanwhile, where that makes a difference."""
     matters = fault in ANSWER_MISSING and situation in HAS_OPEN_AXES
-    return ("hold", "continue", "drive_off") if matters else ("hold",)
+    return BEHAVIOURS if matters else BEHAVIOURS[:1]
 
 
 def cases() -> Iterator[tuple[str, str, str]]:
@@ -395,3 +395,23 @@ def cases() -> Iterator[tuple[str, str, str]]:
         for situation in SITUATIONS:
             for behaviour in behaviours(fault, situation):
                 yield fault, situation, behaviour
+
+
+SPEEDS: Final = (0.25, 0.5, 0.8, 1.0)
+"""Shares of full speed at which packets and answers are lost in a row."""
+FAULTS_AT_SPEED: Final = ("3 packets lost", "5 packets lost", "3 answers lost", "5 answers lost")
+PATIENT: Final = 12
+"""Answers missing in a row that the controller puts up with in these runs."""
+
+
+def play_at(fault: str, speed: float, while_silent: str) -> Run:
+    """Let packets or answers be lost where the motion has reached a share of full speed."""
+
+    def run(of_link: tuple[Any, ...], cycle: int) -> Run:
+        moving = controller(while_silent, PATIENT)
+        made = Run(moving, True, speed=speed, moving=0.99 * speed)
+        made.play(of_link, cycle, cycle)
+        return made
+
+    cycle = run((), 0).cycles["moving"]
+    return run(split_faults([parse_fault(FAULTS[fault].format(c=cycle))])[0], cycle)

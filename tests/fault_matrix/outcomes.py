@@ -4,7 +4,6 @@
     stopped           it came to rest on its path, and open mode was left
     lost: why         it ended because drive, open mode or link went away; nothing moves after that
     505 X, 508 X      error X was raised: all axes are asked to drive off, or one is reported
-    505: mode         a mode that nobody knows was reported, and drive-off asked for
     waits             it has not begun and waits for the drive, or for axes to open
     open, closed      no motion was requested: open mode went on, or was ended by the controller
     silence           no motion was requested: the link counts as lost
@@ -20,7 +19,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.fault_matrix.faulty_runs import SITUATIONS
+from tests.fault_matrix.faulty_runs import SITUATIONS, SPEEDS
 
 _SPANS: Final[dict[str, dict[str, str]]] = {
     "packet lost": {
@@ -156,7 +155,7 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "init packet": "no start",
         "init .. drive off": "completed",
         "driving on .. opening": "lost: mode",
-        "open at rest": "505: mode",
+        "open at rest": "505 ModeRefused",
         "moving": "505 AxisLeft",
         "exiting": "completed",
     },
@@ -287,3 +286,19 @@ def row(fault: str, outcomes: dict[str, tuple[str, ...]]) -> str:
 HEADING: Final = (
     "| fault | " + " | ".join(SITUATIONS) + " |\n" + "|---" * (len(SITUATIONS) + 1) + "|\n"
 )
+
+AT_SPEED: Final = {
+    "3 packets lost": "505 MotionHeld / stopped / 505 MotionHeld",
+    "5 packets lost": "505 MotionHeld / stopped / 505 MotionHeld",
+    "3 answers lost": "stopped / completed / stopped",
+    "5 answers lost": "stopped / completed / stopped",
+}
+"""Outcomes by fault, the same at every share of full speed."""
+
+
+def at_speed() -> str:
+    """The table of `AT_SPEED` in Markdown."""
+    speeds = [f"{share:.0%}".replace("%", " %") for share in SPEEDS]
+    lines = ["| fault | " + " | ".join(speeds) + " |", "|---" * (len(speeds) + 1) + "|"]
+    lines += [f"| {fault} |" + f" {text} |" * len(speeds) for fault, text in AT_SPEED.items()]
+    return "\n".join(lines) + "\n"

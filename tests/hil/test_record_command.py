@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers import ModeRefused
 from drivers.packets import DRIVE_ON, INIT_LENGTH
 from drivers.states import State
-from drivers.transports import Lose, SimulatedTransport
+from drivers.transports import Corrupt, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.campaign import Link, Progress, Stop
 from hil.cell import Cell
@@ -32,7 +33,7 @@ from hil.simulation import controller_settings, own_postures, simulated_controll
 NAME = "excitation_000_a1.mcap"
 
 
-def own_motion_link(cell: Cell, *faults: Lose, accept_init: bool = False) -> Link:
+def own_motion_link(cell: Cell, *faults: Lose | Corrupt, accept_init: bool = False) -> Link:
     """A link in virtual time to a controller whose own program moves the arm."""
     settings = replace(controller_settings(cell), own_motion=own_postures(cell))
     controller = simulated_controller(cell, settings=settings)
@@ -144,6 +145,27 @@ def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> N
     assert archive.columns["gap"].sum() == 1
     assert archive.outcome is not None
     assert archive.outcome["lost_packets"] == "1"
+
+
+def test_a_refusal_is_shown_at_once_and_ends_the_recording_as_refused(
+    tmp_path: Path, cell: Cell
+) -> None:
+    """One packet of mode 3: cause, axis and remedy stand on one line and in the archive."""
+    link = own_motion_link(cell, Corrupt(600, offset=12, mask=3))
+    lines: list[str] = []
+    link.connection.say = lines.append
+    done = record(
+        link, cell, tmp_path / NAME, kind="excitation", stop=Stop(), duration=1.0, durable=False
+    )
+    cause = "joint 1 is in mode 3: no answer is known to that mode"
+    assert (done.outcome, done.reason.partition(" (cycle")[0]) == ("refused", cause)
+    assert [line.partition(" (cycle")[0] for line in lines] == [f"REFUSED: {cause}"]
+    assert lines[0].endswith(ModeRefused.remedy)
+    archive = open_archive(tmp_path / NAME)
+    assert archive.complete
+    assert [event.text for event in archive.events if event.name == "Refused"] == [
+        line.removeprefix("REFUSED: ") for line in lines
+    ]
 
 
 def test_a_controller_of_another_arm_is_not_recorded_unless_its_figures_are_accepted(

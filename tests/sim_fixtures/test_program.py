@@ -171,6 +171,25 @@ def test_after_so_many_lost_openings_in_a_row_the_session_ends_with_a_reason() -
     )
 
 
+def test_openings_that_end_by_508_are_lost_like_any_other() -> None:
+    """With a pause before the next, and an end of the session after so many."""
+    loop = program(lost_openings=3, reopening_time=0.05)
+    for lost in (1, 2, 3):
+        advance_to(loop, Phase.OPEN)
+        advance(loop, answer=Answer(valid=True, following_error=True))
+        assert loop.openings_lost == lost
+        if lost < 3:
+            closed = 0
+            while loop.phase is not Phase.OPENING:
+                closed += 1
+                advance(loop)
+            assert closed == 50
+    assert loop.gave_up
+    assert loop.reason == (
+        "open mode was lost 3 times in a row: the PC reported a following error (508)"
+    )
+
+
 def test_an_opening_that_the_pc_ends_makes_the_lost_ones_forgotten() -> None:
     loop = program(lost_openings=2)
     for _ in range(5):

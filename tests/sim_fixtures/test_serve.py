@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 import struct
+import time
 from collections.abc import Callable
 from heapq import heappop, heappush
 from itertools import pairwise
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 
 from drivers.packets import CyclicPacket, echo, next_number, packet_number
 from drivers.transports.faults import Corrupt, Delay, Duplicate, FaultyLink, Lose
+from sim_fixtures.far_end import UdpFarEnd
 from sim_fixtures.serve import Wish, serve
 from sim_fixtures.tally import Histogram, Tally
 
@@ -48,6 +51,7 @@ class Cabinet:
         self.accepted: list[bytes | None] = []
         self.finished = self.stopped = False
         self.silent_in: set[int] = set()
+        self.ends_in = -1
         self.stands = True
         self._clock, self._cycles, self._cost = clock, cycles, cost
         self._number = 1
@@ -59,7 +63,9 @@ class Cabinet:
         self.sent_at.append(self._clock.time)
         if len(self.accepted) in self.silent_in:
             return b""
-        return CyclicPacket.zeros(self._number, 1).encode()
+        packet = CyclicPacket.zeros(self._number, 1)
+        packet.axes["mode"] = 504 if len(self.accepted) == self.ends_in else 0
+        return packet.encode()
 
     def accept(self, reply: bytes | None) -> None:
         self.accepted.append(reply)
@@ -69,8 +75,9 @@ class Cabinet:
     def finish(self) -> None:
         self.finished = True
 
-    def emergency_stop(self) -> None:
+    def lose_drive(self, reason: str) -> None:
         self.stopped = True
+        self.reason = reason
 
 
 Answer = Callable[[int, bytes], list[tuple[float, bytes]]]
@@ -125,6 +132,35 @@ def served(answer: Answer = prompt, *, cycles: int = 50, cost: float = 0.0, **ke
 
 def gaps(cabinet: Cabinet) -> list[float]:
     return [b - a for a, b in pairwise(cabinet.sent_at)]
+
+
+def test_an_answer_counts_from_when_the_kernel_had_it():
+    """What lay in the queue while this program did not look is no lateness of the PC."""
+    clock = VirtualClock()
+    cabinet, link = Cabinet(clock, 50), VirtualLink(clock, lambda _, p: [(0.6 * T, echo(p))])
+    link.waited = 0.5 * T
+    summary = serve(cabinet, link, clock=clock)
+    assert summary.answer_max == pytest.approx(0.1 * T, rel=0.1)
+
+
+def test_a_datagram_that_lay_in_the_queue_says_for_how_long():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as pc:
+        pc.bind(("127.0.0.1", 0))
+        far_end = UdpFarEnd("127.0.0.1", pc.getsockname()[1])
+        pc.sendto(b"answer", ("127.0.0.1", far_end.source_port))
+        time.sleep(0.05)
+        assert far_end.receive(1.0) == b"answer"
+        far_end.close()
+    assert 0.04 <= far_end.waited < 5.0
+
+
+def test_the_packet_that_ends_the_session_needs_no_answer():
+    clock = VirtualClock()
+    cabinet = Cabinet(clock, 20)
+    cabinet.ends_in = 19
+    link = VirtualLink(clock, lambda index, packet: prompt(index, packet) if index < 19 else [])
+    summary = serve(cabinet, link, clock=clock)
+    assert (summary.cycles, summary.replies, summary.missed) == (20, 19, 0)
 
 
 def test_every_cycle_of_a_prompt_pc_is_answered_and_begins_on_time():
@@ -332,6 +368,7 @@ def test_an_arm_that_never_stands_loses_its_drive_when_patience_is_over():
 
     summary = serve(cabinet, VirtualLink(clock), clock=clock, wish=wish, patience=0.5)
     assert summary.ended and cabinet.stopped
+    assert cabinet.reason == "the arm did not stand within 0.5 s of the end"
     assert cabinet.sent_at[-1] - cabinet.sent_at[5] == pytest.approx(0.5, abs=0.01)
 
 

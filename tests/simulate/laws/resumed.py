@@ -13,6 +13,7 @@ import numpy as np
 
 from hil.errors import HilError
 from planner import FourierSeries, PiecewiseCubic
+from tests.drivers import oracle
 from tests.simulate.observed import Broken, Life, Observed
 
 from .archived import Archived, read
@@ -107,7 +108,9 @@ def _played(
     if archived.ended != "completed":
         return f"it ended {archived.ended!r}"
     q: Array = archived.cycles["commanded_position"]
-    q = q[np.isfinite(q).all(axis=1)]
+    rows = np.isfinite(q).all(axis=1)
+    q = q[rows]
+    q = q[oracle.sent_once(q, archived.cycles["commanded_velocity"][rows])]
     count = int(np.ceil(motion.duration / period)) + 1
     times: Array = np.arange(count, dtype=np.float64) * period
     planned = motion.sample(times)[0]
