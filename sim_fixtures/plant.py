@@ -12,17 +12,68 @@ order otherwise, at the price of one evaluation.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from operator import mul
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from sim_fixtures.errors import PlantDiverged, SettingError
-from sim_fixtures.standstill import resolve_dry_friction
 from sim_fixtures.truth import PlantTruth
 
 Array = NDArray[np.float64]
+
+MAX_SWEEPS = 200
+TOLERANCE = 1e-6
+"""Change of a torque that is no longer made, relative to the Coulomb torque."""
+
+
+class DryFriction(NamedTuple):
+    """Velocities at the end of the step [rad/s] and friction torques during it [N m], (n,)."""
+
+    velocity: list[float]
+    torque: list[float]
+
+
+def resolve_dry_friction(
+    free_velocity: Sequence[float],
+    inverse_inertia: Array,
+    coulomb: Sequence[float],
+    step: float,
+    guess: Sequence[float],
+) -> DryFriction:
+    """Return the friction torques of one step and the velocities they leave.
+
+    Args:
+        free_velocity: velocities at the end of the step without dry friction, (n,) [rad/s].
+        inverse_inertia: A, (n, n), symmetric, positive definite.
+        coulomb: Coulomb torques f0, (n,) [N m].
+        step: h [s].
+        guess: torques to start from, (n,) [N m]; those of the step before.
+    """
+    coupling = inverse_inertia * step
+    rows: list[list[float]] = coupling.tolist()
+    torque = [max(-c, min(c, f)) for f, c in zip(guess, coulomb, strict=True)]
+    velocity: list[float] = (np.array(free_velocity) - coupling @ torque).tolist()
+    for _ in range(MAX_SWEEPS):
+        settled = True
+        for i, limit in enumerate(coulomb):
+            held = torque[i]
+            wanted = max(-limit, min(limit, held + velocity[i] / rows[i][i]))
+            change = wanted - held
+            if abs(change) > TOLERANCE * limit:
+                torque[i] = wanted
+                velocity = [v - a * change for v, a in zip(velocity, rows[i], strict=True)]
+                settled = False
+        if settled:
+            break
+    # a joint stands if friction had enough in hand to take away what is left of its velocity
+    for i, limit in enumerate(coulomb):
+        if abs(torque[i] + velocity[i] / rows[i][i]) < limit:
+            velocity[i] = 0.0
+    return DryFriction(velocity, torque)
 
 
 def build_model(

@@ -6,20 +6,276 @@ is of the file alone: whether the motion in it is any good is not asked.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any, BinaryIO
 
-from hil.archive import description, schema
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from drivers.packet_records import LONGEST_PACKET
+from hil.archive import container, definitions, description, index, schema
 from hil.archive.amend import REJECTED
-from hil.archive.check_messages import message_faults
-from hil.archive.description import DescriptionError
+from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
+from hil.archive.chunk import ChunkParser, Messages
+from hil.archive.container import ChannelRecord, Damage, Record
+from hil.archive.description import Description, DescriptionError
+from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
 from hil.archive.names import KINDS, ArchiveName
 from hil.archive.order import checksums
 from hil.archive.standing import Survey
 from hil.archive.survey import survey
 from hil.errors import NotAnArchiveError
+from hil.reading import opened
+
+Fault = tuple[str, str]
+
+_CHUNK_NS = 100_000_000
+_STATES = {
+    schema.MEASURED: {"position": "position", "velocity": "velocity", "effort": "torque"},
+    schema.COMMANDED: {"position": "commanded_position", "velocity": "commanded_velocity"},
+}
+"""Which columns of the cycles each channel repeats."""
+
+
+_CYCLE_FIELDS = (
+    "cycle",
+    "gap",
+    *(column for state in _STATES.values() for column in state.values()),
+)
+_ADDED_LATER = 1  # fields at the end of the cycle that the first archives do not have
+
+
+def message_faults(found: Survey) -> Iterator[Fault]:
+    """What is wrong with schemas, channels and messages of what stands of an archive.
+
+    Yields:
+        Aspect of the profile, and what is wrong.
+    """
+    checker = _Checker(found)
+    with opened(found.path) as stream:
+        yield from checker.run(stream)
+
+
+class _Checker:
+    """Goes through the chunks that stand."""
+
+    def __init__(self, found: Survey) -> None:
+        assert found.metadata is not None
+        self._found = found
+        self._imported = found.metadata["kind"] == "imported"
+        description = Description.of(found.metadata)
+        self._joints = description.joint_names
+        self._period_ns = None if description.period is None else description.period * 1e9
+        self._parser = ChunkParser()
+        self._announced = self._parser.announced
+        self._layouts: dict[str, MessageLayout | None] = {}
+        self._last_cycle: int | None = None
+        self._gaps = 0
+        self._decompressor = zstandard.ZstdDecompressor()
+
+    def run(self, stream: BinaryIO) -> Iterator[Fault]:
+        """All faults."""
+        for record in self._found.announced:
+            self._announced.take(record.opcode, record.body, record.offset)
+        for piece in self._found.pieces:
+            record = container.record_at(stream, piece.offset, piece.length)
+            if piece.opcode == container.CHUNK:
+                try:
+                    yield from self._chunk(record)
+                except Damage as damage:
+                    yield "chunks", f"the record at byte {damage.offset} {damage}"
+            elif piece.opcode in (container.SCHEMA, container.CHANNEL):
+                self._announced.take(record.opcode, record.body, record.offset)
+        if self._announced.channels:
+            yield from self._channels()
+        yield from self._outcome()
+
+    def _channels(self) -> Iterator[Fault]:
+        """Check topics, types and encodings."""
+        channels = {channel.topic: channel for channel in self._announced.channels.values()}
+        needed = {schema.MEASURED, schema.EVENTS}
+        if not self._imported:
+            needed |= {schema.CYCLE, schema.COMMANDED}
+        for topic in sorted(needed - channels.keys()):
+            yield "channels", f"there is no {topic}"
+        for topic in sorted(channels):
+            yield from self._channel(channels[topic])
+
+    def _channel(self, channel: ChannelRecord) -> Iterator[Fault]:
+        expected = _expected(channel.topic, len(self._joints))
+        if expected is None:
+            return  # a later version may add channels
+        name, definition = expected
+        if channel.encoding != "cdr":
+            yield "channels", f"{channel.topic} is encoded as {channel.encoding!r}, not 'cdr'"
+        found = self._announced.schemas.get(channel.schema_id)
+        if found is None:
+            yield "schemas", f"{channel.topic} has none"
+            return
+        if found.name != name:
+            yield "channels", f"{channel.topic} is of type {found.name}, not {name}"
+        if found.encoding != "ros2msg":
+            yield "schemas", f"that of {channel.topic} is {found.encoding!r}, not 'ros2msg'"
+        if not _extends(found.definition, definition, fixed=channel.topic != schema.CYCLE):
+            yield "schemas", f"that of {channel.topic} is not the text of the profile"
+
+    def _chunk(self, record: Record) -> Iterator[Fault]:
+        place = f"the chunk at byte {record.offset}"
+        head = container.chunk(record)
+        if head.compression != "zstd":
+            yield "chunks", f"{place} is compressed with {head.compression or 'nothing'}, not zstd"
+        data = container.chunk_data(record, decompressor=self._decompressor)
+        yield from self._log_times(data, record.offset, place)
+        found = self._parser.messages(data, record.offset)
+        rows: dict[str, Rows] = {}
+        for topic, messages in found.items():
+            if topic == schema.EVENTS:
+                yield from _events(messages, place)
+                continue
+            laid_out = self._rows(topic, messages)
+            if laid_out is None:
+                yield "sizes", f"{place} has messages of {topic} unlike its others"
+            else:
+                rows[topic] = laid_out
+        if schema.CYCLE in rows and set(_CYCLE_FIELDS) <= set(rows[schema.CYCLE].dtype.names or ()):
+            yield from self._cycles(rows, place)
+
+    def _rows(self, topic: str, messages: Messages) -> Rows | None:
+        """The messages as a structured array; None where one has another layout."""
+        if topic not in self._layouts:
+            self._layouts[topic] = self._layout(topic, messages)
+        layout = self._layouts[topic]
+        data = messages.matrix(layout.size) if layout else None
+        if layout is None or data is None or not layout.is_kept_by(data):
+            return None
+        return np.ascontiguousarray(data).view(layout.dtype)[:, 0]
+
+    def _layout(self, topic: str, messages: Messages) -> MessageLayout | None:
+        try:
+            if topic not in _STATES:
+                announced = self._announced.schema(topic)
+                if announced is None:
+                    return None
+                layout = fixed_layout(announced.definition)
+                schema.check_fields(topic, layout, len(self._joints))
+                return layout
+            names, layout = joint_state_of(messages.first())
+        except LayoutError:
+            return None
+        lengths = {
+            word: layout.dtype[word].shape[0] if word in (layout.dtype.names or ()) else 0
+            for word in ("position", "velocity", "effort")
+        }
+        expected = joint_state_layout(
+            self._joints,
+            position=lengths["position"],
+            velocity=lengths["velocity"],
+            effort=lengths["effort"],
+        )
+        known = names == self._joints and set(lengths.values()) <= {0, len(self._joints)}
+        return layout if known and expected.template == layout.template else None
+
+    def _log_times(self, data: bytes, offset: int, place: str) -> Iterator[Fault]:
+        """Check log and publish times against the stamps in the messages."""
+        stamps = []
+        for item in index.messages(data, offset):
+            if isinstance(item, Record):
+                continue
+            seconds = int.from_bytes(data[item.data + 4 : item.data + 8], "little", signed=True)
+            rest = int.from_bytes(data[item.data + 8 : item.data + 12], "little")
+            if not item.log_time == item.publish_time == seconds * 10**9 + rest:
+                yield "times", f"{place} has messages logged at another time than their stamp"
+                return
+            stamps.append(item.log_time)
+
+    def _cycles(self, rows: Mapping[str, Rows], place: str) -> Iterator[Fault]:
+        """Check the cycles of a chunk, and the channels that repeat them."""
+        cycles = rows[schema.CYCLE]
+        number, stamp = cycles["cycle"], _stamps(cycles)
+        if self._period_ns is not None:
+            if not np.array_equal(stamp, np.rint(number * self._period_ns)):
+                yield "times", f"{place} has cycles whose stamp is not cycle times period"
+            if (int(number[-1]) - int(number[0])) * self._period_ns >= max(
+                _CHUNK_NS, self._period_ns
+            ):
+                yield "chunks", f"{place} spans more than 100 ms"
+        behind = () if self._last_cycle is None else (number[0] <= self._last_cycle,)
+        if any(behind) or (number[1:] <= number[:-1]).any():
+            yield "times", f"{place} has cycles that do not grow"
+        self._last_cycle = int(number[-1])
+        self._gaps += int(cycles["gap"].sum())
+        for topic, columns in _STATES.items():
+            if topic in rows and not _repeats(rows[topic], cycles, columns):
+                yield "joint_states", f"{place} has messages of {topic} unlike its cycles"
+
+    def _outcome(self) -> Iterator[Fault]:
+        """Check what the outcome says of the cycles."""
+        outcome = self._found.outcome
+        if self._imported or outcome is None or "repaired" in outcome or self._found.losses:
+            return
+        stated = outcome.get("lost_packets")
+        if stated is not None and stated != str(self._gaps):
+            yield "outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}"
+
+
+def _expected(topic: str, n_joints: int) -> tuple[str, str] | None:
+    """Type and text that a topic of the profile must have."""
+    return {
+        schema.CYCLE: (definitions.cycle_name(n_joints), definitions.cycle(n_joints)),
+        schema.MEASURED: (definitions.JOINT_STATE, definitions.joint_state()),
+        schema.COMMANDED: (definitions.JOINT_STATE, definitions.joint_state()),
+        schema.MOTOR_CURRENT: (
+            definitions.motor_current_name(n_joints),
+            definitions.motor_current(n_joints),
+        ),
+        schema.EVENTS: (definitions.LOG, definitions.log()),
+        schema.PACKETS: (definitions.PACKET, definitions.packet(LONGEST_PACKET)),
+    }.get(topic)
+
+
+def _extends(text: str, profile: str, *, fixed: bool) -> bool:
+    """Whether a text is that of the profile, or has its fields up to those added at the end."""
+    if text == profile:
+        return True
+    ours, theirs = _fields(profile), _fields(text)
+    shorter = min(len(ours), len(theirs))
+    enough = shorter >= len(ours) - _ADDED_LATER
+    return not fixed and enough and ours[:shorter] == theirs[:shorter]
+
+
+def _fields(text: str) -> list[str]:
+    lines = (line.partition("#")[0].split() for line in text.partition("=" * 80)[0].splitlines())
+    return [" ".join(words) for words in lines if words]
+
+
+def _events(messages: Messages, place: str) -> Iterator[Fault]:
+    try:
+        for message in messages.all():
+            decode_log(message)
+    except LayoutError as error:
+        yield "sizes", f"{place} has an event that cannot be read: {error}"
+
+
+def _repeats(state: Rows, cycles: Rows, columns: Mapping[str, str]) -> bool:
+    names = state.dtype.names or ()
+    if set(names) != {"sec", "nanosec", *columns} or len(state) != len(cycles):
+        return False
+    pairs = [(state[word], cycles[column]) for word, column in columns.items()]
+    pairs.append((_stamps(state), _stamps(cycles)))
+    return all(_bits(a) == _bits(b) for a, b in pairs)
+
+
+def _bits(values: NDArray[Any]) -> bytes:
+    return values.tobytes()
+
+
+def _stamps(rows: Rows) -> NDArray[np.int64]:
+    return np.asarray(rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"])
+
 
 ASPECTS = {
     "container": "MCAP records in order, header of profile ros2 by hil",

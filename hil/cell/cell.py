@@ -34,9 +34,9 @@ from .schema import (
     LimitsTable,
     NominalTable,
     RobotTable,
+    SimulationTable,
     WorkspaceTable,
 )
-from .simulation_schema import SimulationTable
 from .text import replaced_value
 from .unknown import require_known
 

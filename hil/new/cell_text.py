@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 import textwrap
-from collections.abc import Mapping
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from scipy.spatial.transform import Rotation
 
 from drivers.drive_train import WRIST_AXES
 from hil.cell.unknown import UNKNOWN, WHERE
@@ -20,11 +25,104 @@ from hil.importers import Convention, urdf_of_dh
 from hil.reading import remedy_of, text_of
 from identification.errors import ModelError
 from identification.kinematics import Chain, chain_from_urdf
+from identification.urdf_tree import urdf_tree
 from planner.toml_value import toml_key, toml_value
 
-from .fixing import mimics, with_fixed
 from .known import Known, from_urdf
-from .quiet import quiet_libraries
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Drop what is written to file descriptor 2 meanwhile, such as urdfdom's lines of C++.
+
+    Python's own `sys.stderr` is dropped with it: nothing is to be said inside.
+    """
+    sys.stderr.flush()
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+_OF_MOVING_JOINTS: Final = (
+    "axis", "limit", "mimic", "dynamics", "safety_controller", "calibration"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """What a joint follows.
+
+    Attributes:
+        joint: the one that leads it.
+        offset: its own position [rad or m] where that stands at zero.
+    """
+
+    joint: str
+    offset: float
+
+
+def mimics(urdf: str) -> dict[str, Mimic]:
+    """Joints that follow another one, by name; an offset that is no number counts as 0."""
+    found = {}
+    for joint in urdf_tree(urdf).findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            try:
+                offset = float(mimic.get("offset", "0"))
+            except ValueError:
+                offset = 0.0
+            found[joint.get("name", "")] = Mimic(mimic.get("joint", "?"), offset)
+    return found
+
+
+def with_fixed(urdf: str, positions: Mapping[str, float]) -> str:
+    """The URDF with joints held at positions [rad or m], by name; comments stay.
+
+    Raises:
+        KeyError: no joint has such a name.
+    """
+    root = urdf_tree(urdf, comments=True)
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    for name, position in positions.items():
+        _fix(joints[name], position)
+    return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _fix(joint: ET.Element, position: float) -> None:
+    axis = joint.find("axis")
+    along = _three(None if axis is None else axis.get("xyz"), "1 0 0")
+    along /= np.linalg.norm(along)
+    if position:
+        origin = joint.find("origin")
+        if origin is None:
+            origin = ET.SubElement(joint, "origin")
+        place, turn = _three(origin.get("xyz"), "0 0 0"), _three(origin.get("rpy"), "0 0 0")
+        rotation = Rotation.from_euler("xyz", turn)  # URDF: roll, pitch, yaw about fixed axes
+        if joint.get("type") == "prismatic":
+            place = place + rotation.apply(along * position)
+        else:
+            rotation = rotation * Rotation.from_rotvec(along * position)
+        origin.set("xyz", _text(place))
+        origin.set("rpy", _text(rotation.as_euler("xyz")))
+    joint.set("type", "fixed")
+    for tag in _OF_MOVING_JOINTS:
+        for element in joint.findall(tag):
+            joint.remove(element)
+
+
+def _three(text: str | None, default: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    return np.array([float(part) for part in (text or default).split()])
+
+
+def _text(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
 
 _ONE_FOR_ALL: Final = frozenset(
     (

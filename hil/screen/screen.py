@@ -7,7 +7,10 @@ broke, a pipe that is full) delays neither the motion nor a stop.
 from __future__ import annotations
 
 import contextlib
+import math
+import select
 import sys
+import termios
 import threading
 import time
 from collections import deque
@@ -18,19 +21,120 @@ from typing import Final, Protocol
 
 from rich.console import Console, Group
 from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
+from hil.campaign.gravity_check import AGAINST
 from hil.campaign.motion_watch import Wish
 from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.campaign.stop import Stop
 from hil.cell import Cell
+from hil.counted import counted
 from hil.lines import put
+from hil.printable import printable
 from hil.progress import Silent, Task
 
 from . import marks, plain
-from .acceptance import ask
 from .keys import Keyboard, after, can_read, stops
 from .layout import SIMULATED, Shown, lines
-from .pace import Pace
+
+_KNOWN_AFTER = 2.0
+"""s of motion and of waiting after which the pace is told."""
+_PAUSE = 30.0
+"""s without news that are no part of the pace."""
+
+
+class Pace:
+    """Waiting time per time of motion, from what was seen of the run so far.
+
+    Args:
+        virtual: whether the controller's time is virtual; else both pass alike.
+    """
+
+    def __init__(self, *, virtual: bool) -> None:
+        self._virtual = virtual
+        self._waited = self._moved = 0.0
+        self._last: tuple[float, float] | None = None
+
+    def take(self, status: RunStatus, now: float, *, held: bool) -> None:
+        """Learn from a status that came `now` [s, any monotonic clock]; not while it is held."""
+        left = status.time_left
+        if self._last is not None and not held:
+            waited, moved = now - self._last[0], self._last[1] - left
+            # A motion that is run again, or another override, makes what is left longer.
+            if moved >= 0.0 and waited < _PAUSE:
+                self._waited += waited
+                self._moved += moved
+        self._last = (now, left)
+
+    def pause(self) -> None:
+        """What passes until the next status is a person's time."""
+        self._last = None
+
+    def left(self, time_left: float) -> float | None:
+        """Waiting time for so much time of motion [s]; None where it cannot be told yet."""
+        if not self._virtual:
+            return time_left
+        if min(self._waited, self._moved) < _KNOWN_AFTER:
+            return None
+        return time_left * self._waited / self._moved
+
+
+_LOOK: Final = 0.2
+
+
+def ask(console: Console, summary: DryRunSummary, stop: Stop) -> bool:
+    """Show what was measured and wait for an answer; only "yes" accepts.
+
+    Where torques contradict the model, only the names of the joints concerned do.
+
+    A stop asked for meanwhile is a refusal. It is looked for while nothing is typed, so that the
+    heartbeat of a real link goes on and Ctrl-C needs no answer.
+    """
+    console.print(_table(summary))
+    what = "the simulated arm" if summary.simulated else "the arm"
+    word = " ".join(summary.against_gravity) or "yes"
+    for joint in summary.against_gravity:
+        console.print(f"{joint}: {AGAINST}", style="bold red", markup=False, highlight=False)
+    known = f"If you know why, type {word}" if summary.against_gravity else "Type yes"
+    console.print(
+        f"Did {what} move as it should, with nothing in its way at {summary.override:.0%} of full "
+        f"speed? {known} to accept; anything else ends the run: ",
+        end="", markup=False, highlight=False,
+    )  # fmt: skip
+    sys.stdout.flush()
+    with contextlib.suppress(termios.error):  # what was typed before the question is no answer
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    while not stop.requested:
+        with contextlib.suppress(InterruptedError):
+            if select.select([sys.stdin], [], [], _LOOK)[0]:
+                answer = sys.stdin.readline().split()
+                return " ".join(answer).lower() == word.lower()
+    return False
+
+
+def _table(summary: DryRunSummary) -> Table:
+    title = f"Dry run of {summary.campaign}, {marks.clock(summary.duration)} long"
+    table = Table(title=Text(printable(title)))
+    table.add_column("joint")
+    table.add_column("largest following error", justify="right")
+    table.add_column("largest current", justify="right")
+    table.add_column("torque and weight")
+    for name, error, share in zip(
+        summary.joint_names, summary.following_error, summary.current_share, strict=True
+    ):
+        degrees = f"{math.degrees(error):.3f}°"
+        agree = Text("agree")
+        if name in summary.against_gravity:
+            agree = Text("contradict", style="bold red")
+        elif name in summary.gravity_not_seen:
+            agree = Text("not seen")
+        table.add_row(Text(printable(name)), degrees, f"{100.0 * share:.0f} % of its limit", agree)
+    archives = ", ".join(summary.archives)
+    link = f"{counted(summary.missed, 'packet')} missed, {counted(summary.late, 'answer')} late"
+    table.caption = Text(printable(f"{link}; {archives}"))
+    return table
+
 
 DRAWN_EVERY: Final = 0.1
 """s between two pictures."""

@@ -6,21 +6,64 @@ import io
 import threading
 import time
 from contextlib import AbstractContextManager, redirect_stdout
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hil.arm import Arm, reach
 from hil.cell import Cell
-from hil.view.playback import Playback
-from hil.view.rotation import quaternion
 from identification.excitation import Workspace
 from planner import Trajectory
 
 Array = NDArray[np.float64]
+
+
+def quaternion(rotation: Array) -> Array:
+    """Return the quaternion (w, x, y, z) of a rotation matrix (3, 3)."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return np.array([w, x, y, z])
+
+
+@dataclass
+class Playback:
+    """A clock that runs around from the end of a motion to its beginning.
+
+    Attributes:
+        duration: of the motion [s].
+        time: where it stands [s].
+        speed: seconds of the motion in a second.
+        playing: whether the clock runs.
+        pause: how long the end is shown before it begins again [s].
+    """
+
+    duration: float
+    time: float = 0.0
+    speed: float = 1.0
+    playing: bool = True
+    pause: float = 1.0
+    _rested: float = 0.0
+
+    def advance(self, seconds: float) -> None:
+        """Let so much real time pass [s]."""
+        if not self.playing:
+            return
+        if self.time >= self.duration:
+            self._rested += seconds
+            if self._rested >= self.pause:
+                self.seek(0.0)
+            return
+        self.time = min(self.time + seconds * self.speed, self.duration)
+
+    def seek(self, time: float) -> None:
+        """Go to a time, the nearest there is [s]."""
+        self.time = min(max(time, 0.0), self.duration)
+        self._rested = 0.0
+
 
 _RATE = 30.0
 """Pictures a second."""

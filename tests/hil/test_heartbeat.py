@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.exchange import NO_SUPERVISOR
-from hil.campaign.heartbeat import STALL, Heartbeat
+from hil.campaign.live_link import STALL, Heartbeat
 
 
 class Clock:

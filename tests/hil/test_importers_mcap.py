@@ -19,7 +19,7 @@ from hil.archive import open_archive
 from hil.cli import app
 from hil.errors import SourceError
 from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
-from hil.importers.mcap_arrays import read_mcap
+from hil.importers.arrays import read_mcap
 from hil.recordings import open_recording
 from identification import FrictionLaw
 

@@ -15,8 +15,8 @@ from mcap.writer import CompressionType, Writer
 from hil.archive import container, index
 from hil.archive.cdr import ENCAPSULATION, LayoutError
 from hil.errors import SourceError
-from hil.importers import Robot, bags, import_rosbag2, mcap_arrays
-from hil.importers.mcap_arrays import layout_of, read_mcap
+from hil.importers import Robot, arrays, bags, import_rosbag2
+from hil.importers.arrays import layout_of, read_mcap
 from identification import FrictionLaw
 from tests.hil.test_importers_rosbag2 import STATE, URDF, bag, states
 
@@ -172,7 +172,7 @@ class TestMcap:
     def test_more_numbers_than_fit_into_memory(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(mcap_arrays, "MOST_BYTES", 600)
+        monkeypatch.setattr(arrays, "MOST_BYTES", 600)
         path = chunked(tmp_path / "x.mcap", CompressionType.ZSTD)
         with pytest.raises(SourceError, match="too large to be read at once"):
             read_mcap(path)

@@ -10,7 +10,7 @@ import pytest
 PROGRAM = """
 import sys
 import numpy as np
-from hil.campaign.memory import LARGE, return_large_arrays
+from hil.campaign.live_link import LARGE, return_large_arrays
 
 def mapped():
     return int(open("/proc/self/statm").read().split()[0]) * 4096

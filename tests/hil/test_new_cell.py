@@ -28,8 +28,8 @@ from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError
 from hil.importers import Robot
 from hil.new import cell_of_urdf, from_archive
+from hil.new.cell_text import with_fixed
 from hil.new.controller import _nothing_moves
-from hil.new.fixing import with_fixed
 from hil.progress import Silent
 from hil.simulation import simulated_link
 from hil.testing import shortened

@@ -16,8 +16,8 @@ from hil.cli.plan import plan
 from hil.cli.plan_input import read_plan_file
 from hil.errors import InputError
 from hil.plots import draw_plan
-from hil.plots.corner import flown_corners, sharpest_corner
 from hil.plots.joints import corner_times
+from hil.plots.plan_picture import flown_corners, sharpest_corner
 from planner.motion_csv import from_csv
 from planner.moves import FlyPercent, Move, plan_moves
 from planner.plan_file import PlanFile

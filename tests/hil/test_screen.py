@@ -35,8 +35,7 @@ from hil.lines import put
 from hil.screen import Screen, marks, plain
 from hil.screen.keys import Keyboard, after, single_keys, typed
 from hil.screen.layout import Shown, lines
-from hil.screen.pace import Pace
-from hil.screen.screen import ScreenError, far_end_of
+from hil.screen.screen import Pace, ScreenError, far_end_of
 from sim_fixtures.ns16 import CELL_PATH
 
 RIG = Path(__file__).with_name("screen_rig.py")

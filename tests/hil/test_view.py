@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.view import require_viewer, show
-from hil.view.playback import Playback
-from hil.view.rotation import quaternion
+from hil.view.scene import Playback, quaternion
 from planner import plan
 from sim_fixtures.ns16 import CELL_PATH
 

@@ -22,7 +22,7 @@ from identification.elements import (
     TorsionSpring,
 )
 from identification.errors import ModelError
-from identification.excitation.searches.digest import digest
+from identification.excitation.searches.journal import digest
 from identification.friction import FrictionLaw
 from identification.parameter_text import parameters_dict
 from tests.identification import two_link

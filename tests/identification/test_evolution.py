@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from identification.excitation import Scores, SearchSettings
-from identification.excitation.searches.evolution import Evolution
+from identification.excitation.searches.run import Evolution
 from identification.excitation.searches.scores import ROW, unplanned
 
 

@@ -26,7 +26,7 @@ from identification.excitation import (
     SineGenome,
     ViaPointGenome,
 )
-from identification.excitation.searches.digest import digest
+from identification.excitation.searches.journal import digest
 from identification.excitation.searches.scores import ROW, unplanned
 from planner.remote import load, pack
 from tests.identification.searching import LIMITS, URDF, problem
@@ -277,7 +277,7 @@ def test_a_problem_has_one_fingerprint_however_it_was_made():
 def test_a_problem_has_the_same_fingerprint_in_every_process():
     root = Path(__file__).parents[2]
     script = """
-from identification.excitation.searches.digest import digest
+from identification.excitation.searches.journal import digest
 from tests.identification.searching import problem
 print(digest(problem()))
 """

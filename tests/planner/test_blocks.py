@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner import JointLimits, PiecewiseCubic, PlanningError, check_limits
+from planner.batch import StraightMoves
 from planner.blocks import Block, LimitRows
-from planner.straight import StraightMoves
 from planner.verify import check_smooth
 
 COUNT, JOINTS, PIECES = 3, 2, 5

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner import PiecewiseCubic
-from planner.scurve import rest_to_rest
+from planner.segments import rest_to_rest
 
 magnitude = st.floats(-3.0, 3.0).map(lambda exponent: 10.0**exponent)
 

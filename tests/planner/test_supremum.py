@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from planner.supremum import supremum
+from planner.fourier import supremum
 
 # Rounded, because the reference cannot divide by the very small; see the second example for those.
 numbers = st.floats(-10.0, 10.0).map(lambda x: round(x, 6))

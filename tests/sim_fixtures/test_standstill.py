@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim_fixtures.standstill import TOLERANCE, resolve_dry_friction
+from sim_fixtures.plant import TOLERANCE, resolve_dry_friction
 
 Array = NDArray[np.float64]
 STEP = 5e-4

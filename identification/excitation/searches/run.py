@@ -9,27 +9,192 @@ interrupted and resumed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
+from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
+from pymoo.config import Config
+from pymoo.core.problem import Problem
+from pymoo.core.termination import NoTermination
+from pymoo.operators.crossover.sbx import SBX
+from pymoo.operators.mutation.pm import PM
+from pymoo.operators.selection.tournament import TournamentSelection
+from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
 
-from identification.excitation.criteria import Criteria
+from identification.excitation.criteria import Criteria, fitness_of
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.design import Design
 from identification.excitation.searches.front import Front
-from identification.excitation.searches.goal import Goal
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.ledger import Ledger, Phase, Progress
-from identification.excitation.searches.polish import polish
+from identification.excitation.searches.polish import dominating, polish
 from identification.excitation.searches.population import Population
 from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
 from identification.excitation.searches.scores import Scores
 from identification.excitation.searches.settings import SearchSettings
+from identification.excitation.violation import KINDS
 from planner import FourierSeries, PiecewiseCubic
 
 Array = NDArray[np.float64]
+
+# Random numbers that are no other part's, whatever the seeds.
+_STREAM: Final = 6
+# Added to the excess of a motion that cannot be judged: it ranks behind all that can, however much
+# they exceed, and before those that cannot even be planned, whose excess is infinite.
+_UNEXCITING: Final = 1e6
+
+
+class Evolution:
+    """A GA with one objective, NSGA-II with two; both rank feasible motions before all others.
+
+    Infeasible ones are ranked by the sum of their excesses, so constraints need no weights.
+    Crossover is simulated binary, mutation polynomial, selection a binary tournament. Random
+    numbers come from the seed alone.
+
+    Args:
+        settings: rates and sizes.
+        first: genes (m, n_genes) of the first generation.
+        n_objectives: 1 or 2.
+    """
+
+    def __init__(self, settings: SearchSettings, first: Array, n_objectives: int) -> None:
+        Config.warnings["not_compiled"] = False  # it would be printed
+        self._algorithm = _algorithm(settings, first, n_objectives)
+        self._algorithm.setup(
+            Problem(
+                n_var=first.shape[1],
+                n_obj=n_objectives,
+                n_ieq_constr=len(KINDS) + 1,
+                xl=np.zeros(first.shape[1]),
+                xu=np.ones(first.shape[1]),
+            ),
+            termination=NoTermination(),
+            seed=[_STREAM, settings.seed],
+        )
+        self._asked: Any = None
+
+    def ask(self) -> Array | None:
+        """Return the genes (m, n_genes) of the next generation.
+
+        There may be fewer than a population, as no motion is asked for twice; None where mating
+        brings nothing new at all, which ends the search.
+        """
+        self._asked = self._algorithm.infill()
+        if self._asked is None or len(self._asked) == 0:
+            return None
+        return np.array(self._asked.get("X"), dtype=np.float64)
+
+    def tell(self, scores: Scores, objectives: Array) -> None:
+        """Take the scores of what was asked for, and its objectives (m, n_objectives)."""
+        judged = scores.usable
+        exciting = np.isfinite(scores.log10_det) & np.isfinite(scores.coupling_index)
+        unexciting = np.where(exciting, 0.0, _UNEXCITING)
+        excess = np.column_stack((scores.excess, unexciting))
+        # Objectives decide among feasible motions only, and must be finite for their distances.
+        finite = np.nan_to_num(np.where(judged[:, None], objectives, 0.0))
+        self._asked.set("F", finite, "G", excess)
+        self._algorithm.advance(infills=self._asked)
+
+
+def _algorithm(settings: SearchSettings, first: Array, n_objectives: int) -> Any:
+    common = {
+        "pop_size": settings.population,
+        "sampling": first,
+        "crossover": SBX(prob=settings.crossover, eta=settings.crossover_eta),
+        "mutation": PM(prob=1.0, prob_var=settings.mutation, eta=settings.mutation_eta),
+    }
+    if n_objectives == 1:
+        return GA(
+            selection=TournamentSelection(func_comp=comp_by_cv_and_fitness),
+            survival=FitnessSurvival(),
+            **common,
+        )
+    return NSGA2(
+        selection=TournamentSelection(func_comp=binary_tournament),
+        survival=RankAndCrowding(),
+        **common,
+    )
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Which of two motions is the better one, or that both measures count (method "front").
+
+    Attributes:
+        settings: of the search.
+        p: number of parameters that are judged.
+        scale: units of the two measures; None where it plays no part.
+    """
+
+    settings: SearchSettings
+    p: int
+    scale: Scale | None
+
+    @property
+    def single(self) -> bool:
+        """Whether one number decides."""
+        return self.settings.method != "front"
+
+    def objectives(self, scores: Scores) -> Array:
+        """Return what is to be minimised, (m, 1) or (m, 2)."""
+        if self.single:
+            return -self.fitness(scores.log10_det, scores.coupling_index)[:, None]
+        return np.stack((-scores.log10_det, scores.coupling_index), axis=1)
+
+    def fitness(self, log10_det: Array, coupling_index: Array) -> Array:
+        """Return the one number of each motion (m,), the larger the better.
+
+        -inf for a motion that leaves a parameter without excitation.
+        """
+        weights = self.settings.weights
+        if self.settings.method == "a":
+            return np.where(np.isfinite(coupling_index), log10_det, -np.inf)
+        if self.scale is not None:
+            return self.scale.fitness(log10_det, coupling_index, weights)
+        pairs = zip(log10_det.tolist(), coupling_index.tolist(), strict=True)
+        return np.array([fitness_of(*pair, self.p, weights=weights) for pair in pairs])
+
+    def choice(self, front: Front) -> int:
+        """Return which motion of a front (at least one) is the winner.
+
+        No fitness gets worse when both measures get better, so its best motion is on the front.
+        """
+        if self.single:
+            return int(np.argmax(self.fitness(front.log10_det, front.coupling_index)))
+        return front.knee(self.scale)
+
+    def best(self, front: Front) -> tuple[float, float, float]:
+        """Return fitness, log10 det and coupling index of the winner so far; nan without one.
+
+        Method "front" has no fitness (nan); its measures are the best of either on the front.
+        """
+        if len(front) == 0:
+            return (np.nan, np.nan, np.nan)
+        if not self.single:
+            return (np.nan, float(np.max(front.log10_det)), float(np.min(front.coupling_index)))
+        k = self.choice(front)
+        values = self.fitness(front.log10_det, front.coupling_index)
+        return float(values[k]), float(front.log10_det[k]), float(front.coupling_index[k])
+
+    def is_worse(self, one: Criteria, other: Criteria) -> bool:
+        """Return whether a motion is worse than another, with "front" in either measure."""
+        log10_det = np.array((one.log10_det, other.log10_det))
+        coupling_index = np.array((one.coupling_index, other.coupling_index))
+        if self.single:
+            fitness = self.fitness(log10_det, coupling_index)
+            return not bool(fitness[0] >= fitness[1])
+        return not bool(log10_det[0] >= log10_det[1] and coupling_index[0] <= coupling_index[1])
+
+    def polished_by(self, start: Scores) -> Callable[[Scores], Array]:
+        """Return what a polish from a motion (scores, m = 1) makes larger."""
+        if self.single:
+            return lambda scores: self.fitness(scores.log10_det, scores.coupling_index)
+        return dominating(start, self.scale)
+
 
 RESCORE_PERIOD: Final = 0.001
 """s; the chosen motion is judged once more at the rate of a servo loop."""
@@ -146,7 +311,6 @@ class _Search:
             raise self._ledger.failure(stopped=False) from None
 
     def _evolve(self, goal: Goal) -> None:
-        from identification.excitation.searches.evolution import Evolution  # pymoo: slow to import
 
         self._phase = "search"
         random = np.random.default_rng((_FIRST, self._settings.seed))
