@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -28,8 +28,12 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.friction import TERMS
-from identification.kinematics import chain_from_urdf, pinocchio_model
-from identification.locked_bodies import locked_bodies, without_locked
+from identification.kinematics import (
+    FROM_PINOCCHIO,
+    chain_from_urdf,
+    locked_posture,
+    pinocchio_model,
+)
 from identification.model import RobotModel
 from identification.pseudo_inertia import Body, body, margin
 from identification.regressor import RegressorPlan
@@ -37,6 +41,60 @@ from identification.wrench import LINK_SYMBOLS
 from identification.xml_source import Edit, Element, XmlSource, comment_text
 
 Array = NDArray[np.float64]
+
+
+class LockedBody(NamedTuple):
+    """Nominal inertia of what one locked joint carries, up to the next moving or locked joint.
+
+    Attributes:
+        joint: name of the locked joint.
+        carrier: index of the joint of the model that moves it, -1 for the base.
+        inertial: the ten parameters about the carrier's frame, in its axes (10,).
+    """
+
+    joint: str
+    carrier: int
+    inertial: Array
+
+
+def locked_bodies(urdf: str, model: RobotModel) -> tuple[LockedBody, ...]:
+    """Return what the locked joints of a model carry, at the positions where they are locked."""
+    if not model.locked:
+        return ()
+    arm = pin.buildModelFromXML(urdf)
+    data = arm.createData()
+    pin.forwardKinematics(arm, data, locked_posture(arm, model.locked))
+    found = []
+    for name in model.locked:
+        own = arm.getJointId(name)
+        before = own
+        while before > 0 and arm.names[before] in model.locked:
+            before = arm.parents[before]
+        body = (data.oMi[before].inverse() * data.oMi[own]).act(arm.inertias[own])
+        inertial = body.toDynamicParameters()[list(FROM_PINOCCHIO)]
+        carrier = model.joint_names.index(arm.names[before]) if before > 0 else -1
+        found.append(LockedBody(name, carrier, inertial))
+    return tuple(found)
+
+
+def without_locked(inertial: Array, locked: tuple[LockedBody, ...]) -> tuple[Array, frozenset[str]]:
+    """Take what locked joints carry out of the links (n, 10), where a possible body is left.
+
+    Returns:
+        The links (n, 10), and the locked joints that keep what they carry: those of the base too.
+    """
+    left = inertial.copy()
+    kept: set[str] = set()
+    for carrier in {one.carrier for one in locked}:
+        carried = [one for one in locked if one.carrier == carrier]
+        if carrier >= 0:
+            rest = left[carrier] - sum(one.inertial for one in carried)
+            if not margin(rest) > 0.0:
+                continue
+            left[carrier] = rest
+        kept.update(one.joint for one in carried)
+    return left, frozenset(kept)
+
 
 _N_LINK: Final = len(LINK_SYMBOLS)
 _TENSOR: Final = {

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple, get_type_hints
 
 from hil.archive import Archive, ArchiveName, open_archive
+from hil.cell import Cell
+from hil.cell.schema import PayloadTable
+from hil.identify.settings import stated_delay
 from hil.whole_number import whole_number
 
 from .cache import Store, Where
@@ -21,8 +24,29 @@ from .factors import cell_in, digest_of, local_file, stamp_of
 from .keys import arm_digest, belief_digest, code_digest, text_digest
 from .on_workers import Part
 from .places import Place
-from .setup import setup_of
 from .types import FileStamp
+
+
+def setup_of(cell: Cell) -> str:
+    """Delay of the torque and payload of a cell in words, with every digit; "" for neither."""
+    return ", ".join(filter(None, (_lag(stated_delay(cell)), _load(cell.file.robot.payload))))
+
+
+def _lag(delay: float) -> str:
+    return f"torque lags by {1e3 * delay:.12g} ms" if delay else ""
+
+
+def _load(payload: PayloadTable | None) -> str:
+    if payload is None or not (payload.mass or any(payload.inertia)):
+        return ""
+    frame = f" in {payload.frame}" if payload.frame else ""
+    words = f"carries {payload.mass:.12g} kg at {_row(payload.centre)} m{frame}"
+    return words + (f", {_row(payload.inertia)} kg·m²" if any(payload.inertia) else "")
+
+
+def _row(figures: Iterable[float]) -> str:
+    return f"({', '.join(f'{figure:.12g}' for figure in figures)})"
+
 
 USES: Final = ("excitation", "validation", "standstill")
 """What archives are used for; those of other kinds are left alone."""

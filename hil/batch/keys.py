@@ -54,8 +54,8 @@ def code_digest() -> str:
 def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:
     """Digest of what makes a robot the same one: links, joints, friction law, drives.
 
-    Not of a payload or a delay (see :mod:`hil.batch.setup`): an arm that carries something else is
-    the same arm.
+    Not of a payload or a delay (see :mod:`hil.batch.examining`): an arm with another payload is the
+    same arm.
 
     Args:
         cell: as it travels in the archive.

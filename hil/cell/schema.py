@@ -9,19 +9,23 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from .fields import (
-    Choice,
-    NonNegative,
-    Number,
-    Point,
-    Positive,
-    PositiveVector,
-    Table,
-    Vector,
-    Whole,
-)
+# Strict: TOML has numbers and truth values of its own, so "yes" and "3" are slips of the pen.
+Number = Annotated[FiniteFloat, Field(strict=True)]
+Whole = Annotated[int, Field(strict=True)]
+Choice = Annotated[bool, Field(strict=True)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+Vector = list[Number]
+PositiveVector = list[Positive]
+Point = tuple[Number, Number, Number]
+
+
+class Table(BaseModel):
+    """A TOML table that refuses what it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class SimulatedDriveTable(Table):

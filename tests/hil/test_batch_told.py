@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from benchmarks import archive_files
 from hil.archive import ArchiveWriter
-from hil.batch.doubts import Doubts
+from hil.batch.estimates import Doubts
 from hil.batch.run import Plan, reidentify
 from hil.batch.trend import Trends
 from hil.batch.types import ArchiveRef, BatchResult, Broken, Summary

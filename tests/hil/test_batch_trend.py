@@ -21,9 +21,8 @@ from scipy.stats import kendalltau
 from hil.batch import payload_change
 from hil.batch.axis_figures import friction_of, friction_weights
 from hil.batch.chart import FEWEST, chart, drift, limits, qn_scale
-from hil.batch.shifts import shifts
 from hil.batch.trend import FALSE_ALARMS, ArmTrend, Trends, Watched, arm_trend
-from hil.batch.trend_words import findings, summary
+from hil.batch.trend_words import findings, shifts, summary
 from hil.batch.types import Broken
 from hil.report.trend import render_trend_report, write_trend_report
 from identification.payload import Payload

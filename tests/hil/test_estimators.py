@@ -19,11 +19,11 @@ from hil.errors import InputError
 from hil.identify import Options
 from hil.identify.cad_prior import FRICTION_SHARE, cad_prior
 from hil.identify.estimating import Estimation, estimate_with
-from hil.identify.estimation_summary import uncertainty_result
 from hil.identify.instruments import NARROWEST, widely_smoothed
 from hil.identify.options import ESTIMATORS, Estimator
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
+from hil.identify.summary import uncertainty_result
 from hil.progress import Silent
 from hil.results import SCHEMA_VERSION, Results
 from hil.simulation import planted_values

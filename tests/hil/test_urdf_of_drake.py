@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from hil.campaign.sealed import MESH, MISSING, checksums
+from hil.campaign.folder import MESH, MISSING, checksums
 from hil.cell.urdf import urdf_limits
 from hil.importers.findings import urdf_limits as limits_of_an_import
 from sim_fixtures.plant import build_model

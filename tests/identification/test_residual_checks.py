@@ -12,15 +12,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from identification.autocorrelation import autocorrelation
 from identification.errors import IdentificationError
 from identification.friction import FrictionLaw
 from identification.model import RobotModel
 from identification.motion import Motion
 from identification.preprocessing import Samples
 from identification.residual_blocks import FEWEST_BLOCKS, BlockSums
-from identification.residual_checks import ResidualChecks, check_residuals
-from identification.ripple import HARMONICS
+from identification.residual_checks import (
+    HARMONICS,
+    ResidualChecks,
+    autocorrelation,
+    check_residuals,
+)
 
 Array = NDArray[np.float64]
 Disturbance = Callable[[Motion, int], Array]

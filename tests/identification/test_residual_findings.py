@@ -9,8 +9,8 @@ import pytest
 
 from identification.friction_drift import FrictionDrift
 from identification.residual_blocks import BlockMean
+from identification.residual_checks import HARMONICS, Ripple
 from identification.residual_findings import over_motor_angle, over_time
-from identification.ripple import HARMONICS, Ripple
 from identification.thresholds import Thresholds
 
 NAMES = ("shoulder", "elbow")
