@@ -51,15 +51,15 @@ import numpy as np
 
 from benchmarks.regressor import SAMPLES, sine_motion
 from identification import Motion, RobotModel
-from identification.consistent import consistent_estimate
-from identification.coupling import Coupling
-from identification.covariance import with_block_covariance
-from identification.estimation import Estimate, estimate, joint_weights
-from identification.factor import Factor
-from identification.friction import FrictionLaw
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples, prepare
-from identification.recording import Recording
+from identification.estimators.consistent import consistent_estimate
+from identification.estimators.covariance import with_block_covariance
+from identification.factor.estimation import Estimate, estimate, joint_weights
+from identification.factor.gram import Factor
+from identification.factor.phases import PhaseFactor
+from identification.model.coupling import Coupling
+from identification.model.friction import FrictionLaw
+from identification.signals.recording import Recording
+from identification.signals.samples import Samples, prepare
 from planner.arrays import Array
 from sim_fixtures.ns16 import URDF_PATH
 

@@ -3,11 +3,11 @@
 Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--json]``, with FOLDER as in
 `benchmarks.board`.
 
-Each default of :mod:`identification.inner_prediction` is varied alone. For each robot, the value
-with the least geometric mean of held-out errors over all *other* robots is taken and judged on this
-one: on the first held-out split, all rows, as a ratio to the error of `benchmarks.plain_fit`. If a
-default were fitted to these recordings, the mean of the ratios with a robot left out would be
-larger than that of the present values.
+Each default of :mod:`identification.selection.inner_prediction` is varied alone. For each robot,
+the value with the least geometric mean of held-out errors over all *other* robots is taken and
+judged on this one: on the first held-out split, all rows, as a ratio to the error of
+`benchmarks.plain_fit`. If a default were fitted to these recordings, the mean of the ratios with a
+robot left out would be larger than that of the present values.
 """
 
 # ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
@@ -31,7 +31,7 @@ import numpy as np
 
 from benchmarks.board import DATA, cut, identified_parts, plain_errors, split_logs
 from benchmarks.published import known
-from identification import inner_prediction
+from identification.selection import inner_prediction
 
 ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "WORTHWHILE": (0.0, 0.03),

@@ -48,24 +48,24 @@ from hil.identify.settings import samples_of
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from hil.recordings import open_recording
-from identification.consistent import consistent_estimate
-from identification.coupling import Coupling
-from identification.essential import eliminate
-from identification.estimation import Estimate, joint_weights, solve
-from identification.factor import NormalEquations
-from identification.friction import FrictionLaw
-from identification.inner_prediction import Settings, choose_settings
-from identification.least_squares import fit_least_squares
-from identification.losses import Huber, Tukey
-from identification.model import RobotModel
-from identification.nominal_prior import nominal_prior
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Preprocessing, Samples, prepare
-from identification.prior import fit_with_prior
-from identification.recording import Recording
-from identification.robust import robust_estimate
-from identification.torque_channel import possible_low_passes
-from identification.validation import prediction_error
+from identification.estimators.consistent import consistent_estimate
+from identification.estimators.least_squares import fit_least_squares
+from identification.estimators.losses import Huber, Tukey
+from identification.estimators.nominal_prior import nominal_prior
+from identification.estimators.prior import fit_with_prior
+from identification.estimators.robust import robust_estimate
+from identification.estimators.torque_channel import possible_low_passes
+from identification.factor.estimation import Estimate, joint_weights, solve
+from identification.factor.gram import NormalEquations
+from identification.factor.phases import PhaseFactor
+from identification.model.coupling import Coupling
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.selection.essential import eliminate
+from identification.selection.inner_prediction import Settings, choose_settings
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.validation.prediction import prediction_error
 from planner.arrays import Array
 
 LAWS: Final = {

@@ -30,8 +30,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification import Factor, Motion, RobotModel
-from identification.kinematics import FROM_PINOCCHIO
-from identification.wrench import LINK_SYMBOLS
+from identification.model.kinematics import FROM_PINOCCHIO
+from identification.model.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 

@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 
 from benchmarks.study_recordings import Condition, Kept, study_cell, validation_paths
 from hil.simulation import planted_values
-from identification.consistent import consistent_estimate
-from identification.endogeneity import EndogeneityTest, endogeneity_test
-from identification.estimation import Estimate
-from identification.factor import Factor
-from identification.instrument_factor import InstrumentFactor
-from identification.instrument_motion import planned_motion
-from identification.instrumental import InstrumentalEstimate, estimate_instrumental
-from identification.least_squares import fit_least_squares
-from identification.losses import Huber, Tukey
-from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, Samples, prepare
-from identification.repetitions import estimate_repetitions
-from identification.robust import robust_estimate
+from identification.estimators.consistent import consistent_estimate
+from identification.estimators.instrument_motion import planned_motion
+from identification.estimators.instrumental import InstrumentalEstimate, estimate_instrumental
+from identification.estimators.least_squares import fit_least_squares
+from identification.estimators.losses import Huber, Tukey
+from identification.estimators.repetitions import estimate_repetitions
+from identification.estimators.robust import robust_estimate
+from identification.factor.estimation import Estimate
+from identification.factor.gram import Factor
+from identification.factor.instruments import InstrumentFactor
+from identification.model.robot import RobotModel
+from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 from planner.arrays import Array
 
 Outliers = Literal["none", "spikes", "bursts"]

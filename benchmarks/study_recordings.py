@@ -23,7 +23,7 @@ from hil.files import make_folder
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from hil.simulation import simulated_link, simulated_provenance
-from identification.recording import Recording
+from identification.signals.recording import Recording
 from planner.arrays import Array
 from sim_fixtures.ns16 import CELL_PATH
 

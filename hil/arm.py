@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from identification.excitation.collision.bodies import described_shapes
 from identification.excitation.collision.poses import joint_poses
-from identification.kinematics import FARTHEST, Chain, chain_from_urdf
+from identification.model.kinematics import FARTHEST, Chain, chain_from_urdf
 
 Array = NDArray[np.float64]
 

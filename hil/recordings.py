@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from drivers.events import AnswersLost
 from hil.archive import CONTROLLERS_OWN, Archive, foreign_json, open_archive
 from hil.errors import ArchiveError
-from identification.recording import Recording
+from identification.signals.recording import Recording
 from planner.plain import DAMAGED, numbers
 
 Array = NDArray[np.float64]

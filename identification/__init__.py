@@ -1,60 +1,69 @@
 """Robot dynamics identification: model, regressor, excitation, estimation, validation."""
 
-from identification.base_parameters import BaseParameters
-from identification.consistent import Consistency, ConsistentEstimate, consistent_estimate
-from identification.coupling import Coupling
-from identification.covariance import with_block_covariance
-from identification.delay import DelayEstimate, estimate_delays
-from identification.delay_compensation import (
+from identification.errors import IdentificationError, ModelError, ShapeError
+from identification.estimators.consistent import (
+    Consistency,
+    ConsistentEstimate,
+    consistent_estimate,
+)
+from identification.estimators.covariance import with_block_covariance
+from identification.estimators.delay import DelayEstimate, estimate_delays
+from identification.estimators.delay_compensation import (
     compensate,
     delay_sensitivity,
     rate_products,
     with_uncertain_delay,
 )
-from identification.elements import (
+from identification.estimators.gains import Gains, identify_gains
+from identification.estimators.instrument_motion import planned_motion
+from identification.estimators.instrumental import InstrumentalEstimate, estimate_instrumental
+from identification.estimators.least_squares import (
+    fit_least_squares,
+    ordinary_least_squares,
+    weighted_least_squares,
+)
+from identification.estimators.losses import Huber, Tukey
+from identification.estimators.nominal_prior import nominal_prior
+from identification.estimators.prior import (
+    GaussianPrior,
+    PosteriorEstimate,
+    fit_with_prior,
+    with_prior,
+)
+from identification.estimators.repetitions import RepeatedEstimate, estimate_repetitions
+from identification.estimators.robust import RobustEstimate, robust_estimate
+from identification.export.friction import friction_in_words, friction_source
+from identification.export.parameters import parameters_csv, parameters_json
+from identification.export.urdf import write_urdf
+from identification.factor.estimation import Estimate, estimate
+from identification.factor.gram import Factor, NormalEquations
+from identification.factor.instruments import InstrumentFactor
+from identification.factor.phases import PhaseFactor
+from identification.factor.qr import QRFactor
+from identification.model.base_parameters import BaseParameters
+from identification.model.coupling import Coupling
+from identification.model.elements import (
     Anchors,
     ExtensionSpring,
     GasCylinder,
     JointElements,
     TorsionSpring,
 )
-from identification.endogeneity import EndogeneityTest, endogeneity_test
-from identification.errors import IdentificationError, ModelError, ShapeError
-from identification.essential import Elimination, eliminate
-from identification.estimation import Estimate, estimate
-from identification.evidence import Evidence, gather
-from identification.factor import Factor, NormalEquations
-from identification.friction import FrictionLaw, JointFriction
-from identification.friction_text import friction_in_words, friction_source
-from identification.gains import Gains, identify_gains
-from identification.instrument_factor import InstrumentFactor
-from identification.instrument_motion import planned_motion
-from identification.instrumental import InstrumentalEstimate, estimate_instrumental
-from identification.least_squares import (
-    fit_least_squares,
-    ordinary_least_squares,
-    weighted_least_squares,
-)
-from identification.losses import Huber, Tukey
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.noise import standstill_variance
-from identification.nominal_prior import nominal_prior
-from identification.parameter_text import parameters_csv, parameters_json
-from identification.payload import Payload
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Preprocessing, Samples, prepare, smooth
-from identification.prior import GaussianPrior, PosteriorEstimate, fit_with_prior, with_prior
-from identification.qr_factor import QRFactor
-from identification.recording import Recording, RecordingError
-from identification.regressor import Regressor
-from identification.repetitions import RepeatedEstimate, estimate_repetitions
-from identification.resampling import resample
-from identification.robust import RobustEstimate, robust_estimate
+from identification.model.friction import FrictionLaw, JointFriction
+from identification.model.motion import Motion
+from identification.model.payload import Payload
+from identification.model.regressor import Regressor
+from identification.model.robot import RobotModel
+from identification.selection.essential import Elimination, eliminate
 from identification.signals.clock import Clock, TimeBase, time_base, true_times
-from identification.urdf_write import write_urdf
-from identification.validation import PredictionError, prediction_error
-from identification.verdict import Thresholds, Verdict, judge
+from identification.signals.noise import standstill_variance
+from identification.signals.recording import Recording, RecordingError
+from identification.signals.resampling import resample
+from identification.signals.samples import Preprocessing, Samples, prepare, smooth
+from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
+from identification.validation.evidence import Evidence, gather
+from identification.validation.prediction import PredictionError, prediction_error
+from identification.validation.verdict import Thresholds, Verdict, judge
 
 __all__ = [
     # model

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification import RobotModel
-from identification.factor import Factor
-from identification.friction import Viscous
+from identification.factor.gram import Factor
+from identification.model.friction import Viscous
 
 Array = NDArray[np.float64]
 

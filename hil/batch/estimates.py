@@ -14,23 +14,23 @@ from hil.cell import Cell
 from hil.identify.cad_prior import cad_prior, required
 from hil.identify.settings import Settings
 from identification import IdentificationError
-from identification.consistent import consistent_estimate
-from identification.delay_compensation import with_uncertain_delay
-from identification.estimation import (
+from identification.estimators.consistent import consistent_estimate
+from identification.estimators.delay_compensation import with_uncertain_delay
+from identification.estimators.least_squares import Weighting, fit_least_squares, weights_of
+from identification.estimators.prior import fit_with_prior, with_prior
+from identification.estimators.repetitions import no_narrower
+from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
+from identification.factor.estimation import (
     Estimate,
     mark_undetermined,
     nothing_usable,
     solve,
 )
-from identification.factor import Factor
-from identification.least_squares import Weighting, fit_least_squares, weights_of
-from identification.model import RobotModel
-from identification.payload import Payload
-from identification.phase_factor import PhaseFactor
-from identification.prior import fit_with_prior, with_prior
-from identification.qr_factor import QR_CONDITION
-from identification.repetitions import no_narrower
-from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
+from identification.factor.gram import Factor
+from identification.factor.phases import PhaseFactor
+from identification.factor.qr import QR_CONDITION
+from identification.model.payload import Payload
+from identification.model.robot import RobotModel
 
 from .axis_figures import speed_rms
 from .types import ArchiveRef, BatchEstimator, Level, LevelEstimate, Summary

@@ -24,13 +24,13 @@ from hil.identify.settings import Settings, judged_samples, samples_of, signals_
 from hil.identify.sources import Source, known_doubts, source_of
 from hil.importers import Findings
 from identification import IdentificationError
-from identification.covariance import block_covariance
-from identification.delay_compensation import rate_products
-from identification.estimation import Estimate
-from identification.least_squares import Weighting, fit_least_squares, weights_of
-from identification.model import RobotModel
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples
+from identification.estimators.covariance import block_covariance
+from identification.estimators.delay_compensation import rate_products
+from identification.estimators.least_squares import Weighting, fit_least_squares, weights_of
+from identification.factor.estimation import Estimate
+from identification.factor.phases import PhaseFactor
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
 
 from .errors import ChangedError, TornError
 from .types import ArchiveFactor, ArchiveRef, Broken, Bundle, FileStamp, Fit, Summary

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from hil.identify.settings import Settings
-from identification.estimation import Estimate
-from identification.phase_factor import PhaseFactor
+from identification.factor.estimation import Estimate
+from identification.factor.phases import PhaseFactor
 from planner.plain import number, table, text, texts, whole
 
 from .cache import Entry

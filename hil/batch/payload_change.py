@@ -26,7 +26,7 @@ from scipy.linalg import pinvh
 from scipy.stats import f as fisher
 
 from identification import RobotModel
-from identification.wrench import LINK_SYMBOLS
+from identification.model.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from hil.batch import payload_change
 from hil.batch.payload_change import Change, Projection, State
 from hil.batch.types import LevelEstimate
 from identification import RobotModel
-from identification.payload import Payload
+from identification.model.payload import Payload
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from hil.errors import InputError
 from hil.identify.options import Options
 from hil.progress import Reporter
 from identification import IdentificationError
-from identification.payload import Payload
-from identification.phase_factor import PhaseFactor
+from identification.factor.phases import PhaseFactor
+from identification.model.payload import Payload
 
 from .cache import Where
 from .discovery import discover

@@ -14,7 +14,7 @@ from hil.batch.chart import FEWEST
 from hil.batch.payload_change import Change
 from hil.batch.payload_trend import Statement
 from hil.batch.trend import ArmTrend, AxisTrend, Watched
-from identification.payload import Payload
+from identification.model.payload import Payload
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from identification.estimation import Estimate
-from identification.factor import Factor
-from identification.payload import Payload
-from identification.phase_factor import PhaseFactor
+from identification.factor.estimation import Estimate
+from identification.factor.gram import Factor
+from identification.factor.phases import PhaseFactor
+from identification.model.payload import Payload
 
 Array = NDArray[np.float64]
 
@@ -125,8 +125,9 @@ class Summary:
         fits: by weighting, "weighted" and "ordinary"; none of a validation run.
         duration: from first to last sample [s].
         doubts: what a reader must know of it.
-        products: (n, p, p + 1), see :func:`identification.delay_compensation.rate_products`; None
-            where the delay is known, or nothing is fitted.
+        products: (n, p, p + 1), see
+            :func:`identification.estimators.delay_compensation.rate_products`; None where the delay
+            is known, or nothing is fitted.
     """
 
     ref: ArchiveRef

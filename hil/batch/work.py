@@ -13,7 +13,7 @@ from hil.identify.options import Options
 from hil.identify.settings import Settings
 from hil.progress import Reporter, Task
 from identification import IdentificationError
-from identification.phase_factor import PhaseFactor
+from identification.factor.phases import PhaseFactor
 
 from .cache import Where
 from .errors import CacheError

@@ -34,7 +34,7 @@ from collections.abc import Mapping
 
 from hil.reading import toml_of
 from identification.errors import ModelError
-from identification.urdf_tree import urdf_tree
+from identification.model.urdf_tree import urdf_tree
 
 MESH: Final = "mesh "
 """Begins the entry of a mesh, by its name in the URDF."""

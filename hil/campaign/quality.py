@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from drivers.events import MotionStarted
 from hil.archive import Archive, open_archive
 from hil.cell import Cell
-from identification.noise import STANDSTILL_WINDOW
-from identification.recording import stuck
+from identification.signals.noise import STANDSTILL_WINDOW
+from identification.signals.recording import stuck
 from planner import FourierSeries, PiecewiseCubic
 
 from .standstill import ARM_MOVED

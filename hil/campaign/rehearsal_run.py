@@ -40,10 +40,10 @@ from hil.identify.estimating import estimate_with
 from hil.identify.options import FIXED
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
+from identification.distributions import normal_limit
 from identification.errors import IdentificationError
-from identification.quantiles import normal_limit
-from identification.recording import RecordingError
-from identification.validation import over_all, prediction_error
+from identification.signals.recording import RecordingError
+from identification.validation.prediction import over_all, prediction_error
 
 from .folder import CampaignFolder
 

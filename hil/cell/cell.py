@@ -16,7 +16,7 @@ from drivers.drive_train import DriveTrain
 from drivers.guard import GuardLimits
 from hil.reading import text_of, toml_of
 from identification.excitation import Box, Workspace
-from identification.model import RobotModel
+from identification.model.robot import RobotModel
 from planner import JointLimits
 from planner.toml_value import toml_value
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.coupling import Coupling
-from identification.elements import (
+from identification.errors import ModelError
+from identification.model.coupling import Coupling
+from identification.model.elements import (
     Anchors,
     Element,
     ElementError,
@@ -20,11 +21,10 @@ from identification.elements import (
     JointElements,
     TorsionSpring,
 )
-from identification.errors import ModelError
-from identification.friction import FrictionLaw
-from identification.kinematics import Chain, chain_from_urdf, pinocchio_model
-from identification.model import RobotModel
-from identification.payload import Payload
+from identification.model.friction import FrictionLaw
+from identification.model.kinematics import Chain, chain_from_urdf, pinocchio_model
+from identification.model.payload import Payload
+from identification.model.robot import RobotModel
 
 from .errors import CellError
 from .schema import (

@@ -14,8 +14,8 @@ from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
 from hil.identify.gain_run import GainsFound, find_gains
 from hil.progress import reporter as make_reporter
-from identification.gains import GainMethod
-from identification.payload import Payload
+from identification.estimators.gains import GainMethod
+from identification.model.payload import Payload
 
 
 def gains(

@@ -9,7 +9,7 @@ import typer
 
 from hil.errors import InputError
 from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator
-from identification.preprocessing import Smoother
+from identification.signals.samples import Smoother
 
 LONGEST_DELAY: Final = 0.5
 """s; what lags by more belongs to another recording."""

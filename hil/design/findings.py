@@ -18,7 +18,7 @@ from identification.excitation import (
     sampled,
 )
 from identification.excitation.collision.built_in import NEAR
-from identification.motion import Motion
+from identification.model.motion import Motion
 from planner import Trajectory
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from identification.excitation import (
     ViaPointGenome,
 )
 from identification.excitation.constraints import clearance
-from identification.motion import Motion
+from identification.model.motion import Motion
 
 from .advice import NoExcitationError
 from .settings import DesignSettings, SettingsError, SineTable

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.results import CalibrationResult
-from identification.calibration import Calibration, TorqueMeans, calibrate
 from identification.errors import IdentificationError
-from identification.factor import Factor
-from identification.residual_blocks import BLOCK
-from identification.shrinkage import Shrinkage, fitted_values
+from identification.estimators.shrinkage import Shrinkage, fitted_values
+from identification.factor.gram import Factor
+from identification.validation.calibration import Calibration, TorqueMeans, calibrate
+from identification.validation.residual_blocks import BLOCK
 
 from .estimating import Estimation
 from .prepared import Prepared

@@ -6,12 +6,12 @@ import numpy as np
 
 from hil.results import ConsistencyResult, LinkResult
 from identification import Factor, IdentificationError, RobotModel, estimate
-from identification.consistency_check import ConsistencyCheck, check_consistency
-from identification.consistent import Consistency
-from identification.consistent_program import link_parameters
-from identification.covariance import with_block_covariance
-from identification.estimation import joint_weights
-from identification.phase_factor import PhaseFactor
+from identification.estimators.consistent import Consistency
+from identification.estimators.consistent_program import link_parameters
+from identification.estimators.covariance import with_block_covariance
+from identification.factor.estimation import joint_weights
+from identification.factor.phases import PhaseFactor
+from identification.validation.consistency import ConsistencyCheck, check_consistency
 
 
 def consistency_of(

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from identification.estimation import Estimate
-from identification.inertia_ratio import InertiaRatio, inertia_ratio
-from identification.preprocessing import Samples
-from identification.validation import PredictionError, over_all
+from identification.factor.estimation import Estimate
+from identification.signals.samples import Samples
+from identification.validation.inertia_ratio import InertiaRatio, inertia_ratio
+from identification.validation.prediction import PredictionError, over_all
 
 from .sources import Source
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import ArchiveError
-from identification.current_scale import CurrentScale, scale_from_nominal
-from identification.preprocessing import smooth
-from identification.recording import Recording
+from identification.estimators.current_scale import CurrentScale, scale_from_nominal
+from identification.signals.recording import Recording
+from identification.signals.samples import smooth
 from planner.plain import numbers
 
 from .sources import Sources

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.progress import Reporter
-from identification.delay import DelayEstimate, estimate_delays
 from identification.errors import IdentificationError
-from identification.inner_prediction import Question, choose_settings
-from identification.inner_prediction import Settings as Candidate
-from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, Samples
-from identification.repetition_noise import repetition_noise
-from identification.thresholds import Thresholds
-from identification.torque_channel import possible_low_passes
+from identification.estimators.delay import DelayEstimate, estimate_delays
+from identification.estimators.torque_channel import possible_low_passes
+from identification.model.robot import RobotModel
+from identification.selection.inner_prediction import Question, choose_settings
+from identification.selection.inner_prediction import Settings as Candidate
+from identification.signals.repetition_noise import repetition_noise
+from identification.signals.samples import Preprocessing, Samples
+from identification.validation.thresholds import Thresholds
 
 from .options import Options
 from .settings import Settings, samples_of, signals_of, stated_delay, stated_settings

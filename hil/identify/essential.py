@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from hil.results import BlindResult, EliminationStepResult, EssentialParameter, EssentialResult
 from identification import IdentificationError, RobotModel
-from identification.essential_choice import EssentialChoice, choose_essential
-from identification.phase_factor import PhaseFactor
+from identification.factor.phases import PhaseFactor
+from identification.selection.essential_choice import EssentialChoice, choose_essential
 
 
 def essential_of(

@@ -13,19 +13,19 @@ import numpy as np
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
-from identification.consistent import consistent_estimate
-from identification.delay_compensation import rate_products, with_uncertain_delay
-from identification.endogeneity import EndogeneityTest
-from identification.estimation import Estimate, joint_weights, nothing_usable
-from identification.least_squares import Weighting, fit_least_squares
-from identification.losses import Huber, Loss, Tukey
-from identification.phase_factor import PhaseFactor, total_phase
-from identification.preprocessing import Samples
-from identification.prior import GaussianPrior, PosteriorEstimate, fit_with_prior
-from identification.qr_factor import QR_CONDITION
-from identification.repetitions import RepeatedEstimate, estimate_repetitions
-from identification.robust import RobustEstimate, robust_estimate
-from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk
+from identification.estimators.consistent import consistent_estimate
+from identification.estimators.delay_compensation import rate_products, with_uncertain_delay
+from identification.estimators.least_squares import Weighting, fit_least_squares
+from identification.estimators.losses import Huber, Loss, Tukey
+from identification.estimators.prior import GaussianPrior, PosteriorEstimate, fit_with_prior
+from identification.estimators.repetitions import RepeatedEstimate, estimate_repetitions
+from identification.estimators.robust import RobustEstimate, robust_estimate
+from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
+from identification.factor.estimation import Estimate, joint_weights, nothing_usable
+from identification.factor.phases import PhaseFactor, total_phase
+from identification.factor.qr import QR_CONDITION
+from identification.signals.samples import Samples
+from identification.validation.endogeneity import EndogeneityTest
 
 from .cad_prior import cad_prior, required
 from .instruments import InstrumentalFit, fit_instrumental, widely_smoothed

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.results import ExportResult, Results
 from identification import Estimate, IdentificationError, RobotModel
-from identification.consistent import ConsistentEstimate
-from identification.friction_text import friction_in_words, friction_source
-from identification.parameter_text import parameters_csv, parameters_json, standard_csv
-from identification.urdf_write import write_urdf
-from identification.xml_source import Edit, XmlSource, comment_text
+from identification.estimators.consistent import ConsistentEstimate
+from identification.export.friction import friction_in_words, friction_source
+from identification.export.parameters import parameters_csv, parameters_json, standard_csv
+from identification.export.urdf import write_urdf
+from identification.export.xml_source import Edit, XmlSource, comment_text
 
 Array = NDArray[np.float64]
 

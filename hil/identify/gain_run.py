@@ -13,11 +13,11 @@ from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
-from identification.gain_factor import GainFactor
-from identification.gains import GainMethod, Gains, identify_gains
-from identification.model import RobotModel
-from identification.payload import Payload
-from identification.recording import Recording, RecordingError
+from identification.estimators.gains import GainMethod, Gains, identify_gains
+from identification.factor.gains import GainFactor
+from identification.model.payload import Payload
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording, RecordingError
 
 from .currents import motor_from_joint
 from .options import FIXED
@@ -60,7 +60,7 @@ def find_gains(
         archives: recordings as their cells say.
         loaded: further recordings, each with what the robot carried.
         reporter: told of the progress.
-        method: see :mod:`identification.gains`.
+        method: see :mod:`identification.estimators.gains`.
         delay: time by which currents lag positions [s]; None takes it from the cell.
 
     Raises:

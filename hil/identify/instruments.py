@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification import IdentificationError, RobotModel
-from identification.endogeneity import EndogeneityTest, endogeneity_test
-from identification.estimation import Estimate
-from identification.instrument_factor import InstrumentFactor
-from identification.instrument_motion import planned_motion, same_plan
-from identification.instrumental import InstrumentalEstimate, estimate_instrumental
-from identification.preprocessing import Samples
+from identification.estimators.instrument_motion import planned_motion, same_plan
+from identification.estimators.instrumental import InstrumentalEstimate, estimate_instrumental
+from identification.factor.estimation import Estimate
+from identification.factor.instruments import InstrumentFactor
+from identification.signals.samples import Samples
+from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 
 from .prepared import Prepared
 from .settings import samples_of

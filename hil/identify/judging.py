@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from hil.results import FindingResult, JointJudgement, JudgementResult, ProfileResult
 from identification.errors import IdentificationError
-from identification.evidence import Evidence
-from identification.residual_profile import Profile
-from identification.verdict import Verdict
+from identification.validation.evidence import Evidence
+from identification.validation.residual_profile import Profile
+from identification.validation.verdict import Verdict
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args
 
 from hil.errors import InputError
-from identification.friction import ABSENT, TERMS
-from identification.masks import LeftOut
-from identification.preprocessing import RIGID_BANDWIDTH, Smoother, VelocitySource
+from identification.model.friction import ABSENT, TERMS
+from identification.signals.masks import LeftOut
+from identification.signals.samples import RIGID_BANDWIDTH, Smoother, VelocitySource
 
 Method = Literal["default", "paper"]
 Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
@@ -52,7 +52,7 @@ class Options:
         in_sample: everything is fitted and nothing predicted: all errors are in-sample.
 
     What is "auto" is chosen by predicting parts of what is fitted from the rest
-    (:mod:`identification.inner_prediction`).
+    (:mod:`identification.selection.inner_prediction`).
 
     Raises:
         InputError: a name is unknown, the split no share or the bandwidth no frequency.

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.progress import Reporter
-from identification.delay import DelayEstimate
-from identification.preprocessing import Samples
+from identification.estimators.delay import DelayEstimate
 from identification.signals.clock import time_base
+from identification.signals.samples import Samples
 
 from .currents import with_torques
 from .deciding import Decided, decide, with_noise

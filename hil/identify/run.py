@@ -13,12 +13,12 @@ from hil.errors import InputError
 from hil.progress import Reporter
 from hil.report import ReportSeries
 from hil.results import Results
-from identification.consistency_check import ConsistencyCheck
-from identification.essential_choice import EssentialChoice
-from identification.evidence import gather
-from identification.phase_factor import PhaseFactor
-from identification.repetitions import RepeatedEstimate
-from identification.verdict import Verdict, judge
+from identification.estimators.repetitions import RepeatedEstimate
+from identification.factor.phases import PhaseFactor
+from identification.selection.essential_choice import EssentialChoice
+from identification.validation.consistency import ConsistencyCheck
+from identification.validation.evidence import gather
+from identification.validation.verdict import Verdict, judge
 
 from .consistency import consistency_doubts, consistency_of, consistency_reasons
 from .essential import essential_doubts, essential_of

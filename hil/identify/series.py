@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.report import ReportSeries
-from identification.friction_curve import friction_curve, friction_torque
-from identification.model import RobotModel
-from identification.preprocessing import Samples
-from identification.repetitions import RepeatedEstimate
-from identification.spectrum import spectrum
-from identification.torque_parts import torque_parts
-from identification.validation import for_figure
+from identification.estimators.repetitions import RepeatedEstimate
+from identification.export.friction_curve import friction_curve, friction_torque
+from identification.export.torque_parts import torque_parts
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.signals.spectrum import spectrum
+from identification.validation.prediction import for_figure
 
 from .prepared import Prepared
 from .summary import moving_rows

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from identification.delay_compensation import compensate
-from identification.inner_prediction import Choice
-from identification.model import RobotModel
-from identification.preprocessing import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
-from identification.shrinkage import Shrinkage
+from identification.estimators.delay_compensation import compensate
+from identification.estimators.shrinkage import Shrinkage
+from identification.model.robot import RobotModel
+from identification.selection.inner_prediction import Choice
+from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
 
 from .options import Options
 from .sources import Source

@@ -21,11 +21,11 @@ from hil.errors import ArchiveError, InputError
 from hil.importers import Findings
 from hil.reading import digest_of
 from hil.recordings import recording_of
-from identification.noise import standstill_variance
-from identification.recording import Recording, RecordingError
-from identification.resampling import without_repeats
 from identification.signals.clock import true_times
+from identification.signals.noise import standstill_variance
+from identification.signals.recording import Recording, RecordingError
 from identification.signals.repeats import offsets_of_repetitions
+from identification.signals.resampling import without_repeats
 
 Array = NDArray[np.float64]
 

@@ -31,8 +31,7 @@ from hil.results import (
 from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, RobotModel
-from identification.consistency_check import ConsistencyCheck
-from identification.essential_choice import EssentialChoice
+from identification.estimators.repetitions import RepeatedEstimate
 from identification.excitation import (
     Excitation,
     condition_number,
@@ -43,10 +42,11 @@ from identification.excitation import (
     information,
     log10_det,
 )
-from identification.preprocessing import Samples
-from identification.repetitions import RepeatedEstimate
-from identification.validation import PredictionError, over_all, prediction_error
-from identification.verdict import Verdict
+from identification.selection.essential_choice import EssentialChoice
+from identification.signals.samples import Samples
+from identification.validation.consistency import ConsistencyCheck
+from identification.validation.prediction import PredictionError, over_all, prediction_error
+from identification.validation.verdict import Verdict
 from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, URDF_PATH
 

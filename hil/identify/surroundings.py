@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from identification.estimation import Estimate
-from identification.evidence import Surroundings
-from identification.finding import Finding, listed
-from identification.inner_prediction import LOW_PASS
-from identification.masks import SATURATED
-from identification.nominal_prior import NOMINAL_SHARE
-from identification.nominal_scale import NominalScale, nominal_scale
-from identification.position_jumps import position_jumps
-from identification.urdf_tree import urdf_tree
+from identification.estimators.nominal_prior import NOMINAL_SHARE
+from identification.factor.estimation import Estimate
+from identification.model.urdf_tree import urdf_tree
+from identification.selection.inner_prediction import LOW_PASS
+from identification.signals.masks import SATURATED
+from identification.validation.evidence import Surroundings
+from identification.validation.findings.finding import Finding, listed
+from identification.validation.nominal_scale import NominalScale, nominal_scale
+from identification.validation.position_jumps import position_jumps
 
 from .controller_model import controller_error, controller_inertia
 from .prepared import Prepared

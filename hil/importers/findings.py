@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from hil.archive import Samples, foreign_json
+from identification.model.urdf_tree import urdf_tree
 from identification.signals.clock import time_base
-from identification.urdf_tree import urdf_tree
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from hil.importers.findings import Limits, urdf_limits
 from hil.reading import remedy_of, text_of
 from identification import FrictionLaw
 from identification.errors import ModelError
-from identification.kinematics import pinocchio_model
+from identification.model.kinematics import pinocchio_model
 from planner.toml_value import toml_value
 
 STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)

@@ -24,8 +24,8 @@ from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
 from hil.reading import remedy_of, text_of
 from identification.errors import ModelError
-from identification.kinematics import Chain, chain_from_urdf
-from identification.urdf_tree import urdf_tree
+from identification.model.kinematics import Chain, chain_from_urdf
+from identification.model.urdf_tree import urdf_tree
 from planner.toml_value import toml_key, toml_value
 
 from .known import Known, from_urdf

@@ -23,7 +23,7 @@ from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
 from hil.report.figures.canvas import thinned
 from identification.errors import ModelError
-from identification.kinematics import chain_from_urdf
+from identification.model.kinematics import chain_from_urdf
 
 Array = NDArray[np.float64]
 

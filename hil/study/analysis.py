@@ -20,10 +20,10 @@ from hil.identify.sources import gather_sources
 from hil.identify.summary import executed_rows, moving_rows
 from hil.progress import Reporter, Silent
 from identification import Factor, RobotModel
+from identification.estimators.repetitions import estimate_repetitions
 from identification.excitation import correlation, coupling_index, information, log10_det
-from identification.preprocessing import Samples
-from identification.repetitions import estimate_repetitions
-from identification.validation import PredictionError, for_figure
+from identification.signals.samples import Samples
+from identification.validation.prediction import PredictionError, for_figure
 from planner import FlyDistance, FlyPercent, InvalidPlanFile
 from planner.commands import Fly
 

@@ -22,9 +22,9 @@ from hil.files import make_folder, write_or_tell
 from hil.reading import text_of
 from hil.results.frozen import Frozen
 from identification import RobotModel
-from identification.preprocessing import Samples
-from identification.smoothing_spline import low_pass
-from identification.validation import FIGURE_BANDWIDTH
+from identification.signals.samples import Samples
+from identification.signals.smoothing import low_pass
+from identification.validation.prediction import FIGURE_BANDWIDTH
 
 Array = NDArray[np.float64]
 MotionClass = Literal["fly-by", "stop-to-stop", "sinusoid"]

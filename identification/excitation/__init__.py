@@ -22,7 +22,6 @@ from identification.excitation.criteria import (
     information,
     log10_det,
 )
-from identification.excitation.drawn import DrawnMotion
 from identification.excitation.errors import (
     CollisionModelError,
     DesignError,
@@ -36,6 +35,7 @@ from identification.excitation.errors import (
 from identification.excitation.excitation import Excitation
 from identification.excitation.genome import Genome
 from identification.excitation.objective import Measures, Objective
+from identification.excitation.random_motion import DrawnMotion
 from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
 from identification.excitation.searches.design import Design
 from identification.excitation.searches.front import Front

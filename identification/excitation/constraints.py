@@ -13,8 +13,8 @@ from identification.excitation.errors import DesignError
 from identification.excitation.joint_limits import limit_violations, rest_violations
 from identification.excitation.sampling import SAMPLE_PERIOD, sampled
 from identification.excitation.violation import KINDS, Kind, Violation, excess_by_kind
-from identification.model import RobotModel
-from identification.motion import Motion
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
 from planner import FourierSeries, JointLimits, PiecewiseCubic
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.criteria import Criteria
-from identification.excitation.drawn import moves_through
+from identification.excitation.random_motion import moves_through
 from planner import FourierSeries, Move, PiecewiseCubic
 from planner.plain import DAMAGED, number, numbers, table, text, whole
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.violation import Violation
-from identification.motion import Motion
+from identification.model.motion import Motion
 from planner import (
     FourierSeries,
     JointLimits,

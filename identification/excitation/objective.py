@@ -13,9 +13,9 @@ from identification.errors import ShapeError
 from identification.excitation.criteria import Criteria, log10_det_and_coupling
 from identification.excitation.errors import DesignError
 from identification.excitation.sampling import SAMPLE_PERIOD, midpoints
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.regressor import joint_arrays
+from identification.model.motion import Motion
+from identification.model.regressor import joint_arrays
+from identification.model.robot import RobotModel
 from planner import Trajectory
 
 Array = NDArray[np.float64]

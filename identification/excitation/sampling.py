@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from identification.motion import Motion
+from identification.model.motion import Motion
 from planner import Trajectory
 
 SAMPLE_PERIOD: Final = 0.008

@@ -20,9 +20,9 @@ from identification.excitation.constraints import (
     check_motion,
     clearance,
 )
-from identification.excitation.drawn import DrawnMotion
 from identification.excitation.errors import DesignError, NoFeasibleMotionError
-from identification.excitation.ways import is_inside, straight_way
+from identification.excitation.random_motion import DrawnMotion
+from identification.excitation.straight_paths import is_inside, straight_way
 from planner import (
     JointLimits,
     PlannerCrashed,

@@ -15,7 +15,7 @@ from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genome import between, checked_genes, share_between
-from identification.excitation.ways import free_ways, is_inside, straight_way
+from identification.excitation.straight_paths import free_ways, is_inside, straight_way
 from planner import FourierSeries, JointLimits, PiecewiseCubic, PlannerError, plan_in_child
 from planner.arrays import read_only
 from planner.batch import plan_chunk

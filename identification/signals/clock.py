@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.recording import GAP_STEPS, Recording, RecordingError
+from identification.signals.recording import GAP_STEPS, Recording, RecordingError
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]

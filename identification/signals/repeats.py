@@ -9,7 +9,7 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
-from identification.recording import Recording
+from identification.signals.recording import Recording
 
 Array = NDArray[np.float64]
 

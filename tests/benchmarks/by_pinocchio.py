@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from identification.preprocessing import Samples
+from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 

@@ -18,12 +18,12 @@ from benchmarks.study_recordings import (
 )
 from benchmarks.study_tables import Covered, coverage_table, markdown, size_table
 from hil.simulation import planted_values
-from identification.factor import Factor
-from identification.friction import FrictionLaw
-from identification.least_squares import weighted_least_squares
-from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, prepare
-from identification.recording import Recording
+from identification.estimators.least_squares import weighted_least_squares
+from identification.factor.gram import Factor
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
 from tests.benchmarks import by_pinocchio
 
 SAMPLES, JOINTS = 20_000, 6

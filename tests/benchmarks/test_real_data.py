@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.real_data import ESTIMATORS, Case, error, load_case, splits_of
-from identification.friction import FrictionLaw
-from identification.least_squares import weighted_least_squares
-from identification.model import RobotModel
-from identification.preprocessing import prepare
+from identification.estimators.least_squares import weighted_least_squares
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.samples import prepare
 from tests.benchmarks import by_pinocchio
 
 

@@ -14,7 +14,7 @@ import typer
 from hil.cli import app
 from tests.docs.typed import ROOT
 
-MODULES = sorted((ROOT / "identification").glob("*_findings.py"))
+MODULES = sorted((ROOT / "identification" / "validation" / "findings").glob("[a-z]*.py"))
 _COMMAND = re.compile(r"`hil ([^`]+)`")
 
 

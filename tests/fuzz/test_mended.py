@@ -25,8 +25,8 @@ from hil.importers import ColumnMap, import_log, import_rosbag2
 from hil.new import from_archive
 from hil.plots.archive_view import _state_name, view_of
 from identification.errors import ModelError
-from identification.kinematics import chain_from_urdf
-from identification.payload import Payload
+from identification.model.kinematics import chain_from_urdf
+from identification.model.payload import Payload
 from tests.fault_matrix.small_cell import URDF
 from tests.fuzz.targets import documents, importers
 from tests.hil.fast_cell import CELL

@@ -16,11 +16,11 @@ from hil.batch.trend import ArmTrend, arm_trend
 from hil.batch.types import LevelEstimate
 from hil.cell import Cell
 from identification import Motion, RobotModel
-from identification.covariance import with_block_covariance
-from identification.estimation import estimate, joint_weights
-from identification.payload import Payload
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples
+from identification.estimators.covariance import with_block_covariance
+from identification.factor.estimation import estimate, joint_weights
+from identification.factor.phases import PhaseFactor
+from identification.model.payload import Payload
+from identification.signals.samples import Samples
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
 
 Array = NDArray[np.float64]

@@ -17,12 +17,12 @@ from hil.identify.consistency import consistency_of
 from hil.identify.essential import essential_of
 from hil.identify.exports import Exports, exports_of
 from identification import Estimate, Motion
-from identification.consistency_check import ConsistencyCheck
-from identification.covariance import with_block_covariance
-from identification.essential_choice import EssentialChoice
-from identification.estimation import estimate, joint_weights
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples
+from identification.estimators.covariance import with_block_covariance
+from identification.factor.estimation import estimate, joint_weights
+from identification.factor.phases import PhaseFactor
+from identification.selection.essential_choice import EssentialChoice
+from identification.signals.samples import Samples
+from identification.validation.consistency import ConsistencyCheck
 
 Array = NDArray[np.float64]
 

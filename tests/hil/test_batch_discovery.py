@@ -32,7 +32,7 @@ from hil.errors import InputError
 from hil.identify.options import FIXED
 from hil.identify.settings import Settings
 from hil.progress import Silent
-from identification.preprocessing import Preprocessing
+from identification.signals.samples import Preprocessing
 
 from .archive_edits import with_attachment
 from .batch_workers import Here

@@ -26,10 +26,10 @@ from hil.batch.types import ArchiveRef, Broken
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
 from hil.identify.settings import Settings
-from identification.inner_prediction import Choice
-from identification.low_passes import LowPassShape
-from identification.preprocessing import Preprocessing
-from identification.shrinkage import Shrinkage
+from identification.estimators.shrinkage import Shrinkage
+from identification.selection.inner_prediction import Choice
+from identification.signals.low_passes import LowPassShape
+from identification.signals.samples import Preprocessing
 from sim_fixtures.ns16 import CELL_PATH
 
 KEY = "0123456789abcdef"

@@ -32,7 +32,7 @@ from hil.identify.options import FIXED
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import Sources, gather_sources
 from hil.progress import Reporter, Silent
-from identification.shrinkage import Shrinkage
+from identification.estimators.shrinkage import Shrinkage
 
 from .batch_workers import NOTHING_OPEN, Here
 

@@ -25,7 +25,7 @@ from hil.batch.trend import FALSE_ALARMS, ArmTrend, Trends, Watched, arm_trend
 from hil.batch.trend_words import findings, shifts, summary
 from hil.batch.types import Broken
 from hil.report.trend import render_trend_report, write_trend_report
-from identification.payload import Payload
+from identification.model.payload import Payload
 
 from .arm_histories import FRICTION, Condition, Load, history, model, motion, steady, trend_of
 

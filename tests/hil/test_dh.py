@@ -18,7 +18,7 @@ from hil.cli import app
 from hil.errors import InputError
 from hil.identify.surroundings import nominal_of
 from hil.importers import Convention, Robot, urdf_of_dh
-from identification.kinematics import chain_from_urdf
+from identification.model.kinematics import chain_from_urdf
 from tests.hil.simulated_logs import urdf_path
 
 Array = NDArray[np.float64]

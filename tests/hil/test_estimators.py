@@ -27,7 +27,7 @@ from hil.identify.summary import uncertainty_result
 from hil.progress import Silent
 from hil.results import SCHEMA_VERSION, Results
 from hil.simulation import planted_values
-from identification.prior import GaussianPrior
+from identification.estimators.prior import GaussianPrior
 
 
 def archives(campaign: Campaign) -> list[Path]:

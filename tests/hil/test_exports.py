@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from hil.identify.exports import FILES, Exports, provenance_of
 from hil.results import VerdictResult
-from identification.kinematics import chain_from_urdf
-from identification.urdf_write import not_in_urdf
+from identification.export.urdf import not_in_urdf
+from identification.model.kinematics import chain_from_urdf
 
 from .identified_arm import IdentifiedArm, a_motion, identified_arm, packaged_urdf, write_exports
 from .test_report import make_results

@@ -18,7 +18,7 @@ from hil.errors import InputError, SourceError
 from hil.importers import Robot, import_rosbag2, recorded_joints
 from hil.recordings import open_recording
 from identification import FrictionLaw
-from identification.recording import RecordingError
+from identification.signals.recording import RecordingError
 
 STATE = "sensor_msgs/msg/JointState"
 STORE = get_typestore(Stores.ROS2_HUMBLE)

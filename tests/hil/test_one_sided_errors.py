@@ -22,7 +22,7 @@ from hil.progress import Silent
 from hil.recordings import recording_of
 from hil.results import VerdictResult
 from hil.simulation import simulated_drive
-from identification.friction import Coulomb
+from identification.model.friction import Coulomb
 from sim_fixtures import SimulatedDrive
 
 Run = Callable[..., Campaign]

@@ -14,7 +14,7 @@ import pytest
 from pydantic import BaseModel
 
 from hil.results import Results
-from identification.parameter_text import parameters_dict
+from identification.export.parameters import parameters_dict
 
 from .identified_arm import IdentifiedArm, identified_arm, write_exports
 from .test_exports import ALL, TWO_LINK, table

@@ -11,7 +11,7 @@ from hil.cell import Cell, CellError
 from hil.design import preset, problem_of
 from hil.design.advice import NoExcitationError
 from hil.motion_checks import MotionChecks
-from identification.motion import Motion
+from identification.model.motion import Motion
 from sim_fixtures.ns16 import CELL_PATH
 
 HELD = 2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.pseudo_inertia import Body, inertial_parameters
+from identification.model.pseudo_inertia import Body, inertial_parameters
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.packets import CyclicPacket, Mode, echo, is_init, next_number
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.recording import Recording
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
 from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, SimulatedDrive, ns16
 
 Array = NDArray[np.float64]

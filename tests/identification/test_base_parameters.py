@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from identification import RobotModel
-from identification.base_parameters import TOLERANCE
+from identification.model.base_parameters import TOLERANCE
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, standard_parameters, urdf_text
 
 

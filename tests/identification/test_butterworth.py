@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import butter, filtfilt
 
-from identification.butterworth import butterworth_motion, choose_cutoff
 from identification.errors import ShapeError
-from identification.estimation import estimate
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, prepare
-from identification.recording import Recording, RecordingError
+from identification.factor.estimation import estimate
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.butterworth import butterworth_motion, choose_cutoff
 from identification.signals.clock import time_base
-from identification.validation import prediction_error
+from identification.signals.recording import Recording, RecordingError
+from identification.signals.samples import Preprocessing, prepare
+from identification.validation.prediction import prediction_error
 from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.calibration import Calibration, TorqueMeans, calibrate, inner_errors
 from identification.errors import IdentificationError
-from identification.estimation import joint_weights, solve
-from identification.factor import Factor
-from identification.masks import SATURATED, STANDSTILL, TORN, RowMask
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples
-from identification.repetitions import estimate_repetitions
+from identification.estimators.repetitions import estimate_repetitions
+from identification.factor.estimation import joint_weights, solve
+from identification.factor.gram import Factor
+from identification.factor.phases import PhaseFactor
+from identification.signals.masks import SATURATED, STANDSTILL, TORN, RowMask
+from identification.signals.samples import Samples
+from identification.validation.calibration import Calibration, TorqueMeans, calibrate, inner_errors
 from tests.identification.two_link import MODEL, NOISE, a_motion, coloured, recording, truth
 
 Array = NDArray[np.float64]

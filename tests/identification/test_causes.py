@@ -10,11 +10,11 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from identification.causes import Causes, find_causes
-from identification.estimation import estimate, total
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.preprocessing import Samples
+from identification.factor.estimation import estimate, total
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.causes import Causes, find_causes
 from sim_fixtures.ns16 import urdf_text
 
 Array = NDArray[np.float64]

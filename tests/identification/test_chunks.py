@@ -13,20 +13,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.consistent import consistent_estimate
-from identification.endogeneity import endogeneity_test
-from identification.essential import eliminate
-from identification.estimation import Estimate
-from identification.instrument_factor import InstrumentFactor
-from identification.instrumental import estimate_instrumental
-from identification.least_squares import fit_least_squares
-from identification.losses import Huber, Tukey
-from identification.motion import Motion
-from identification.nominal_prior import nominal_prior
-from identification.phase_factor import PhaseFactor, joined, total_phase
-from identification.preprocessing import Samples
-from identification.prior import fit_with_prior
-from identification.robust import robust_estimate
+from identification.estimators.consistent import consistent_estimate
+from identification.estimators.instrumental import estimate_instrumental
+from identification.estimators.least_squares import fit_least_squares
+from identification.estimators.losses import Huber, Tukey
+from identification.estimators.nominal_prior import nominal_prior
+from identification.estimators.prior import fit_with_prior
+from identification.estimators.robust import robust_estimate
+from identification.factor.estimation import Estimate
+from identification.factor.instruments import InstrumentFactor
+from identification.factor.phases import PhaseFactor, joined, total_phase
+from identification.model.motion import Motion
+from identification.selection.essential import eliminate
+from identification.signals.samples import Samples
+from identification.validation.endogeneity import endogeneity_test
 from tests.identification.two_link import MODEL, a_motion, coloured, recording
 
 Array = NDArray[np.float64]

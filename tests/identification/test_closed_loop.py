@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import FrictionLaw, Motion, RobotModel
-from identification.closed_loop import JointServo, simulated_motion
-from identification.coupling import Coupling
-from identification.elements import TorsionSpring
-from identification.payload import Payload
+from identification.estimators.closed_loop import JointServo, simulated_motion
+from identification.model.coupling import Coupling
+from identification.model.elements import TorsionSpring
+from identification.model.payload import Payload
 
 Array = NDArray[np.float64]
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.consistency_check import ConsistencyCheck, check_consistency
-from identification.covariance import with_block_covariance
-from identification.estimation import estimate, joint_weights
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples
+from identification.estimators.covariance import with_block_covariance
+from identification.factor.estimation import estimate, joint_weights
+from identification.factor.phases import PhaseFactor
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.consistency import ConsistencyCheck, check_consistency
 from tests.identification.test_essential import NOISE, URDF, a_motion, samples_of
 
 Array = NDArray[np.float64]

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification import Factor, FrictionLaw, IdentificationError, Motion, RobotModel, ShapeError
-from identification.consistent import (
+from identification.estimators.consistent import (
     Consistency,
     ConsistentEstimate,
     InfeasibleError,
     consistent_estimate,
     square_root,
 )
-from identification.estimation import Estimate, estimate, joint_weights
-from identification.pseudo_inertia import pseudo_inertia
+from identification.factor.estimation import Estimate, estimate, joint_weights
+from identification.model.pseudo_inertia import pseudo_inertia
 from sim_fixtures.ns16 import urdf_text
 from sim_fixtures.ns16.table2 import table2
 from sim_fixtures.ns16.truth import load_truth, standard_parameters

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import Factor, FrictionLaw, Motion, RobotModel
-from identification.consistent import ConsistentEstimate, consistent_estimate
-from identification.coupling import Coupling
-from identification.estimation import estimate
-from identification.urdf_write import NotConsistentError, not_in_urdf, write_urdf
+from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
+from identification.export.urdf import NotConsistentError, not_in_urdf, write_urdf
+from identification.factor.estimation import estimate
+from identification.model.coupling import Coupling
 from sim_fixtures.ns16 import urdf_text
 from sim_fixtures.ns16.truth import standard_parameters
 

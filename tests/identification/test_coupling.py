@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import Factor, FrictionLaw, ModelError, Motion, RobotModel
-from identification.coupling import Coupling
-from identification.estimation import estimate
+from identification.factor.estimation import estimate
+from identification.model.coupling import Coupling
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
 
 Array = NDArray[np.float64]

@@ -5,17 +5,17 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from identification.covariance import (
+from identification.estimators.covariance import (
     block_length,
     left_out,
     leverage_corrected,
     spread,
     with_block_covariance,
 )
-from identification.estimation import estimate, joint_weights, solve
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples
-from identification.repetitions import estimate_repetitions
+from identification.estimators.repetitions import estimate_repetitions
+from identification.factor.estimation import estimate, joint_weights, solve
+from identification.factor.phases import PhaseFactor
+from identification.signals.samples import Samples
 from tests.identification.two_link import (
     MODEL,
     NOISE,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hil.identify.currents import _doubts
-from identification.current_scale import CurrentScale, scale_from_nominal
+from identification.estimators.current_scale import CurrentScale, scale_from_nominal
 from tests.identification.two_link import MODEL, a_motion, coloured
 
 GAINS = np.array([12.0, 3.0])  # N·m/A

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.delay import LONGEST_DELAY, DelayEstimate, delays_of, estimate_delays
 from identification.errors import IdentificationError
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.payload import Payload
-from identification.preprocessing import Preprocessing, prepare
-from identification.recording import Recording
-from identification.smoothing_spline import low_pass
+from identification.estimators.delay import LONGEST_DELAY, DelayEstimate, delays_of, estimate_delays
+from identification.model.friction import FrictionLaw
+from identification.model.payload import Payload
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
+from identification.signals.smoothing import low_pass
 from tests.identification.simulated_ns16 import ns16_model, simulated_recording
 from tests.identification.ur10_bag import ur10
 

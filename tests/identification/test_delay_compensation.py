@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.delay_compensation import (
+from identification.errors import IdentificationError, ShapeError
+from identification.estimators.delay_compensation import (
     compensate,
     delay_sensitivity,
     rate_products,
     with_uncertain_delay,
 )
-from identification.errors import IdentificationError, ShapeError
-from identification.estimation import Estimate, estimate
-from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, Samples, prepare
+from identification.factor.estimation import Estimate, estimate
+from identification.model.robot import RobotModel
+from identification.signals.samples import Preprocessing, Samples, prepare
 from tests.identification.test_delay import a_recording, model, motion, truth
 
 Array = NDArray[np.float64]

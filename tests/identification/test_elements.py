@@ -12,7 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import Factor, RobotModel, consistent_estimate, estimate
-from identification.elements import (
+from identification.errors import ModelError
+from identification.excitation.searches.journal import digest
+from identification.export.parameters import parameters_dict
+from identification.model.elements import (
     Anchors,
     Element,
     ElementError,
@@ -21,10 +24,7 @@ from identification.elements import (
     JointElements,
     TorsionSpring,
 )
-from identification.errors import ModelError
-from identification.excitation.searches.journal import digest
-from identification.friction import FrictionLaw
-from identification.parameter_text import parameters_dict
+from identification.model.friction import FrictionLaw
 from tests.identification import two_link
 from tests.identification.robots import one_joint
 

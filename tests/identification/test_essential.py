@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.essential import CutRule, eliminate
-from identification.estimation import estimate
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples, prepare
-from identification.torque_channel import possible_low_passes
-from identification.validation import prediction_error
+from identification.estimators.torque_channel import possible_low_passes
+from identification.factor.estimation import estimate
+from identification.factor.phases import PhaseFactor
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.selection.essential import CutRule, eliminate
+from identification.signals.samples import Samples, prepare
+from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.ur10_bag import ur10
 

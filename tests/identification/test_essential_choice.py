@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.essential import CutRule, eliminate
-from identification.essential_choice import choose_essential, relative_error
-from identification.estimation import joint_weights
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Samples
-from identification.validation import over_all, prediction_error
+from identification.factor.estimation import joint_weights
+from identification.factor.phases import PhaseFactor
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.selection.essential import CutRule, eliminate
+from identification.selection.essential_choice import choose_essential, relative_error
+from identification.signals.samples import Samples
+from identification.validation.prediction import over_all, prediction_error
 from tests.identification.test_essential import (
     NOISE,
     URDF,

@@ -11,11 +11,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimation import estimate, joint_weights, residual_variance, solve, total
-from identification.factor import Factor
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.motion import Motion
+from identification.factor.estimation import (
+    estimate,
+    joint_weights,
+    residual_variance,
+    solve,
+    total,
+)
+from identification.factor.gram import Factor
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 

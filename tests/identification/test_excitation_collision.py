@@ -27,7 +27,7 @@ from identification.excitation.collision.bodies import link_bodies
 from identification.excitation.collision.built_in import told
 from identification.excitation.collision.checker import joint_poses
 from identification.excitation.sampling import sampled
-from identification.kinematics import chain_from_urdf
+from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
 

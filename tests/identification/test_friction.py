@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from identification.errors import ModelError
-from identification.friction import TERMS, FrictionLaw, FrictionTerm, Stribeck
+from identification.model.friction import TERMS, FrictionLaw, FrictionTerm, Stribeck
 
 SPEED = np.array([-2.0, -1e-9, 0.0, 1e-9, 0.5])
 

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification import FrictionLaw, RobotModel, ShapeError
-from identification.coupling import Coupling
-from identification.friction import ThirdTerm
-from identification.friction_text import friction_in_words, friction_source
+from identification.export.friction import friction_in_words, friction_source
+from identification.model.coupling import Coupling
+from identification.model.friction import ThirdTerm
 
 URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 LAWS = [

@@ -8,13 +8,13 @@ import pytest
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.friction import FrictionLaw
-from identification.gain_factor import GainFactor
-from identification.gains import GainMethod, Gains, identify_gains
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.payload import Load, Payload
-from identification.preprocessing import Samples
+from identification.estimators.gains import GainMethod, Gains, identify_gains
+from identification.factor.gains import GainFactor
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.payload import Load, Payload
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
 from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import RobotModel
-from identification.inertia_ratio import diagonal_inertia, inertia_ratio
+from identification.validation.inertia_ratio import diagonal_inertia, inertia_ratio
 from tests.hil.identified_arm import packaged_urdf
 
 Array = NDArray[np.float64]

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identification.inner_prediction import Choice, Question, Settings, choose_settings
-from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, Samples, prepare
-from identification.recording import Recording
+from identification.model.robot import RobotModel
+from identification.selection.inner_prediction import Choice, Question, Settings, choose_settings
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, Samples, prepare
 from tests.identification.two_link import MODEL, a_motion, truth
 
 CUT = 1400  # of 2000 rows: what is fitted

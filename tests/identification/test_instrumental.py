@@ -11,22 +11,22 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from identification import instrument_motion
-from identification.closed_loop import JointServo, simulated_motion, standard_parameters
-from identification.endogeneity import EndogeneityTest, endogeneity_test
 from identification.errors import IdentificationError, ShapeError
-from identification.friction import FrictionLaw
-from identification.instrument_factor import InstrumentFactor
-from identification.instrument_motion import planned_motion, same_plan
-from identification.instrumental import (
+from identification.estimators import instrument_motion
+from identification.estimators.closed_loop import JointServo, simulated_motion, standard_parameters
+from identification.estimators.instrument_motion import planned_motion, same_plan
+from identification.estimators.instrumental import (
     InstrumentalEstimate,
     estimate_instrumental,
     partial_r2,
 )
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.preprocessing import Samples
-from identification.smoothing_spline import fit_smoothing_spline
+from identification.factor.instruments import InstrumentFactor
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.signals.smoothing import fit_smoothing_spline
+from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 from sim_fixtures.ns16 import urdf_text
 
 Array = NDArray[np.float64]

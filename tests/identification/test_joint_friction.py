@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
-from identification.coupling import Coupling
-from identification.friction import JointFriction, dissipation
+from identification.model.coupling import Coupling
+from identification.model.friction import JointFriction, dissipation
 from sim_fixtures.ns16 import urdf_text
 
 Array = NDArray[np.float64]

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.covariance import with_block_covariance
 from identification.errors import IdentificationError
-from identification.estimation import estimate, joint_weights
-from identification.least_squares import (
+from identification.estimators.covariance import with_block_covariance
+from identification.estimators.least_squares import (
     fit_least_squares,
     ordinary_least_squares,
     weighted_least_squares,
 )
-from identification.motion import Motion
-from identification.phase_factor import PhaseFactor
-from identification.qr_factor import QRFactor
-from identification.robust import robust_estimate
+from identification.estimators.robust import robust_estimate
+from identification.factor.estimation import estimate, joint_weights
+from identification.factor.phases import PhaseFactor
+from identification.factor.qr import QRFactor
+from identification.model.motion import Motion
 from tests.identification.two_link import (
     MODEL,
     P,

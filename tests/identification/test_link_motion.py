@@ -4,8 +4,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from identification.kinematics import chain_from_urdf
-from identification.link_motion import LinkMotion, _cos_sin
+from identification.model.kinematics import chain_from_urdf
+from identification.model.link_motion import LinkMotion, _cos_sin
 from sim_fixtures.ns16 import urdf_text
 
 

@@ -8,8 +8,8 @@ import pinocchio as pin
 import pytest
 
 from identification import ModelError, RobotModel
-from identification.kinematics import chain_from_urdf
-from identification.urdf_write import WriteBackError, write_urdf
+from identification.export.urdf import WriteBackError, write_urdf
+from identification.model.kinematics import chain_from_urdf
 from tests.identification.robots import one_joint, random_urdf, robot_text, some_bodies
 
 TWO_LINK = (Path(__file__).parent / "two_link.urdf").read_text()

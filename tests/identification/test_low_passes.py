@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt, sosfiltfilt
 
-from identification.estimation import estimate
-from identification.inner_prediction import Question, Settings, choose_settings
-from identification.low_passes import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
-from identification.model import RobotModel
-from identification.preprocessing import Preprocessing, Samples, prepare
-from identification.recording import Recording
-from identification.torque_channel import possible_low_passes
+from identification.estimators.torque_channel import possible_low_passes
+from identification.factor.estimation import estimate
+from identification.model.robot import RobotModel
+from identification.selection.inner_prediction import Question, Settings, choose_settings
+from identification.signals.low_passes import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, Samples, prepare
 from tests.identification.two_link import MODEL, NOISE, a_motion, truth
 
 Array = NDArray[np.float64]

@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.coupling import Coupling
 from identification.errors import ShapeError
-from identification.friction import FrictionLaw
-from identification.masks import (
+from identification.model.coupling import Coupling
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.masks import (
     END_PERIODS,
     LONGEST_END,
     REVERSAL,
@@ -22,10 +24,8 @@ from identification.masks import (
     flat_topped,
     mask_rows,
 )
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.preprocessing import Preprocessing, prepare
-from identification.recording import Recording
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
 
 Array = NDArray[np.float64]
 URDF = (Path(__file__).parent / "two_link.urdf").read_text()

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import RobotModel
-from identification.friction import FrictionLaw
-from identification.nominal_scale import nominal_scale
-from identification.preprocessing import Samples
+from identification.model.friction import FrictionLaw
+from identification.signals.samples import Samples
+from identification.validation.nominal_scale import nominal_scale
 from tests.hil.identified_arm import a_motion, packaged_urdf
 
 Array = NDArray[np.float64]

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from identification.residual_checks import find_outliers
+from identification.validation.residual_checks import find_outliers
 
 
 def test_planted_spikes_are_counted_and_taken_off() -> None:

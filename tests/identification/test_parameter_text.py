@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from identification import Estimate, Factor, FrictionLaw, IdentificationError, Motion, RobotModel
-from identification.consistent import ConsistentEstimate, consistent_estimate
-from identification.estimation import estimate
-from identification.parameter_text import parameters_csv, parameters_json, standard_csv
-from identification.urdf_write import write_urdf
+from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
+from identification.export.parameters import parameters_csv, parameters_json, standard_csv
+from identification.export.urdf import write_urdf
+from identification.factor.estimation import estimate
 
 URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 PROVENANCE = {"recording": "run_1.mcap\nsha256 0a1b", "made by": "hil 0.1.0"}

@@ -5,8 +5,8 @@ import pinocchio as pin
 import pytest
 
 from identification import FrictionLaw, ModelError, Recording, RobotModel, prepare
-from identification.payload import Payload
-from identification.validation import prediction_error
+from identification.model.payload import Payload
+from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text
 

@@ -8,13 +8,13 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from identification.coupling import Coupling
-from identification.estimation import Estimate
-from identification.factor import Factor
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.plausibility import Implausible, _inertia_columns, implausibilities
+from identification.factor.estimation import Estimate
+from identification.factor.gram import Factor
+from identification.model.coupling import Coupling
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.validation.plausibility import Implausible, _inertia_columns, implausibilities
 
 Array = NDArray[np.float64]
 

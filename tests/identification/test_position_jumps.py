@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from identification import Recording
-from identification.position_jumps import jump_findings, position_jumps
+from identification.validation.position_jumps import jump_findings, position_jumps
 
 
 def recording(rate: float, *, jitter: float = 0.0, seed: int = 0) -> Recording:

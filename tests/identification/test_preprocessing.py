@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from identification.friction import FrictionLaw
-from identification.masks import REVERSAL
-from identification.model import RobotModel
-from identification.noise import difference_variance, standstill_variance
-from identification.preprocessing import (
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.masks import REVERSAL
+from identification.signals.noise import difference_variance, standstill_variance
+from identification.signals.recording import Recording, RecordingError
+from identification.signals.samples import (
     Preprocessing,
     prepare,
     smooth,
 )
-from identification.recording import Recording, RecordingError
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from identification.friction import FrictionLaw, presliding_state
+from identification.model.friction import FrictionLaw, presliding_state
 from tests.identification.two_link import MODEL, a_motion, truth
 
 steps = st.lists(st.sampled_from([-3e-4, -1e-5, 0.0, 1e-5, 2e-3]), min_size=2, max_size=60)

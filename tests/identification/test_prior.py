@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from identification.errors import IdentificationError, ShapeError
-from identification.estimation import estimate
-from identification.factor import Factor
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.nominal_prior import nominal_prior
-from identification.preprocessing import Samples
-from identification.prior import LEARNED, GaussianPrior, fit_with_prior, with_prior
-from identification.qr_factor import QRFactor
+from identification.estimators.nominal_prior import nominal_prior
+from identification.estimators.prior import LEARNED, GaussianPrior, fit_with_prior, with_prior
+from identification.factor.estimation import estimate
+from identification.factor.gram import Factor
+from identification.factor.qr import QRFactor
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
 from sim_fixtures.ns16 import urdf_text
 
 Array = NDArray[np.float64]

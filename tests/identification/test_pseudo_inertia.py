@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.kinematics import FROM_PINOCCHIO
-from identification.pseudo_inertia import (
+from identification.model.kinematics import FROM_PINOCCHIO
+from identification.model.pseudo_inertia import (
     Body,
     NoMassError,
     body,

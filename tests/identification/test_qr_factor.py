@@ -10,14 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.augmented_rows import augmented_rows
 from identification.errors import IdentificationError, ShapeError
-from identification.estimation import estimate, joint_weights, residual_variance, solve, total
-from identification.factor import Factor
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.preprocessing import Samples
-from identification.qr_factor import (
+from identification.factor.augmented_rows import augmented_rows
+from identification.factor.estimation import (
+    estimate,
+    joint_weights,
+    residual_variance,
+    solve,
+    total,
+)
+from identification.factor.gram import Factor
+from identification.factor.qr import (
     QR_CONDITION,
     QRFactor,
     qr_estimate,
@@ -25,7 +28,10 @@ from identification.qr_factor import (
     qr_residual_variance,
     reduced,
 )
-from identification.row_solution import rows_of, solve_rows
+from identification.factor.row_solution import rows_of, solve_rows
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
 from tests.identification.two_link import MODEL, NOISE, URDF, P, recording, truth
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from identification.errors import ShapeError
-from identification.recording import Recording, RecordingError
+from identification.signals.recording import Recording, RecordingError
 
 NAMES = ("shoulder", "elbow", "wrist")
 

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.pseudo_inertia import Body, inertial_parameters, margin, pseudo_inertia
-from identification.reference_bodies import AS_GIVEN, ASSUMED, MADE_POSSIBLE, reference_bodies
+from identification.model.pseudo_inertia import Body, inertial_parameters, margin, pseudo_inertia
+from identification.model.reference_bodies import AS_GIVEN, ASSUMED, MADE_POSSIBLE, reference_bodies
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ import pinocchio as pin
 import pytest
 
 from identification import FrictionLaw, RobotModel
-from identification.kinematics import FROM_PINOCCHIO
-from identification.regressor import CHUNK, joint_arrays
-from identification.wrench import LINK_SYMBOLS
+from identification.model.kinematics import FROM_PINOCCHIO
+from identification.model.regressor import CHUNK, joint_arrays
+from identification.model.wrench import LINK_SYMBOLS
 from sim_fixtures.ns16 import urdf_text
 
 

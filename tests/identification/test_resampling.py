@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.recording import Recording, RecordingError
-from identification.resampling import resample, without_repeats
 from identification.signals.clock import time_base
+from identification.signals.recording import Recording, RecordingError
+from identification.signals.resampling import resample, without_repeats
 
 Array = NDArray[np.float64]
 

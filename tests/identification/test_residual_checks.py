@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from identification.errors import IdentificationError
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.preprocessing import Samples
-from identification.residual_blocks import FEWEST_BLOCKS, BlockSums
-from identification.residual_checks import (
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.residual_blocks import FEWEST_BLOCKS, BlockSums
+from identification.validation.residual_checks import (
     HARMONICS,
     ResidualChecks,
     autocorrelation,

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from identification.friction_drift import FrictionDrift
-from identification.residual_blocks import BlockMean
-from identification.residual_checks import HARMONICS, Ripple
-from identification.residual_findings import over_motor_angle, over_time
-from identification.thresholds import Thresholds
+from identification.validation.findings.residual import over_motor_angle, over_time
+from identification.validation.friction_drift import FrictionDrift
+from identification.validation.residual_blocks import BlockMean
+from identification.validation.residual_checks import HARMONICS, Ripple
+from identification.validation.thresholds import Thresholds
 
 NAMES = ("shoulder", "elbow")
 LIMIT = Thresholds()

@@ -15,13 +15,13 @@ from scipy.optimize import minimize
 from hil.importers import Robot, import_rosbag2
 from hil.recordings import open_recording
 from identification.errors import IdentificationError
-from identification.estimation import estimate
-from identification.friction import FrictionLaw
-from identification.losses import Huber, LeastSquares, Loss, Tukey
-from identification.model import RobotModel
-from identification.preprocessing import Samples, prepare
-from identification.robust import robust_estimate, robust_weights
-from identification.validation import prediction_error
+from identification.estimators.losses import Huber, LeastSquares, Loss, Tukey
+from identification.estimators.robust import robust_estimate, robust_weights
+from identification.factor.estimation import estimate
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples, prepare
+from identification.validation.prediction import prediction_error
 from tests.identification.two_link import (
     MODEL,
     NOISE,

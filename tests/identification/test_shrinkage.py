@@ -7,11 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from identification.estimation import joint_weights
-from identification.least_squares import fit_least_squares
-from identification.phase_factor import total_phase
-from identification.preprocessing import Samples
-from identification.shrinkage import Shrinkage, consistent_centre, fit_shrunk, shrunk_values
+from identification.estimators.least_squares import fit_least_squares
+from identification.estimators.shrinkage import (
+    Shrinkage,
+    consistent_centre,
+    fit_shrunk,
+    shrunk_values,
+)
+from identification.factor.estimation import joint_weights
+from identification.factor.phases import total_phase
+from identification.signals.samples import Samples
 from tests.identification.two_link import MODEL, a_motion, gaussian, recording, truth
 
 

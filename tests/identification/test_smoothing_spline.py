@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.interpolate import BSpline
 from scipy.signal import butter, sosfiltfilt
 
-from identification.smoothing_spline import fit_smoothing_spline, low_pass
+from identification.signals.smoothing import fit_smoothing_spline, low_pass
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from identification import ShapeError
-from identification.model import StandardLayout
+from identification.model.robot import StandardLayout
 
 PAIRS = ((0, 1), (1, 3))
 LAYOUT = StandardLayout((True, False, True, False), rotor_inertia=True, pairs=PAIRS)

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.recording import Recording
-from identification.torque_channel import possible_low_passes
+from identification.estimators.torque_channel import possible_low_passes
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
 
 Array = NDArray[np.float64]
 

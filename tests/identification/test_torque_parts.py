@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.elements import TorsionSpring
-from identification.friction import FrictionLaw
-from identification.friction_curve import friction_curve, friction_torque
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.preprocessing import Samples
-from identification.spectrum import spectrum
-from identification.torque_parts import torque_parts
+from identification.export.friction_curve import friction_curve, friction_torque
+from identification.export.torque_parts import torque_parts
+from identification.model.elements import TorsionSpring
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.signals.spectrum import spectrum
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import FrictionLaw, Preprocessing, Recording, RobotModel, prepare
-from identification.coupling import Coupling
-from identification.estimation import Estimate, estimate
-from identification.validation import PredictionError, prediction_error
+from identification.factor.estimation import Estimate, estimate
+from identification.model.coupling import Coupling
+from identification.validation.prediction import PredictionError, prediction_error
 
 Array = NDArray[np.float64]
 

@@ -16,9 +16,9 @@ import pytest
 from identification import ModelError, RobotModel
 from identification.excitation import CollisionChecker, Workspace
 from identification.excitation.errors import CollisionModelError
-from identification.kinematics import MOST_JOINTS, chain_from_urdf
-from identification.urdf_text import LONGEST, MOST_LINKS, refusal
-from identification.urdf_write import write_urdf
+from identification.export.urdf import write_urdf
+from identification.model.kinematics import MOST_JOINTS, chain_from_urdf
+from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal
 
 INERTIAL = (
     '<inertial><mass value="6"/><origin xyz="0.2 0 0"/>'

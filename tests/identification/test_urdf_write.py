@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
-from identification.urdf_write import NotConsistentError, WriteBackError, write_urdf
+from identification.export.urdf import NotConsistentError, WriteBackError, write_urdf
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import robot_text, some_bodies
 

@@ -10,12 +10,11 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.preprocessing import Samples
-from identification.repeatability import repeatability
-from identification.validation import (
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.prediction import (
     PredictionError,
     for_figure,
     over_all,
@@ -23,6 +22,7 @@ from identification.validation import (
     residual,
     slow_error,
 )
+from identification.validation.repeatability import repeatability
 
 Array = NDArray[np.float64]
 

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.causes import Cause, Causes, Fault, Kind
-from identification.delay import DelayEstimate
-from identification.estimation import Estimate
-from identification.evidence import Evidence, Surroundings, gather
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.payload import Payload
-from identification.plausibility import Implausible
-from identification.preprocessing import Samples
-from identification.repeatability import Repeatability
-from identification.repetitions import estimate_repetitions
-from identification.validation import PredictionError
-from identification.verdict import Thresholds, Verdict, judge
+from identification.estimators.delay import DelayEstimate
+from identification.estimators.repetitions import estimate_repetitions
+from identification.factor.estimation import Estimate
+from identification.model.motion import Motion
+from identification.model.payload import Payload
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.causes import Cause, Causes, Fault, Kind
+from identification.validation.evidence import Evidence, Surroundings, gather
+from identification.validation.plausibility import Implausible
+from identification.validation.prediction import PredictionError
+from identification.validation.repeatability import Repeatability
+from identification.validation.verdict import Thresholds, Verdict, judge
 from sim_fixtures.ns16 import urdf_text
 
 Array = NDArray[np.float64]

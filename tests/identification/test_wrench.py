@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identification.wrench import LINK_SYMBOLS, N_PRIMITIVES, wrench_matrix, write_primitives
+from identification.model.wrench import LINK_SYMBOLS, N_PRIMITIVES, wrench_matrix, write_primitives
 
 TENSOR = {"Ixx": (0, 0), "Ixy": (0, 1), "Ixz": (0, 2), "Iyy": (1, 1), "Iyz": (1, 2), "Izz": (2, 2)}
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from identification.errors import ModelError
-from identification.xml_source import Element, XmlSource
+from identification.export.xml_source import Element, XmlSource
 
 TEXT = """<?xml version="1.0"?>
 <!-- a > comment with <mass value="9"/> in it -->

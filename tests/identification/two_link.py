@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.motion import Motion
-from identification.preprocessing import Samples
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 

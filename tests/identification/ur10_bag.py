@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification.friction import FrictionLaw
-from identification.model import RobotModel
-from identification.recording import Recording
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
 
 ALL_TERMS = FrictionLaw(offset=True)
 

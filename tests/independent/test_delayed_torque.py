@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.delay import DelayEstimate, estimate_delays
-from identification.delay_compensation import rate_products, with_uncertain_delay
-from identification.friction import FrictionLaw
-from identification.least_squares import fit_least_squares
-from identification.model import RobotModel
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Preprocessing, prepare
-from identification.recording import Recording
+from identification.estimators.delay import DelayEstimate, estimate_delays
+from identification.estimators.delay_compensation import rate_products, with_uncertain_delay
+from identification.estimators.least_squares import fit_least_squares
+from identification.factor.phases import PhaseFactor
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
 from tests.independent.simulated_arm import Noise, SimulatedArm, ns16, panda, record
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from hil.campaign.execution_result import RunResult
 from hil.campaign.plan import CampaignPlan
 from hil.cell import Cell
 from identification import RobotModel, Samples
-from identification.repetitions import RepeatedEstimate
+from identification.estimators.repetitions import RepeatedEstimate
 from sim_fixtures import ControllerSettings
 
 Array = NDArray[np.float64]

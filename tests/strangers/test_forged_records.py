@@ -23,10 +23,10 @@ from hil.errors import ArchiveError
 from hil.identify.settings import Settings
 from hil.study.analysis import class_in
 from hil.study.records import Record, read_record, write_record
-from identification.estimation import Estimate
 from identification.excitation import Journal, SearchSettings
-from identification.phase_factor import PhaseFactor
-from identification.preprocessing import Preprocessing
+from identification.factor.estimation import Estimate
+from identification.factor.phases import PhaseFactor
+from identification.signals.samples import Preprocessing
 from tests.identification.searching import problem
 
 # What a batch keeps

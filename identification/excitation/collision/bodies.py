@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from identification.excitation.collision.workspace import Workspace
 from identification.excitation.errors import CollisionModelError, MissingMeshError
-from identification.kinematics import FARTHEST
-from identification.urdf_tree import urdf_tree
+from identification.model.kinematics import FARTHEST
+from identification.model.urdf_tree import urdf_tree
 
 _SHAPES: Final = ("box", "cylinder", "sphere", "mesh")
 

@@ -17,7 +17,7 @@ from identification.excitation.collision.scene import Path, Scene
 from identification.excitation.collision.separation import Indices
 from identification.excitation.collision.workspace import Workspace
 from identification.excitation.joint_limits import rate_bounds
-from identification.motion import Motion
+from identification.model.motion import Motion
 from planner import FourierSeries, JointLimits, PiecewiseCubic
 
 __all__ = ["CollisionChecker", "Contact", "PathContact", "joint_poses"]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.collision.bodies import Body
-from identification.kinematics import Chain
+from identification.model.kinematics import Chain
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

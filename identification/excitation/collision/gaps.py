@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from identification.excitation.collision.near import BLOCK, Near, Touch, rows_of
 from identification.excitation.collision.scene import Path, Scene
 from identification.excitation.collision.separation import Indices
-from identification.motion import Motion
+from identification.model.motion import Motion
 from planner import FourierSeries, PiecewiseCubic
 
 Array = NDArray[np.float64]

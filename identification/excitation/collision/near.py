@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from identification.excitation.collision.scene import Path, Scene
 from identification.excitation.collision.separation import Indices
 from identification.excitation.joint_limits import rate_bounds
-from identification.motion import Motion
+from identification.model.motion import Motion
 from planner import FourierSeries, PiecewiseCubic
 
 Array = NDArray[np.float64]

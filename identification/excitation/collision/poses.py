@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.collision.bodies import Body
-from identification.kinematics import Chain, skew
+from identification.model.kinematics import Chain, skew
 
 Array = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from identification.excitation.collision.poses import (
 from identification.excitation.collision.separation import Indices, Separation
 from identification.excitation.collision.workspace import Workspace
 from identification.excitation.errors import PostureError
-from identification.kinematics import Chain, chain_from_urdf
+from identification.model.kinematics import Chain, chain_from_urdf
 from planner import JointLimits
 
 Array = NDArray[np.float64]

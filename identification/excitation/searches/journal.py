@@ -33,7 +33,7 @@ from identification.excitation.errors import ForeignJournalError, JournalError
 from identification.excitation.searches.problem import Problem
 from identification.excitation.searches.scores import ROW, Scores
 from identification.excitation.searches.settings import SearchSettings
-from identification.model import RobotModel
+from identification.model.robot import RobotModel
 
 # Another release of any of these may draw or compute something else.
 _DISTRIBUTIONS: Final = ("hil", "numpy", "scipy", "pymoo", "cma", "ruckig", "pin", "coal")

@@ -17,8 +17,8 @@ from identification.errors import ModelError
 from identification.excitation import Workspace
 from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.errors import CollisionModelError
-from identification.kinematics import chain_from_urdf
-from identification.model import RobotModel
+from identification.model.kinematics import chain_from_urdf
+from identification.model.robot import RobotModel
 from tests.fuzz.mutate_text import mutate_text
 from tests.fuzz.targets import Target, place_of
 from tests.hil.fast_cell import URDF

@@ -1,0 +1,510 @@
+r"""The constant delay of a torque or current channel behind the positions.
+
+The torque of axis j was logged d_j later than the position it belongs to:
+
+.. math:: \tau_j(t) = W_j\bigl(q, \dot q, \ddot q\bigr)(t - d_j)\,\pi + e_j(t)
+
+One logger writes the torques of all axes, so one delay of all of them is estimated first, from all
+rows at once: a profile of the residual over common delays finds the valley, Gauss-Newton steps on
+parameters and delay together, with the column :math:`-d\tau/dt`, find its floor. An axis gets a
+deviation of its own only where that is significant and predicts blocks of time that were left out
+better. Parameters and delays are estimated jointly because they can be taken for one another: a
+delayed acceleration looks like viscous friction when the motion has one frequency only.
+
+The motion is read at other times, never the torque: reading noise between its samples would smooth
+it, at some delays more than at others. Rows near a velocity reversal do not count here: dry
+friction that turns round over a displacement looks like a delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from identification.distributions import student_limit
+from identification.errors import IdentificationError
+from identification.estimators.covariance import block_length, spread
+from identification.estimators.delay_compensation import payload_torque, predicted_rate, read_at
+from identification.factor.estimation import (
+    Solution,
+    estimate,
+    nothing_usable,
+    residual_variance,
+    solve,
+    total,
+)
+from identification.factor.gram import NormalEquations
+from identification.factor.phases import PhaseFactor, add_grams, equal_runs, joined, merged
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.masks import near_any_reversal
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, Samples, prepare
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+LONGEST_DELAY: Final = 0.05  # s, either way
+# Encoder noise goes round a servo's loop and correlates with the torque. On the simulated NS 16 in
+# closed loop (delay 0.2 ms, four seeds) the mean is 0.18 ms at 10 Hz, 0.155 at 15 and 0.16 at
+# 40 Hz, where wrist axes seem to deviate by 0.3 ms besides.
+DELAY_BANDWIDTH: Final = 10.0  # Hz
+# Half a 95 % interval of a delay that is determined: the cycle of the fastest usual controllers.
+WIDEST_INTERVAL: Final = 1e-3  # s
+# Torques are averaged over bins of so long: planned motion has next to nothing above 10 Hz, of
+# which this takes 2 %, the same before and after the torque's time.
+_BIN: Final = 0.01  # s
+# Valleys of the profile over delays are wider than this.
+_PROFILE_STEP: Final = 0.01  # s
+_ITERATIONS: Final = 12
+_CONVERGED, _OF_STD = 1e-6, 0.02  # step: s, or this small beside what noise does
+# Two valleys whose residual variances differ by less are told apart by what the model gets wrong.
+_MODEL_ERROR: Final = 0.05
+# Of the smoothing's bandwidth, on either side of a velocity reversal.
+_REVERSAL_PERIODS: Final = 0.5
+_FOLDS: Final = 5
+# Of the time, at most half as many of the covariance: one delay needs no more.
+_BLOCKS: Final = 79
+_WORTHWHILE: Final = 0.02  # of the squared error, that a delay of its own has to save
+_CHANCE: Final = 0.005  # of a delay that is found where there is none, each way
+
+
+@dataclass(frozen=True, eq=False)
+class DelayEstimate:
+    """How long the torque of n axes lags the position.
+
+    Attributes:
+        joint_names: (n,).
+        common: delay of all axes without a deviation [s].
+        common_std: its standard deviation, cluster-robust [s]; infinite where the motion says
+            nothing about it.
+        deviations: of each axis from the common delay (n,) [s]; zero where prediction does not
+            ask for one.
+        deviation_std: their standard deviations (n,) [s].
+        assumed: delay that the samples were prepared with [s].
+        cycle: the usual step of the clock [s].
+        interval_factor: standard deviations in half a 95 % interval.
+        reason: why the common delay is not determined, None where it is.
+        significant: whether `common` and `deviations` differ from what was assumed by more than
+            chance alone makes in 99 % of recordings, and predict blocks of time that were left
+            out better.
+    """
+
+    joint_names: tuple[str, ...]
+    common: float
+    common_std: float
+    deviations: Array
+    deviation_std: Array
+    assumed: float
+    cycle: float
+    interval_factor: float
+    reason: str | None
+    significant: bool
+
+    @property
+    def half_interval(self) -> float:
+        """Half a 95 % interval of the common delay [s]."""
+        return self.interval_factor * self.common_std
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """Whether the delay of each axis is determined (n,): of all or none."""
+        return np.full(len(self.joint_names), self.reason is None)
+
+    @property
+    def delays(self) -> Array:
+        """Delays of the axes (n,) [s], NaN where not determined."""
+        return np.where(self.determined, self.common + self.deviations, np.nan)
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations of `delays` (n,) [s], infinite where not determined."""
+        own = np.where(self.deviations != 0.0, self.deviation_std, self.common_std)
+        return np.where(self.determined, own, np.inf)
+
+    @property
+    def agree(self) -> bool:
+        """Whether one delay serves all axes."""
+        return not self.deviations.any()
+
+    @property
+    def applied(self) -> Array:
+        """Delays to compensate (n,) [s]: what was assumed where nothing else is significant."""
+        n = len(self.joint_names)
+        return self.common + self.deviations if self.significant else np.full(n, self.assumed)
+
+    @property
+    def variance(self) -> float:
+        """Variance of the common delay [s²], no more than that of any delay in `LONGEST_DELAY`.
+
+        Where the assumed delay is applied it is within the interval of the common one, and its
+        error of this size.
+        """
+        return float(np.fmin(self.common_std**2, LONGEST_DELAY**2 / 3.0))
+
+    def describe(self) -> list[str]:
+        """The common delay, then each axis that deviates from it, in words."""
+        who = "all axes" if self.agree else "all other axes"
+        against = f"the {self.assumed * 1e3:.3g} ms assumed"
+        if self.reason is None or self.significant:
+            line = f"{self._words(self.common, self.common_std)},"
+            line += f" {'' if self.significant else 'not '}significantly different from {against}"
+        else:
+            line = f"not determined; {self.reason}"
+        lines = [f"{who}: {line}"]
+        lines += [
+            f"{name}: {self._words(self.common + deviation, std)}, which predicts better than the"
+            " delay of the others"
+            for name, deviation, std in zip(
+                self.joint_names, self.deviations, self.deviation_std, strict=True
+            )
+            if deviation != 0.0
+        ]
+        return lines
+
+    def _words(self, delay: float, std: float) -> str:
+        half = self.interval_factor * std
+        return (
+            f"{delay * 1e3:.3f} ms ± {half * 1e3:.3f} ms"
+            f" ({delay / self.cycle:.2f} ± {half / self.cycle:.2f} cycles)"
+        )
+
+
+def estimate_delays(
+    recording: Recording,
+    model: RobotModel,
+    *,
+    noise_variance: Array | None = None,
+    options: Preprocessing = Preprocessing(),  # noqa: B008 - frozen
+    longest: float = LONGEST_DELAY,
+) -> DelayEstimate:
+    """Estimate by how much the torque of a recording lags its position.
+
+    Args:
+        recording: with torque, joints in the model's order.
+        model: the robot.
+        noise_variance: of the positions (n,), see :func:`identification.signals.samples.smooth`.
+        options: how it is smoothed, what the torque has come through, and the assumed delay.
+        longest: delays are sought up to this one, either way [s].
+
+    Raises:
+        RecordingError: see :func:`identification.signals.samples.prepare`.
+        IdentificationError: no usable row.
+    """
+    narrow = min(options.rigid_bandwidth, DELAY_BANDWIDTH)
+    options = replace(options, smooth_torque=False, rigid_bandwidth=narrow)
+    samples = prepare(recording, model, noise_variance=noise_variance, options=options)
+    return delays_of(model, [samples], assumed=options.torque_delay, longest=longest)
+
+
+def delays_of(
+    model: RobotModel,
+    recordings: Sequence[Samples],
+    *,
+    assumed: float = 0.0,
+    longest: float = LONGEST_DELAY,
+) -> DelayEstimate:
+    """Estimate by how much the torque lags the position in recordings with one delay.
+
+    Args:
+        model: the robot.
+        recordings: smoothed, torque as measured.
+        assumed: delay that they were prepared with [s].
+        longest: delays are sought up to this one, either way [s].
+
+    Raises:
+        IdentificationError: no usable row.
+    """
+    n, p = model.n_joints, model.n_parameters
+    problem = _Problem(model, tuple(_Reader.of(model, samples) for samples in recordings))
+    ends = (-longest - assumed, longest - assumed)
+    grid = np.linspace(*ends, 1 + 2 * max(1, int(np.ceil(longest / _PROFILE_STEP))))
+    heights, values = problem.profile(grid)
+    shift = np.full(n, grid[np.argmin(heights)])
+    shift, blocks = _descend(problem, shift, values, _basis(p, n), ends)
+    rival = _rival(grid, heights, float(shift[0]), problem.profile(shift[:1])[0][0])
+    axes = _deviating(blocks, p, n)
+    basis = _basis(p, n, axes)
+    if axes:
+        shift, blocks = _descend(problem, shift, values, basis, ends)
+    solution = blocks.solution(basis)
+    covariance, factor = blocks.covariance(basis, solution)
+    _, by_chance = blocks.covariance(basis, solution, _CHANCE)
+    std = np.sqrt(np.einsum("jk,kl,jl->j", basis[p:, p:], covariance[p:, p:], basis[p:, p:]))
+    own = np.isin(np.arange(n), axes)
+    first = int(np.argmin(own))  # of the axes without a delay of their own
+    common = float(shift[first])
+    common_std = float(std[first]) if solution.determined[p] else np.inf
+    at_edge = bool(np.any((shift <= ends[0]) | (shift >= ends[1])))
+    before = problem.linearised(np.zeros(n), solution.values[:p], blocks.weights)
+    return DelayEstimate(
+        joint_names=model.joint_names,
+        common=common + assumed,
+        common_std=common_std,
+        deviations=np.where(own, shift - common, 0.0),
+        deviation_std=np.where(own, std, 0.0),
+        assumed=assumed,
+        cycle=problem.readers[0].cycle,
+        interval_factor=factor,
+        reason=_why_not(factor * common_std, at_edge, rival + assumed),
+        significant=bool(
+            not at_edge
+            and np.isnan(rival)
+            and (axes or abs(common) > by_chance * common_std)
+            and blocks.predicted(basis) < before.predicted(basis[:, :p])
+        ),
+    )
+
+
+def _basis(p: int, n: int, axes: Sequence[int] = ()) -> Array:
+    """Parameters and delays of all axes (p + n, k) by p parameters, one delay, deviations."""
+    return np.column_stack(
+        [np.eye(p + n, p), np.repeat([0.0, 1.0], [p, n]), np.eye(p + n)[:, p + np.array(axes, int)]]
+    )
+
+
+def _descend(
+    problem: _Problem, shift: Array, values: Array, basis: Array, ends: tuple[float, float]
+) -> tuple[Array, _Blocks]:
+    """Shifts (n,) of least weighted residual by Gauss-Newton, and the linear problem there."""
+    p = problem.model.n_parameters
+    for _ in range(_ITERATIONS):
+        blocks = problem.linearised(shift, values)
+        solution = blocks.solution(basis)
+        values = solution.values[:p]
+        step = np.clip(basis[p:, p:] @ solution.values[p:], -_PROFILE_STEP, _PROFILE_STEP)
+        before, shift = shift, np.clip(shift + step, *ends)
+        small = max(_CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p])))
+        if np.all(np.abs(shift - before) <= small):
+            break
+    return shift, blocks
+
+
+def _deviating(blocks: _Blocks, p: int, n: int) -> list[int]:
+    """Axes whose own delay is significant and predicts better, the best first; never all."""
+    axes: list[int] = []
+    left = [axis for axis in range(n) if blocks.gram[:, p + axis, p + axis].any()]
+    error = blocks.predicted(_basis(p, n))
+    while len(left) > 1:
+        errors = {axis: blocks.predicted(_basis(p, n, [*axes, axis])) for axis in left}
+        axis = min(left, key=lambda one: errors[one])
+        basis = _basis(p, n, [*axes, axis])
+        solution = blocks.solution(basis)
+        covariance, limit = blocks.covariance(basis, solution, _CHANCE / n)
+        far = abs(solution.values[-1]) > limit * np.sqrt(covariance[-1, -1])
+        if errors[axis] >= (1.0 - _WORTHWHILE) * error or not far:
+            break
+        axes.append(axis)
+        left.remove(axis)
+        error = errors[axis]
+    return axes
+
+
+def _rival(grid: Array, heights: Array, shift: float, height: float) -> float:
+    """Another valley of the profile than the one at a shift, no less deep; NaN without one."""
+    padded = np.concatenate([[np.inf], heights, [np.inf]])
+    valley = (heights <= padded[:-2]) & (heights <= padded[2:])
+    other = np.abs(grid - shift) > grid[1] - grid[0]
+    found = np.flatnonzero(valley & other & (heights < height + _MODEL_ERROR))
+    return float(grid[found[np.argmin(heights[found])]]) if found.size else float("nan")
+
+
+def _why_not(half_interval: float, at_edge: bool, rival: float) -> str | None:
+    if not np.isfinite(half_interval):
+        return "the motion does not tell a delay from the other parameters"
+    if at_edge:
+        return "the residual still falls at the longest delay that was tried"
+    if half_interval > WIDEST_INTERVAL:
+        return (
+            f"the 95 % interval would be ± {half_interval * 1e3:.2g} ms: the torques change too"
+            " slowly, or have too much noise"
+        )
+    if np.isfinite(rival):
+        return f"a delay of {rival * 1e3:.0f} ms explains the torques as well"
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Weighted normal equations of p parameters and n delay steps, by B blocks of time."""
+
+    gram: Array  # (B, p + n + 1, p + n + 1)
+    weights: Array  # (n,)
+    rows: int
+
+    def solution(self, basis: Array) -> Solution:
+        """Least squares in the coordinates of a basis (p + n, k)."""
+        return _solved(_reduced(self.gram.sum(axis=0), basis))
+
+    def covariance(
+        self, basis: Array, solution: Solution, share: float = 0.025
+    ) -> tuple[Array, float]:
+        """Cluster-robust covariance (k, k), and the limit that chance exceeds with `share`."""
+        gram = _reduced(self.gram[self.gram[:, -1, -1] > 0.0], basis)
+        augmented = np.append(-solution.values, 1.0)
+        gram = merged(gram, block_length(gram[:, :-1] @ augmented))
+        moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root)
+        return np.asarray(moved.T @ moved), float(student_limit(share, max(1, len(gram) - 1)))
+
+    def predicted(self, basis: Array) -> float:
+        """Mean weighted squared error of each fifth of the time, predicted from the others."""
+        parts = np.array_split(_reduced(self.gram, basis), _FOLDS)
+        folds = np.array([part.sum(axis=0) for part in parts])
+        error = 0.0
+        for own in folds:
+            augmented = np.append(-_solved(folds.sum(axis=0) - own).values, 1.0)
+            error += float(augmented @ own @ augmented)
+        return error / self.rows
+
+
+def _reduced(gram: Array, basis: Array) -> Array:
+    """Gram matrices (..., q + 1, q + 1) of [W | y] in the coordinates of a basis (q, k) of W."""
+    wide = scipy.linalg.block_diag(basis, 1.0)
+    return np.asarray(wide.T @ (gram @ wide))
+
+
+def _solved(gram: Array) -> Solution:
+    return solve(NormalEquations(gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1]), 0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Recordings whose torque can be compared with earlier or later motion."""
+
+    model: RobotModel
+    readers: tuple[_Reader, ...]
+
+    def profile(self, shifts: Array) -> tuple[Array, Array]:
+        """Mean log variance of the residual at common shifts (K,), the parameters of the least.
+
+        Raises:
+            IdentificationError: no usable row.
+        """
+        heights, best = np.full(len(shifts), np.inf), np.zeros(self.model.n_parameters)
+        for k, shift in enumerate(shifts):
+            parts = [reader.at(self.model, float(shift)) for reader in self.readers]
+            factor = total([part.factor(self.model) for part in parts])
+            moving = factor.samples > 0
+            if moving.any():
+                found = estimate(self.model, factor)
+                height = 2.0 * np.log(found.noise_std[moving])
+                heights[k] = np.average(height, weights=factor.samples[moving])
+                best = found.values if heights[k] <= heights.min() else best
+        if not np.isfinite(heights).any():
+            raise IdentificationError(nothing_usable(self.model))
+        return heights, best
+
+    def linearised(self, shift: Array, values: Array, weights: Array | None = None) -> _Blocks:
+        """Normal equations about shifts (n,) and parameters (p,).
+
+        Weighted (n,) by default by the inverse variance of the residual there.
+        """
+        count = _BLOCKS // len(self.readers) + 1
+        phase = joined([one.phase(self.model, shift, values, count) for one in self.readers])
+        if weights is None:
+            q = phase.n_parameters
+            here = np.append(values, np.zeros(q - len(values)))
+            variance = residual_variance(phase.total, here, np.zeros((q, q)), np.ones(len(shift)))
+            weights = np.where(np.isnan(variance), 0.0, 1.0 / variance)
+        return _Blocks(phase.weighted(weights), weights, max(1, int(phase.samples.sum())))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    """A recording with its torque averaged over short bins, whose motion is read at any shift.
+
+    Attributes:
+        samples: as prepared.
+        binned: their torque in bins, a known payload's included; without motion.
+        parts: per stretch its rows of `samples` and of `binned`.
+        clear: bins whose motion is away from standstill and reversals (m, n).
+        cycle: usual step of the clock [s].
+    """
+
+    samples: Samples
+    binned: Samples
+    parts: tuple[tuple[slice, slice], ...]
+    clear: Rows
+    cycle: float
+
+    @classmethod
+    def of(cls, model: RobotModel, samples: Samples) -> _Reader:
+        """Reader of a recording."""
+        motion = samples.motion
+        reach = _REVERSAL_PERIODS / samples.position_bandwidth
+        clear = model.moving(motion.velocity) & ~near_any_reversal(model, motion, reach)
+        cycle = float(np.median(np.diff(motion.time)))
+        size = max(1, round(_BIN / cycle))
+        parts, start = [], 0
+        for segment in samples.segments:
+            count = (segment.stop - segment.start) // size
+            if count > 1:
+                parts.append((segment, slice(start, start + count)))
+                start += count
+
+        def bins(array: NDArray[Any]) -> NDArray[Any]:
+            """An array (m, ...) cut into (bins, size, ...)."""
+            cut = [array[raw][: (b.stop - b.start) * size] for raw, b in parts]
+            return np.concatenate([array[:0], *cut]).reshape(-1, size, *array.shape[1:])
+
+        def every(rows: Rows) -> Rows:
+            """Bins all of whose rows (m, n) count."""
+            return np.asarray(bins(rows).all(axis=1))
+
+        still = np.zeros((start, model.n_joints))
+        binned = replace(
+            samples,
+            motion=Motion(bins(motion.time).mean(axis=1), still, still, still),
+            torque=bins(samples.torque + payload_torque(model, samples)).mean(axis=1),
+            usable=every(samples.usable),
+            segments=tuple(b for _, b in parts),
+            mask=None,
+            whole=None,
+        )
+        return cls(samples, binned, tuple(parts), every(clear), cycle)
+
+    def at(self, model: RobotModel, shift: float) -> Samples:
+        """Bins whose torque belongs to the motion a shift earlier than it was prepared with."""
+        time, usable = self.binned.motion.time, self.binned.usable.copy()
+        fields = [field for field in self.samples.motion[1:] if field is not None]
+        moved = [np.zeros((len(time), field.shape[1])) for field in fields]
+        for raw, b in self.parts:
+            inside, at = self.samples.motion.time[raw], time[b] - shift
+            for field, target in zip(fields, moved, strict=True):
+                target[b] = read_at(inside, field[raw], at)
+            place, clear = np.interp(at, time[b], np.arange(len(at))), self.clear[b]
+            near = clear[np.floor(place).astype(int)] & clear[np.ceil(place).astype(int)]
+            usable[b] &= near & ((at >= inside[0]) & (at <= inside[-1]))[:, None]
+        result = replace(self.binned, motion=Motion(time, *moved), usable=usable)
+        return replace(result, torque=result.torque - payload_torque(model, result))
+
+    def phase(self, model: RobotModel, shift: Array, values: Array, count: int) -> PhaseFactor:
+        """Gram matrices of `count` blocks, of p parameters and n steps of the delay.
+
+        With each axis at its own shift (n,), the columns of the steps at parameters (p,).
+        """
+        n, p = model.n_joints, model.n_parameters
+        time = self.binned.motion.time
+        index = np.arange(len(time)) * count // max(1, len(time))
+        runs = equal_runs(index)
+        gram = [np.zeros((count, len(own) + 2, len(own) + 2)) for own in model.plan.columns]
+        rows = np.zeros_like(self.clear)
+        for value in np.unique(shift):
+            samples = self.at(model, float(value))
+            blocks, columns = samples.regressor(model)
+            load = payload_torque(model, samples)
+            for j in np.flatnonzero(shift == value):
+                rate = predicted_rate(samples, load[:, j] + blocks[j] @ values[columns[j]])
+                table = np.column_stack([blocks[j], -rate, samples.torque[:, j]])
+                rows[:, j] = samples.usable[:, j]
+                add_grams(gram[j], np.where(rows[:, j], table.T, 0.0), runs)
+        columns = tuple(np.append(own, p + j) for j, own in enumerate(model.plan.columns))
+        names = model.parameter_names + tuple(f"delay of {name}" for name in model.joint_names)
+        counts = np.zeros((count, n), dtype=np.intp)
+        np.add.at(counts, index, rows)
+        return PhaseFactor(tuple(gram), columns, counts, names)

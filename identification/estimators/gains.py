@@ -1,0 +1,347 @@
+r"""Current-to-torque gains of all drives at once, from a payload whose torque is known.
+
+Without a payload, parameters and gains can all be scaled by one number. A recording with a known
+payload fixes it (Gautier and Briot 2014, "Global identification of joint drive gains and dynamic
+parameters of robots"). Two estimators on one :class:`identification.factor.gains.GainFactor`:
+
+*weighted* least squares of what was measured, the current:
+
+.. math:: i_m = \kappa_m \bigl(W_m \pi + t_m\bigr) + e_m, \qquad \kappa_m = 1 / K_m
+
+which is bilinear and solved by Gauss-Newton, each motor weighted by its inverse noise variance;
+and *total* least squares of :math:`K_m i_m - W_m \pi - t_m = 0`, whose errors are in the columns
+of the currents, the others taken as exact (Van Huffel and Vandewalle 1991). Plain least squares of
+the latter equation would shrink all gains, the more the noisier the currents.
+
+A motor's gain is determined only if the payload loads it, or if its torque shares parameters with
+motors that the payload does load. What is not determined is named, and has no number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from identification.distributions import student_limit
+from identification.errors import IdentificationError
+from identification.estimators.covariance import block_length, spread
+from identification.factor.estimation import Solution, mark_undetermined, solve
+from identification.factor.gains import GainFactor
+from identification.factor.gram import NormalEquations
+
+Array = NDArray[np.float64]
+GainMethod = Literal["weighted", "total"]
+
+# A gain is of use when it is better known than a maker's typical tolerance of a torque constant.
+WORST_RELATIVE_STD: Final = 0.05
+# Share of the payload's own length of column: what is smaller is rounding.
+_NO_LOAD: Final = 1e-9
+_ITERATIONS: Final = 50
+_VANISHING: Final = 1e-100
+_LEAST_NOISE: Final = 1e-6  # share of a current's length: rounding of the Gram matrix
+_LEAST_ERROR: Final = 1e-9  # of rounding, where the data have no noise
+_CONVERGED: Final = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Gains of n motors.
+
+    Attributes:
+        motor_names: (n,).
+        values: torque per current (n,) [N·m/A or N/A], NaN where not determined.
+        std: standard deviations, cluster-robust (n,); infinite likewise.
+        covariance: of the gains (n, n); infinite variance likewise.
+        reasons: per motor why its gain is not determined, None where it is.
+        parameters: the model's parameters that were estimated with them (p,).
+        noise_std: of the current (n,) [A].
+        method: "weighted" or "total".
+        interval_factor: standard deviations in half a 95 % interval.
+    """
+
+    motor_names: tuple[str, ...]
+    values: Array
+    std: Array
+    covariance: Array
+    reasons: tuple[str | None, ...]
+    parameters: Array
+    noise_std: Array
+    method: GainMethod
+    interval_factor: float
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """Which gains the data determine (n,)."""
+        return np.isfinite(self.values)
+
+    def describe(self) -> list[str]:
+        """One line per motor, in words."""
+        lines = []
+        for motor, name in enumerate(self.motor_names):
+            reason, half = self.reasons[motor], self.interval_factor * self.std[motor]
+            lines.append(
+                f"{name}: {self.values[motor]:.5g} ± {half:.2g}"
+                if reason is None
+                else f"{name}: gain not determined; {reason}"
+            )
+        return lines
+
+
+def identify_gains(
+    factor: GainFactor,
+    motor_names: Sequence[str],
+    *,
+    method: GainMethod = "weighted",
+    worst_relative_std: float = WORST_RELATIVE_STD,
+) -> Gains:
+    """Estimate the gain of each motor, with its confidence.
+
+    Args:
+        factor: recordings with a known payload, and without or with another.
+        motor_names: (n,), in the order of the factor.
+        method: see the module.
+        worst_relative_std: gains less well known than this are not determined.
+
+    Raises:
+        IdentificationError: no usable row, or no recording with a payload.
+    """
+    total = factor.gram.sum(axis=0)
+    p, rows = factor.n_parameters, factor.rows.sum(axis=0)
+    if not rows.any():
+        raise IdentificationError("there is not one usable sample to identify gains from")
+    if not total[:, p, p].any():
+        raise IdentificationError(
+            "no recording has a known payload: gains and parameters can be scaled together"
+        )
+    noise, inverses = _motor_by_motor(total, rows)
+    fit = _gauss_newton(total, noise, inverses)
+    if method == "total":
+        fit = _total_least_squares(total, rows, fit)
+        blocks = _errors_in_currents(factor.gram, factor.rows, fit)
+    else:
+        blocks = _currents_predicted(factor.gram, fit)
+    covariance, interval = _clustered(*blocks, fit.solution)
+    reasons = _reasons(total, rows, fit, np.sqrt(np.diag(covariance)[p:]), worst_relative_std)
+    known = np.array([reason is None for reason in reasons])
+    gains, own = fit.unknowns[p:], covariance[p:, p:]
+    if method == "weighted":
+        gains, own = _inverted(gains, own, known)
+    mark_undetermined(own, known)
+    return Gains(
+        motor_names=tuple(motor_names),
+        values=np.where(known, gains, np.nan),
+        std=np.sqrt(np.diag(own)),
+        covariance=own,
+        reasons=reasons,
+        parameters=fit.unknowns[:p],
+        noise_std=fit.noise,
+        method=method,
+        interval_factor=interval,
+    )
+
+
+def _reasons(
+    total: Array, rows: NDArray[np.intp], fit: _Fit, std: Array, worst: float
+) -> tuple[str | None, ...]:
+    """Why each motor's gain is not determined, None where it is; std of gain or inverse (n,)."""
+    p = total.shape[1] - 2
+    found, determined = fit.unknowns[p:], fit.solution.determined[p:]
+    size = np.abs(found)
+    relative = np.divide(std, size, out=np.full_like(size, np.inf), where=size > _VANISHING)
+    return tuple(
+        _why_not(int(rows[m]), bool(determined[m]), relative[m], found[m], _loaded(gram, p), worst)
+        for m, gram in enumerate(total)
+    )
+
+
+def _inverted(inverses: Array, covariance: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Gains (n,) and their covariance from those of their inverses, to first order."""
+    safe = np.where(known, inverses, 1.0)
+    return 1.0 / safe, covariance / np.outer(safe**2, safe**2)
+
+
+class _Fit(NamedTuple):
+    """Parameters and gains, or their inverses (p + n,); current noise (n,); the last problem.
+
+    Total least squares adds its row weights (n,) and share of the noise taken out.
+    """
+
+    unknowns: Array
+    noise: Array
+    solution: Solution
+    weights: Array = np.empty(0)
+    shrink: float = 1.0
+
+
+def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Noise of each current (n,) and inverse gain (n,), each motor with parameters of its own.
+
+    The current is then linear in [W | t], with the inverse gain as the coefficient of t. What one
+    motor alone does not determine is given the others' typical value, to start from.
+    """
+    n, p = len(total), total.shape[1] - 2
+    noise, inverses = np.full(n, np.nan), np.full(n, np.nan)
+    for m, gram in enumerate(total):
+        if rows[m] == 0:
+            continue
+        own = solve(NormalEquations(gram[:-1, :-1], gram[:-1, -1], gram[-1, -1], int(rows[m])))
+        squares = gram[-1, -1] - own.values @ gram[:-1, -1]
+        freedom = max(rows[m] - len(gram) + 1, 1)
+        noise[m] = np.sqrt(max(squares, _LEAST_NOISE**2 * gram[-1, -1]) / freedom)
+        if own.determined[p] and own.values[p] > 0.0:
+            inverses[m] = own.values[p]
+    known = inverses[np.isfinite(inverses)]
+    typical = float(np.median(known)) if known.size else 1.0
+    return noise, np.where(np.isfinite(inverses), inverses, typical)
+
+
+def _total_least_squares(total: Array, rows: NDArray[np.intp], start: _Fit) -> _Fit:
+    """Mixed least squares and total least squares: only currents have errors.
+
+    A row's error is K_m times that of the current, so rows are weighted by (K_m noise_m)^-2,
+    with the gains of another estimate.
+    """
+    n, p = len(total), total.shape[1] - 2
+    noise, gains = start.noise, 1.0 / start.unknowns[p:]
+    weights = np.nan_to_num(1.0 / (gains * noise) ** 2, nan=0.0, posinf=0.0)
+    errors = weights * np.nan_to_num(noise) ** 2 * rows
+    full = _assemble(total, weights)
+    shrink = _smallest_error(full, errors, p)
+    corrected = full[:-1, :-1].copy()
+    corrected[np.arange(p, p + n), np.arange(p, p + n)] -= shrink * errors
+    solution = solve(
+        NormalEquations(corrected, -full[:-1, -1], float(full[-1, -1]), int(rows.sum()))
+    )
+    return _Fit(solution.values, noise, solution, weights, shrink)
+
+
+def _assemble(total: Array, weights: Array) -> Array:
+    """Weighted Gram matrix of [-W | i_1 .. i_n | -t] from those of [W | t | i] per motor."""
+    n, p = len(total), total.shape[1] - 2
+    full = np.zeros((p + n + 1, p + n + 1))
+    sign = np.concatenate([-np.ones(p + 1), [1.0]])
+    for m, gram in enumerate(total):
+        place = np.concatenate([np.arange(p), [p + n, p + m]])
+        full[np.ix_(place, place)] += weights[m] * gram * np.outer(sign, sign)
+    return full
+
+
+def _smallest_error(full: Array, errors: Array, p: int) -> float:
+    """Least ratio of squared residuals to what noise of the assumed size would leave.
+
+    The exact columns are projected out first.
+    """
+    exact = np.concatenate([np.arange(p), [len(full) - 1]])
+    noisy = p + np.flatnonzero(errors > 0.0)
+    projected = solve(NormalEquations(full[np.ix_(exact, exact)], np.zeros(p + 1), 0.0, 0)).inverse
+    cross = full[np.ix_(exact, noisy)]
+    left = full[np.ix_(noisy, noisy)] - cross.T @ projected @ cross
+    scale = np.sqrt(errors[noisy - p])
+    smallest = scipy.linalg.eigh(left / np.outer(scale, scale), eigvals_only=True)[0]
+    return float(max(smallest, _LEAST_ERROR))
+
+
+def _gauss_newton(total: Array, noise: Array, inverses: Array) -> _Fit:
+    """Weighted least squares of the currents; unknowns are pi and 1 / K (n,), here a start."""
+    p = total.shape[1] - 2
+    unknowns = np.concatenate([np.zeros(p), inverses])
+    information, score, _ = _linearised(total[None], unknowns, noise)
+    unknowns[:p] = solve(NormalEquations(information[0, :p, :p], score[0, :p], 0.0, 0)).values
+    # Halved if the sum of squares does not fall: far from determined, steps overshoot.
+    damping, cost = 1.0, np.inf
+    best, step = unknowns, np.zeros_like(unknowns)
+    for _ in range(_ITERATIONS):
+        information, score, squares = _linearised(total[None], unknowns, noise)
+        if squares.sum() > cost * (1.0 + 1e-12):
+            damping *= 0.5
+            unknowns = best + damping * step
+            if damping < 1e-3:
+                break
+            continue
+        solution = solve(NormalEquations(information[0], score[0], 0.0, 0))
+        best, cost, damping, step = unknowns, float(squares.sum()), 1.0, solution.values
+        unknowns = best + step
+        if step @ information[0] @ step < _CONVERGED:
+            break
+    information, score, _ = _linearised(total[None], best, noise)
+    solution = solve(NormalEquations(information[0], score[0], 0.0, 0))
+    return _Fit(best, noise, solution)
+
+
+def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """Information (B, k, k), scores (B, k) and weighted squares (B,) of the predicted currents."""
+    blocks, n, width, _ = gram.shape
+    p = width - 2
+    k = p + n
+    information, scores = np.zeros((blocks, k, k)), np.zeros((blocks, k))
+    squares = np.zeros(blocks)
+    for m in np.flatnonzero(noise > 0.0):
+        inverse = unknowns[p + m]
+        torque = np.concatenate([unknowns[:p], [1.0, 0.0]])  # of [W | t | i]
+        slope = np.zeros((width, p + 1))
+        slope[:p, :p] = inverse * np.eye(p)
+        slope[:, p] = torque
+        residual = -inverse * torque
+        residual[-1] = 1.0
+        place = np.append(np.arange(p), p + m)
+        own = gram[:, m] / noise[m] ** 2
+        information[:, place[:, None], place] += slope.T @ own @ slope
+        scores[:, place] += own @ residual @ slope
+        squares += np.einsum("i,bij,j->b", residual, own, residual)
+    return information, scores, squares
+
+
+def _currents_predicted(gram: Array, fit: _Fit) -> tuple[Array, Array]:
+    information, scores, _ = _linearised(gram, fit.unknowns, fit.noise)
+    return information, scores
+
+
+def _errors_in_currents(gram: Array, rows: NDArray[np.intp], fit: _Fit) -> tuple[Array, Array]:
+    """Information (B, k, k) and scores (B, k) of total least squares, block by block."""
+    p, n = gram.shape[2] - 2, gram.shape[1]
+    information, scores = [], []
+    for own, count in zip(gram, rows, strict=True):
+        full = _assemble(own, fit.weights)
+        errors = fit.shrink * fit.weights * np.nan_to_num(fit.noise) ** 2 * count
+        full[np.arange(p, p + n), np.arange(p, p + n)] -= errors
+        information.append(full[:-1, :-1])
+        scores.append(-(full[:-1] @ np.append(fit.unknowns, 1.0)))
+    return np.array(information), np.array(scores)
+
+
+def _clustered(information: Array, scores: Array, solution: Solution) -> tuple[Array, float]:
+    """Sandwich covariance over blocks of time, and the factor of half a 95 % interval."""
+    used = scores.any(axis=1)
+    information, scores = information[used], scores[used]
+    edges = np.arange(0, len(scores), block_length(scores))
+    information = np.add.reduceat(information, edges, axis=0)
+    scores = np.add.reduceat(scores, edges, axis=0)
+    moved = spread(information, scores, solution.root)
+    return np.asarray(moved.T @ moved), float(student_limit(0.025, max(1, len(scores) - 1)))
+
+
+def _loaded(gram: Array, p: int) -> bool:
+    """Whether the payload's torque on a motor (of its [W | t | i]) is more than rounding."""
+    largest = float(np.diag(gram)[:p].max(initial=0.0))
+    return bool(gram[p, p] > _NO_LOAD**2 * largest)
+
+
+def _why_not(
+    rows: int, determined: bool, relative: float, gain: float, loaded: bool, worst: float
+) -> str | None:
+    if rows == 0:
+        return "the motor has no usable row"
+    if determined and gain > 0.0 and relative <= worst:
+        return None
+    if not loaded:
+        return "the payload does not load it, and nothing else fixes its scale"
+    if not determined:
+        return "the payload's torque on it looks like the robot's own"
+    if not gain > 0.0:
+        return "its best value is not positive: what the payload adds to its current is noise"
+    return f"its relative standard deviation would be {relative:.0%}, more than {worst:.0%}"

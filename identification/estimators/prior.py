@@ -1,0 +1,312 @@
+r"""Gaussian prior on the parameters, from CAD or zero (ridge), and what the data add to it.
+
+.. math:: \hat\pi = \arg\min \; \sum_j w_j \lVert y_j - W_j \pi \rVert^2
+                    + (\pi - \mu)^T C^{-1} (\pi - \mu)
+
+(Hoerl and Kennard 1970 with mu = 0; Gelman et al. 2013, section 14.8). Parameters that the data
+do not determine keep the prior; the ratio of posterior to prior standard deviation says of each
+parameter how much of what is now known the data have said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError, ShapeError
+from identification.estimators.clustered import clustered_covariance
+from identification.estimators.covariance import block_covariance
+from identification.estimators.least_squares import variance_of, weights_of
+from identification.factor.estimation import Estimate, mark_undetermined, nothing_usable
+from identification.factor.gram import Factor
+from identification.factor.phases import PhaseFactor, total_phase
+from identification.factor.qr import QRFactor, reduced, solve_weighted
+from identification.factor.row_solution import rows_of, solve_rows, undetermined_names
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+
+# Posterior over prior standard deviation below which a parameter counts as learned from the
+# data: three quarters of what is known about it (inverse variance) come from there.
+LEARNED: Final = 0.5
+# A prior may be far weaker than the data and still decide where they say nothing.
+_WORST_CONDITION: Final = 1e13
+_FEWEST_ROWS: Final = 2  # per parameter: fewer do not tell noise from fit
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianPrior:
+    """What is believed before the data: ``root @ (pi - mean)`` is standard Gaussian.
+
+    Attributes:
+        mean: (p,).
+        root: (k, p); directions that it does not see are flat: nothing is believed of them.
+        words: where it comes from.
+    """
+
+    mean: Array
+    root: Array
+    words: str
+
+    @classmethod
+    def independent(cls, mean: Array, std: Array, words: str = "given") -> GaussianPrior:
+        """Prior with one standard deviation per parameter (p,), infinite for none.
+
+        With mean zero this is ridge regression in units of `std`.
+
+        Raises:
+            IdentificationError: a standard deviation is not positive.
+            ShapeError: mean and std differ in shape.
+        """
+        return cls.of_combinations(np.eye(len(mean)), mean, std, words)
+
+    @classmethod
+    def from_covariance(cls, mean: Array, covariance: Array, words: str = "given") -> GaussianPrior:
+        """Prior with a covariance (p, p); an infinite variance makes a parameter flat.
+
+        Raises:
+            IdentificationError: what is finite of the covariance is not positive definite.
+            ShapeError: it does not fit the mean.
+        """
+        mean, covariance = np.asarray(mean, dtype=np.float64), np.asarray(covariance)
+        if covariance.shape != (len(mean), len(mean)):
+            raise ShapeError("covariance", covariance.shape, f"({len(mean)}, {len(mean)})")
+        known = np.isfinite(np.diag(covariance))
+        root = np.zeros((np.count_nonzero(known), len(mean)))
+        root[:, known] = _inverse_root(covariance[np.ix_(known, known)])
+        return cls(mean, root, words)
+
+    @classmethod
+    def of_combinations(
+        cls, combinations: Array, mean: Array, std: Array, words: str = "given"
+    ) -> GaussianPrior:
+        """Prior on ``combinations @ s`` of independent quantities s.
+
+        Args:
+            combinations: (p, s), of full rank.
+            mean: of the quantities (s,).
+            std: of the quantities (s,), infinite where nothing is believed. Such a quantity
+                makes flat the one direction it acts in, not every parameter it is part of.
+            words: where it comes from.
+
+        Raises:
+            IdentificationError: a standard deviation is not positive.
+            ShapeError: the arrays do not fit together.
+        """
+        mean, std = np.asarray(mean, dtype=np.float64), np.asarray(std, dtype=np.float64)
+        for name, array in (("mean", mean), ("std", std)):
+            if array.shape != (combinations.shape[1],):
+                raise ShapeError(name, array.shape, f"({combinations.shape[1]},)")
+        if not np.all(np.isfinite(mean)) or not np.all(std > 0.0):
+            raise IdentificationError("a prior needs finite means and positive deviations")
+        flat = np.isinf(std)
+        spread = combinations[:, ~flat] * std[~flat]
+        size = np.linalg.norm(spread, axis=1)
+        size = np.where(size > 0.0, size, 1.0)
+        seen = _orthogonal_to(combinations[:, flat] / size[:, None])
+        seen_spread = seen.T @ (spread / size[:, None])
+        root = _inverse_root(seen_spread @ seen_spread.T) @ seen.T / size
+        return cls(combinations @ mean, np.asarray(root), words)
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (p,), infinite where the prior is flat."""
+        solution = solve_rows(self.root, np.zeros(len(self.root)), _WORST_CONDITION)
+        covariance = solution.inverse
+        mark_undetermined(covariance, solution.determined)
+        return np.sqrt(np.diag(covariance))
+
+
+@dataclass(frozen=True, eq=False)
+class PosteriorEstimate:
+    """Estimate from prior and data, and who said what.
+
+    Attributes:
+        estimate: its covariance is the posterior's.
+        prior_mean: (p,).
+        prior_std: (p,), infinite where nothing was believed.
+        words: where the prior comes from.
+        design_effect: by how much coloured residuals make the variance larger than white ones.
+    """
+
+    estimate: Estimate
+    prior_mean: Array
+    prior_std: Array
+    words: str
+    design_effect: float
+
+    @property
+    def ratio(self) -> Array:
+        """Posterior over prior standard deviation (p,): 0 all from the data, 1 all from the prior.
+
+        0 as well where nothing was believed before, 1 where still nothing is known.
+        """
+        flat = np.isinf(self.prior_std)
+        ratio = self.estimate.std / np.where(flat, 1.0, self.prior_std)
+        return np.where(flat, np.isinf(self.estimate.std).astype(np.float64), ratio)
+
+    @property
+    def learned(self) -> NDArray[np.bool_]:
+        """Whether each parameter is learned from the data (p,): ratio below `LEARNED`."""
+        return np.asarray(self.ratio < LEARNED)
+
+    @property
+    def surprise(self) -> Array:
+        """Change of each learned parameter by the data, in the deviations the prior allows (p,).
+
+        If prior and data agree this is standard Gaussian: beyond three or four, CAD is wrong or
+        its uncertainty too small. NaN where nothing was believed or little was learned.
+        """
+        tested = self.learned & np.isfinite(self.prior_std)
+        allowed = np.where(tested, self.prior_std**2, 1.0) * (
+            1.0 - np.where(tested, self.ratio, 0.0) ** 2
+        )
+        return np.where(tested, (self.estimate.values - self.prior_mean) / np.sqrt(allowed), np.nan)
+
+
+def with_prior(
+    model: RobotModel,
+    factor: Factor | QRFactor,
+    prior: GaussianPrior,
+    weights: Array | None = None,
+    *,
+    design_effect: float = 1.0,
+) -> PosteriorEstimate:
+    """Estimate from data and prior; without data, the prior; with a flat one, least squares.
+
+    Args:
+        model: the robot.
+        factor: the samples, possibly none.
+        prior: on the model's p parameters.
+        weights: per joint (n,), 1/variance; by default from an ordinary fit without prior.
+        design_effect: how many rows say as much as one would if residuals were white; the data
+            weigh that much less against the prior. See :func:`fit_with_prior`.
+
+    Raises:
+        IdentificationError: some rows, but too few to know the noise from, and no weights.
+        ShapeError: the prior is on another number of parameters.
+    """
+    if prior.mean.shape != (model.n_parameters,):
+        raise ShapeError("prior mean", prior.mean.shape, f"({model.n_parameters},)")
+    if weights is None:
+        weights = _weights(factor)
+    rows, target = _rows(factor, weights)
+    believed = np.sqrt(1.0 / design_effect)
+    # Solved for the change of the prior's mean: what nobody knows anything about stays there.
+    posterior = solve_rows(
+        np.concatenate([believed * rows, prior.root]),
+        np.concatenate([believed * (target - rows @ prior.mean), np.zeros(len(prior.root))]),
+        _WORST_CONDITION,
+    )
+    solution = posterior._replace(values=prior.mean + posterior.values)
+    covariance = posterior.inverse
+    mark_undetermined(covariance, posterior.determined)
+    estimate = Estimate(
+        names=model.parameter_names,
+        units=model.units,
+        values=solution.values,
+        covariance=covariance,
+        noise_std=np.sqrt(variance_of(factor, solution, weights / design_effect)),
+        samples=factor.samples,
+        method=f"weighted least squares with a Gaussian prior ({prior.words}),"
+        " posterior covariance (white residuals)",
+        condition=solve_rows(rows, target).condition if len(rows) else np.inf,
+        undetermined=undetermined_names(model.parameter_names, posterior.determined),
+    )
+    return PosteriorEstimate(estimate, prior.mean, prior.std, prior.words, design_effect)
+
+
+def fit_with_prior(
+    model: RobotModel,
+    recordings: Sequence[Samples],
+    prior: GaussianPrior,
+    *,
+    phase: PhaseFactor | None = None,
+) -> PosteriorEstimate:
+    """Fit recordings with a prior, the data weighing as much as their coloured residuals allow.
+
+    Counting every row as independent would make the data too sure of themselves, and the prior
+    worth nothing. So their information is divided by the design effect: the mean ratio, over
+    all directions of the parameter space, of the cluster-robust variance to that of white
+    residuals (Rao and Scott 1981; Pauli, Racugno and Ventura 2011).
+
+    Args:
+        model: the robot.
+        recordings: can be gone through twice: a sequence, not a generator.
+        prior: on the model's p parameters.
+        phase: of the recordings, if it is known: they are then read for QR only.
+
+    Raises:
+        IdentificationError: no recordings, or not one usable row.
+    """
+    phase = total_phase(model, recordings) if phase is None else phase
+    factor = reduced(model, recordings, phase.total)
+    if not factor.samples.any():
+        raise IdentificationError(nothing_usable(model))
+    weights = _weights(factor)
+    solution = solve_weighted(factor, weights)
+    clustered = (
+        block_covariance(phase, weights, solution.values)
+        if isinstance(factor, Factor)
+        else clustered_covariance(model, recordings, solution, weights)
+    )
+    effect = max(1.0, clustered.design_effect)
+    result = with_prior(model, factor, prior, weights, design_effect=effect)
+    return replace(
+        result,
+        estimate=replace(
+            result.estimate,
+            interval_factor=clustered.interval_factor,
+            method=f"weighted least squares with a Gaussian prior ({prior.words}), posterior"
+            f" covariance, {effect:.3g} rows counted as one for their colour",
+        ),
+    )
+
+
+def _rows(factor: Factor | QRFactor, weights: Array) -> tuple[Array, Array]:
+    """Rows (k, p) and target (k,) that stand for all samples."""
+    if isinstance(factor, QRFactor):
+        return factor.weighted(weights)[:2]
+    return rows_of(factor.weighted(weights))
+
+
+def _weights(factor: Factor | QRFactor) -> Array:
+    rows = int(factor.samples.sum())
+    if 0 < rows < _FEWEST_ROWS * factor.n_parameters:
+        raise IdentificationError(
+            f"{rows} rows are too few to know the torque's noise from, for {factor.n_parameters}"
+            " parameters; give the weights"
+        )
+    return weights_of(factor) if rows else np.zeros(factor.n_joints)
+
+
+def _inverse_root(covariance: Array) -> Array:
+    """Lower triangular L^-1 with L L' = covariance.
+
+    Raises:
+        IdentificationError: the covariance is not positive definite.
+    """
+    scale = np.sqrt(np.abs(np.diag(covariance)))
+    if not (np.all(np.isfinite(covariance)) and np.all(scale > 0.0)):
+        raise IdentificationError("a prior covariance needs finite, positive variances")
+    try:
+        lower = np.linalg.cholesky(covariance / np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        raise IdentificationError("the prior covariance is not positive definite") from None
+    return np.asarray(np.linalg.solve(lower, np.diag(1.0 / scale)))
+
+
+def _orthogonal_to(columns: Array) -> Array:
+    """Orthonormal basis (p, p - r) of what is orthogonal to columns (p, k) of rank r."""
+    if columns.shape[1] == 0:
+        return np.eye(len(columns))
+    length = np.linalg.norm(columns, axis=0)
+    acting = columns[:, length > 0.0] / length[length > 0.0]
+    left, singular, _ = np.linalg.svd(acting, full_matrices=True)
+    rank = int(np.count_nonzero(singular > 1e-12 * singular.max(initial=0.0)))
+    return np.asarray(left[:, rank:])

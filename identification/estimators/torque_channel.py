@@ -1,0 +1,212 @@
+"""What the torque channel of a log has been through before it was logged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from identification.factor.estimation import estimate
+from identification.factor.gram import Factor
+from identification.model.robot import RobotModel
+from identification.signals.low_passes import (
+    FORWARDS,
+    SMOOTHER,
+    WITHOUT_PHASE,
+    LowPassShape,
+    low_passed,
+)
+from identification.signals.masks import LONGEST_END, torn_rows
+from identification.signals.recording import Recording
+from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, prepare
+
+Array = NDArray[np.float64]
+
+LOWEST_BANDWIDTH: Final = 0.5  # Hz; below it nothing of a robot's motion would be left
+# The low-pass has to earn its place: residuals smaller by this share, on average over joints.
+_WORTHWHILE: Final = 0.05
+# Candidates per factor of ten in bandwidth, before the best one is refined.
+_COARSE: Final = 4.0
+_RATE: Final = 250.0  # Hz; rows beyond it are averaged
+_SHORTEST: Final = 12  # samples
+
+
+class LowPassFit(NamedTuple):
+    """The low-pass of one shape that fits best.
+
+    Attributes:
+        misfit: mean over the joints of the log of the residual's standard deviation.
+        bandwidth: [Hz].
+        shape: how it falls off.
+    """
+
+    misfit: float
+    bandwidth: float
+    shape: LowPassShape
+
+
+def possible_low_passes(
+    recording: Recording,
+    model: RobotModel,
+    *,
+    noise_variance: Array | None = None,
+    options: Preprocessing = Preprocessing(),  # noqa: B008 - frozen
+    undelayed: float | None = None,
+) -> tuple[Preprocessing, ...]:
+    """Settings with the low-passes that fit a recording best, one of each kind.
+
+    Many controllers log a smoothed effort: Coulomb friction, a step in the regressor, is then a
+    slope in the torque, and a fit of one to the other is wrong at every reversal.
+
+    The kinds are causal ones, whose lag is what a delay without a low-pass would have to stand in
+    for, and ones without phase, beside that delay or without it, as fits better. A kind whose
+    residuals are not clearly smaller than with a delay by itself is left out. The motion is read
+    with a wide bandwidth: a narrow one would itself be a low-pass of the regressor.
+
+    Args:
+        recording: checked, with torque.
+        model: the robot.
+        noise_variance: of the positions (n,), see :func:`identification.signals.samples.smooth`.
+        options: the other settings.
+        undelayed: delay [s] where that of the options was found without a low-pass; that of the
+            options if left out.
+    """
+    still = options.torque_delay if undelayed is None else undelayed
+    wide = replace(options, rigid_bandwidth=RIGID_BANDWIDTH)
+    channels = {
+        delay: _Channel.of(recording, model, noise_variance, replace(wide, torque_delay=delay))
+        for delay in {still, options.torque_delay}
+    }
+    # What a delay by itself explains as well is no low-pass.
+    plain = min(float(np.nanmean(one.log_residuals())) for one in channels.values())
+    enough = plain + math.log(1.0 - _WORTHWHILE)
+    found = []
+    for delays, shapes in ((tuple(channels), WITHOUT_PHASE), ((still,), FORWARDS)):
+        fits = [(channels[delay].best(shape), delay) for delay in delays for shape in shapes]
+        fits = [one for one in fits if one[0].misfit < enough]
+        if fits:
+            fit, delay = min(fits, key=lambda one: one[0].misfit)
+            found.append(
+                replace(
+                    options,
+                    torque_delay=delay,
+                    torque_bandwidth=fit.bandwidth,
+                    torque_shape=fit.shape,
+                )
+            )
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Channel:
+    """Rows of each joint before any low-pass, averaged to a rate of some 250 Hz.
+
+    Attributes:
+        model: the robot.
+        time: (m,) [s].
+        segments: stretches without a gap.
+        blocks: per joint the columns of its row and, last, the torque of known loads (m, c + 1).
+        columns: parameters that the columns belong to.
+        torque: recorded (m, n).
+        usable: (m, n).
+    """
+
+    model: RobotModel
+    time: Array
+    segments: tuple[slice, ...]
+    blocks: tuple[Array, ...]
+    columns: Sequence[NDArray[np.intp]]
+    torque: Array
+    usable: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        model: RobotModel,
+        noise_variance: Array | None,
+        options: Preprocessing,
+    ) -> Self:
+        plain = replace(options, torque_bandwidth=None)
+        samples = prepare(recording, model, noise_variance=noise_variance, options=plain)
+        # The ends that the narrowest filter knows badly count for none.
+        usable = samples.usable & ~torn_rows(recording, LONGEST_END)[:, None]
+        load = np.zeros_like(samples.torque)
+        if model.has_load:
+            load = model.load_torque(*samples.motion[1:4])
+        regressor = samples.regressor(model)
+        every = max(1, round(1.0 / (_RATE * float(np.median(np.diff(recording.time))))))
+        average, segments = _averaging(samples.segments, every)
+        return cls(
+            model=model,
+            time=average(recording.time),
+            segments=segments,
+            blocks=tuple(
+                average(np.column_stack([block, load[:, joint]]))
+                for joint, block in enumerate(regressor.blocks)
+            ),
+            columns=regressor.columns,
+            torque=average(samples.torque + load),
+            usable=average(usable.astype(np.float64)) == 1.0,
+        )
+
+    def log_residuals(
+        self, bandwidth: float | None = None, shape: LowPassShape = SMOOTHER
+    ) -> Array:
+        """Log of the residual's standard deviation per joint (n,), NaN where one never moves."""
+        factor = Factor.zero(self.model)
+        for joint, (block, used) in enumerate(zip(self.blocks, self.columns, strict=True)):
+            rows, seen = self.usable[:, joint], block
+            if bandwidth is not None:
+                parts = [(self.time[one], block[one]) for one in self.segments]
+                seen = np.concatenate([low_passed(*part, bandwidth, shape) for part in parts])
+            table = np.column_stack([seen[:, :-1], self.torque[:, joint] - seen[:, -1]])[rows]
+            index = np.append(used, self.model.n_parameters)
+            factor.gram[joint][np.ix_(index, index)] = table.T @ table
+            factor.samples[joint] = np.count_nonzero(rows)
+        return np.asarray(np.log(estimate(self.model, factor).noise_std))
+
+    def best(self, shape: LowPassShape) -> LowPassFit:
+        """The bandwidth with which a shape fits best."""
+
+        def misfit(log_bandwidth: float) -> float:
+            return float(np.nanmean(self.log_residuals(math.exp(log_bandwidth), shape)))
+
+        highest = 0.25 / float(np.median(np.diff(self.time)))
+        ends = np.log(LOWEST_BANDWIDTH), np.log(max(highest, 2.0 * LOWEST_BANDWIDTH))
+        count = max(4, round(_COARSE * (ends[1] - ends[0]) / np.log(10.0)) + 1)
+        grid = np.linspace(*ends, count)
+        coarse = [misfit(point) for point in grid]
+        best = int(np.argmin(coarse))
+        around = grid[max(best - 1, 0)], grid[min(best + 1, count - 1)]
+        fine = scipy.optimize.minimize_scalar(
+            misfit, bounds=around, method="bounded", options={"xatol": 0.02}
+        )
+        return LowPassFit(float(fine.fun), float(np.exp(fine.x)), shape)
+
+
+def _averaging(
+    segments: Sequence[slice], every: int
+) -> tuple[Callable[[Array], Array], tuple[slice, ...]]:
+    """Mean of so many rows each, and the segments (long enough for a filter) of such means.
+
+    A mean is linear and the same for torque and regressor: what relates them stays.
+    """
+    counts = [(one.stop - one.start) // every for one in segments]
+    kept = [(s.start, c) for s, c in zip(segments, counts, strict=True) if c >= _SHORTEST]
+
+    def average(values: Array) -> Array:
+        parts = [
+            values[start : start + count * every].reshape(count, every, *values.shape[1:])
+            for start, count in kept
+        ]
+        return np.concatenate([part.mean(axis=1) for part in parts])
+
+    edges = np.concatenate([[0], np.cumsum([count for _, count in kept])]).astype(int).tolist()
+    return average, tuple(slice(a, b) for a, b in pairwise(edges))

@@ -1,0 +1,1 @@
+"""What leaves an identification: parameters, friction and URDF as files."""

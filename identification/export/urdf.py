@@ -1,0 +1,416 @@
+"""The way back: a URDF with identified inertia and friction, everything else as it was.
+
+- A moving link gets mass, centre of mass and the tensor about it, in the axes of the inertial
+  frame it had (its ``rpy`` stays).
+- What is fixed to a moving link cannot be told from it. Its inertia is contained in the moving
+  link's, so its own ``<inertial>`` is taken out, with a comment in its place.
+- A locked joint, and what it carries, stays as it was; the moving link gets what is left of the
+  identified inertia. Where that is no possible body, the locked links are treated as fixed ones.
+- The base and what is fixed to it keep theirs: no torque depends on it.
+- ``<dynamics>`` gets viscous friction as ``damping`` and Coulomb friction as ``friction``.
+- A payload is known and no part of the arm: it is not written.
+- What a URDF has no place for, such as rotor inertias, :func:`not_in_urdf` names; see
+  :func:`identification.export.parameters.parameters_json`.
+
+The text is read back and its inverse dynamics, by pinocchio, compared with the regressor's before
+it is returned.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError
+from identification.export.xml_source import Edit, Element, XmlSource, comment_text
+from identification.model.friction import TERMS
+from identification.model.kinematics import (
+    FROM_PINOCCHIO,
+    chain_from_urdf,
+    locked_posture,
+    pinocchio_model,
+)
+from identification.model.pseudo_inertia import Body, body, margin
+from identification.model.regressor import RegressorPlan
+from identification.model.robot import RobotModel
+from identification.model.wrench import LINK_SYMBOLS
+
+Array = NDArray[np.float64]
+
+
+class LockedBody(NamedTuple):
+    """Nominal inertia of what one locked joint carries, up to the next moving or locked joint.
+
+    Attributes:
+        joint: name of the locked joint.
+        carrier: index of the joint of the model that moves it, -1 for the base.
+        inertial: the ten parameters about the carrier's frame, in its axes (10,).
+    """
+
+    joint: str
+    carrier: int
+    inertial: Array
+
+
+def locked_bodies(urdf: str, model: RobotModel) -> tuple[LockedBody, ...]:
+    """Return what the locked joints of a model carry, at the positions where they are locked."""
+    if not model.locked:
+        return ()
+    arm = pin.buildModelFromXML(urdf)
+    data = arm.createData()
+    pin.forwardKinematics(arm, data, locked_posture(arm, model.locked))
+    found = []
+    for name in model.locked:
+        own = arm.getJointId(name)
+        before = own
+        while before > 0 and arm.names[before] in model.locked:
+            before = arm.parents[before]
+        body = (data.oMi[before].inverse() * data.oMi[own]).act(arm.inertias[own])
+        inertial = body.toDynamicParameters()[list(FROM_PINOCCHIO)]
+        carrier = model.joint_names.index(arm.names[before]) if before > 0 else -1
+        found.append(LockedBody(name, carrier, inertial))
+    return tuple(found)
+
+
+def without_locked(inertial: Array, locked: tuple[LockedBody, ...]) -> tuple[Array, frozenset[str]]:
+    """Take what locked joints carry out of the links (n, 10), where a possible body is left.
+
+    Returns:
+        The links (n, 10), and the locked joints that keep what they carry: those of the base too.
+    """
+    left = inertial.copy()
+    kept: set[str] = set()
+    for carrier in {one.carrier for one in locked}:
+        carried = [one for one in locked if one.carrier == carrier]
+        if carrier >= 0:
+            rest = left[carrier] - sum(one.inertial for one in carried)
+            if not margin(rest) > 0.0:
+                continue
+            left[carrier] = rest
+        kept.update(one.joint for one in carried)
+    return left, frozenset(kept)
+
+
+_N_LINK: Final = len(LINK_SYMBOLS)
+_TENSOR: Final = {
+    "ixx": (0, 0),
+    "ixy": (0, 1),
+    "ixz": (0, 2),
+    "iyy": (1, 1),
+    "iyz": (1, 2),
+    "izz": (2, 2),
+}
+_DYNAMICS: Final = {kind.symbol: kind.urdf for kind in reversed(TERMS) if kind.urdf}
+_STATES: Final = 50
+_SEED: Final = 20140902
+# Of the largest torque of a joint: what going through centre of mass and decimal text may cost.
+_ROUNDING: Final = 1e-8
+
+
+class NotConsistentError(IdentificationError):
+    """Parameters that no machine can have are not written into a robot description.
+
+    Attributes:
+        joint: whose link, rotor or friction it is.
+    """
+
+    def __init__(self, message: str, *, joint: str) -> None:
+        super().__init__(message)
+        self.joint = joint
+
+
+class WriteBackError(IdentificationError):
+    """The description cannot take the parameters, or does not give them back when read again."""
+
+
+def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | None = None) -> str:
+    """Return the URDF text with other inertial parameters, and friction if given.
+
+    Args:
+        urdf: the text of the file that the model was made from.
+        model: the robot.
+        standard: all standard parameters (s,), as in `model.standard_names`.
+        friction: coefficients (k,), see `RobotModel.friction_part`; none leaves
+            ``<dynamics>`` as it is, NaN leaves that figure.
+
+    Raises:
+        NotConsistentError: a link, a rotor or friction is not physically possible.
+        WriteBackError: the text is not of this robot, or reads back as another.
+        ModelError: the text is no URDF.
+        ShapeError: an array does not have the shape it should have.
+    """
+    standard = model.layout.checked(standard)
+    inertial = standard[model.layout.links]
+    coefficients = _friction(model, friction)
+    _refuse_impossible(model, standard, inertial, coefficients)
+    bodies, kept = without_locked(inertial, locked_bodies(urdf, model))
+    source = XmlSource(urdf)
+    tree = _Tree(source.root, model, kept)
+    edits: list[Edit] = []
+    for joint, parameters in zip(model.joint_names, bodies, strict=True):
+        link = tree.link_of(joint)
+        edits += _inertia_edits(source, link, body(parameters))
+        for merged in tree.fixed_to(link):
+            edits += _merged_edits(merged, link)
+        edits += _friction_edits(source, tree.joints[joint], coefficients.get(joint, {}))
+    text = source.edited(edits)
+    _compare(text, model, inertial, coefficients)
+    return text
+
+
+def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
+    """Return in words which of the model's parameters a URDF has no place for."""
+    absent = {
+        "rotor inertias": model.rotor_inertia,
+        "coupling inertias": bool(model.layout.pairs),
+        **{kind.words: not kind.urdf for kind in model.friction.kinds},
+        "friction of coupled motors": bool(model.friction.motors),
+        "the payload": model.payload is not None,
+        "springs and balancers": bool(model.elements.elements),
+    }
+    return tuple(words for words, there in absent.items() if there)
+
+
+class _Tree:
+    """Links and joints of a description by name; locked joints not in `kept` count as fixed."""
+
+    def __init__(self, root: Element, model: RobotModel, kept: Collection[str]) -> None:
+        self.links = {e.attributes.get("name", ""): e for e in root.children if e.name == "link"}
+        # Not every <joint> is one: a transmission has elements of that name, deeper down.
+        self.joints = {e.attributes.get("name", ""): e for e in root.children if e.name == "joint"}
+        self._rigid: list[Element] = []
+        missing = [name for name in model.joint_names if name not in self.joints]
+        if missing:
+            raise WriteBackError(f"the description has no joint {missing[0]!r}")
+        for name, joint in self.joints.items():
+            if joint.attributes.get("type") == "fixed":
+                self._rigid.append(joint)
+            elif name in model.locked:
+                self._rigid += [] if name in kept else [joint]
+            elif name not in model.joint_names:
+                raise WriteBackError(
+                    f"joint {name!r} moves in the description but not in the model: the inertia"
+                    " of what it carries is not known by itself"
+                )
+
+    def link_of(self, joint: str) -> Element:
+        """Return the link that a joint moves."""
+        return self._end(self.joints[joint], "child")
+
+    def fixed_to(self, link: Element) -> Iterator[Element]:
+        """Yield the links that fixed joints carry on from a link, all the way."""
+        for joint in self._rigid:
+            if self._end(joint, "parent") is link:
+                carried = self._end(joint, "child")
+                yield carried
+                yield from self.fixed_to(carried)
+
+    def _end(self, joint: Element, end: str) -> Element:
+        named = joint.child(end)
+        name = named.attributes.get("link", "") if named else ""
+        if name not in self.links:
+            raise WriteBackError(
+                f"joint {joint.attributes.get('name')!r} has no {end} link in the description"
+            )
+        return self.links[name]
+
+
+def _inertia_edits(source: XmlSource, link: Element, of: Body) -> Iterator[Edit]:
+    """Set, or put in, the inertial element of a link."""
+    element = link.child("inertial")
+    if element is None:
+        lines = ["<inertial>", *(f"  {line}" for line in _inertial_lines(of)), "</inertial>"]
+        yield source.with_first_child(link, lines)
+        return
+    origin, mass, tensor = (element.child(name) for name in ("origin", "mass", "inertia"))
+    turn = _rotation(origin.attributes.get("rpy", "")) if origin else np.eye(3)
+    turned = turn.T @ of.inertia @ turn
+    missing = []
+    for name, child, values in (
+        ("origin", origin, {"xyz": _vector(of.centre)}),
+        ("mass", mass, {"value": _number(of.mass)}),
+        ("inertia", tensor, _tensor_attributes(turned)),
+    ):
+        if child is None:
+            missing.append(_tag(name, values))
+        else:
+            yield source.with_attributes(child, values)
+    if missing:
+        yield source.with_first_child(element, missing)
+
+
+def _merged_edits(merged: Element, link: Element) -> Iterator[Edit]:
+    """Take out the inertia of a link whose mass is counted with the one it is fixed to."""
+    element = merged.child("inertial")
+    if element is not None:
+        name = comment_text(link.attributes["name"])
+        yield Edit(element.start, element.end, f"<!-- inertia is contained in {name} -->")
+
+
+def _friction_edits(
+    source: XmlSource, joint: Element, coefficients: dict[str, float]
+) -> Iterator[Edit]:
+    """Set, or put in, damping and dry friction of a joint."""
+    values = {
+        attribute: _number(coefficients[symbol])
+        for symbol, attribute in _DYNAMICS.items()
+        if math.isfinite(coefficients.get(symbol, math.nan))
+    }
+    if not values:
+        return
+    element = joint.child("dynamics")
+    if element is None:
+        yield source.with_first_child(joint, [_tag("dynamics", values)])
+    else:
+        yield source.with_attributes(element, values)
+
+
+def _inertial_lines(of: Body) -> list[str]:
+    return [
+        _tag("origin", {"xyz": _vector(of.centre), "rpy": "0 0 0"}),
+        _tag("mass", {"value": _number(of.mass)}),
+        _tag("inertia", _tensor_attributes(of.inertia)),
+    ]
+
+
+def _tag(name: str, values: dict[str, str]) -> str:
+    return f"<{name} " + " ".join(f'{key}="{value}"' for key, value in values.items()) + "/>"
+
+
+def _tensor_attributes(tensor: Array) -> dict[str, str]:
+    return {name: _number(tensor[place]) for name, place in _TENSOR.items()}
+
+
+def _vector(values: Array) -> str:
+    return " ".join(_number(value) for value in values)
+
+
+def _number(value: float) -> str:
+    """Return the shortest text that is read back as the same number."""
+    return repr(float(value) + 0.0)  # no minus in front of zero
+
+
+def _rotation(rpy: str) -> Array:
+    """Return the rotation of a URDF's roll, pitch and yaw, about fixed axes; none is none."""
+    if not rpy.strip():
+        return np.eye(3)
+    return np.asarray(pin.rpy.rpyToMatrix(np.array([float(angle) for angle in rpy.split()])))
+
+
+def _friction(model: RobotModel, friction: Array | None) -> dict[str, dict[str, float]]:
+    """Return friction coefficients by joint and symbol, nothing without friction."""
+    if friction is None:
+        return {}
+    return dict(zip(model.joint_names, model.friction.table(friction), strict=False))
+
+
+def _refuse_impossible(
+    model: RobotModel,
+    standard: Array,
+    inertial: Array,
+    coefficients: dict[str, dict[str, float]],
+) -> None:
+    """Raise `NotConsistentError` for what no machine can have."""
+    for name, value in zip(model.standard_names, standard, strict=True):
+        if not math.isfinite(value):
+            joint = _joint_of(model, name)
+            raise NotConsistentError(
+                f"parameter {name} of joint {joint!r} is no number", joint=joint
+            )
+    for joint, smallest in zip(model.joint_names, margin(inertial), strict=True):
+        if not smallest > 0.0:
+            raise NotConsistentError(
+                f"the link of joint {joint!r} is no possible body: its pseudo-inertia has the"
+                f" eigenvalue {smallest:.3g}; write the physically consistent estimate",
+                joint=joint,
+            )
+    rotors = model.layout.rotor_matrix(standard)
+    for joint, rotor in zip(model.joint_names, np.diag(rotors), strict=True):
+        if not rotor >= 0.0:
+            raise NotConsistentError(f"the rotor of joint {joint!r} is negative", joint=joint)
+    smallest, directions = np.linalg.eigh(rotors)
+    if smallest[0] < -_ROUNDING * np.abs(rotors).max(initial=0.0):
+        joint = model.joint_names[int(np.argmax(np.abs(directions[:, 0])))]
+        raise NotConsistentError(
+            f"the coupling inertias of joint {joint!r} are too large for its rotors", joint=joint
+        )
+    for joint, terms in coefficients.items():
+        for symbol, attribute in _DYNAMICS.items():
+            if terms.get(symbol, 0.0) < 0.0:
+                raise NotConsistentError(
+                    f"{attribute} of joint {joint!r} is {terms[symbol]:.3g}; friction takes"
+                    " energy, it is never negative",
+                    joint=joint,
+                )
+
+
+def _compare(
+    text: str, model: RobotModel, inertial: Array, coefficients: dict[str, dict[str, float]]
+) -> None:
+    """Raise `WriteBackError` unless the text is read back as the robot that was meant."""
+    chain = chain_from_urdf(text, model.locked)
+    if chain.joint_names != model.joint_names:
+        raise WriteBackError("the description is of another robot: its joints are not the model's")
+    n = model.n_joints
+    q, qd, qdd = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, n))
+    plan = RegressorPlan(
+        model.chain, model.gravity, [range(_N_LINK)] * n, [False] * n, friction=None
+    )
+    columns = plan.evaluate(q, qd, qdd).dense(_N_LINK * n)
+    expected = columns @ inertial.reshape(-1)
+    error = np.abs(_inverse_dynamics(text, model, q, qd, qdd) - expected).max(axis=0)
+    # Links of very different mass share the rounding of the largest.
+    allowed = _ROUNDING * max(float(np.abs(expected).max()), 1.0)
+    wrong = np.flatnonzero(~(error <= allowed))
+    if len(wrong):
+        joint = model.joint_names[int(wrong[0])]
+        raise WriteBackError(
+            f"the written description gives other torques: joint {joint!r} by {error.max():.3g}"
+        )
+    if not np.allclose(chain.inertial, inertial, rtol=0.0, atol=_ROUNDING * np.abs(inertial).max()):
+        raise WriteBackError("the written description gives other inertial parameters")
+    for joint, smallest in zip(model.joint_names, margin(chain.inertial), strict=True):
+        if not smallest > 0.0:
+            raise NotConsistentError(
+                f"the link of joint {joint!r} is so close to the edge of what is possible that"
+                " rounding takes it beyond",
+                joint=joint,
+            )
+    elements = XmlSource(text).root.children
+    joints = {e.attributes.get("name"): e for e in elements if e.name == "joint"}
+    for joint, values in coefficients.items():
+        dynamics = joints[joint].child("dynamics")
+        for symbol, attribute in _DYNAMICS.items():
+            wanted = values.get(symbol, math.nan)
+            if math.isfinite(wanted) and (
+                dynamics is None or float(dynamics.attributes[attribute]) != wanted
+            ):
+                raise WriteBackError(f"{attribute} of joint {joint!r} was not written")
+
+
+def _joint_of(model: RobotModel, standard: str) -> str:
+    """Return the joint that a standard parameter is numbered after."""
+    place = model.standard_names.index(standard)
+    layout = model.layout
+    if place >= layout.n_joints * layout.width:
+        return model.joint_names[layout.pairs[place - layout.n_joints * layout.width][0]]
+    return model.joint_names[place // layout.width]
+
+
+def _inverse_dynamics(text: str, model: RobotModel, q: Array, qd: Array, qdd: Array) -> Array:
+    """Return the torques (m, n) that pinocchio finds for a description."""
+    arm = pinocchio_model(text, model.locked)
+    arm.gravity.linear = model.gravity
+    data = arm.createData()
+    still = pin.neutral(arm)  # joints that turn on and on have two coordinates
+    return np.array(
+        [
+            pin.rnea(arm, data, pin.integrate(arm, still, a), b, c)
+            for a, b, c in zip(q, qd, qdd, strict=True)
+        ]
+    )

@@ -1,0 +1,1 @@
+"""Samples reduced to what an estimate needs, and its solution."""

@@ -1,0 +1,248 @@
+r"""Gram matrices of [W | y] by short blocks of time: factor and covariance in one pass.
+
+.. math:: G_{bj} = \sum_{t \in b} \begin{bmatrix} W_j & y_j \end{bmatrix}^T
+                                  \begin{bmatrix} W_j & y_j \end{bmatrix}
+
+Summed over the blocks b they are the :class:`identification.factor.gram.Factor`; block by block
+they give the scores of a cluster-robust covariance (:mod:`identification.estimators.covariance`)
+for any weights and parameters. Kept are only the columns that act on a joint, a third of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError
+from identification.factor.augmented_rows import augmented_rows
+from identification.factor.gram import Factor
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
+
+FINE_BLOCK: Final = 0.125  # s
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseFactor:
+    """Factors of B short blocks of time since the motion's origin.
+
+    They add at equal times since the origin: repetitions of a motion block by block.
+
+    Attributes:
+        gram: per joint j over its columns, and last the torque, (B, c_j + 1, c_j + 1).
+        columns: per joint the parameter index of each of its columns (c_j,).
+        samples: rows that count (B, n).
+        parameter_names: (p,).
+    """
+
+    gram: tuple[Array, ...]
+    columns: tuple[NDArray[np.intp], ...]
+    samples: NDArray[np.intp]
+    parameter_names: tuple[str, ...]
+
+    @classmethod
+    def zero(cls, model: RobotModel) -> PhaseFactor:
+        """Return the factor of no samples: what a sum starts from."""
+        columns = model.plan.columns
+        gram = tuple(np.zeros((0, len(c) + 1, len(c) + 1)) for c in columns)
+        return cls(
+            gram, columns, np.zeros((0, model.n_joints), dtype=np.intp), model.parameter_names
+        )
+
+    @classmethod
+    def from_samples(cls, model: RobotModel, samples: Samples) -> PhaseFactor:
+        """Reduce a recording, block by block. Rows before the origin belong to the first."""
+        index = fine_blocks(samples)
+        count = int(index[-1]) + 1 if len(index) else 0
+        columns = model.plan.columns
+        gram = tuple(np.zeros((count, len(c) + 1, len(c) + 1)) for c in columns)
+        for part, rows in augmented_rows(model, samples):
+            runs = equal_runs(index[part])
+            for total, block in zip(gram, rows, strict=True):
+                add_grams(total, block, runs)
+        return cls(gram, columns, counted(index, samples.usable), model.parameter_names)
+
+    @property
+    def n_joints(self) -> int:
+        """Number n of joints."""
+        return len(self.gram)
+
+    @property
+    def n_parameters(self) -> int:
+        """Number p of parameters."""
+        return len(self.parameter_names)
+
+    def __len__(self) -> int:
+        """Number B of blocks."""
+        return len(self.samples)
+
+    def __add__(self, other: PhaseFactor) -> PhaseFactor:
+        """Blocks of both at equal times since the origin.
+
+        Raises:
+            IdentificationError: the two belong to different models.
+        """
+        if self.parameter_names != other.parameter_names or self.n_joints != other.n_joints:
+            raise IdentificationError("factors with different joints or parameters cannot be added")
+        gram = tuple(_sum(a, b) for a, b in zip(self.gram, other.gram, strict=True))
+        return PhaseFactor(
+            gram, self.columns, _sum(self.samples, other.samples), self.parameter_names
+        )
+
+    def weighted(self, weights: Array) -> Array:
+        """Gram matrices of the blocks (B, p + 1, p + 1) with one weight per joint (n,)."""
+        width = self.n_parameters + 1
+        whole = np.zeros((len(self.samples), width * width))
+        for weight, gram, used in zip(weights, self.gram, self.columns, strict=True):
+            place = np.append(used, self.n_parameters)
+            flat = (place[:, None] * width + place).ravel()
+            whole[:, flat] += weight * gram.reshape(len(gram), -1)
+        return whole.reshape(-1, width, width)
+
+    def scores(self, weights: Array, values: Array) -> Array:
+        """Pull of each block's residuals on the parameters, ``W' w (y - W values)`` (B, p)."""
+        pull = np.zeros((len(self.samples), self.n_parameters))
+        for weight, gram, used in zip(weights, self.gram, self.columns, strict=True):
+            pull[:, used] += weight * (gram[:, :-1] @ np.append(-values[used], 1.0))
+        return pull
+
+    def blocks(self, which: slice | NDArray[np.bool_]) -> PhaseFactor:
+        """Some of the blocks, by place or by a mask (B,)."""
+        gram = tuple(own[which] for own in self.gram)
+        return PhaseFactor(gram, self.columns, self.samples[which], self.parameter_names)
+
+    def occupied(self) -> PhaseFactor:
+        """Without the blocks that hold no row."""
+        rows = np.asarray(self.samples.any(axis=1))
+        return self if rows.all() else self.blocks(rows)
+
+    def merged(self, length: int) -> PhaseFactor:
+        """Runs of `length` blocks as one; the last one may be shorter."""
+        gram = tuple(merged(own, length) for own in self.gram)
+        return PhaseFactor(gram, self.columns, merged(self.samples, length), self.parameter_names)
+
+    @property
+    def total(self) -> Factor:
+        """Factor of all blocks."""
+        width = self.n_parameters + 1
+        whole = np.zeros((self.n_joints, width, width))
+        for joint, (gram, used) in enumerate(zip(self.gram, self.columns, strict=True)):
+            place = np.append(used, self.n_parameters)
+            whole[joint][np.ix_(place, place)] = gram.sum(axis=0)
+        return Factor(whole, self.samples.sum(axis=0), self.parameter_names)
+
+    def restricted(self, kept: NDArray[np.intp]) -> PhaseFactor:
+        """The same samples for a model that has only the parameters `kept` (k,), in that order."""
+        place = np.full(self.n_parameters, -1, dtype=np.intp)
+        place[kept] = np.arange(len(kept))
+        gram, columns = [], []
+        for own, used in zip(self.gram, self.columns, strict=True):
+            stays = np.flatnonzero(place[used] >= 0)
+            both = np.append(stays, len(used))
+            gram.append(own[:, both[:, None], both])
+            columns.append(place[used[stays]])
+        names = tuple(self.parameter_names[k] for k in kept)
+        return PhaseFactor(tuple(gram), tuple(columns), self.samples, names)
+
+
+def joined(parts: Sequence[PhaseFactor]) -> PhaseFactor:
+    """Blocks of several recordings one after the other."""
+    first = parts[0]
+    gram = tuple(np.concatenate(own) for own in zip(*(part.gram for part in parts), strict=True))
+    samples = np.concatenate([part.samples for part in parts])
+    return PhaseFactor(gram, first.columns, samples, first.parameter_names)
+
+
+def total_phase(model: RobotModel, recordings: Iterable[Samples]) -> PhaseFactor:
+    """Sum of the factors of recordings, each read once."""
+    return sum(
+        (PhaseFactor.from_samples(model, samples) for samples in recordings),
+        PhaseFactor.zero(model),
+    )
+
+
+def fine_blocks(samples: Samples) -> NDArray[np.int64]:
+    """Block of each sample (m,), rising; rows before the origin belong to the first."""
+    since = samples.motion.time - samples.origin
+    return np.maximum(np.floor(since / FINE_BLOCK + 1e-9).astype(np.int64), 0)
+
+
+def block_runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
+    """Yield each value of a rising index with where it stands."""
+    edges = np.flatnonzero(np.diff(index)) + 1
+    for start, stop in pairwise([0, *edges.tolist(), len(index)]):
+        if stop > start:
+            yield int(index[start]), slice(start, stop)
+
+
+class EqualRuns(NamedTuple):
+    """Blocks one after the other that have as many rows each.
+
+    Attributes:
+        first: the first block.
+        blocks: how many of them.
+        start: its first row.
+        length: rows of each.
+    """
+
+    first: int
+    blocks: int
+    start: int
+    length: int
+
+
+def equal_runs(index: NDArray[np.int64]) -> list[EqualRuns]:
+    """Group :func:`block_runs` of a rising index, for as few and large operations as can be."""
+    groups: list[EqualRuns] = []
+    for block, at in block_runs(index):
+        length = at.stop - at.start
+        last = groups[-1] if groups else None
+        if last is not None and last.length == length and last.first + last.blocks == block:
+            groups[-1] = last._replace(blocks=last.blocks + 1)
+        else:
+            groups.append(EqualRuns(block, 1, at.start, length))
+    return groups
+
+
+def add_grams(total: Array, rows: Array, runs: Iterable[EqualRuns]) -> None:
+    """Add ``rows rows'`` of each block to the total (B, c, c), in place; rows is (c, k)."""
+    for first, count, start, length in runs:
+        own = rows[:, start : start + count * length].reshape(len(rows), count, length)
+        # The product of an array with itself transposed takes half the work.
+        own = own.transpose(1, 0, 2)
+        total[first : first + count] += own @ own.transpose(0, 2, 1)
+
+
+def counted(index: NDArray[np.int64], usable: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Rows that count (B, n) of a mask (m, n), by a rising index of blocks (m,)."""
+    if not len(index):
+        return np.zeros((0, usable.shape[1]), dtype=np.intp)
+    ends = np.searchsorted(index, np.arange(int(index[-1]) + 1), side="right")
+    sums = np.cumsum(usable, axis=0, dtype=np.intp)[np.maximum(ends - 1, 0)]
+    sums[ends == 0] = 0
+    return np.diff(sums, axis=0, prepend=0)
+
+
+def merged(blocks: Blocks, length: int) -> Blocks:
+    """Sum runs of `length` blocks along the first axis (B, ...); the last one may be shorter."""
+    total = blocks[::length].copy()
+    for later in range(1, length):  # several times as fast as np.add.reduceat
+        own = blocks[later::length]
+        total[: len(own)] += own
+    return total
+
+
+def _sum(first: Blocks, second: Blocks) -> Blocks:
+    """Sum of blocks (B, ...) of possibly different number."""
+    longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
+    total = longer.copy()
+    total[: len(shorter)] += shorter
+    return total

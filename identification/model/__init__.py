@@ -1,0 +1,1 @@
+"""The robot: kinematics, regressor, friction, payload, base parameters."""

@@ -1,0 +1,611 @@
+r"""Friction of joints, linear in its coefficients: terms, the law of a joint, and that of an arm.
+
+.. math:: \tau_f = f_0\,\mathrm{sgn}(v) + f_1 v + f_d |v| + f_2\,\mathrm{sgn}(v)\,v^2
+                   + f_s\,\mathrm{sgn}(v)\,e^{-(v/v_s)^2} + f_o
+
+with the joint's speed v. Each summand is a :class:`FrictionTerm`; a new one is a class in
+:data:`TERMS`, a field of :class:`FrictionLaw`, and fields of the same name in the cell file's
+tables. Dry friction does not jump at a reversal: over a displacement of some 1e-4 rad, while teeth
+and bearings bend, it reverses like a spring (presliding). Dahl (1968) describes it by a state z in
+place of sgn(v), which follows the displacement dq alone,
+
+.. math:: z \leftarrow s + (z - s)\,e^{-|dq| / d}, \qquad s = \mathrm{sgn}(dq)
+
+so that the torque stays linear in the coefficients once the distance d is fixed, and friction at
+rest is what was left of the motion before it.
+
+The source equation of the paper (after eq. 1: three coefficients per joint) could not be read. The
+quadratic third term is what the same authors' later software uses; the cubic one, ``v**3``, is the
+other form found in the field, so the term can be chosen or left out.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Final, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import ModelError, ShapeError
+from identification.model.coupling import Coupling
+
+Array = NDArray[np.float64]
+ThirdTerm = Literal["quadratic", "cubic"]
+Zone = Literal["exclude", "linear"]
+Pair = tuple[str, tuple[tuple[float, float], tuple[float, float]]]
+
+_EXPONENT: Final = {1: "", 2: "²", 3: "³"}
+
+
+class Sliding(NamedTuple):
+    """Where a column is taken.
+
+    Attributes:
+        v: speeds (...) [rad/s, m/s].
+        s: direction of dry friction there (...), for a slope its derivative with v.
+    """
+
+    v: Array
+    s: Array
+
+
+@dataclass(frozen=True)
+class FrictionTerm(ABC):
+    """A coefficient times a column of speed and direction.
+
+    Attributes:
+        speed: v_s of a column of v / v_s [rad/s, m/s].
+        symbol: of the coefficient; terms with the same one exclude each other.
+        option: of :class:`FrictionLaw`, and of `[robot.friction]`, that asks for it.
+        label: of the term in a list; in lower case its name on the command line.
+        power: of the speed in the denominator of the coefficient's unit.
+        words: what it is.
+        basis: the column as a formula for people.
+        code: the column in Python, as a factor of the coefficient; ``v`` is the speed, ``sign`` its
+            direction, ``E`` Euler's number and ``LABEL_SPEED[joint]`` the `speed`.
+        speed_symbol: of `speed`; empty for a column without it.
+        urdf: attribute of `<dynamics>` that holds the coefficient; empty for none.
+        of_motor: whether a coupled motor has one beside those of the joints.
+        is_friction: whether it cannot be the zero error of a sensor instead.
+        not_negative: whether only coefficients from zero on take energy. With a `pair` that holds
+            of g, where ``(coefficient of the other symbol, this one) = matrix @ g``.
+        pair: that symbol and matrix.
+    """
+
+    speed: float = 1.0
+
+    symbol: ClassVar[str]
+    option: ClassVar[str]
+    label: ClassVar[str]
+    power: ClassVar[int] = 0
+    words: ClassVar[str]
+    basis: ClassVar[str] = ""
+    code: ClassVar[str] = ""
+    speed_symbol: ClassVar[str] = ""
+    urdf: ClassVar[str] = ""
+    of_motor: ClassVar[bool] = False
+    is_friction: ClassVar[bool] = True
+    not_negative: ClassVar[bool] = False
+    pair: ClassVar[Pair | None] = None
+
+    @classmethod
+    def formula(cls) -> str:
+        """Return the term for people."""
+        return f"{cls.symbol} {cls.basis}".rstrip()
+
+    @classmethod
+    def of(cls, law: FrictionLaw) -> Self | None:
+        """Return the term as a law has it, None where it has not."""
+        match cls._setting(law):
+            case None | False:
+                return None
+            case str(label):
+                return cls() if label == cls.label else None
+            case True:
+                return cls()
+            case speed:
+                return cls(speed)
+
+    @classmethod
+    def _setting(cls, law: FrictionLaw) -> Any:
+        return getattr(law, cls.option)
+
+    def column(self, v: Array, s: Array) -> Array:
+        """Return the column (...) for speeds and directions of dry friction (...)."""
+        return self._column(Sliding(v, s))
+
+    def slope(self, v: Array, ds: Array) -> Array:
+        """Return its derivative (...) with v, where that of the direction is `ds` (...)."""
+        return self._slope(Sliding(v, ds))
+
+    @abstractmethod
+    def _column(self, at: Sliding) -> Array: ...
+
+    @abstractmethod
+    def _slope(self, at: Sliding) -> Array: ...
+
+    def unit(self, *, revolute: bool) -> str:
+        """Return the unit of the coefficient of a revolute or a prismatic joint."""
+        if self.power == 0:
+            return "N·m" if revolute else "N"
+        power = _EXPONENT[self.power]
+        return f"N·m·s{power}/rad{power}" if revolute else f"N·s{power}/m{power}"
+
+
+class Coulomb(FrictionTerm):
+    """Dry friction."""
+
+    symbol, option, label = "f0", "coulomb", "Coulomb"
+    words = "Coulomb (dry) friction f0"
+    basis, code = "sgn(v)", " * sign"
+    urdf, of_motor, not_negative = "friction", True, True
+
+    def _column(self, at: Sliding) -> Array:
+        return at.s
+
+    _slope = _column
+
+
+class Viscous(FrictionTerm):
+    """Friction proportional to speed."""
+
+    symbol, option, label, power = "f1", "viscous", "viscous", 1
+    words = "viscous friction f1"
+    basis, code = "v", " * v"
+    urdf, of_motor, not_negative = "damping", True, True
+
+    def _column(self, at: Sliding) -> Array:
+        return at.v
+
+    def _slope(self, at: Sliding) -> Array:
+        return np.ones_like(at.v)
+
+
+class Asymmetric(FrictionTerm):
+    """Viscous friction by direction: f1 + fd forwards, f1 - fd backwards."""
+
+    symbol, option, label, power = "fd", "asymmetric", "asymmetric", 1
+    words = "half the difference fd of viscous friction forwards and backwards"
+    basis, code = "|v|", " * abs(v)"
+    not_negative, pair = True, ("f1", ((0.5, 0.5), (0.5, -0.5)))
+
+    @classmethod
+    def _setting(cls, law: FrictionLaw) -> Any:
+        return law.asymmetric and law.viscous
+
+    def _column(self, at: Sliding) -> Array:
+        return np.abs(at.v)
+
+    def _slope(self, at: Sliding) -> Array:
+        return np.asarray(np.sign(at.v))
+
+
+class Quadratic(FrictionTerm):
+    """The third term as the authors' later software has it."""
+
+    symbol, option, label, power = "f2", "third", "quadratic", 2
+    words = "a term f2 with the speed squared"
+    basis, code = "sgn(v) v²", " * v * abs(v)"
+
+    def _column(self, at: Sliding) -> Array:
+        return np.abs(at.v) * at.v
+
+    def _slope(self, at: Sliding) -> Array:
+        return 2.0 * np.abs(at.v)
+
+
+class Cubic(FrictionTerm):
+    """The third term in its other form."""
+
+    symbol, option, label, power = "f2", "third", "cubic", 3
+    words = "a term f2 with the third power of the speed"
+    basis, code = "v³", " * v**3"
+
+    def _column(self, at: Sliding) -> Array:
+        return at.v * at.v * at.v
+
+    def _slope(self, at: Sliding) -> Array:
+        return 3.0 * at.v**2
+
+
+class Stribeck(FrictionTerm):
+    """What friction is larger by at low speed."""
+
+    symbol, option, label = "fs", "stribeck", "Stribeck"
+    words = "additional friction fs at low speed (Stribeck)"
+    basis, code = "sgn(v) exp(-(v/vs)²)", " * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)"
+    speed_symbol = "vs"
+    not_negative, pair = True, ("f0", ((1.0, 0.0), (-1.0, 1.0)))
+
+    def _column(self, at: Sliding) -> Array:
+        ratio = at.v / self.speed
+        return np.asarray(np.exp(-ratio * ratio) * at.s)
+
+    def _slope(self, at: Sliding) -> Array:
+        # Without the fall with speed, which only the step after the next would feel.
+        return at.s
+
+
+class Offset(FrictionTerm):
+    """A constant torque, also the zero error of a sensor."""
+
+    symbol, option, label = "fo", "offset", "offset"
+    words = "a constant offset fo"
+    is_friction = False
+
+    @classmethod
+    def _setting(cls, law: FrictionLaw) -> Any:
+        return law.offset or (law.asymmetric and law.coulomb)
+
+    def _column(self, at: Sliding) -> Array:
+        return np.ones_like(at.v)
+
+    def _slope(self, at: Sliding) -> Array:
+        return np.zeros_like(at.v)
+
+
+Kind = type[FrictionTerm]
+TERMS: Final[tuple[Kind, ...]] = (Coulomb, Viscous, Asymmetric, Quadratic, Cubic, Stribeck, Offset)
+"""All terms that a joint can have, in the order of the parameters."""
+
+_SYMBOLS: Final = tuple(dict.fromkeys(kind.symbol for kind in TERMS))
+
+ABSENT: Final[Mapping[str, Any]] = {"third": "none", "stribeck": 0.0}
+"""How a cell file writes None, by option."""
+
+
+@dataclass(frozen=True)
+class FrictionLaw:
+    """Which friction terms a joint has.
+
+    Attributes:
+        coulomb: ``f0 sgn(v)``.
+        viscous: ``f1 v``.
+        third: ``f2 sgn(v) v**2`` ("quadratic"), ``f2 v**3`` ("cubic") or none.
+        offset: constant ``fo``, also the zero error of a torque or current measurement.
+        standstill: speed [rad/s, m/s] below which a joint counts as standing. Stiction can take
+            any value there; see `zone`.
+        stribeck: fixed speed v_s [rad/s, m/s] of a term ``fs sgn(v) exp(-(v / v_s)**2)``, by which
+            friction is larger at low speed; none without it.
+        asymmetric: friction differs by direction, viscous by a term ``fd |v|``. Coulomb friction is
+            f0 + fo forwards and f0 - fo backwards: its asymmetry is the constant column of the
+            offset, which is there then too, and the two cannot be distinguished.
+        presliding: displacement d [rad, m] over which dry friction reverses; zero for a jump.
+        zone: what becomes of rows slower than standstill. "exclude": they are not fitted, see
+            :meth:`moving`. "linear": they are, with sgn(v) replaced by v / standstill.
+    """
+
+    coulomb: bool = True
+    viscous: bool = True
+    third: ThirdTerm | None = "quadratic"
+    offset: bool = False
+    standstill: float = 0.01
+    stribeck: float | None = None
+    asymmetric: bool = False
+    zone: Zone = "exclude"
+    presliding: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.third not in (None, "quadratic", "cubic"):
+            raise ModelError(
+                f'friction term third = {self.third!r}: "quadratic", "cubic" or None are known'
+            )
+        for name, value in (
+            ("standstill speed", self.standstill),
+            ("presliding displacement", self.presliding),
+        ):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ModelError(
+                    f"friction's {name} is {value!r}; it must be a finite number, zero or more"
+                )
+        for term in self.terms:
+            if not (math.isfinite(term.speed) and term.speed > 0.0):
+                raise ModelError(
+                    f"friction's {term.label} speed is {term.speed!r}; it must be finite and"
+                    " positive"
+                )
+        if self.zone not in ("exclude", "linear"):
+            raise ModelError(f'friction zone = {self.zone!r}: "exclude" or "linear" are known')
+        if self.zone == "linear" and self.standstill == 0.0:
+            raise ModelError(
+                "a linear friction zone needs a standstill speed above zero to be as wide as"
+            )
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> FrictionLaw:
+        """Return the law of a table `[robot.friction]`.
+
+        Raises:
+            ModelError: there is no such law.
+        """
+        options: dict[str, Any] = {k: None if v == ABSENT.get(k) else v for k, v in table.items()}
+        return cls(**options)
+
+    def table(self) -> dict[str, Any]:
+        """Return the table `[robot.friction]` of the law."""
+        return {k: ABSENT[k] if v is None else v for k, v in asdict(self).items()}
+
+    @property
+    def terms(self) -> tuple[FrictionTerm, ...]:
+        """The terms in the order of the parameters."""
+        return tuple(term for kind in TERMS if (term := kind.of(self)) is not None)
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """Their symbols."""
+        return tuple(term.symbol for term in self.terms)
+
+    def words(self) -> tuple[str, str]:
+        """The terms, and what dry friction does at a reversal, in words."""
+        listed = ", ".join(
+            f"{term.label} ({term.speed:g} rad/s)" if term.speed_symbol else term.label
+            for term in self.terms
+        )
+        reversal = f"presliding over {self.presliding:g} rad" if self.presliding else "sgn(v)"
+        return listed or "no friction", reversal
+
+    def sign(self, velocity: Array, out: Array | None = None) -> Array:
+        """Return the direction of motion: sgn(v), in a linear zone v / standstill.
+
+        Otherwise it has no dead zone: sgn(0) = 0, everything else is ±1.
+        """
+        if self.zone == "exclude":
+            return np.asarray(np.sign(velocity, out=out))
+        scaled = np.divide(velocity, self.standstill, out=out)
+        return np.asarray(np.clip(scaled, -1.0, 1.0, out=out))
+
+    def direction(self, time: Array, position: Array, velocity: Array) -> Array:
+        """Return the direction of dry friction (m,) along a motion: presliding state, or sign.
+
+        A reversal between two instants divides the step where the velocity, linear between them,
+        is zero.
+
+        Args:
+            time: of m instants [s].
+            position: of the joint or motor [rad, m], in joint units.
+            velocity: likewise [rad/s, m/s].
+        """
+        if self.presliding == 0.0:
+            return self.sign(velocity)
+        steps, before = np.diff(time), velocity[:-1]
+        share = before / np.where(before == velocity[1:], 1.0, before - velocity[1:])
+        turning = np.flatnonzero(before * velocity[1:] < 0.0)
+        turned = position[turning] + 0.5 * (before * steps * share)[turning]
+        path = np.insert(position, turning + 1, turned)
+        # What was before the first instant is not known: one step at its speed.
+        start = position[0] - velocity[0] * (steps[0] if len(steps) else 0.0)
+        state = presliding_state(np.insert(path, 0, start), self.presliding)[1:]
+        return np.delete(state, turning + 1 + np.arange(len(turning)))
+
+    def columns(self, velocity: Array, direction: Array) -> Array:
+        """Return one row per coefficient (k, ...), for speeds and directions (...)."""
+        rows = [term.column(velocity, direction) for term in self.terms]
+        return np.reshape(rows, (len(rows), *np.shape(velocity)))
+
+    def moving(self, velocity: Array) -> NDArray[np.bool_]:
+        """Return where this law can be fitted: faster than standstill, or in a linear zone."""
+        if self.zone == "linear":
+            return np.ones(np.shape(velocity), dtype=np.bool_)
+        return np.asarray(np.abs(velocity) > self.standstill)
+
+
+def presliding_state(position: Array, distance: float) -> Array:
+    """Return Dahl's state z (m,) of positions (m,), zero at the first of them.
+
+    Within a stretch of one direction it is ``s + (z0 - s) exp(-travel / distance)``.
+    """
+    steps = np.diff(position, prepend=position[:1])
+    travel = np.cumsum(np.abs(steps))
+    moved = np.flatnonzero(steps)
+    state = np.zeros(len(position))
+    if not moved.size:
+        return state
+    sign = np.sign(steps[moved])
+    turns = np.append(0, np.flatnonzero(np.diff(sign)) + 1)
+    starts, signs = moved[turns], sign[turns]
+    stops = np.append(starts[1:], len(position))
+    before, value = travel[starts - 1], 0.0
+    for start, stop, s, origin in zip(starts, stops, signs, before, strict=True):
+        stretch = s + (value - s) * np.exp((origin - travel[start:stop]) / distance)
+        state[start:stop], value = stretch, stretch[-1]
+    return state
+
+
+class JointTerm(NamedTuple):
+    """A term of one joint or motor.
+
+    Attributes:
+        name: of the parameter: ``f0_3``, or ``f0_m6`` of a motor.
+        term: which.
+        owner: which joint or motor, from 0.
+        motor: whether it acts on the speed of a motor that several joints turn.
+        unit: at the joint.
+    """
+
+    name: str
+    term: FrictionTerm
+    owner: int
+    motor: bool
+    unit: str
+
+    @property
+    def symbol(self) -> str:
+        """Of the coefficient."""
+        return self.term.symbol
+
+
+@dataclass(frozen=True, eq=False)
+class JointFriction:
+    """Friction of n joints: k coefficients, term by term (all f0, all f1, ...), then motors.
+
+    Attributes:
+        laws: of each joint (n,).
+        revolute: whether each joint turns (n,), for units.
+        coupling: motors that turn with several joints; None where each joint has its own.
+    """
+
+    laws: tuple[FrictionLaw, ...]
+    revolute: tuple[bool, ...]
+    coupling: Coupling | None = None
+
+    @property
+    def n_joints(self) -> int:
+        """Number n of joints."""
+        return len(self.laws)
+
+    @cached_property
+    def motors(self) -> tuple[int, ...]:
+        """Motors, from 0, whose friction depends on the speeds of several joints."""
+        if self.coupling is None or not self.coupling.friction:
+            return ()
+        coupled = self.coupling.coupled_motors
+        return tuple(m for m in coupled if any(term.of_motor for term in self.laws[m].terms))
+
+    @cached_property
+    def terms(self) -> tuple[JointTerm, ...]:
+        """The k coefficients in the order of the parameters."""
+        owners = [(j, False) for j in range(self.n_joints)], [(m, True) for m in self.motors]
+        return tuple(
+            JointTerm(
+                f"{symbol}_{'m' if motor else ''}{owner + 1}",
+                term,
+                owner,
+                motor,
+                term.unit(revolute=self.revolute[owner]),
+            )
+            for part in owners
+            for symbol in _SYMBOLS
+            for owner, motor in part
+            for term in self.laws[owner].terms
+            # A motor's share of any other term cannot be distinguished from that of the joints.
+            if term.symbol == symbol and (term.of_motor or not motor)
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the k parameters."""
+        return tuple(term.name for term in self.terms)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the k parameters."""
+        return tuple(term.unit for term in self.terms)
+
+    @property
+    def all_laws(self) -> tuple[FrictionLaw, ...]:
+        """Laws of the joints, then of `motors`."""
+        return *self.laws, *(self.laws[motor] for motor in self.motors)
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """Kinds of term that any joint has, in order."""
+        return tuple(kind for kind in TERMS if any(kind.of(law) for law in self.laws))
+
+    @property
+    def standstill(self) -> Array:
+        """Speed per joint (n,) [rad/s or m/s] below which it counts as standing."""
+        return np.array([law.standstill for law in self.laws])
+
+    @property
+    def one_law(self) -> FrictionLaw | None:
+        """The law of all joints, None where they differ."""
+        return self.laws[0] if len(set(self.laws)) == 1 else None
+
+    @property
+    def dissipating(self) -> NDArray[np.bool_]:
+        """Which of the k coefficients are friction (k,): all but the offset."""
+        return np.array([term.term.is_friction for term in self.terms], dtype=np.bool_)
+
+    def motor_speeds(self) -> Array:
+        """Speed of each of `motors` per joint speed, one for its own joint (len(motors), n)."""
+        if self.coupling is None or not self.motors:
+            return np.zeros((0, self.n_joints))
+        return self.coupling.speeds[list(self.motors)]
+
+    def direction(self, time: Array, position: Array, velocity: Array) -> Array:
+        """Return the direction of dry friction (m, n + k), of joints and then of `motors`.
+
+        Args:
+            time: of m instants [s].
+            position: of the joints along a motion (m, n) [rad or m].
+            velocity: likewise (m, n).
+        """
+        joints = [
+            law.direction(time, position[:, j], velocity[:, j]) for j, law in enumerate(self.laws)
+        ]
+        motors = [
+            self.laws[motor].direction(time, position @ speed, velocity @ speed)
+            for motor, speed in zip(self.motors, self.motor_speeds(), strict=True)
+        ]
+        return np.column_stack([*joints, *motors])
+
+    def moving(self, velocity: Array) -> NDArray[np.bool_]:
+        """Return where the row of a joint can be fitted (m, n), from joint speeds (m, n).
+
+        The joint, and every motor whose friction it feels, has to be faster than standstill.
+        """
+        one = self.one_law
+        if one is not None:
+            moving = one.moving(velocity)
+        else:
+            rows = [law.moving(velocity[:, j]) for j, law in enumerate(self.laws)]
+            moving = np.column_stack(rows)
+        for motor, speed in zip(self.motors, self.motor_speeds(), strict=True):
+            turning = self.laws[motor].moving(velocity @ speed)
+            moving[:, speed != 0.0] &= turning[:, None]
+        return moving
+
+    def place(self, term: JointTerm) -> int:
+        """Return the place of a term's joint or motor among the joints, then `motors`."""
+        return self.n_joints + self.motors.index(term.owner) if term.motor else term.owner
+
+    def table(self, coefficients: Array) -> tuple[dict[str, float], ...]:
+        """Return the coefficients (k,) by symbol of each joint, then of each of `motors`.
+
+        Raises:
+            ShapeError: they are not (k,).
+        """
+        values = np.asarray(coefficients, dtype=np.float64)
+        if values.shape != (len(self.terms),):
+            raise ShapeError("coefficients", values.shape, f"({len(self.terms)},)")
+        rows: tuple[dict[str, float], ...] = tuple({} for _ in self.all_laws)
+        for term, value in zip(self.terms, values.tolist(), strict=True):
+            rows[self.place(term)][term.symbol] = value
+        return rows
+
+
+class Dissipation(NamedTuple):
+    """Coefficients ``f = combine @ g``, of which some g may not be negative.
+
+    Attributes:
+        combine: (k, k), invertible.
+        not_negative: which of the g (k,).
+    """
+
+    combine: Array
+    not_negative: NDArray[np.bool_]
+
+
+def dissipation(friction: JointFriction) -> Dissipation:
+    """Return what friction needs to take energy in either direction and at low speed.
+
+    - Coulomb friction f0, and with a Stribeck term its value at rest f0 + fs;
+    - viscous friction, by direction f1 + fd and f1 - fd where it is asymmetric.
+
+    Signs of the third term and of the offset, which may be a sensor's, are left open.
+    """
+    place = {(t.motor, t.owner, t.symbol): k for k, t in enumerate(friction.terms)}
+    combine = np.eye(len(place))
+    for k, (_, term, owner, motor, _) in enumerate(friction.terms):
+        if term.pair is None:
+            continue
+        symbol, matrix = term.pair
+        if (other := place.get((motor, owner, symbol))) is not None:
+            combine[np.ix_([other, k], [other, k])] = matrix
+    kinds = [joint_term.term.not_negative for joint_term in friction.terms]
+    return Dissipation(combine, np.array(kinds, dtype=np.bool_))

@@ -1,0 +1,244 @@
+"""The chain of joints, read from a URDF.
+
+Every link is described in the frame of its own joint: origin on the joint axis, axes moving
+with the link. Joints are numbered depth first, so a parent comes before its children.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from identification.errors import ModelError
+from identification.model.urdf_faults import closed_chain, urdf_fault
+from identification.model.urdf_text import refusal
+
+Array = NDArray[np.float64]
+
+# Where our ten parameters stand in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, ...
+FROM_PINOCCHIO = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)
+
+MOST_JOINTS: Final = 64
+"""Time and memory of a model grow faster than their square: a minute and 1.5 GB for 100."""
+
+FARTHEST: Final = 1e6
+"""m; no robot is larger, and squares of such lengths are numbers yet."""
+
+_LINK = "link "
+_UNIT: Final = 1e-6  # by which the length of an axis, made a unit vector by the reader, may be off
+
+
+class LinkFrame(NamedTuple):
+    """Where the frame of a link of the description stands."""
+
+    joint: int
+    rotation: Array
+    translation: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A tree of n revolute and prismatic joints on a fixed base.
+
+    Attributes:
+        joint_names: n names, depth first.
+        parents: index of the parent joint, -1 for the base, shape (n,).
+        rotation: axes of joint frame i at q = 0 in its parent's frame, shape (n, 3, 3).
+        translation: origin of joint frame i in its parent's frame [m], shape (n, 3).
+        axis: unit joint axis in the joint's own frame, shape (n, 3).
+        revolute: False where the joint is prismatic, shape (n,).
+        inertial: the ten parameters per link (:data:`identification.model.wrench.LINK_SYMBOLS`)
+            about the joint frame's origin in its axes, as the description gives them (the nominal,
+            CAD values), shape (n, 10).
+        frames: by name the links of the description, what is fixed to the base included: the
+            joint that moves each (-1: none), and its axes (3, 3) and origin (3,) [m] in that
+            joint's frame.
+    """
+
+    joint_names: tuple[str, ...]
+    parents: NDArray[np.intp]
+    rotation: Array
+    translation: Array
+    axis: Array
+    revolute: NDArray[np.bool_]
+    inertial: Array
+    frames: dict[str, LinkFrame] = field(default_factory=dict, repr=False)
+
+    @property
+    def n_joints(self) -> int:
+        """Number n of joints."""
+        return len(self.joint_names)
+
+    def ancestors(self, joint: int) -> tuple[int, ...]:
+        """Return the joints that move link `joint`, from the base to the joint itself."""
+        path = [joint]
+        while (parent := int(self.parents[path[-1]])) >= 0:
+            path.append(parent)
+        return tuple(reversed(path))
+
+
+def chain_from_urdf(urdf: str, locked: Mapping[str, float] | None = None) -> Chain:
+    """Read a chain from URDF text; fixed joints are merged into the link they sit on.
+
+    Args:
+        urdf: the text of the file.
+        locked: joints held at a position [rad or m], by name; they become fixed joints.
+
+    Raises:
+        ModelError: the text is no URDF, has no moving joint or more than `MOST_JOINTS`, has a
+            joint that is neither revolute (or continuous) nor prismatic, or no joint of a name
+            in `locked`; the message names the joint.
+    """
+    model = pinocchio_model(urdf, locked)
+    if model.njoints < 2:
+        raise ModelError("the robot description has no revolute or prismatic joint")
+    if model.njoints > 1 + MOST_JOINTS:
+        raise ModelError(
+            f"the robot description has {model.njoints - 1} joints that move; at most "
+            f"{MOST_JOINTS} can be identified together: lock the others"
+        )
+    indices = range(1, model.njoints)
+    axes, revolute = zip(*(_axis(model, i) for i in indices), strict=True)
+    return Chain(
+        joint_names=tuple(model.names[i] for i in indices),
+        parents=np.array([model.parents[i] - 1 for i in indices], dtype=np.intp),
+        rotation=np.array([model.jointPlacements[i].rotation for i in indices]),
+        translation=np.array([model.jointPlacements[i].translation for i in indices]),
+        axis=np.array(axes),
+        revolute=np.array(revolute, dtype=np.bool_),
+        inertial=np.array(
+            [model.inertias[i].toDynamicParameters()[list(FROM_PINOCCHIO)] for i in indices]
+        ),
+        frames={
+            frame.name: LinkFrame(
+                int(frame.parentJoint) - 1,
+                frame.placement.rotation.copy(),
+                frame.placement.translation.copy(),
+            )
+            for frame in model.frames
+            if frame.type == pin.FrameType.BODY
+        },
+    )
+
+
+def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin.Model:
+    """Return pinocchio's model of URDF text, without the joints that are locked.
+
+    Raises:
+        ModelError: the text is no URDF of an open chain or none that may be read
+            (:func:`identification.model.urdf_text.refusal`), has a joint without a direction or
+            beyond `FARTHEST`, or no joint of a name in `locked`.
+    """
+    if (refused := refusal(urdf)) is not None:
+        raise ModelError(f"the robot description is not a readable URDF: {refused}")
+    try:
+        model = pin.buildModelFromXML(urdf)
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(
+            f"the robot description is not a readable URDF: {urdf_fault(urdf) or error}"
+        ) from error
+    if (closed := closed_chain(urdf)) is not None:
+        raise ModelError(f"the robot description is no open chain: {closed}")
+    for index in range(1, model.njoints):
+        _require_direction(model, index)
+    if not locked:
+        _require_near(model)
+        return model
+    posture = locked_posture(model, locked)
+    # Joints and links may share names, which the reduction takes for one and the same.
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY:
+            frame.name = _LINK + frame.name
+    reduced = pin.buildReducedModel(model, [model.getJointId(name) for name in locked], posture)
+    for frame in reduced.frames:
+        frame.name = frame.name.removeprefix(_LINK)
+    _require_near(reduced)
+    return reduced
+
+
+def locked_posture(model: pin.Model, locked: Mapping[str, float]) -> Array:
+    """Return the configuration with joints held at positions [rad or m], others at zero.
+
+    Raises:
+        ModelError: no joint has such a name, or a position is no number.
+    """
+    posture = pin.neutral(model)
+    names = list(model.names)[1:]
+    for name, position in locked.items():
+        if name not in names:
+            known = ", ".join(names) or "none"
+            raise ModelError(f"there is no moving joint {name!r} to lock; there are {known}")
+        if not math.isfinite(position):
+            raise ModelError(f"joint {name!r} is locked at {position!r}, no number", joint=name)
+        joint = model.joints[model.getJointId(name)]
+        if joint.nv == 1:
+            step = np.zeros(model.nv)
+            step[joint.idx_v] = position
+            posture = pin.integrate(model, posture, step)
+        elif position != 0.0:
+            raise ModelError(
+                f"joint {name!r} has {joint.nv} degrees of freedom; it can be locked at 0 only",
+                joint=name,
+            )
+    return np.asarray(posture)
+
+
+def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:
+    """Return the joint axis in the joint frame, and whether the joint turns about it."""
+    joint = model.joints[index]
+    kind = joint.shortname()
+    name = model.names[index]
+    if joint.nv != 1 or not kind.startswith(("JointModelR", "JointModelP")):
+        raise ModelError(
+            f"joint {name!r} is of type {kind.removeprefix('JointModel')}; "
+            "only revolute, continuous, prismatic and fixed joints can be identified",
+            joint=name,
+        )
+    subspace = _subspace(model, index)
+    linear, angular = subspace[:3], subspace[3:]
+    revolute = bool(np.any(angular))
+    return (angular if revolute else linear).copy(), revolute
+
+
+def _require_near(model: pin.Model) -> None:
+    """Refuse joints and links that are farther away than any robot reaches."""
+    places = [*zip(model.names, model.jointPlacements, strict=True)]
+    places += [(frame.name, frame.placement) for frame in model.frames]
+    for name, place in places:
+        if not np.abs(place.translation).max() <= FARTHEST:
+            raise ModelError(
+                f"{name!r} of the robot description is more than {FARTHEST:g} m away from what "
+                "carries it"
+            )
+
+
+def _require_direction(model: pin.Model, index: int) -> None:
+    """Refuse an axis of length zero: a joint locked at an angle about it has no placement."""
+    if model.joints[index].nv == 1 and not (
+        abs(float(np.linalg.norm(_subspace(model, index))) - 1.0) < _UNIT
+    ):
+        name = model.names[index]
+        raise ModelError(
+            f'joint {name!r} has an <axis> without a direction; write one such as xyz="0 0 1"',
+            joint=name,
+        )
+
+
+def _subspace(model: pin.Model, index: int) -> Array:
+    """Return the velocity of a joint with one degree of freedom at unit speed (6,)."""
+    joint = model.joints[index]
+    data = joint.createData()
+    joint.calc(data, pin.neutral(model))
+    return np.asarray(data.S, dtype=np.float64).reshape(6)
+
+
+def skew(vector: Array) -> Array:
+    """Return the (3, 3) matrix of ``vector x``."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,0 +1,120 @@
+"""A body of known mass that the arm carries: its torque is known, not identified."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import ModelError
+from identification.model.kinematics import Chain
+from identification.model.pseudo_inertia import Body, inertial_parameters
+from identification.model.regressor import RegressorPlan, joint_arrays
+from identification.model.wrench import LINK_SYMBOLS
+
+Array = NDArray[np.float64]
+
+_ROUNDING = 1e-9
+"""Share of the largest principal moment."""
+_MOST = 1e9
+"""kg, m, kg m²: no arm carries more, and products of more would overflow."""
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A body of known mass.
+
+    Attributes:
+        mass: [kg].
+        centre: its centre of mass in the frame (3,) [m].
+        inertia: tensor about the centre of mass, in the axes of the frame: xx, xy, xz, yy, yz,
+            zz [kg m²]; a point without it.
+        frame: link of the robot description whose frame that is, such as "tool0"; without it the
+            frame of the last joint.
+
+    Raises:
+        ModelError: no body has this mass, or a figure is not finite, or beyond 1e9.
+    """
+
+    mass: float
+    centre: tuple[float, float, float]
+    inertia: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    frame: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.mass <= _MOST:
+            raise ModelError(f"the payload weighs {self.mass!r} kg; give its mass, zero or more")
+        if not all(math.isfinite(value) for value in (*self.centre, *self.inertia)):
+            raise ModelError("the payload's centre or inertia holds a number that is not finite")
+        if not all(abs(value) <= _MOST for value in (*self.centre, *self.inertia)):
+            raise ModelError(f"the payload's centre or inertia holds a number beyond {_MOST:g}")
+
+    @property
+    def possible(self) -> bool:
+        """Whether a body can have this inertia.
+
+        Principal moments are not negative, and none exceeds the sum of the others.
+        """
+        least, middle, most = np.linalg.eigvalsh(_tensor(self.inertia))
+        return bool(least >= -_ROUNDING * most and most <= (1.0 + _ROUNDING) * (least + middle))
+
+    @property
+    def parameters(self) -> Array:
+        """Inertial parameters about the frame's origin, in its axes (10,), as `LINK_SYMBOLS`."""
+        return inertial_parameters(Body(self.mass, np.array(self.centre), _tensor(self.inertia)))
+
+    def carried_by(self, chain: Chain) -> tuple[int, Array]:
+        """Return the joint that carries it, from 0, and its parameters about that joint (10,).
+
+        Raises:
+            ModelError: the description has no such frame, or it is fixed to the base.
+        """
+        if self.frame is None:
+            return chain.n_joints - 1, self.parameters
+        if self.frame not in chain.frames:
+            raise ModelError(
+                f"the payload's frame {self.frame!r} is no link of the robot description; it has"
+                f" {', '.join(chain.frames)}"
+            )
+        joint, rotation, translation = chain.frames[self.frame]
+        if joint < 0:
+            raise ModelError(f"the payload's frame {self.frame!r} is fixed to the base")
+        centre = rotation @ np.array(self.centre) + translation
+        tensor = rotation @ _tensor(self.inertia) @ rotation.T
+        return joint, inertial_parameters(Body(self.mass, centre, tensor))
+
+
+class Load:
+    """Torque of a payload on a chain.
+
+    Args:
+        chain: the robot.
+        gravity: acceleration of gravity in base axes (3,) [m/s²].
+        payload: what it carries.
+
+    Raises:
+        ModelError: the payload's frame is not one of the robot's.
+    """
+
+    def __init__(self, chain: Chain, gravity: Array, payload: Payload) -> None:
+        self.joint, self.parameters = payload.carried_by(chain)
+        links: list[list[int]] = [[] for _ in range(chain.n_joints)]
+        links[self.joint] = list(range(len(LINK_SYMBOLS)))
+        self._plan = RegressorPlan(chain, gravity, links, [False] * chain.n_joints, None)
+
+    def torque(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """Return the joint torques (m, n) [N·m or N] that moving it alone takes."""
+        q, qd, qdd = joint_arrays(self._plan.chain.n_joints, q=q, qd=qd, qdd=qdd)
+        torque = np.zeros(q.shape)
+        weights = [self.parameters[columns] for columns in self._plan.columns]
+        for part, rows in self._plan.chunks(q, qd, qdd):
+            for joint, block in enumerate(rows):
+                torque[part, joint] = weights[joint] @ block
+        return torque
+
+
+def _tensor(six: tuple[float, ...]) -> Array:
+    xx, xy, xz, yy, yz, zz = six
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

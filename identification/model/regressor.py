@@ -1,0 +1,438 @@
+r"""Inverse dynamics, linear in the parameters: tau = W(q, qd, qdd) pi, vectorised over samples.
+
+The torque of joint j is the power of the wrenches on all links it moves, on their twists per
+unit speed of joint j (:mod:`identification.model.link_motion`, :mod:`identification.model.wrench`).
+A column is therefore one dot product per sample, and only the columns asked for are made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import ShapeError
+from identification.model.elements import Element, JointElements
+from identification.model.friction import FrictionLaw, JointFriction, JointTerm
+from identification.model.kinematics import Chain
+from identification.model.link_motion import LinkMotion
+from identification.model.wrench import (
+    N_INERTIA,
+    N_PRIMITIVES,
+    ROTATIONAL,
+    wrench_matrix,
+    write_primitives,
+)
+
+Array = NDArray[np.float64]
+Rows = slice | NDArray[np.intp]
+
+# Samples worked on at a time: enough to make the cost of a numpy call small, few enough for the
+# working arrays to stay in the processor's cache. Measured for six joints: 1000 to 2000 are alike,
+# 512 takes a quarter longer, 256 two thirds.
+CHUNK = 1280
+
+# Working arrays kept for the next call: fresh memory costs more than the arithmetic on it. Sizes
+# are multiples of the grain, so that a search over motions of all durations meets few different
+# ones: the six between half a chunk and a chunk, and some shorter (some 8 kB per sample).
+_SPARE = 8
+_GRAIN = 128
+
+
+class Regressor(NamedTuple):
+    """Regressor of m samples, joint by joint, without the columns that are zero by structure.
+
+    Attributes:
+        blocks: per joint j the columns that act on it, shape (m, c_j).
+        columns: per joint the parameter index of each of its columns, shape (c_j,).
+    """
+
+    blocks: tuple[Array, ...]
+    columns: tuple[NDArray[np.intp], ...]
+
+    def dense(self, p: int) -> Array:
+        """Return all p columns with their zeros, shape (m, n, p)."""
+        full = np.zeros((self.blocks[0].shape[0], len(self.blocks), p))
+        for joint, (block, columns) in enumerate(zip(self.blocks, self.columns, strict=True)):
+            full[:, joint, columns] = block
+        return full
+
+
+class RegressorPlan:
+    """Which columns of the regressor to make for a chain, and where they stand.
+
+    Args:
+        chain: the robot.
+        gravity: acceleration of gravity in base axes [m/s²], shape (3,).
+        links: per joint the kept :data:`identification.model.wrench.LINK_SYMBOLS` (0..9), rising.
+        rotors: joints whose rotor inertia has a column of its own.
+        friction: of joints and coupled motors, None for none.
+        couplings: pairs of joints whose coupling inertia has a column.
+        elements: springs and balancers, None for none.
+
+    Attributes:
+        columns: per joint j the parameter index of each column in its row, shape (c_j,).
+            Parameters are numbered link by link (inertial, then rotor), then coupling inertias,
+            then friction, then springs and balancers.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        gravity: Array,
+        links: Sequence[Sequence[int]],
+        rotors: Sequence[bool],
+        friction: JointFriction | None,
+        couplings: Sequence[tuple[int, int]] = (),
+        elements: JointElements | None = None,
+    ) -> None:
+        self.chain = chain
+        self.gravity = gravity
+        self.links = tuple(tuple(kept) for kept in links)
+        self.rotors = tuple(rotors)
+        self.friction = friction
+        self.couplings = tuple(couplings)
+        self.elements = tuple(elements.identified()) if elements is not None else ()
+        # Order in the working array: columns of the links, then of the joint's drive: friction,
+        # motor friction, rotor, coupling inertias, elements, response.
+        self.first_own = sum(len(kept) for kept in links)
+        self.own = tuple(_OwnRows.of(self, joint) for joint in range(chain.n_joints))
+        self.rows: tuple[Rows, ...]
+        self.columns: tuple[NDArray[np.intp], ...]
+        self.rows, self.columns = _lay_out(self)
+        self._spare: list[_Workspace] = []
+        self._lock = Lock()
+
+    def __getstate__(self) -> dict[str, object]:
+        return {k: v for k, v in self.__dict__.items() if k not in ("_spare", "_lock")}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state, _spare=[], _lock=Lock())
+
+    def chunks(
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        direction: Array | None = None,
+        *,
+        response: Array | None = None,
+    ) -> Iterator[tuple[slice, list[Array]]]:
+        """Yield the regressor in chunks of samples: (which samples, per joint its rows).
+
+        `direction` is that of dry friction, of joints and coupled motors (m, n + k); without it
+        the sign of their speeds.
+
+        The rows of joint j have shape (c_j, k) for k samples, one more with `response` (m, n)
+        as the last. They are views of a working array: valid until the next chunk.
+        """
+        m, n = q.shape
+        rows = self.rows
+        if response is not None:
+            rows = tuple(_append(r, self.response_row(j)) for j, r in enumerate(rows))
+        with self._borrowed(m) as work:
+            for start in range(0, m, work.size):
+                part = slice(start, min(start + work.size, m))
+                k = part.stop - start
+                turned = None if direction is None else direction[part]
+                work.update(q[part], qd[part], qdd[part], turned)
+                if response is not None:
+                    for joint in range(n):
+                        work.rows[joint, self.response_row(joint), :k] = response[part, joint]
+                yield part, [work.rows[joint, rows[joint], :k] for joint in range(n)]
+
+    @contextmanager
+    def _borrowed(self, m: int) -> Iterator[_Workspace]:
+        """Lend working arrays that divide m samples evenly, to one user at a time."""
+        even = -(-m // max(1, -(-m // CHUNK)))
+        size = min(CHUNK, -(-max(even, 1) // _GRAIN) * _GRAIN)
+        with self._lock:
+            index = next((i for i, work in enumerate(self._spare) if work.size == size), None)
+            work = None if index is None else self._spare.pop(index)
+        work = work or _Workspace(self, size)
+        try:
+            yield work
+        finally:
+            with self._lock:
+                self._spare = [*self._spare, work][-_SPARE:]
+
+    def evaluate(
+        self, q: Array, qd: Array, qdd: Array, direction: Array | None = None
+    ) -> Regressor:
+        """Return the whole regressor for motion arrays (m, n); `direction` as in :meth:`chunks`."""
+        m = q.shape[0]
+        full = [np.empty((len(columns), m)) for columns in self.columns]
+        for part, rows in self.chunks(q, qd, qdd, direction):
+            for target, block in zip(full, rows, strict=True):
+                target[:, part] = block
+        return Regressor(tuple(block.T for block in full), self.columns)
+
+    def response_row(self, joint: int) -> int:
+        """Return the row behind all columns of a joint."""
+        return self.own[joint].response
+
+
+class _OwnRows(NamedTuple):
+    """Rows of one joint, in the working array, that belong to its drive."""
+
+    friction: slice  # its own law, term by term
+    motors: dict[JointTerm, int]  # of coupled motors
+    rotor: int | None
+    couplings: dict[int, int]  # by the joint that it is coupled to
+    elements: slice  # those on it, one after the other
+    response: int
+
+    @classmethod
+    def of(cls, plan: RegressorPlan, joint: int) -> _OwnRows:
+        """Lay out the rows of a joint, one behind the other."""
+        row = plan.first_own
+        motors: dict[JointTerm, int] = {}
+        if plan.friction is not None:
+            row += len(plan.friction.laws[joint].symbols)
+            speeds = plan.friction.motor_speeds()[:, joint]
+            felt = {m for m, s in zip(plan.friction.motors, speeds, strict=True) if s != 0.0}
+            acting = [t for t in plan.friction.terms if t.motor and t.owner in felt]
+            motors = {term: row + k for k, term in enumerate(acting)}
+        friction = slice(plan.first_own, row)
+        row += len(motors)
+        rotor = row if plan.rotors[joint] else None
+        row += plan.rotors[joint]
+        others = [sum(pair) - joint for pair in plan.couplings if joint in pair]
+        couplings = {other: row + k for k, other in enumerate(others)}
+        row += len(others)
+        acting_here = [len(one.symbols) for one, owner, _ in plan.elements if owner == joint]
+        elements = slice(row, row + sum(acting_here))
+        return cls(friction, motors, rotor, couplings, elements, elements.stop)
+
+
+class _Workspace:
+    """Arrays for one block of samples, and the views of them that the work needs.
+
+    Attributes:
+        size: samples in a block.
+        rows: per joint all columns, shape (n, columns, size); what a joint does not feel is not
+            written and means nothing.
+    """
+
+    def __init__(self, plan: RegressorPlan, size: int) -> None:
+        n = plan.chain.n_joints
+        self.rows = np.zeros((n, max(own.response for own in plan.own) + 1, size))
+        self.size = size
+        # Not the plan itself, which keeps this: large memory would wait for the cycle collector.
+        self._own, self._joint_friction = plan.own, plan.friction
+        self._motion = LinkMotion(plan.chain, plan.gravity, size)
+        motors = 0 if plan.friction is None else len(plan.friction.motors)
+        self._direction = np.zeros((n + motors, size))
+        self._primitives = np.empty((n, N_PRIMITIVES, size))
+        self._friction = self._friction_parts()
+        self._drives = self._drive_parts()
+        self._elements = self._element_parts(plan)
+        self._contractions: list[_Contraction] = []
+        first = 0
+        for link, own in enumerate(plan.links):
+            inertia = [s for s in own if s < N_INERTIA]
+            for symbols, moments_only in ((inertia, True), (own[len(inertia) :], False)):
+                if symbols:
+                    joints = _as_slice(plan.chain.ancestors(link))
+                    self._add(link, joints, symbols, moments_only, first)
+                    first += len(symbols)
+
+    def _add(
+        self, link: int, joints: Rows, symbols: Sequence[int], moments_only: bool, first: int
+    ) -> None:
+        """Prepare the columns of one link: inertia makes no force, so half the work."""
+        size = self.rows.shape[2]
+        twists = self._motion.twists[link]
+        part = twists[:, 0] if moments_only else twists.reshape(len(twists), 6, size)
+        length = part.shape[1]
+        used = ROTATIONAL if moments_only else slice(None)
+        matrix = np.concatenate([wrench_matrix(symbol)[:length, used] for symbol in symbols])
+        wrenches = np.empty((len(matrix), size))
+        columns = slice(first, first + len(symbols))
+        contiguous = isinstance(joints, slice)
+        self._contractions.append(
+            _Contraction(
+                matrix,
+                self._primitives[link, used],
+                wrenches,
+                part,
+                wrenches.reshape(len(symbols), length, size),
+                self.rows[joints, columns] if contiguous else self.rows[:, columns],
+                None if isinstance(joints, slice) else joints,
+            )
+        )
+
+    def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array, Array]]:
+        """Return laws, the speeds and directions that they read, and the rows that they write."""
+        velocity = self._motion.velocity
+        direction = self._direction[: len(velocity)]
+        if self._joint_friction is None:
+            return []
+        if (one := self._joint_friction.one_law) is not None:
+            rows = self.rows[:, self._own[0].friction]
+            return [(one, velocity, direction, rows.transpose(1, 0, 2))]
+        return [
+            (law, velocity[j], direction[j], self.rows[j, self._own[j].friction])
+            for j, law in enumerate(self._joint_friction.laws)
+        ]
+
+    def _drive_parts(self) -> list[tuple[Array, Array]]:
+        """Return accelerations and the rows of rotors and coupling inertias that they go to."""
+        acceleration = self._motion.acceleration
+        places = {own.rotor for own in self._own}
+        parts = []
+        if len(places) == 1 and None not in places:  # one step for all joints
+            parts.append((acceleration, self.rows[:, next(iter(places))]))
+        else:
+            for joint, own in enumerate(self._own):
+                if own.rotor is not None:
+                    parts.append((acceleration[joint], self.rows[joint, own.rotor]))
+        for joint, own in enumerate(self._own):
+            for other, row in own.couplings.items():
+                parts.append((acceleration[other], self.rows[joint, row]))
+        return parts
+
+    def _element_parts(self, plan: RegressorPlan) -> list[tuple[Element, int, Array]]:
+        """Return springs and balancers, the joint of each, and the rows that they write."""
+        free = [own.elements.start for own in self._own]
+        parts = []
+        for element, joint, place in plan.elements:
+            first = free[joint]
+            free[joint] += place.stop - place.start
+            parts.append((element, joint, self.rows[joint, first : free[joint]]))
+        return parts
+
+    def _write_motor_friction(self, friction: JointFriction) -> None:
+        """Friction f(c qd) of a motor acts on the joints as c' f(c qd)."""
+        directions = self._direction[friction.n_joints :]
+        for motor, share, direction in zip(
+            friction.motors, friction.motor_speeds(), directions, strict=True
+        ):
+            speed = share @ self._motion.velocity
+            for joint in np.flatnonzero(share):
+                for (_, term, owner, _, _), row in self._own[joint].motors.items():
+                    if owner == motor:
+                        column = term.column(speed, direction)
+                        np.multiply(share[joint], column, out=self.rows[joint, row])
+
+    def _write_direction(self, friction: JointFriction, direction: Array | None, k: int) -> None:
+        if direction is not None:
+            self._direction[:, :k] = direction.T
+            return
+        velocity, n = self._motion.velocity, friction.n_joints
+        if (one := friction.one_law) is not None:
+            one.sign(velocity, out=self._direction[:n])
+        else:
+            for law, speed, out in zip(friction.laws, velocity, self._direction, strict=False):
+                law.sign(speed, out=out)
+        for motor, share, out in zip(
+            friction.motors, friction.motor_speeds(), self._direction[n:], strict=True
+        ):
+            friction.laws[motor].sign(share @ velocity, out=out)
+
+    def update(self, q: Array, qd: Array, qdd: Array, direction: Array | None = None) -> None:
+        """Make all columns for k <= size samples (k, n); those behind mean nothing."""
+        motion = self._motion
+        motion.update(q, qd, qdd)
+        write_primitives(motion.motion, self._primitives)
+        for c in self._contractions:
+            np.matmul(c.matrix, c.primitives, out=c.flat_wrenches)
+            if c.joints is None:
+                np.einsum("jrt,crt->jct", c.twists, c.wrenches, out=c.target)
+            else:
+                c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
+        if self._joint_friction is not None:
+            self._write_direction(self._joint_friction, direction, len(q))
+        for law, velocity, turned, target in self._friction:
+            target[...] = law.columns(velocity, turned)
+        for source, target in self._drives:
+            np.copyto(target, source)
+        for element, joint, target in self._elements:
+            target[:, : len(q)] = element.columns(q[:, joint]).T
+        if self._joint_friction is not None and self._joint_friction.motors:
+            self._write_motor_friction(self._joint_friction)
+
+
+class _Contraction(NamedTuple):
+    """Some columns of one link, for all a joints that move it: twists times wrenches."""
+
+    matrix: Array  # (columns * r, 12 or 9): wrenches from primitives
+    primitives: Array  # (12 or 9, size)
+    flat_wrenches: Array  # (columns * r, size)
+    twists: Array  # (a, r, size), r = 3 (moments) or 6
+    wrenches: Array  # the same memory as flat_wrenches, (columns, r, size)
+    target: Array  # (a, columns, size), or of all joints
+    joints: NDArray[np.intp] | None  # which of all joints
+
+
+def joint_arrays(n_joints: int, **arrays: Array) -> tuple[Array, ...]:
+    """Return arrays of joint values as float64 of one shape (m, n_joints).
+
+    Raises:
+        ShapeError: an array has another shape; the message names it.
+    """
+    checked = []
+    rows: int | None = None
+    for name, array in arrays.items():
+        values = np.asarray(array, dtype=np.float64)
+        m = "m" if rows is None else rows
+        if values.ndim != 2 or values.shape[1] != n_joints or rows not in (None, len(values)):
+            raise ShapeError(name, values.shape, f"({m}, {n_joints})")
+        rows = len(values)
+        checked.append(values)
+    return tuple(checked)
+
+
+def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.intp], ...]]:
+    """Return per joint its rows in the working array, and their parameter indices."""
+    chain, n = plan.chain, plan.chain.n_joints
+    sizes = [len(kept) + rotor for kept, rotor in zip(plan.links, plan.rotors, strict=True)]
+    offsets = np.concatenate([[0], np.cumsum(sizes)]).tolist()
+    rows: list[list[int]] = [[] for _ in range(n)]
+    columns: list[list[int]] = [[] for _ in range(n)]
+    place = 0
+    for link, kept in enumerate(plan.links):
+        for position, symbol in enumerate(kept):
+            for joint in chain.ancestors(link):
+                # A sliding joint does not feel moments: it has no inertia columns.
+                if chain.revolute[joint] or symbol >= N_INERTIA:
+                    rows[joint].append(place)
+                    columns[joint].append(offsets[link] + position)
+            place += 1
+    first_friction = offsets[-1] + len(plan.couplings)
+    terms = plan.friction.terms if plan.friction is not None else ()
+    places = {term: first_friction + k for k, term in enumerate(terms)}
+    first_element = first_friction + len(terms)
+    for joint, own in enumerate(plan.own):
+        columns[joint] += [places[t] for t in terms if not t.motor and t.owner == joint]
+        columns[joint] += [places[term] for term in own.motors]
+        if own.rotor is not None:
+            columns[joint].append(offsets[joint] + len(plan.links[joint]))
+        for other in own.couplings:
+            pair = (min(joint, other), max(joint, other))
+            columns[joint].append(offsets[-1] + plan.couplings.index(pair))
+        for _, owner, span in plan.elements:
+            if owner == joint:
+                columns[joint] += range(first_element + span.start, first_element + span.stop)
+        rows[joint] += range(plan.first_own, own.response)
+    return (
+        tuple(_as_slice(r) for r in rows),
+        tuple(np.array(c, dtype=np.intp) for c in columns),
+    )
+
+
+def _append(rows: Rows, last: int) -> Rows:
+    if isinstance(rows, slice):
+        return slice(rows.start, last + 1)
+    return np.append(rows, last)
+
+
+def _as_slice(indices: Sequence[int]) -> Rows:
+    """Return a slice where the indices are consecutive: it costs no copy."""
+    if len(indices) > 0 and list(indices) == list(range(indices[0], indices[0] + len(indices))):
+        return slice(indices[0], indices[0] + len(indices))
+    return np.array(indices, dtype=np.intp)

@@ -1,0 +1,392 @@
+"""Essential parameters: those that a motion needs, chosen by backward elimination.
+
+One parameter after the other is taken out, the one known worst first: of the largest relative
+standard deviation (Pham and Gautier 1991). The usual rule stops when the relative standard
+deviations left differ by less than a factor of 30. It knows nothing about prediction: on a real
+UR10 it gives away the offset of a wrist axis, whose error then rises from 7 to 16 %. Here every
+removal also has to stand on motion that was held out. It is refused, and the next worst known is
+tried, if it makes the prediction worse and the squared error, weighted by joint, then exceeds that
+of the best model so far
+
+- by more than chance (Student's t, one-sided 5 %, over blocks of time long enough to be
+  uncorrelated) and more than is worth a word; or
+- by more than may be given away however uncertain it is (see :class:`CutRule`).
+
+What was refused is tried once more when nothing else can go.
+
+All of it works on factors: a step is the solution of the remaining normal equations, an error a
+quadratic form. The samples are not read again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.distributions import student_limit
+from identification.errors import IdentificationError
+from identification.estimators.covariance import block_length, with_block_covariance
+from identification.factor.estimation import (
+    Estimate,
+    Solution,
+    joint_weights,
+    residual_variance,
+    solve,
+)
+from identification.factor.gram import Factor, NormalEquations
+from identification.factor.phases import PhaseFactor
+from identification.model.robot import RobotModel
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_LEVEL: Final = 0.95
+_TINY: Final = 1e-300
+
+
+@dataclass(frozen=True)
+class CutRule:
+    """When to stop taking parameters out.
+
+    Attributes:
+        spread: largest over smallest relative standard deviation of those left; below it the
+            data know all of them comparably well (Pham and Gautier 1991: 10 to 30).
+        overall: rise of the relative torque error on held-out motion, over all joints, that is
+            given away for a smaller model: 0.001 is 0.1 points of per cent.
+        axis: the same for one joint, as a share of that joint's torque.
+        noticeable: share of these two that a rise which is more than chance must reach to count.
+    """
+
+    spread: float = 30.0
+    overall: float = 0.001
+    axis: float = 0.005
+    noticeable: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class EliminationStep:
+    """The model after one more parameter was taken out.
+
+    Attributes:
+        removed: the parameter, None for the model it all begins with.
+        relative_std: the parameter's classical standard deviation over its value, before it was
+            removed; infinite for one that the data do not determine.
+        left: number of parameters left.
+        spread: largest over smallest relative standard deviation of those left.
+        largest_relative_std: of those left, classical; infinite with one that is not determined.
+        condition: of the weighted regressor with columns of unit length.
+        in_sample: relative torque error ||e|| / ||tau|| over all joints on the fitted motion.
+        held_out: the same on the motion that was held out.
+        held_out_joint: the same per joint (n,), NaN for one that has no row there.
+        rise: weighted squared held-out error less that of the best step before, in standard
+            deviations of this difference; negative where this step is the better one.
+    """
+
+    removed: str | None
+    relative_std: float
+    left: int
+    spread: float
+    largest_relative_std: float
+    condition: float
+    in_sample: float
+    held_out: float
+    held_out_joint: Array
+    rise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Elimination:
+    """All steps down to one parameter, and where to stop.
+
+    Attributes:
+        steps: the path: step k has k removals. Behind the cut parameters go on being removed by
+            relative standard deviation alone, to show what that costs.
+        cut: the step chosen.
+        refused: parameters that the held-out motion did not let go before the cut, in order.
+        reason: why the cut is there, in words.
+        estimate: of the parameters left at the cut, with their names and the cluster-robust
+            covariance, which is that of a model with exactly these parameters: it takes no
+            account of their having been chosen.
+        values: the same for the full model (p,), zero for what was removed.
+    """
+
+    steps: tuple[EliminationStep, ...]
+    cut: int
+    refused: tuple[str, ...]
+    reason: str
+    estimate: Estimate
+    values: Array
+
+    @property
+    def removed(self) -> tuple[str, ...]:
+        """Names of the parameters removed up to the cut, in order."""
+        return tuple(str(step.removed) for step in self.steps[1 : self.cut + 1])
+
+    @property
+    def chosen(self) -> EliminationStep:
+        """The step at the cut."""
+        return self.steps[self.cut]
+
+
+def eliminate(
+    model: RobotModel,
+    training: PhaseFactor,
+    held_out: PhaseFactor,
+    *,
+    weights: Array | None = None,
+    rule: CutRule = CutRule(),
+) -> Elimination:
+    """Take parameters out one by one and choose how many can go.
+
+    Args:
+        model: the robot whose parameters the factors have.
+        training: the samples to fit, of one repetition or of all.
+        held_out: samples that are not fitted; better another motion than another stretch of it.
+            They choose the cut, so their error there is a little flattered.
+        weights: per joint (n,); by default the inverse residual variances of an ordinary fit.
+        rule: when to stop.
+
+    Raises:
+        IdentificationError: one of the factors has no rows or other parameters than the model.
+    """
+    for factor, what in ((training, "fitted"), (held_out, "held-out")):
+        if factor.parameter_names != model.parameter_names:
+            raise IdentificationError(f"the {what} samples belong to a model of other parameters")
+        if not factor.samples.any():
+            raise IdentificationError(f"there is not one usable {what} sample")
+    total = training.total
+    if weights is None:
+        weights = joint_weights(total)
+    path = _Path(total, held_out, weights, rule)
+    path.guarded()
+    cut, refused = len(path.steps) - 1, tuple(total.parameter_names[k] for k in path.refused)
+    chosen = path.current
+    path.to_the_end()
+    return Elimination(
+        steps=tuple(path.steps),
+        cut=cut,
+        refused=refused,
+        reason=_reason(path.steps, cut, refused, rule),
+        estimate=_estimate(model, training, weights, chosen.left),
+        values=chosen.values,
+    )
+
+
+class _Subset(NamedTuple):
+    """The fit with some of the parameters, and its errors.
+
+    Attributes:
+        left: indices of the parameters (k,).
+        solution: of the normal equations in these.
+        relative: their relative standard deviations (k,), infinite where undetermined.
+        values: for the full model (p,), zero elsewhere.
+        blocks: weighted squared held-out error by blocks of time (B,).
+        held_out: relative held-out error over all joints.
+        held_out_joint: per joint (n,), zero for one without rows.
+    """
+
+    left: Indices
+    solution: Solution
+    relative: Array
+    values: Array
+    blocks: Array
+    held_out: float
+    held_out_joint: Array
+
+
+class _Path:
+    """Elimination in progress.
+
+    Attributes:
+        steps: so far.
+        current: the model after the last of them.
+        best: the model of the least weighted held-out error so far.
+        refused: indices that must not go.
+    """
+
+    def __init__(self, total: Factor, held_out: PhaseFactor, weights: Array, rule: CutRule) -> None:
+        self._total = total
+        self._equations = total.weighted(weights)
+        self._unseen = held_out.total
+        self._blocks = held_out.weighted(weights)[held_out.samples.any(axis=1)]
+        self._rule = rule
+        self.refused: list[int] = []
+        self.steps: list[EliminationStep] = []
+        self.best = self.current = self._subset(np.arange(total.n_parameters))
+        self._take(self.current, None, np.nan)
+
+    def guarded(self) -> None:
+        """Remove until those that may go are known comparably well, or nothing may go."""
+        self._remove_what_may_go()
+        # What another parameter stood in for may have become superfluous without it.
+        before: list[int] = []
+        while before != self.refused:
+            before, self.refused = self.refused, []
+            self._remove_what_may_go()
+
+    def _remove_what_may_go(self) -> None:
+        while self._spread(self.current) >= self._rule.spread and len(self.current.left) > 1:
+            index, relative_std = self._worst()
+            smaller = self._without(index)
+            if np.isfinite(relative_std) and self._is_worse(smaller):
+                self.refused.append(index)
+            else:
+                self._take(smaller, index, relative_std)
+
+    def to_the_end(self) -> None:
+        """Remove by relative standard deviation alone until one parameter is left."""
+        self.refused = []
+        while self.steps[-1].left > 1:
+            index, relative_std = self._worst()
+            self._take(self._without(index), index, relative_std)
+
+    def _worst(self) -> tuple[int, float]:
+        """Index and relative standard deviation of what to take out next.
+
+        Of a combination that the data do not determine the parameter with the largest share in
+        it goes, and of equal ones the last: as base parameters are chosen.
+        """
+        solution, left = self.current.solution, self.current.left
+        if not solution.determined.all():
+            own = self._equations.A[np.ix_(left, left)]
+            lost = 1.0 - np.einsum("ij,ji->i", solution.inverse, own)
+            return int(left[np.flatnonzero(lost > 0.99 * lost.max())[-1]]), np.inf
+        free = ~np.isin(left, self.refused)
+        worst = int(np.argmax(np.where(free, self.current.relative, -1.0)))
+        return int(left[worst]), float(self.current.relative[worst])
+
+    def _without(self, index: int) -> _Subset:
+        return self._subset(self.current.left[self.current.left != index])
+
+    def _subset(self, left: Indices) -> _Subset:
+        whole = self._equations
+        solution = solve(
+            NormalEquations(whole.A[np.ix_(left, left)], whole.b[left], whole.yy, whole.n)
+        )
+        variance = np.maximum(np.diag(solution.inverse), 0.0)
+        relative = np.sqrt(variance) / np.maximum(np.abs(solution.values), _TINY)
+        relative[~solution.determined] = np.inf
+        values = np.zeros(len(whole.b))
+        values[left] = solution.values
+        overall, joint = _relative_errors(self._unseen, values)
+        blocks = _squared(self._blocks, values)
+        return _Subset(left, solution, relative, values, blocks, overall, joint)
+
+    def _is_worse(self, smaller: _Subset) -> bool:
+        """Whether a removal raises the held-out error, by more than the rule gives away."""
+        if smaller.blocks.sum() <= self.current.blocks.sum():
+            return False
+        overall = (smaller.held_out - self.best.held_out) / self._rule.overall
+        axis = (smaller.held_out_joint - self.best.held_out_joint) / self._rule.axis
+        share = max(overall, float(axis.max()))
+        certain = _rise(smaller.blocks - self.best.blocks)[1]
+        return share > (self._rule.noticeable if certain else 1.0)
+
+    def _spread(self, subset: _Subset) -> float:
+        """Relative standard deviation of the worst that may go over that of the best known."""
+        free = subset.relative[~np.isin(subset.left, self.refused)]
+        return float(free.max(initial=0.0) / max(subset.relative.min(), _TINY))
+
+    def _take(self, subset: _Subset, index: int | None, relative_std: float) -> None:
+        self.steps.append(
+            EliminationStep(
+                removed=None if index is None else self._total.parameter_names[index],
+                relative_std=relative_std,
+                left=len(subset.left),
+                spread=float(subset.relative.max() / max(subset.relative.min(), _TINY)),
+                largest_relative_std=float(subset.relative.max()),
+                condition=subset.solution.condition,
+                in_sample=_relative_errors(self._total, subset.values)[0],
+                held_out=subset.held_out,
+                held_out_joint=np.where(self._unseen.samples > 0, subset.held_out_joint, np.nan),
+                rise=_rise(subset.blocks - self.best.blocks)[0],
+            )
+        )
+        self.current = subset
+        if subset.blocks.sum() < self.best.blocks.sum():
+            self.best = subset
+
+
+def _squared(gram: Array, values: Array) -> Array:
+    """Squared error of parameters (p,) by each Gram matrix (B, p + 1, p + 1), shape (B,)."""
+    augmented = np.append(-values, 1.0)
+    return np.asarray(np.maximum((gram @ augmented) @ augmented, 0.0))
+
+
+def _relative_errors(factor: Factor, values: Array) -> tuple[float, Array]:
+    """Relative torque error over all joints, and of each (n,)."""
+    squared, power = _squared(factor.gram, values), factor.gram[:, -1, -1]
+    return (
+        float(np.sqrt(squared.sum() / max(power.sum(), _TINY))),
+        np.sqrt(squared / np.maximum(power, _TINY)),
+    )
+
+
+def _rise(difference: Array) -> tuple[float, bool]:
+    """Sum of a difference of squared errors, by blocks (B,), over its standard deviation.
+
+    Also whether it is more than chance: Student's t with as many blocks as are left when they
+    are merged until neighbours hardly correlate.
+    """
+    if not difference.any():
+        return 0.0, False
+    length = block_length(difference[:, None])
+    merged = np.add.reduceat(difference, np.arange(0, len(difference), length))
+    count = len(merged)
+    if count < 2:
+        return 0.0, False
+    rise = float(merged.sum() / max(np.sqrt(count * merged.var(ddof=1)), _TINY))
+    return rise, rise > _chance(count - 1)
+
+
+@lru_cache
+def _chance(freedom: int) -> float:
+    """What Student's t exceeds one time in twenty."""
+    return float(student_limit(1.0 - _LEVEL, freedom))
+
+
+def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], rule: CutRule) -> str:
+    """Say why the cut is where it is."""
+    full, chosen = steps[0], steps[cut]
+    text = (
+        f"{chosen.left} of {full.left} parameters are essential: their relative standard deviations"
+        f" differ by a factor of {chosen.spread:.3g}"
+    )
+    if refused:
+        text += (
+            f"; those of more than {rule.spread:g} times the smallest stay because the error on"
+            f" held-out motion rises without them: {', '.join(refused)}"
+        )
+    elif chosen.spread < rule.spread:
+        text += f", less than {rule.spread:g}"
+    return (
+        f"{text}. Error on the motion they were chosen on: {full.held_out:.2%} with all"
+        f" parameters, {chosen.held_out:.2%} with these"
+    )
+
+
+def _estimate(model: RobotModel, training: PhaseFactor, weights: Array, left: Indices) -> Estimate:
+    """Estimate of some of the parameters, as a model of its own."""
+    names = tuple(model.parameter_names[k] for k in left)
+    part = training.restricted(left)
+    total = part.total
+    solution = solve(total.weighted(weights))
+    result = Estimate(
+        names=names,
+        units=tuple(model.units[k] for k in left),
+        values=solution.values,
+        covariance=solution.inverse,
+        noise_std=np.sqrt(residual_variance(total, solution.values, solution.inverse, weights)),
+        samples=total.samples,
+        method="",
+        condition=solution.condition,
+        undetermined=tuple(
+            name for name, known in zip(names, solution.determined, strict=True) if not known
+        ),
+    )
+    robust = with_block_covariance(result, part, weights)
+    return replace(robust, method=f"essential parameters by {robust.method}")

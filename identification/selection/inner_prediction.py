@@ -1,0 +1,429 @@
+"""Settings of an identification, chosen by predicting parts of what is fitted from the rest.
+
+Each recording is cut into `FOLDS` stretches of time. Parameters are estimated from all stretches
+but one and predict the torque of that one: every row of it, at rest too. The score of a candidate
+is ``||e|| / ||tau||`` over all joints and stretches. What is held out of the fit is never read.
+
+Only the factors of the stretches are needed (:mod:`identification.factor.phases`), so the samples
+are read once for each candidate way of preparing them, and any number of estimators are compared
+on the same factors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError
+from identification.estimators.shrinkage import Shrinkage, consistent_centre, shrunk_values
+from identification.factor.augmented_rows import augmented_rows
+from identification.factor.estimation import joint_weights, solve
+from identification.factor.gram import Factor
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.masks import LeftOut
+from identification.signals.samples import Preprocessing, Samples, VelocitySource
+
+Array = NDArray[np.float64]
+Question = Literal[
+    "bandwidth", "velocity", "presliding", "rows", "friction", "low-pass", "estimator"
+]
+
+FOLDS: Final = 5
+LOW_PASS: Final = "low-pass of the torque"
+"""Name of that choice."""
+# What a rigid model leaves out (elasticity of gears, the clock of a logger, the servo) begins at
+# some 10 Hz on most arms: the first candidate, which others have to beat.
+BANDWIDTHS: Final = (10.0, 5.0, 7.0, 14.0, 20.0, 40.0)  # Hz
+# In the middle of what gears do first. A jump (zero) is no candidate: at rest its sign is that of
+# the noise.
+PRESLIDING: Final = (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
+# Rows near a reversal say how dry friction turns round, but not so well as sliding ones what it is:
+# where they do not help, intervals are honest only without them.
+LEFT_OUT: Final[tuple[LeftOut, ...]] = ("slow", "rests")
+NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # of a low-pass that was found
+STRENGTHS: Final = (0.0, 1e-3, 1e-2, 0.1, 1.0, math.inf)
+PRIOR_WEIGHTS: Final = (0.01, 0.1, 1.0, 10.0)
+# Beyond Coulomb and viscous friction; one of them alone, for they look alike.
+FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
+    {"third": None, "stribeck": None},
+    {"third": "quadratic", "stribeck": None},
+    {"third": "cubic", "stribeck": None},
+    {"third": None, "stribeck": 0.1},
+)
+# A candidate replaces the simpler one before it only if it predicts better by this share; a
+# low-pass of the torque, which can stand in for much else, by more.
+WORTHWHILE: Final = 0.01
+LOW_PASS_WORTHWHILE: Final = 0.05
+TERM_WORTHWHILE: Final = 0.02
+# Rows beyond this rate add nothing to a comparison of bandwidths of 40 Hz and less.
+_RATE: Final = 250.0  # Hz
+_MOST_SWEEPS: Final = 4
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is chosen.
+
+    Attributes:
+        model: the robot, with its friction.
+        preprocessing: of recordings into samples.
+        shrinkage: of the estimate.
+    """
+
+    model: RobotModel
+    preprocessing: Preprocessing
+    shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
+
+    @property
+    def key(self) -> tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage]:
+        """What tells settings of one robot apart."""
+        return self.model.friction.laws, self.preprocessing, self.shrinkage
+
+    def describe(self) -> tuple[str, ...]:
+        """The settings in words, part by part."""
+        how, width = self.preprocessing, self.preprocessing.torque_bandwidth
+        return (
+            f"{how.rigid_bandwidth:g} Hz",
+            "measured velocity" if how.velocity == "measured" else "velocity from positions",
+            *self.model.friction.laws[0].words(),
+            {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
+                how.left_out or "", "by the friction law"
+            ),
+            "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
+            self.shrinkage.describe(),
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One question that was decided by inner prediction.
+
+    Attributes:
+        name: what was chosen.
+        candidates: in words.
+        errors: ``||e|| / ||tau||`` of each candidate over all joints; of a low-pass the geometric
+            mean of those of each joint.
+        chosen: index of the one that was taken.
+    """
+
+    name: str
+    candidates: tuple[str, ...]
+    errors: tuple[float, ...]
+    chosen: int
+
+
+class Errors(NamedTuple):
+    """Errors of predictions, infinite where some stretch cannot be predicted.
+
+    Attributes:
+        overall: ``||e|| / ||tau||`` over all joints.
+        by_joint: geometric mean of those of each joint.
+    """
+
+    overall: float = math.inf
+    by_joint: float = math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """Factors of each stretch: of the rows that count in a fit, and of all rows.
+
+    Attributes:
+        fitted: FOLDS factors.
+        predicted: FOLDS factors.
+    """
+
+    fitted: tuple[Factor, ...]
+    predicted: tuple[Factor, ...]
+
+    @classmethod
+    def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> Folds:
+        """Reduce recordings, each cut into `FOLDS` stretches of equal length."""
+        fitted = [Factor.zero(model) for _ in range(FOLDS)]
+        predicted = [Factor.zero(model) for _ in range(FOLDS)]
+        places = [np.append(columns, model.n_parameters) for columns in model.plan.columns]
+        for samples in recordings:
+            usable, m = samples.usable, len(samples.torque)
+            edges = np.linspace(0, m, FOLDS + 1).round().astype(int)
+            for part, rows in augmented_rows(model, replace(samples, usable=usable | True)):
+                for k in range(FOLDS):
+                    start, stop = max(edges[k], part.start), min(edges[k + 1], part.stop)
+                    if start >= stop:
+                        continue
+                    counts = usable[start:stop]
+                    for joint, (block, place) in enumerate(zip(rows, places, strict=True)):
+                        own = block[:, start - part.start : stop - part.start]
+                        used = own if counts[:, joint].all() else own[:, counts[:, joint]]
+                        index = np.ix_(place, place)
+                        predicted[k].gram[joint][index] += own @ own.T
+                        fitted[k].gram[joint][index] += used @ used.T
+                    predicted[k].samples[:] += stop - start
+                    fitted[k].samples[:] += np.count_nonzero(counts, axis=0)
+        return cls(tuple(fitted), tuple(predicted))
+
+    def without(self, k: int) -> Factor:
+        """What is fitted to predict stretch k."""
+        others = [factor for index, factor in enumerate(self.fitted) if index != k]
+        return sum(others[1:], others[0])
+
+    def errors(self, estimate: Callable[[int, Factor], Array]) -> Errors:
+        """Errors of predictions by ``estimate(k, factor without stretch k)``."""
+        squares = np.zeros(self.predicted[0].n_joints)
+        for k, target in enumerate(self.predicted):
+            augmented = np.append(-estimate(k, self.without(k)), 1.0)
+            squares += np.einsum("i,jik,k->j", augmented, target.gram, augmented)
+        torque = np.sum([target.gram[:, -1, -1] for target in self.predicted], axis=0)
+        if not torque.any():
+            return Errors(math.nan, math.nan)
+        loaded = torque > 0.0
+        shares = np.maximum(squares[loaded] / torque[loaded], np.finfo(np.float64).tiny)
+        return Errors(
+            math.sqrt(max(float(squares.sum()), 0.0) / float(torque.sum())),
+            math.exp(0.5 * float(np.log(shares).mean())),
+        )
+
+
+Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
+"""What is fitted, prepared for a model, and nothing else."""
+
+LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
+"""Settings with low-passes that the torque may have come through."""
+
+
+def choose_settings(
+    ready: Ready,
+    start: Settings,
+    questions: Collection[Question],
+    low_passes: LowPasses,
+) -> tuple[Settings, tuple[Choice, ...]]:
+    """Choose settings one question after the other, each with what was chosen before it.
+
+    Args:
+        ready: prepares what is fitted.
+        start: what is not asked for stays as it is here.
+        questions: what is chosen.
+        low_passes: looked for where "low-pass" is among them.
+
+    Returns:
+        The settings, and how they were chosen; those of `start` where what is fitted is too short
+        to predict a part of it from the rest.
+    """
+    trial = _Trial(ready)
+    now = start
+    if "bandwidth" in questions:
+        now = _with(now, rigid_bandwidth=BANDWIDTHS[0])
+    if "rows" in questions:
+        now = _with(now, left_out=LEFT_OUT[0])
+    if "presliding" in questions:
+        now = replace(now, model=now.model.with_friction(presliding=PRESLIDING[0]))
+    choices: list[Choice] = []
+    if "estimator" in questions:
+        # The consistent solution is found once: what is compared on the way has to follow the data.
+        quick = [Shrinkage(strength) for strength in STRENGTHS if math.isfinite(strength)]
+        now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
+    first = now
+    now, choices = _sweep(trial, first, questions)
+    if "low-pass" in questions:
+        # Looked for from the beginning: a narrow bandwidth of the motion or a long presliding
+        # displacement, once chosen, would stand in for a part of it.
+        possible = low_passes(first.model, first.preprocessing)
+        if possible:
+            some = [replace(first, preprocessing=one) for one in possible]
+            filtered, behind = _sweep(trial, trial.best(some), questions)
+            # The residual's least is flat; prediction with what was chosen beside it is sharper.
+            filtered = trial.decide("", _widths(filtered), share=0.0).settings
+            # All joints come through the same channel: the largest errors are not to decide alone.
+            found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
+            if found.choice.chosen:
+                now, choices = filtered, behind
+            choices = [*choices, found.choice]
+    if "friction" in questions:
+        found = trial.decide("friction at speed", _friction_terms(now), TERM_WORTHWHILE)
+        now, choices = found.settings, [*choices, found.choice]
+    if "estimator" in questions:
+        trial.renew_centres()
+        weights = PRIOR_WEIGHTS if now.shrinkage.strength > 0.0 else (now.shrinkage.prior_weight,)
+        candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
+        found = trial.decide("estimator", candidates)
+        now, choices = found.settings, [*choices, found.choice]
+    if not math.isfinite(trial.errors(now).overall):
+        return start, ()
+    return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
+
+
+class _Decision(NamedTuple):
+    settings: Settings
+    choice: Choice
+
+
+class _Trial:
+    """Scores of settings, on factors that are made once."""
+
+    def __init__(self, ready: Ready) -> None:
+        self._ready = ready
+        self._samples: dict[Preprocessing, list[Samples]] = {}
+        self._folds: dict[tuple[tuple[FrictionLaw, ...], Preprocessing], Folds] = {}
+        self._errors: dict[tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage], Errors] = {}
+        self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
+        self._near: dict[tuple[str, ...], Array] = {}  # a solution, from which others are found
+
+    def decide(
+        self,
+        name: str,
+        candidates: Sequence[Settings],
+        share: float = WORTHWHILE,
+        *,
+        by_joint: bool = False,
+    ) -> _Decision:
+        """Take the first candidate, or the best one if it predicts better by that share."""
+        each = [self.errors(one) for one in candidates]
+        errors = [one.by_joint if by_joint else one.overall for one in each]
+        best = int(np.nanargmin(errors)) if np.any(np.isfinite(errors)) else 0
+        chosen = best if errors[best] < (1.0 - share) * errors[0] else 0
+        words = _differences(candidates)
+        return _Decision(candidates[chosen], Choice(name, words, tuple(errors), chosen))
+
+    def best(self, candidates: Sequence[Settings]) -> Settings:
+        """The one that predicts best on average over the joints."""
+        return min(candidates, key=lambda one: self.errors(one).by_joint)
+
+    def errors(self, settings: Settings) -> Errors:
+        """Errors of predicting each stretch from the others."""
+        if settings.key not in self._errors:
+            self._errors[settings.key] = self._predicted(settings)
+        return self._errors[settings.key]
+
+    def _predicted(self, settings: Settings) -> Errors:
+        shrinkage, folds = settings.shrinkage, self._reduced(settings)
+        if not all(np.all(factor.samples > 0) for factor in folds.fitted):
+            return Errors()
+
+        def estimate(k: int, factor: Factor) -> Array:
+            weights = joint_weights(factor)
+            if shrinkage.strength == 0.0:
+                return solve(factor.weighted(weights)).values
+            key = settings.model.parameter_names, shrinkage.prior_weight, k
+            if key not in self._centres:
+                near = self._near.get(settings.model.parameter_names)
+                found = consistent_centre(
+                    settings.model, factor, weights, shrinkage.prior_weight, near
+                )
+                self._centres[key] = found.estimate.values
+                self._near[settings.model.parameter_names] = found.solution
+            return shrunk_values(factor.weighted(weights), self._centres[key], shrinkage.strength)
+
+        try:
+            return folds.errors(estimate)
+        except IdentificationError:
+            return Errors()
+
+    def renew_centres(self) -> None:
+        """Find consistent solutions anew, with the settings that are asked for next."""
+        self._centres.clear()
+        self._errors.clear()
+
+    def _reduced(self, settings: Settings) -> Folds:
+        key = settings.model.friction.laws, settings.preprocessing
+        if key not in self._folds:
+            if settings.preprocessing not in self._samples:
+                samples = self._ready(settings.model, settings.preprocessing)
+                self._samples[settings.preprocessing] = [*samples]
+            samples = self._samples[settings.preprocessing]
+            self._folds[key] = Folds.of(
+                settings.model, (_thinned(one.directed(settings.model)) for one in samples)
+            )
+        return self._folds[key]
+
+
+def _thinned(samples: Samples) -> Samples:
+    """One row in so many, as far as what is compared has no more to say."""
+    usual = float(np.median(np.diff(samples.motion.time)))
+    every = max(1, round(1.0 / (_RATE * usual)))
+    if every == 1 or samples.torque_bandwidth is not None:
+        return samples
+    some = slice(None, None, every)
+    return replace(
+        samples,
+        motion=samples.motion.rows(some),
+        torque=samples.torque[some],
+        usable=samples.usable[some],
+        segments=(slice(0, len(samples.torque[some])),),
+        mask=None,
+    )
+
+
+def _sweep(
+    trial: _Trial, now: Settings, questions: Collection[Question]
+) -> tuple[Settings, list[Choice]]:
+    """Decide what depends on one another in turn, until nothing changes."""
+    asked = [(name, vary) for question, name, vary in _SWEPT if question in questions]
+    choices: list[Choice] = []
+    for _ in range(_MOST_SWEEPS):
+        before = now
+        choices = []
+        for name, vary in asked:
+            found = trial.decide(name, vary(now))
+            now, choices = found.settings, [*choices, found.choice]
+        if now.key == before.key:
+            break
+    return now, choices
+
+
+def _bandwidths(now: Settings) -> list[Settings]:
+    return [_with(now, rigid_bandwidth=width) for width in BANDWIDTHS]
+
+
+def _velocities(now: Settings) -> list[Settings]:
+    return [_with(now, velocity=source) for source in get_args(VelocitySource)]
+
+
+def _rows(now: Settings) -> list[Settings]:
+    return [_with(now, left_out=rows) for rows in LEFT_OUT]
+
+
+def _presliding(now: Settings) -> list[Settings]:
+    return [
+        replace(now, model=now.model.with_friction(presliding=distance)) for distance in PRESLIDING
+    ]
+
+
+_SWEPT: Final[tuple[tuple[Question, str, Callable[[Settings], list[Settings]]], ...]] = (
+    ("bandwidth", "bandwidth of the motion", _bandwidths),
+    ("velocity", "velocity", _velocities),
+    ("presliding", "presliding displacement", _presliding),
+    ("rows", "rows that are left out", _rows),
+)
+
+
+def _friction_terms(now: Settings) -> list[Settings]:
+    return [replace(now, model=now.model.with_friction(**terms)) for terms in FRICTION_TERMS]
+
+
+def _widths(now: Settings) -> list[Settings]:
+    width = now.preprocessing.torque_bandwidth or math.nan
+    return [_with(now, torque_bandwidth=share * width) for share in NEARBY]
+
+
+def _shrinkages(prior_weights: Sequence[float]) -> list[Shrinkage]:
+    some = [strength for strength in STRENGTHS if strength > 0.0]
+    return [Shrinkage(), *(Shrinkage(strength, w) for w in prior_weights for strength in some)]
+
+
+def _with(settings: Settings, **changes: Any) -> Settings:
+    return replace(settings, preprocessing=replace(settings.preprocessing, **changes))
+
+
+def _differences(candidates: Sequence[Settings]) -> tuple[str, ...]:
+    """Each candidate in words, by what differs between them."""
+    parts = [one.describe() for one in candidates]
+    differ = [len(set(column)) > 1 for column in zip(*parts, strict=True)]
+    return tuple(
+        ", ".join(word for word, apart in zip(words, differ, strict=True) if apart)
+        for words in parts
+    )

@@ -1,0 +1,1 @@
+"""Prediction of unseen motion, checks of the residual, causes and the verdict."""

@@ -1,0 +1,529 @@
+"""Faults that explain what a model leaves over: mended, each has to predict better.
+
+The fitted recordings are cut into blocks of time, and the torque of every fifth block is predicted
+from the others: as measured, and with one fault after the other mended, such as torques of two
+joints in each other's column, an axis that counts the other way round, or a payload in one part of
+the recordings. The fault whose mending lowers the error most, beyond chance, is named; with it
+mended the search goes on. What is held out of the fit is never read.
+
+All but the faults of the positions are linear in the columns of one table per joint: regressor,
+columns of a payload, rate of the predicted torque, torques of all joints. Gram matrices of the
+blocks are therefore made once, and a candidate costs a few small solutions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.model.motion import Motion
+from identification.model.regressor import RegressorPlan
+from identification.model.robot import RobotModel
+from identification.model.wrench import LINK_SYMBOLS
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+Kind = Literal[
+    "delay",
+    "gain",
+    "torque sign",
+    "torque order",
+    "axis sign",
+    "position order",
+    "joint order",
+    "payload",
+    "changed gain",
+    "changed friction",
+    "changed arm",
+]
+
+# Standard errors over the blocks, and the share of the error, that make a mended fault better.
+SIGMAS: Final = 3.0
+LEAST_GAIN: Final = 0.1
+# What is as good as that with fewer coefficients is taken in its place.
+_ALIKE: Final = 1.05
+_MOST_CAUSES: Final = 4
+# Rows of all recordings together, and blocks of time: a fault of a whole recording shows in few.
+_MOST_ROWS: Final = 3000
+_BLOCKS: Final = 10
+_FOLDS: Final = 5
+_FEWEST_ROWS: Final = 10
+_FEWEST_BLOCKS: Final = 2
+# Share of each column's own information: keeps what a motion hardly determines small.
+_RIDGE: Final = 1e-6
+_LOAD: Final = len(LINK_SYMBOLS)
+# Which coefficient of a fault of several is its size.
+_SIZE: Final[dict[Kind, int]] = {"payload": LINK_SYMBOLS.index("m")}
+_OF_MOTION: Final = ("axis sign", "position order", "joint order")
+_OF_TORQUE: Final = ("torque sign", "torque order")
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some of the blocks of the fitted recordings.
+
+    Attributes:
+        words: what it is: "A.mcap", or "A.mcap from 3 s on".
+        blocks: whether each belongs to it.
+    """
+
+    words: str
+    blocks: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What may be wrong with recordings.
+
+    Attributes:
+        kind: of fault.
+        joints: whose; all of them if empty.
+        part: of the recordings that has it; None for all.
+    """
+
+    kind: Kind
+    joints: tuple[int, ...] = ()
+    part: Part | None = None
+
+    @property
+    def discrete(self) -> bool:
+        """Whether it is there or not: a sign or an order has no size."""
+        return self.kind in (*_OF_MOTION, *_OF_TORQUE)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A fault that explains errors.
+
+    Attributes:
+        fault: what seems to be wrong.
+        ratio: error of predicted blocks with it mended over that without: geometric mean over the
+            joints.
+        size: how large it is, a delay [s], a factor less one or a mass [kg]; None of others.
+        std: standard deviation of that over the blocks.
+    """
+
+    fault: Fault
+    ratio: float
+    size: float | None
+    std: float
+
+
+@dataclass(frozen=True)
+class Causes:
+    """Faults that were looked for in what was fitted.
+
+    Attributes:
+        found: the one that explains most first.
+        best: of all faults the one with the least error where nothing was found.
+        undecided: joints that might count either way for all that the recordings say.
+    """
+
+    found: tuple[Cause, ...]
+    best: Cause | None
+    undecided: tuple[int, ...]
+
+
+def find_causes(
+    model: RobotModel, recordings: Sequence[Samples], values: Array, names: Sequence[str] = ()
+) -> Causes:
+    """Faults with which, once mended, blocks of the recordings are predicted better.
+
+    Args:
+        model: the robot.
+        recordings: what is fitted.
+        values: parameters (p,) estimated from them.
+        names: of the recordings.
+    """
+    words = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
+    state = _State(model, tuple(recordings), values, words)
+    first = trials = state.trials()
+    found: list[Cause] = []
+    while len(found) < _MOST_CAUSES:
+        trial = _best(trials)
+        if trial is None:
+            break
+        found.append(trial.cause)
+        if trial.cause.fault.kind == "changed arm":
+            break  # with all parameters apart, nothing is left to compare
+        state = state.mended(trial.cause.fault)
+        trials = state.trials()
+    return Causes(
+        tuple(found),
+        min(first, key=lambda one: one.cause.ratio).cause if first and not found else None,
+        tuple(
+            one.cause.fault.joints[0]
+            for one in first
+            if one.cause.fault.kind == "axis sign" and one.cause.ratio < 1.0 + LEAST_GAIN
+        ),
+    )
+
+
+class _Trial(NamedTuple):
+    """A fault mended, the upper end of its ratio, and how many coefficients it has."""
+
+    cause: Cause
+    highest: float
+    coefficients: int
+
+
+def _best(trials: Sequence[_Trial]) -> _Trial | None:
+    """The trial of least error among those that are better beyond chance, simple ones first."""
+    better = [
+        trial for trial in trials if trial.cause.ratio < 1.0 - LEAST_GAIN and trial.highest < 1.0
+    ]
+    if not better:
+        return None
+    least = min(trial.cause.ratio for trial in better)
+    alike = [trial for trial in better if trial.cause.ratio <= _ALIKE * least]
+    return min(alike, key=lambda trial: (trial.coefficients, trial.cause.ratio))
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Recordings with the faults mended that were found so far.
+
+    Faults of signs and orders are mended in the recordings; `found` are those of the other kinds,
+    whose columns stay in the fit.
+    """
+
+    model: RobotModel
+    recordings: tuple[Samples, ...]
+    values: Array
+    names: tuple[str, ...]
+    found: tuple[Fault, ...] = ()
+    _moved: dict[Fault, _Tables] = field(default_factory=dict)
+
+    def mended(self, fault: Fault) -> _State:
+        """The state with one fault less."""
+        if fault.discrete:
+            moved = tuple(_mended(self.model, one, fault) for one in self.recordings)
+            return replace(self, recordings=moved, _moved={})
+        return replace(self, found=(*self.found, fault))
+
+    def trials(self) -> list[_Trial]:
+        """Every fault mended in its turn."""
+        model, p = self.model, self.model.n_parameters
+        tables = _Tables.of(model, self.recordings, self.values)
+        n, width = model.n_joints, tables.gram.shape[-1]
+        target = np.eye(n, width, width - n)
+        none = np.zeros((*tables.gram.shape[:3], 0))
+        known = [_columns_of(tables, model, self.values, one) for one in self.found]
+        before = np.concatenate([none, *known], axis=3)
+        usual = _score(tables, p, before, target)
+        trials = []
+        for fault in self._faults(tables):
+            own, measured, seen = none, target, tables
+            if fault.kind in _OF_MOTION:
+                seen = self._tables_of(fault)
+            elif fault.kind == "torque sign":
+                measured = target.copy()
+                measured[list(fault.joints)] *= -1.0
+            elif fault.kind == "torque order":
+                measured = target.copy()
+                measured[list(fault.joints)] = target[list(fault.joints[::-1])]
+            else:
+                own = _columns_of(tables, model, self.values, fault)
+            score = _score(seen, p, np.concatenate([own, before], axis=3), measured)
+            ratio, highest = score.against(usual)
+            size, std = _size(fault, score, tables, own)
+            trials.append(_Trial(Cause(fault, ratio, size, std), highest, own.shape[3]))
+        return trials
+
+    def _tables_of(self, fault: Fault) -> _Tables:
+        """Tables with a fault of the motion mended; the same in every search."""
+        if fault not in self._moved:
+            moved = [_mended(self.model, one, fault) for one in self.recordings]
+            self._moved[fault] = _Tables.of(self.model, moved, self.values)
+        return self._moved[fault]
+
+    def _faults(self, tables: _Tables) -> Iterator[Fault]:
+        n = self.model.n_joints
+        kinds: tuple[Kind, ...] = ("delay", "gain", "torque sign", "axis sign")
+        orders: tuple[Kind, ...] = ("torque order", "position order", "joint order")
+        yield Fault("delay")
+        for j in range(n):
+            yield from (Fault(kind, (j,)) for kind in kinds)
+            yield from (Fault(kind, (k, j)) for k in range(j) for kind in orders)
+        changes = [Fault("payload"), Fault("changed arm")]
+        for j in range(n):
+            changes += [Fault("changed gain", (j,)), Fault("changed friction", (j,))]
+        for part in self._later_parts(tables):
+            yield from (replace(fault, part=part) for fault in changes)
+        if len(self.recordings) > 2:
+            for fault in changes:
+                yield replace(fault, part=self._other_recordings(tables, fault))
+
+    def _other_recordings(self, tables: _Tables, fault: Fault) -> Part:
+        """The recordings in which a fault is largest, if each has its own size of it.
+
+        They are those beyond the widest gap between the sizes, the fewer ones.
+        """
+        alike = fault if fault.kind != "changed arm" else Fault("payload")
+        each = [self._of(tables, k) for k in range(len(self.recordings))]
+        columns = [
+            _columns_of(tables, self.model, self.values, replace(alike, part=part))
+            for part in each[1:]
+        ]
+        n, width = self.model.n_joints, tables.gram.shape[-1]
+        score = _score(
+            tables,
+            self.model.n_parameters,
+            np.concatenate(columns, axis=3),
+            np.eye(n, width, width - n),
+        )
+        sizes = score.added.mean(axis=0).reshape(len(columns), -1)[:, _SIZE.get(alike.kind, 0)]
+        sizes = np.append(0.0, sizes)
+        order = np.argsort(sizes)
+        cut = int(np.argmax(np.diff(sizes[order]))) + 1
+        those = sorted(min(order[cut:], order[:cut], key=len).tolist())
+        blocks = np.isin(tables.recording, those)
+        return Part(", ".join(self.names[k] for k in those), tuple(blocks.tolist()))
+
+    def _of(self, tables: _Tables, recording: int) -> Part:
+        return Part(self.names[recording], tuple((tables.recording == recording).tolist()))
+
+    def _later_parts(self, tables: _Tables) -> Iterator[Part]:
+        """All that comes after each moment."""
+        blocks, recordings = len(tables.recording), len(self.recordings)
+        for first in range(_FEWEST_BLOCKS, blocks - _FEWEST_BLOCKS + 1):
+            k, start = int(tables.recording[first]), tables.start[first]
+            words = f"{self.names[k]} from {start:.3g} s on" if start > 0.0 else self.names[k]
+            if k < recordings - 1:
+                words += " and what follows it"
+            yield Part(words, tuple((np.arange(blocks) >= first).tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Tables:
+    """Sums over the rows of B blocks of products of columns, joint by joint.
+
+    Columns: parameters (p), payload (10), rate of the predicted torque, torques of all joints (n).
+
+    Attributes:
+        gram: (B, n, q, q).
+        rows: that count (B, n).
+        recording: index of the one that each block is of (B,).
+        start: time at which each begins, since its recording began (B,) [s].
+    """
+
+    gram: Array
+    rows: NDArray[np.intp]
+    recording: NDArray[np.intp]
+    start: Array
+
+    @classmethod
+    def of(cls, model: RobotModel, recordings: Sequence[Samples], values: Array) -> _Tables:
+        """Reduce some thousand rows."""
+        count = -(-_BLOCKS // len(recordings))
+        grams, rows, starts = [], [], []
+        for samples in recordings:
+            m = len(samples.torque)
+            step = max(1, m * len(recordings) // _MOST_ROWS)
+            some = np.arange(step // 2, m, step)
+            edges = np.linspace(0, len(some), count + 1).round().astype(int)
+            tables = _tables(model, samples, values, some)
+            usable = samples.usable[some]
+            for a, b in pairwise(edges):
+                own = np.where(usable[a:b].T[:, :, None], tables[:, a:b], 0.0)
+                grams.append(np.swapaxes(own, 1, 2) @ own)
+                rows.append(np.count_nonzero(usable[a:b], axis=0))
+                starts.append(samples.motion.time[some[a]] - samples.motion.time[0] if a else 0.0)
+        recording = np.repeat(np.arange(len(recordings)), count)
+        return cls(np.array(grams), np.array(rows), recording, np.array(starts))
+
+
+def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
+    """Columns of some rows of each joint (n, k, q)."""
+    n, p = model.n_joints, model.n_parameters
+    links: list[list[int]] = [[] for _ in range(n)]
+    links[-1] = list(range(_LOAD))
+    payload = RegressorPlan(model.chain, model.gravity, links, [False] * n, None)
+    filtered = samples.torque_bandwidth is not None or samples.whole is not None
+    part = np.arange(len(samples.torque)) if filtered else some
+    motion = samples.motion.rows(part)
+    loads = payload.evaluate(*motion[1:4]).blocks
+    if filtered:
+        blocks, columns = samples.regressor(model)
+        blocks = tuple(block[some] for block in blocks)
+        loads = tuple(samples.as_measured(j, block)[some] for j, block in enumerate(loads))
+    else:
+        blocks, columns = model.regressor(*motion[1:])
+    tables = np.zeros((n, len(some), p + _LOAD + 1 + n))
+    for j in range(n):
+        tables[j][:, columns[j]] = blocks[j]
+        tables[j][:, p + payload.columns[j]] = loads[j]
+    tables[:, :, p + _LOAD] = _rate(model, samples, values, some).T
+    tables[:, :, -n:] = samples.torque[some]
+    return tables
+
+
+def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
+    """Rate of the predicted torque (k, n) in some rows, from their neighbours.
+
+    Without the jumps of dry friction: it has the direction that it has in between.
+    """
+    after, before = np.minimum(some + 1, len(samples.torque) - 1), np.maximum(some - 1, 0)
+    now = samples.motion.rows(some)
+    direction = now.direction
+    if direction is None:
+        direction = model.friction.direction(*now[:3])
+    torque, time = [], []
+    for rows in (before, after):
+        motion = samples.motion.rows(rows)
+        torque.append(model.torque(values, *motion[1:4], direction))
+        time.append(motion.time)
+    return np.asarray((torque[1] - torque[0]) / np.maximum(time[1] - time[0], 1e-9)[:, None])
+
+
+class _Score(NamedTuple):
+    """Errors of predicted blocks.
+
+    Attributes:
+        squares: sums of each block (B, n).
+        values: parameters without each fold (F, p).
+        added: coefficients of added columns (F, r).
+    """
+
+    squares: Array
+    values: Array
+    added: Array
+
+    def against(self, other: _Score) -> tuple[float, float]:
+        """Error over another's: geometric mean over joints, and its upper end by the blocks."""
+        tested = (self.squares > 0.0) & (other.squares > 0.0)
+        known = tested.any(axis=0)
+        if not known.any():
+            return 1.0, np.inf
+        ours = np.where(tested, self.squares, 0.0).sum(axis=0)[known]
+        theirs = np.where(tested, other.squares, 0.0).sum(axis=0)[known]
+        ratio = float(np.exp(0.5 * np.mean(np.log(ours / theirs))))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = np.where(tested, 0.5 * np.log(self.squares / other.squares), np.nan)
+        blocks = np.nanmean(change[tested.any(axis=1)], axis=1)
+        if len(blocks) < _FEWEST_BLOCKS:
+            return ratio, np.inf
+        error = np.std(blocks, ddof=1) / np.sqrt(len(blocks))
+        return ratio, float(np.exp(blocks.mean() + SIGMAS * error))
+
+
+def _score(tables: _Tables, p: int, added: Array, target: Array) -> _Score:
+    """Predict each fifth block from the others.
+
+    Args:
+        tables: of the recordings.
+        p: parameters.
+        added: columns beside the regressor, as combinations of a table's (B, n, q, r).
+        target: what is predicted of each joint, likewise (n, q).
+    """
+    blocks, n = tables.rows.shape
+    column = np.broadcast_to(target[:, :, None], (blocks, n, target.shape[1], 1))
+    wide = np.concatenate([added, column], axis=3)
+    moved = tables.gram @ wide
+    width = p + wide.shape[3]
+    gram = np.empty((blocks, n, width, width))
+    gram[..., :p, :p] = tables.gram[..., :p, :p]
+    gram[..., :p, p:] = moved[..., :p, :]
+    gram[..., p:, :p] = np.swapaxes(moved[..., :p, :], 2, 3)
+    gram[..., p:, p:] = np.swapaxes(wide, 2, 3) @ moved
+    weights, floor = _weights(gram.sum(axis=0), tables.rows.sum(axis=0))
+    weighted = np.einsum("j,bjst->bst", weights, gram)
+    total = weighted.sum(axis=0)
+    squares, coefficients = np.zeros((blocks, n)), []
+    for k in range(_FOLDS):
+        own = slice(k, None, _FOLDS)
+        values = _solved(total - weighted[own].sum(axis=0))
+        coefficients.append(values)
+        squares[own] = _squares(gram[own], values)
+    squares = np.where(tables.rows >= _FEWEST_ROWS, np.maximum(squares, floor / blocks), 0.0)
+    found = np.array(coefficients)
+    return _Score(squares, found[:, :p], found[:, p:])
+
+
+def _weights(gram: Array, rows: Array) -> tuple[Array, Array]:
+    """Inverse variances of the residuals (n,) of an ordinary fit, and what rounding leaves."""
+    squares = _squares(gram, _solved(gram.sum(axis=0)))
+    floor = 1e-12 * gram[:, -1, -1] + np.finfo(np.float64).tiny
+    return np.maximum(rows, 1) / np.maximum(squares, floor), floor
+
+
+def _squares(gram: Array, values: Array) -> Array:
+    """Sum of squared errors of coefficients (k,) on Gram matrices (..., k + 1, k + 1)."""
+    augmented = np.append(-values, 1.0)
+    return np.asarray((gram @ augmented) @ augmented)
+
+
+def _solved(gram: Array) -> Array:
+    """Least squares (k,) of a Gram matrix of [W | y] (k + 1, k + 1), slightly regularised."""
+    length = np.sqrt(np.diag(gram)[:-1])
+    present = length > 0.0
+    scale = np.where(present, length, 1.0)
+    normal = gram[:-1, :-1] / np.outer(scale, scale)
+    np.fill_diagonal(normal, np.where(present, 1.0 + _RIDGE, 1.0))
+    return np.asarray(np.linalg.solve(normal, gram[:-1, -1] / scale) / scale)
+
+
+def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[float | None, float]:
+    """How large a fault is, and the standard deviation of that by the jackknife over folds.
+
+    Args:
+        fault: which.
+        score: with its columns.
+        tables: of the recordings.
+        own: its columns (B, n, q, r).
+    """
+    if fault.discrete or fault.kind == "changed arm":
+        return None, 0.0
+    p = score.values.shape[1]
+    sizes = score.added[:, _SIZE.get(fault.kind, 0)]
+    if fault.kind in ("gain", "changed gain", "changed friction"):
+        # Its column has the pooled parameters; what it multiplies is what the fit finds beside it.
+        columns = own[..., :p, 0].reshape(-1, p)
+        column = columns[np.argmax(columns.any(axis=1))]
+        power = tables.gram[:, fault.joints[0], :p, :p].sum(axis=0) @ column
+        sizes = sizes * (power @ column) / ((score.values * (column != 0.0)) @ power)
+    return float(sizes.mean()), float(np.sqrt((_FOLDS - 1) * sizes.var()))
+
+
+def _columns_of(tables: _Tables, model: RobotModel, values: Array, fault: Fault) -> Array:
+    """Columns of a fault's size as combinations of those of a table (B, n, q, r)."""
+    blocks, n, width, _ = tables.gram.shape
+    p, joints = model.n_parameters, list(fault.joints or range(model.n_joints))
+    columns = np.zeros((n, width, {"payload": _LOAD, "changed arm": p}.get(fault.kind, 1)))
+    if fault.kind == "delay":
+        columns[joints, p + _LOAD, 0] = -1.0
+    elif fault.kind == "payload":
+        columns[:, p : p + _LOAD] = np.eye(_LOAD)
+    elif fault.kind == "changed arm":
+        columns[:, :p] = np.eye(p)
+    else:
+        friction = fault.kind == "changed friction"
+        columns[joints, :p, 0] = values * model.friction_columns if friction else values
+    mask = np.ones(blocks) if fault.part is None else np.array(fault.part.blocks, dtype=np.float64)
+    return np.asarray(mask[:, None, None, None] * columns)
+
+
+def _mended(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
+    """Samples without a fault of signs or orders."""
+    n = model.n_joints
+    sign, order = np.ones(n), np.arange(n)
+    if fault.kind.endswith("sign"):
+        sign[list(fault.joints)] = -1.0
+    else:
+        order[list(fault.joints)] = fault.joints[::-1]
+    motion, torque, usable = samples.motion, samples.torque, samples.usable
+    if fault.kind in _OF_MOTION:
+        motion = Motion(motion.time, *(part[:, order] * sign for part in motion[1:4]))
+        usable = usable[:, order]
+    if fault.kind != "position order":
+        torque = torque[:, order] * sign
+    mended = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
+    if samples.whole is not None:
+        whole, part = samples.whole
+        mended = replace(mended, whole=(_mended(model, whole, fault), part))
+    return mended.directed(model)

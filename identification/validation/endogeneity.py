@@ -1,0 +1,278 @@
+"""Was least squares biased by noise in the regressor? A Durbin-Wu-Hausman test.
+
+Noise V in the measured regressor, W = W* + V, makes the error of the equation e - V pi, and least
+squares is biased exactly as far as that correlates with W. The test is the auxiliary regression
+(Durbin 1954, Wu 1973, Hausman 1978): what the instruments do not explain of W, V = W - P_Z W, is
+added to the equation, and its coefficients are zero if least squares was not biased. All p columns
+of V at once cannot be tested honestly: blocks of coloured residuals are no more than some dozens,
+as many as there are parameters. But measurement noise enters in one direction only, V pi. So one
+column per joint is added, V_j pi on that joint's rows, with pi as estimated by instrumental
+variables (under the hypothesis its coefficient is zero, so that pi is estimated does not matter:
+Pagan 1984). That is n coefficients, tested together with the covariance that leaves out one block
+of time at a time, and Hotelling's F for a covariance from few blocks.
+
+With noise of measurement alone the coefficients are minus the share of that column that is noise,
+between -1 and 0. A disturbance that moves the arm through its servo also correlates with the motion
+and biases least squares; its coefficients may have either sign, and a positive one is no noise.
+
+The same differently put, parameter by parameter: how far the two estimates are apart, in standard
+deviations of that difference, which is tested with Bonferroni's correction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.distributions import fisher_tail, student_limit
+from identification.estimators.covariance import block_length, left_out, spread
+from identification.estimators.instrumental import InstrumentalEstimate, solve_cross
+from identification.factor.estimation import solve
+from identification.factor.gram import NormalEquations
+from identification.factor.instruments import InstrumentFactor
+from identification.factor.phases import merged
+from identification.model.robot import RobotModel
+
+Array = NDArray[np.float64]
+
+LEVEL: Final = 0.05
+# Share of an axis's torque, RMS on the fitted motion: what models of industrial arms leave
+# unexplained is 2 to 10 %, a bias of less does nobody harm.
+MATTERS: Final = 0.005
+# Below this share of the torque measured and instrument motion are the same but for rounding.
+_SAME: Final = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class EndogeneityTest:
+    """Result of the test.
+
+    Attributes:
+        statistic: F of the hypothesis that least squares is not biased; NaN if there is nothing
+            to test.
+        p_value: probability of a larger one if the hypothesis is true, NaN likewise.
+        freedom: degrees of freedom of the F.
+        coefficient: of each joint's column (n,): minus the share of it that is noise of
+            measurement; NaN where there is none.
+        coefficient_std: its standard deviation (n,).
+        noise: torque V pi that stands for what the instruments do not explain of the regressor,
+            as a share of each joint's torque (n,), both as RMS.
+        shift: least squares less instrumental variables (p,).
+        shift_std: its standard deviation, cluster-robust (p,).
+        shifted: names of the parameters that differ by more than chance (all of them together
+            5 %).
+        predicted: torque that the two estimates predict differently on the fitted motion, as a
+            share of each joint's torque (n,).
+        words: the answer in words.
+    """
+
+    statistic: float
+    p_value: float
+    freedom: tuple[int, int]
+    coefficient: Array
+    coefficient_std: Array
+    noise: Array
+    shift: Array
+    shift_std: Array
+    shifted: tuple[str, ...]
+    predicted: Array
+    words: str
+
+    @property
+    def biased(self) -> bool:
+        """Whether least squares was biased, beyond what chance does one time in twenty."""
+        return bool(self.p_value < LEVEL)
+
+    @property
+    def matters(self) -> bool:
+        """Whether it was biased, and the torques of some axis are predicted differently for it."""
+        return self.biased and bool(np.max(self.predicted, initial=0.0) >= MATTERS)
+
+
+def endogeneity_test(
+    model: RobotModel, factor: InstrumentFactor, result: InstrumentalEstimate
+) -> EndogeneityTest:
+    """Test whether noise in the regressor has biased least squares.
+
+    Args:
+        model: the robot.
+        factor: what the result was made from.
+        result: see :func:`identification.estimators.instrumental.estimate_instrumental`.
+    """
+    used = np.asarray(factor.samples.any(axis=1))
+    blocks = factor.weighted(result.weights)[used]
+    added, active, noise = _noise_columns(factor, blocks.sum(axis=0), result, used)
+    statistic, freedom, gamma, gamma_std = _wald(*_augmented(blocks, added))
+    coefficient = np.full((2, factor.n_joints), np.nan)
+    coefficient[:, active] = gamma, gamma_std
+    p_value = float(fisher_tail(statistic, *freedom)) if np.isfinite(statistic) else np.nan
+    shift, shift_std, count = _shift(blocks)
+    names, known = factor.parameter_names, shift_std > 0.0
+    critical = student_limit(LEVEL / (2 * max(1, int(known.sum()))), max(1, count - 1))
+    shifted = tuple(
+        names[k] for k in np.flatnonzero(known & (np.abs(shift) > critical * shift_std))
+    )
+    test = EndogeneityTest(
+        statistic=statistic,
+        p_value=p_value,
+        freedom=freedom,
+        coefficient=coefficient[0],
+        coefficient_std=coefficient[1],
+        noise=noise,
+        shift=shift,
+        shift_std=shift_std,
+        shifted=shifted,
+        predicted=_share(factor, np.concatenate([np.zeros(len(names)), shift, [0.0]])),
+        words="",
+    )
+    return replace(test, words=_words(test, result, model.joint_names))
+
+
+def _noise_columns(
+    factor: InstrumentFactor, total: Array, result: InstrumentalEstimate, used: NDArray[np.bool_]
+) -> tuple[tuple[Array, Array], list[int], Array]:
+    """One column per joint: what the instruments leave of W, times the parameters.
+
+    Returns:
+        By blocks, the weighted products of the k columns that are not nothing with [Z | W | y]
+        (B, k, 2 p + 1), and with themselves (B, k); which k joints these are; and the size of all
+        n as a share of the torque (n,).
+    """
+    p = factor.n_parameters
+    values = result.estimate.values
+    explained = solve(NormalEquations(total[:p, :p], total[:p, p : 2 * p] @ values, 0.0, 0)).values
+    combination = np.concatenate([-explained, values, [0.0]])
+    noise = _share(factor, combination)
+    active = np.flatnonzero((noise > _SAME) & (result.weights > 0.0)).tolist()
+    products = np.zeros((int(used.sum()), len(active), 2 * p + 1))
+    squares = np.zeros(products.shape[:2])
+    for k, joint in enumerate(active):
+        place = factor.places(joint)
+        own = result.weights[joint] * factor.gram[joint][used] @ combination[place]
+        products[:, k, place] = own
+        squares[:, k] = own @ combination[place]
+    return (products, squares), active, noise
+
+
+def _share(factor: InstrumentFactor, combination: Array) -> Array:
+    """RMS of a combination (2 p + 1,) of [Z | W | y] as a share of each joint's torque (n,)."""
+    shares = np.zeros(factor.n_joints)
+    for joint, gram in enumerate(factor.gram):
+        own, total = combination[factor.places(joint)], gram.sum(axis=0)
+        shares[joint] = np.sqrt(max(float(own @ total @ own), 0.0) / max(total[-1, -1], 1e-300))
+    return shares
+
+
+def _augmented(blocks: Array, added: tuple[Array, Array]) -> tuple[Array, Array, int]:
+    """Normal equations of y = W pi + C gamma by blocks: (B, q, q), (B, q), number of gamma."""
+    products, squares = added
+    p, k = blocks.shape[-1] // 2, products.shape[1]
+    information = np.zeros((len(blocks), p + k, p + k))
+    information[:, :p, :p] = blocks[:, p : 2 * p, p : 2 * p]
+    information[:, p:, :p] = products[:, :, p : 2 * p]
+    information[:, :p, p:] = products[:, :, p : 2 * p].transpose(0, 2, 1)
+    information[:, range(p, p + k), range(p, p + k)] = squares
+    moments = np.concatenate([blocks[:, p : 2 * p, -1], products[:, :, -1]], axis=1)
+    return information, moments, k
+
+
+def _wald(
+    information: Array, moments: Array, k: int
+) -> tuple[float, tuple[int, int], Array, Array]:
+    """F of the hypothesis that the last k coefficients are zero, and its degrees of freedom.
+
+    Also the coefficients and their standard deviations (k,).
+    """
+    p = information.shape[1] - k
+    solution = solve(NormalEquations(information.sum(axis=0), moments.sum(axis=0), 0.0, 0))
+    information, moments = _merged(information, moments, solution.values)
+    moved = spread(information, moments - information @ solution.values, solution.root)[:, p:]
+    blocks = len(moments)
+    freedom = (k, blocks - k)
+    gamma = solution.values[p:]
+    std = np.sqrt((moved**2).sum(axis=0))
+    if k == 0 or freedom[1] < 1 or not solution.determined[p:].all():
+        return np.nan, freedom, gamma, std
+    squared = float(gamma @ np.linalg.solve(moved.T @ moved, gamma))
+    return squared * freedom[1] / (k * (blocks - 1)), freedom, gamma, std
+
+
+def _merged(information: Array, moments: Array, values: Array) -> tuple[Array, Array]:
+    """Blocks merged until the scores of neighbours hardly correlate."""
+    length = block_length(moments - information @ values)
+    return merged(information, length), merged(moments, length)
+
+
+def _shift(blocks: Array) -> tuple[Array, Array, int]:
+    """Least squares less instrumental variables (p,), its standard deviation, and the blocks.
+
+    Both estimates leave out the same block of time, so what they have in common cancels.
+    """
+    p = blocks.shape[-1] // 2
+    least, cross = blocks[:, p : 2 * p, p:], blocks[:, :p, p:]
+    total = blocks.sum(axis=0)
+    solution = solve(NormalEquations(total[p:-1, p:-1], total[p:-1, -1], 0.0, 0))
+    instrumental = solve_cross(total)
+    length = block_length(cross[:, :, -1] - cross[:, :, :-1] @ instrumental.values)
+    moved = [
+        left_out(part[:, :, :-1], part[:, :, -1] - part[:, :, :-1] @ values, right, left)
+        for part, values, right, left in (
+            (merged(least, length), solution.values, solution.root, solution.root),
+            (merged(cross, length), *instrumental[:3]),
+        )
+    ]
+    known = solution.determined & instrumental.determined
+    spread = np.sqrt(((moved[0] - moved[1]) ** 2).sum(axis=0))
+    shift = np.where(known, solution.values - instrumental.values, 0.0)
+    return shift, np.where(known, spread, 0.0), len(moved[0])
+
+
+def _words(test: EndogeneityTest, result: InstrumentalEstimate, joints: Sequence[str]) -> str:
+    """Put the answer in words."""
+    if result.weak:
+        listed = ", ".join(result.weak[:6])
+        more = f" and {len(result.weak) - 6} more" if len(result.weak) > 6 else ""
+        caution = f" The instruments are too weak for {listed}{more}."
+    else:
+        caution = ""
+    if np.isnan(test.p_value):
+        return (
+            "There is nothing to test: the instruments are the measured motion itself, or the"
+            f" recording is too short.{caution}"
+        )
+    worst = int(np.argmax(test.noise))
+    size = f"{test.noise[worst]:.1%} of the torque of {joints[worst]}"
+    figures = (
+        f"F({test.freedom[0]}, {test.freedom[1]}) = {test.statistic:.2f}, p = {test.p_value:.2g}"
+    )
+    if not test.biased:
+        return (
+            f"Nothing says that noise in the regressor has biased least squares ({figures}): what"
+            f" the instruments do not explain of it amounts to {size} and does not act like an"
+            f" error of measurement.{caution}"
+        )
+    moved = float(np.max(test.predicted))
+    answer = (
+        "Least squares is biased by noise in the regressor"
+        if test.matters
+        else "Noise in the regressor biases least squares measurably, but moves no axis's torque by"
+        f" {MATTERS:.1%} or more: too small to matter"
+    )
+    text = (
+        f"{answer} ({figures}). What the instruments do not explain amounts to {size};"
+        f" the two estimates differ by up to {moved:.1%} of an axis's torque"
+    )
+    if test.shifted:
+        text += f", beyond chance in {', '.join(test.shifted)}"
+    significance = test.coefficient / test.coefficient_std
+    if significance[int(np.nanargmax(np.abs(significance)))] > 0.0:
+        text += (
+            ". It does not act as noise of measurement does: a disturbance or error of the model"
+            " that moves the arm is the likelier cause"
+        )
+    advice = "" if not test.matters else " Use the instrumental variables, or less noisy positions."
+    return f"{text}.{advice}{caution}"

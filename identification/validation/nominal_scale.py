@@ -1,0 +1,205 @@
+"""How large each axis's torque is beside what the nominal inertias ask for.
+
+A torque constant or gear ratio that is wrong by a factor scales everything that is estimated of its
+axis: the fit is as good as ever, and only knowledge from elsewhere can tell. The measured torque of
+each axis is regressed on the nominal model's rigid torque with friction free, which changes by tens
+of per cent, and so are rotor inertias of which nobody knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.distributions import student_limit
+from identification.errors import IdentificationError
+from identification.estimators.nominal_prior import NOMINAL_SHARE
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.findings.finding import Finding, listed
+
+Array = NDArray[np.float64]
+
+_BLOCKS: Final = 20  # stretches of the recordings whose scatter gives the standard deviation
+# What a friction law does not describe, as a share of the friction (Bittencourt and Gunnarsson
+# 2012: some per cent with speed, load and position).
+_FRICTION_SHARE: Final = 0.03
+_LEAST_TOLD: Final = 0.5  # a tolerance, as a share of the scale, above which an axis says nothing
+# Links are wrong each in its own way, which counts where friction takes most of the torque. On a
+# simulated UR5 whose links were off by up to 10 % each no scale was off by more than 7 %.
+_LINKS_APART: Final = 0.05
+_SURE: Final = 2.0  # standard deviations
+# No arm's links are wrong by that much in a description in use: it is a unit, or torques of the
+# motors taken for those of the joints (gears turn 30 to 200 times).
+_IMPOSSIBLE: Final = 10.0
+_OTHER_UNIT: Final = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class NominalScale:
+    """Measured over nominal torque, n axes.
+
+    Attributes:
+        joint_names: (n,).
+        scale: (n,), NaN for an axis on which the nominal torque carries too little.
+        tolerance: what is no wonder in it (n,): half a 95 % interval, and what a wrong nominal
+            torque and a friction that its law does not describe may do; infinite likewise.
+    """
+
+    joint_names: tuple[str, ...]
+    scale: Array
+    tolerance: Array
+
+    @property
+    def off(self) -> NDArray[np.intp]:
+        """Axes whose scale is a wonder."""
+        told = self.tolerance < _LEAST_TOLD
+        return np.flatnonzero(
+            told & (np.abs(np.where(told, self.scale, 1.0) - 1.0) > self.tolerance)
+        )
+
+    @property
+    def common(self) -> float:
+        """Factor by which most axes are off alike: 1 where they are not.
+
+        Of a single axis a factor this large may be a nominal torque that is next to nothing beside
+        friction; of most axes it is a unit, or torques of the motors taken for those of the joints.
+        """
+        known = np.isfinite(self.scale) & (self.scale > 0.0)
+        if np.count_nonzero(known) < 2:
+            return 1.0
+        logs = np.log(self.scale[known])
+        sure = np.abs(self.scale[known] - 1.0) > self.tolerance[known]
+        alike = sure & (np.abs(logs) > np.log(_OTHER_UNIT)) & (logs * np.median(logs) > 0.0)
+        most = np.count_nonzero(alike) > len(logs) / 2
+        return float(np.exp(np.median(logs))) if most else 1.0
+
+    @property
+    def negated(self) -> bool:
+        """Whether the torque of every axis that says something has the other sign."""
+        known = np.isfinite(self.scale)
+        enough = np.count_nonzero(known) >= min(2, len(known))
+        return bool(enough and np.all(self.scale[known] + self.tolerance[known] < 0.0))
+
+    def findings(self) -> list[Finding]:
+        """What a verdict says: the axes that are off; nothing where none is."""
+        if self.negated:
+            known = np.flatnonzero(np.isfinite(self.scale))
+            figures = [f"{self.joint_names[j]} {self.scale[j]:.2g}" for j in known]
+            return [
+                Finding(
+                    "direction of axes",
+                    "wrong",
+                    "all torques seem to have the other sign: over that of the nominal inertias"
+                    f" they are {listed(figures)}",
+                    "give the torques of the column map scale = -1, or all torque constants the"
+                    " other sign",
+                )
+            ]
+        common = self.common
+        off = self.off if common == 1.0 else np.flatnonzero(np.isfinite(self.scale))
+        if not off.size:
+            return []
+        figures = [
+            f"{self.joint_names[j]} {self.scale[j]:.3g} ± {self.tolerance[j]:.2g}" for j in off
+        ]
+        names = [self.joint_names[j] for j in off]
+        step = f"check torque constant and gear ratio of {listed(names)}, what it carries"
+        if common != 1.0:
+            step = "check the unit of the torque (N·m, N·mm?), its side (motor or joint?)"
+        return [
+            Finding(
+                "scale of the torque",
+                "wrong" if abs(np.log(common)) > np.log(_IMPOSSIBLE) else "doubtful",
+                "the torque is not as large as the nominal inertias ask for, by a factor: "
+                + listed(figures),
+                f"{step}, and the masses of the URDF",
+            )
+        ]
+
+
+def nominal_scale(
+    model: RobotModel,
+    nominal: Array,
+    runs: Sequence[Samples],
+    *,
+    rotors_known: bool = False,
+    share: float = NOMINAL_SHARE,
+) -> NominalScale:
+    """Compare measured with nominal torque, axis by axis.
+
+    Args:
+        model: the robot.
+        nominal: parameters (p,) of the nominal model; its friction is not looked at.
+        runs: recordings.
+        rotors_known: whether the nominal parameters hold the rotors' inertias.
+        share: standard deviation of the nominal torque, as a share of it.
+
+    Raises:
+        IdentificationError: no recording.
+    """
+    if not runs:
+        raise IdentificationError("there is no recording to compare with the nominal model")
+    rank = model.base.rank
+    scale, tolerance = np.full(model.n_joints, np.nan), np.full(model.n_joints, np.inf)
+    regressors = [run.regressor(model) for run in runs]
+    for joint in range(model.n_joints):
+        columns = regressors[0].columns[joint]
+        inertial = columns < rank
+        tables, torques = [], []
+        for run, (blocks, _) in zip(runs, regressors, strict=True):
+            rows, block = run.usable[:, joint], blocks[joint]
+            table = [block[:, inertial] @ nominal[columns[inertial]], block[:, ~inertial]]
+            if not rotors_known:
+                turning = run.motion.acceleration[:, _turning(model, joint)]
+                table.append(run.as_measured(joint, turning))
+            tables.append(np.column_stack(table)[rows])
+            torques.append(run.torque[rows, joint])
+        scale[joint], tolerance[joint] = _scale(
+            np.concatenate(tables), np.concatenate(torques), share
+        )
+    return NominalScale(model.joint_names, scale, tolerance)
+
+
+def _turning(model: RobotModel, joint: int) -> list[int]:
+    """Joints whose acceleration the motors of a joint feel: its own, and coupled ones."""
+    if model.coupling is None:
+        return [joint]
+    turns = model.coupling.motor_from_joint
+    return sorted({joint, *np.flatnonzero((turns.T @ turns)[joint]).tolist()})
+
+
+def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
+    """Coefficient of the first column and what is no wonder in it; NaN if it says little."""
+    rigid, others = table[:, 0], table[:, 1:]
+    if len(torque) < 10 * _BLOCKS or not rigid.any():
+        return np.nan, np.inf
+    size = np.linalg.norm(others, axis=0)
+    basis, _ = np.linalg.qr(others[:, size > 0.0] / size[size > 0.0])
+    # What friction does not explain of the nominal torque as well.
+    alone = rigid - basis @ (basis.T @ rigid)
+    power = float(alone @ alone)
+    if not power > 1e-12 * float(rigid @ rigid):
+        return np.nan, np.inf
+    scale = float(alone @ torque) / power
+    friction = basis @ (basis.T @ (torque - scale * rigid))
+    left = torque - scale * rigid - friction
+    scores = [
+        float(part @ rest)
+        for part, rest in zip(
+            np.array_split(alone, _BLOCKS), np.array_split(left, _BLOCKS), strict=True
+        )
+    ]
+    std = np.sqrt(np.sum(np.square(scores)) * _BLOCKS / (_BLOCKS - 1)) / power
+    size_alone = np.sqrt(power)
+    lost = (np.linalg.norm(rigid) / size_alone) ** 2 - 1.0
+    misfit = _FRICTION_SHARE * np.linalg.norm(friction) / size_alone
+    wonder = _SURE * float(np.sqrt(share**2 * (1.0 + _LINKS_APART * lost) + misfit**2))
+    tolerance = student_limit(0.025, _BLOCKS - 1) * std + wonder
+    # Friction and noise have the unit of the torque, so a tolerance is large where the scale is.
+    told = tolerance < _LEAST_TOLD * max(1.0, abs(scale))
+    return (scale, float(tolerance)) if told else (np.nan, np.inf)

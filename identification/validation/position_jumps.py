@@ -1,0 +1,162 @@
+"""Steps of a measured position that no arm makes: an encoder that slipped, or lost its count.
+
+A joint that moves at a speed of v changes it by at most its acceleration times the step of the
+clock; its position therefore steps by about what the steps beside it say. A step that departs from
+these and is not taken back is no motion.
+
+A wrong time stamp, a missing row and a repeated one make every joint depart at once, each by its
+speed times one error of the time. What the other joints have in common with a departure is the
+clock's, and is taken off before it is judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.signals.recording import GAP_STEPS, Recording
+from identification.validation.findings.finding import Finding, listed
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+# Robust standard deviations that a step must depart by.
+_STANDS_OUT: Final = 15.0
+# The same against the largest departures that come in numbers (starts, stops, reversals).
+_USUAL: Final = 20  # departures
+_BEYOND_USUAL: Final = 3.0
+# Acceleration that turns a joint's speed within one step of the clock; robots reach a fifth of it.
+_FASTEST: Final = 150.0  # rad/s² or m/s²
+_BESIDE: Final = 4  # steps to either side
+_SHOWN: Final = 3
+# Standard deviations that other joints must move in a step to show that a row is missing.
+_SHOWS: Final = 5.0
+# Departures of whole steps of motion are sought to this share of one.
+_WHOLE: Final = 0.15
+
+
+@dataclass(frozen=True)
+class PositionJump:
+    """One step.
+
+    Attributes:
+        recording: its name.
+        joint: name.
+        time: of the sample after the step [s], since the recording began.
+        size: of the step, apart from the motion [rad or m].
+    """
+
+    recording: str
+    joint: str
+    time: float
+    size: float
+
+
+def position_jumps(recording: Recording, name: str = "the recording") -> list[PositionJump]:
+    """Lasting steps of the measured positions, in the order of time for each joint.
+
+    Args:
+        recording: positions in its stretches without gaps, at the times that
+            :func:`identification.signals.clock.true_times` decided on.
+        name: by which the jumps say where they are.
+    """
+    parts = [part for part in recording.segments() if part.stop - part.start > 2 * _BESIDE + 2]
+    if not parts:
+        return []
+    pieces = [_departures(recording.time[part], recording.position[part]) for part in parts]
+    departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
+    steps = np.concatenate([np.diff(recording.time[part]) for part in parts])[:, None]
+    after = np.concatenate([np.arange(part.start + 1, part.stop) for part in parts])
+    departure, shown = _without_clock(departure, speed, steps)
+    size = np.abs(departure)
+    spread = 1.4826 * np.median(size, axis=0)
+    usual = np.partition(size, -_USUAL, axis=0)[-_USUAL] if len(size) > 10 * _USUAL else 0.0
+    least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2)
+    suspect = (size - 0.5 * change > least) & (
+        shown | ~_whole_steps(departure, speed * steps, least)
+    )
+    return [
+        PositionJump(
+            name,
+            recording.joint_names[joint],
+            float(recording.time[after[k]] - recording.time[0]),
+            float(departure[k, joint]),
+        )
+        for joint, k in np.argwhere(suspect.T)
+        if _lasts(departure[:, joint], k)
+    ]
+
+
+def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
+    """By how much each step departs from the speed beside it (m - 1, n), and that speed.
+
+    Last what a change of speed from before it to after it explains: a stop is no jump.
+    """
+    steps = np.diff(time)[:, None]
+    speed = np.diff(position, axis=0) / steps
+    padded = np.pad(speed, ((_BESIDE, _BESIDE), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
+    before = np.median(windows[..., :_BESIDE], axis=-1)
+    after = np.median(windows[..., _BESIDE + 1 :], axis=-1)
+    # The mean of both sides' medians follows a steady acceleration; one more jump beside is none.
+    usual = 0.5 * (before + after)
+    return (speed - usual) * steps, usual, np.abs(after - before) * steps
+
+
+def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array, Rows]:
+    """Departures (m, n) without the error of the time that the other joints show.
+
+    Returns:
+        Whichever is less, with that error or without it; and where the others move fast enough
+        to show an error of one step (m, n).
+    """
+    # A joint at rest shows nothing: what does not depart is no measure of its noise.
+    size = np.abs(departure)
+    noise = np.array(
+        [1.4826 * np.median(some) if (some := d[d > 0.0]).size else np.inf for d in size.T]
+    )
+    way, rate = departure / noise, speed / noise
+    weight = (rate**2).sum(axis=1, keepdims=True) - rate**2
+    # The others' error of the time, drawn to zero by as much as one step is likely.
+    error = ((rate * way).sum(axis=1, keepdims=True) - rate * way) / (weight + steps**-2)
+    without = departure - speed * error
+    less = np.where(np.abs(without) < size, without, departure)
+    return less, weight * steps**2 > _SHOWS**2
+
+
+def _whole_steps(departure: Array, one: Array, least: Array) -> Rows:
+    """Where missing or repeated rows explain a departure (m, n) at the motion of `one` step."""
+    count = np.clip(np.rint(departure / np.where(one == 0.0, np.inf, one)), -1.0, GAP_STEPS)
+    return np.asarray(np.abs(departure - count * one) < np.maximum(least, _WHOLE * np.abs(one)))
+
+
+def _lasts(departure: Array, at: int) -> bool:
+    """Whether the steps that follow and precede do not take it back."""
+    around = departure[max(0, at - _BESIDE) : at + _BESIDE + 1]
+    return bool(np.abs(around.sum()) > 0.5 * np.abs(departure[at]))
+
+
+def jump_findings(jumps: Sequence[PositionJump]) -> list[Finding]:
+    """What a verdict says of jumps: nothing where there are none."""
+    if not jumps:
+        return []
+    names = tuple(dict.fromkeys(jump.joint for jump in jumps))
+    largest = sorted(jumps, key=lambda jump: -abs(jump.size))
+    where = [
+        f"{jump.joint} by {jump.size:+.3g} after {jump.time:.3f} s of {jump.recording}"
+        for jump in largest
+    ]
+    return [
+        Finding(
+            "position jumps",
+            "wrong",
+            "the measured position jumped where no arm can follow (rad or m): "
+            + listed(where, _SHOWN),
+            f"look at encoder, coupling and cable of {listed(names)}, and record again; or leave"
+            " out what was recorded after the jump",
+        )
+    ]

@@ -1,0 +1,240 @@
+"""How well a model predicts torque on motion it was not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError, ShapeError
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.signals.smoothing import low_pass
+
+Array = NDArray[np.float64]
+
+FRICTION_CHANGE: Final = 0.10
+FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionError:
+    """Sums over the rows of a prediction error e = measured - predicted, per joint (n,).
+
+    Kept as sums, so that runs add up: the error over all runs is the sum of theirs.
+
+    Attributes:
+        rows: rows that counted.
+        absolute: sum of |e|.
+        signed: sum of e.
+        squared: sum of e².
+        torque_sum: sum of measured torque.
+        torque_squared: sum of measured torque².
+    """
+
+    rows: NDArray[np.intp]
+    absolute: Array
+    signed: Array
+    squared: Array
+    torque_sum: Array
+    torque_squared: Array
+
+    @classmethod
+    def between(
+        cls, measured: Array, predicted: Array, usable: NDArray[np.bool_] | None = None
+    ) -> PredictionError:
+        """Error of predicted (m, n) against measured torque (m, n), over usable rows (m, n)."""
+        if measured.shape != predicted.shape:
+            raise ShapeError("predicted", predicted.shape, f"{measured.shape}, as measured")
+        counts = np.ones(measured.shape, dtype=np.bool_) if usable is None else usable
+        error = np.where(counts, measured - predicted, 0.0)
+        return cls(
+            rows=np.count_nonzero(counts, axis=0),
+            absolute=np.abs(error).sum(axis=0),
+            signed=error.sum(axis=0),
+            squared=(error**2).sum(axis=0),
+            torque_sum=np.where(counts, measured, 0.0).sum(axis=0),
+            torque_squared=(np.where(counts, measured, 0.0) ** 2).sum(axis=0),
+        )
+
+    def __add__(self, other: PredictionError) -> PredictionError:
+        """Error over both sets of rows."""
+        return PredictionError(
+            self.rows + other.rows,
+            self.absolute + other.absolute,
+            self.signed + other.signed,
+            self.squared + other.squared,
+            self.torque_sum + other.torque_sum,
+            self.torque_squared + other.torque_squared,
+        )
+
+    @property
+    def mean_absolute(self) -> Array:
+        """Mean |e| (n,) [N·m or N], the paper's Fig. 3."""
+        return self.absolute / np.maximum(self.rows, 1)
+
+    @property
+    def mean(self) -> Array:
+        """Mean e (n,) [N·m or N]: what the prediction is off by on average."""
+        return self.signed / np.maximum(self.rows, 1)
+
+    @property
+    def rms(self) -> Array:
+        """Root mean square of e (n,) [N·m or N]."""
+        return np.sqrt(self.squared / np.maximum(self.rows, 1))
+
+    @property
+    def torque_rms(self) -> Array:
+        """Root mean square of the measured torque (n,) [N·m or N]."""
+        return np.sqrt(self.torque_squared / np.maximum(self.rows, 1))
+
+    @property
+    def relative(self) -> Array:
+        """||e|| / ||tau|| of each joint (n,); NaN for a joint without a row or without torque."""
+        known = (self.rows > 0) & (self.torque_squared > 0.0)
+        return np.where(
+            known, np.sqrt(self.squared / np.where(known, self.torque_squared, 1.0)), np.nan
+        )
+
+    @property
+    def explained(self) -> Array:
+        """Share of each joint's torque variance that the prediction explains (n,), R².
+
+        One less the squared error over that of the best constant, the mean torque of these very
+        rows: zero or less is no better than a constant. NaN for a joint without rows or whose
+        torque does not vary.
+        """
+        varies = self.torque_squared - self.torque_sum**2 / np.maximum(self.rows, 1)
+        known = (self.rows > 0) & (varies > 1e-12 * self.torque_squared)
+        return np.where(known, 1.0 - self.squared / np.where(known, varies, 1.0), np.nan)
+
+    @property
+    def overall(self) -> float:
+        """||e|| / ||tau|| over all joints stacked; NaN without a row or without torque."""
+        torque = float(self.torque_squared.sum())
+        return float(np.sqrt(self.squared.sum() / torque)) if torque > 0.0 else float("nan")
+
+
+def residual(
+    model: RobotModel, values: Array, samples: Samples, bandwidth: float | None = None
+) -> Array:
+    """Torque measured less predicted (m, n), zero where a row is not usable.
+
+    Args:
+        model: the robot.
+        values: parameters (p,).
+        samples: one recording.
+        bandwidth: of a zero-phase low-pass on the result [Hz]; None for none.
+    """
+    return _usable_part(
+        samples, samples.torque - samples.predicted_torque(model, values), bandwidth
+    )
+
+
+def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Array:
+    """Torque (m, n) with zero for the rows that are not usable, then low-passed."""
+    torque = np.where(samples.usable, torque, 0.0)
+    if bandwidth is None:
+        return torque
+    slow = np.zeros_like(torque)
+    for segment in samples.segments:
+        if samples.usable[segment].any():
+            slow[segment] = low_pass(samples.motion.time[segment], torque[segment], bandwidth)
+    return slow
+
+
+class SlowError(NamedTuple):
+    """Slow error of a prediction, and what a change of friction explains of it.
+
+    Attributes:
+        error: what is left.
+        friction_change: share by which each joint's friction torque would have to be larger than
+            predicted (n,), of any size.
+        apart: what would be left if all of that change were taken off.
+    """
+
+    error: PredictionError
+    friction_change: Array
+    apart: PredictionError
+
+
+def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: float) -> SlowError:
+    """Low-passed error of a prediction, apart from a change of friction since the fit.
+
+    Friction follows the temperature of the gears: between training and validation it may differ
+    by some per cent without anything being wrong with the model. Each joint's whole friction
+    torque may therefore be scaled, by one number within `FRICTION_CHANGE`, before the error is
+    taken.
+
+    Args:
+        model: the robot.
+        values: parameters (p,).
+        samples: one run.
+        bandwidth: of the low-pass [Hz].
+    """
+    error = residual(model, values, samples, bandwidth)
+    friction = samples.predicted_torque(model, np.where(model.friction_columns, values, 0.0))
+    friction = _usable_part(samples, friction, bandwidth)
+    usable = samples.usable
+    power = (friction**2 * usable).sum(axis=0)
+    change = (friction * error * usable).sum(axis=0) / np.where(power > 0.0, power, 1.0)
+
+    def less(share: Array) -> PredictionError:
+        left = error - share * friction
+        return PredictionError.between(samples.torque, samples.torque - left, usable)
+
+    forgiven = np.clip(change, -FRICTION_CHANGE, FRICTION_CHANGE)
+    return SlowError(less(forgiven), change, less(change))
+
+
+def prediction_error(
+    model: RobotModel,
+    values: Array,
+    runs: Iterable[Samples],
+    *,
+    bandwidth: float | None = None,
+    all_rows: bool = False,
+) -> tuple[PredictionError, ...]:
+    """Prediction error of parameters (p,) on each of several runs.
+
+    Args:
+        model: the robot.
+        values: parameters (p,).
+        runs: motions that were not used to estimate the values, if the error is to mean much.
+        bandwidth: of a low-pass on the error [Hz], but not on the torque it is related to.
+        all_rows: count rows at standstill and near ends as well, where no model of sliding
+            friction can be right; without `bandwidth` only.
+    """
+    if all_rows:
+        return tuple(
+            PredictionError.between(run.torque, run.predicted_torque(model, values)) for run in runs
+        )
+    return tuple(
+        PredictionError.between(
+            run.torque, run.torque - residual(model, values, run, bandwidth), run.usable
+        )
+        for run in runs
+    )
+
+
+def over_all(runs: Iterable[PredictionError]) -> PredictionError:
+    """Error over all runs together.
+
+    Raises:
+        IdentificationError: no runs.
+    """
+    errors = list(runs)
+    if not errors:
+        raise IdentificationError("there is no run to validate on")
+    total = errors[0]
+    for error in errors[1:]:
+        total = total + error
+    return total
+
+
+def for_figure(time: Array, torque: Array, bandwidth: float = FIGURE_BANDWIDTH) -> Array:
+    """Torque (m, n) through a zero-phase low-pass, as the paper draws it (Fig. 4)."""
+    return low_pass(time, torque, bandwidth)
