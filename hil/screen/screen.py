@@ -274,7 +274,7 @@ class Screen:
             self._wish = after(self._wish, key, override)
 
     def _left(self, status: RunStatus) -> str:
-        waiting = self._pace.left(status.time_left)
+        waiting = self._pace.left(status)
         if waiting is None:
             return f"{marks.clock(status.time_left)} of motion left"
         return f"{marks.clock(waiting)} left"
