@@ -24,7 +24,7 @@ from identification import IdentificationError
 from planner import PlannerError
 
 from .failing import INTERNAL, asks_for_json, exit_code_of, told_as_json
-from .lazy import LazyCommands
+from .lazy import LazyCommands, without_flag_types
 
 COMMANDS = LazyCommands(
     (
@@ -60,6 +60,7 @@ class Group(TyperGroup):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**{**settings, "commands": COMMANDS})
+        without_flag_types(self)
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """The context of one call, which knows whether JSON is asked for."""
