@@ -82,7 +82,7 @@ def test_essential_estimates_far_from_the_truth_are_marked(arm: IdentifiedArm) -
         for parameter in sections.parameters
     ]
     rows = essential.essential_part(sections, essential_part(sections)).rows  # type: ignore[arg-type]
-    assert [(row.deviation, row.mark) for row in rows[:2]] == [("+4.00", "out3"), ("−2.50", "out2")]
+    assert [(row.deviation, row.mark) for row in rows[:2]] == [("+4.00", "out3"), ("-2.50", "out2")]
     assert {row.mark for row in rows[2:]} == {""}
 
 
