@@ -13,6 +13,7 @@ HilError                   exit status 1
 ├── OperatorStopError         130: a person stopped the work
 ├── OutputError            1: what was found cannot be written: disk full, no permission
 └── InputError             2: something the user gave cannot be used: file, field, problem, remedy
+                           (1 on the command line, where a disk refused: `DISK_REFUSES`)
     ├── ArchiveError       an archive that cannot be read or written
     │   ├── NotAnArchiveError       not ours: other format, empty, torn at its head
     │   ├── ArchiveVersionError     written by a newer version of the archive profile
@@ -27,13 +28,17 @@ HilError                   exit status 1
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar, Self
+from typing import ClassVar, Final, Self
 
 from hil.printable import printable
+
+DISK_REFUSES: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG})
+"""Numbers of an OSError that nothing typed or given can mend: full, over quota, broken."""
 
 
 class HilError(Exception):

@@ -115,12 +115,17 @@ class Closed:
 
 @dataclass(frozen=True)
 class Failed:
-    """Archive `job` could not be opened or written further; what was flushed is whole."""
+    """Archive `job` could not be opened or written further; what was flushed is whole.
+
+    Attributes:
+        errno: the operating system's number of the failure, None where it was none of its own.
+    """
 
     job: int
     path: str
     problem: str
     remedy: str
+    errno: int | None = None
 
 
 Command = Open | Close | Serve | End

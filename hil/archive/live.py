@@ -25,6 +25,7 @@ from hil.archive.live_view import LiveView, LiveViewError
 from hil.archive.messages import encode_log
 from hil.archive.schema import EVENT_CHANNEL, Channel, CycleEncoder
 from hil.archive.wording import describe, level_of
+from hil.version import install_command
 
 if TYPE_CHECKING:
     import foxglove
@@ -141,7 +142,7 @@ def _serve(view: LiveView) -> tuple[WebSocketServer, foxglove.Context]:
     try:
         import foxglove
     except ImportError as error:
-        remedy = "install it: pip install 'hil[live]'"
+        remedy = f"install it: {install_command('live')}"
         raise LiveViewError(None, "--live needs the library foxglove-sdk", remedy=remedy) from error
     context = foxglove.Context()
     try:

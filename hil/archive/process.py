@@ -350,7 +350,9 @@ class ArchiveProcess:
             path, problem, remedy = str(error.path), error.problem, error.remedy
         else:
             path, problem, remedy = "", f"{type(error).__name__}: {error}", ""
-        self._answer(Failed(number, path, problem, remedy))
+        cause = error if isinstance(error, OSError) else error.__cause__
+        number_of_cause = cause.errno if isinstance(cause, OSError) else None
+        self._answer(Failed(number, path, problem, remedy, number_of_cause))
 
     def _answer(self, answer: Answer) -> None:
         if self._commands is None:

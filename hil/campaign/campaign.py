@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -50,6 +51,8 @@ class Campaign:
         cell: Cell,
         excitation: Excitation | CampaignPlan,
         checks: MotionChecks | None = None,
+        *,
+        exist_ok: bool = False,
     ) -> Campaign:
         """A new campaign folder with its own copies of cell, URDF and plan.
 
@@ -59,9 +62,12 @@ class Campaign:
             excitation: an excitation, around which validation motions are drawn as `[campaign]`
                 says; or a whole plan, with validation motions of its own.
             checks: those of the cell, where they are at hand.
+            exist_ok: open the campaign that the folder holds already, if its cell and its
+                excitation are these.
 
         Raises:
-            CampaignFolderError: the folder holds something already.
+            CampaignFolderError: the folder holds something already; with `exist_ok`, something
+                else than this campaign.
             MotionRefusedError: the plan can never run on the cell; no folder was made.
             NoExcitationError: no validation motion keeps the constraints of the cell.
             WrongObjectError: it was given something that is no cell or no excitation.
@@ -77,6 +83,8 @@ class Campaign:
             "a CampaignPlan",
         )
         plan = excitation
+        if exist_ok and CampaignFolder(root).plan.exists():
+            return cls.open(root)._if_of(cell, plan)
         if isinstance(plan, Excitation):
             checks = checks or MotionChecks.of(cell)
             plan = plan_around(cell, plan, checks)
@@ -116,6 +124,25 @@ class Campaign:
                 there.root, "is not a campaign folder", "name one that has plan.json"
             )
         return cls(there, Cell.load(there.cell), CampaignPlan.load(there.plan))
+
+    def _if_of(self, cell: Cell, wanted: Excitation | CampaignPlan) -> Campaign:
+        """This campaign.
+
+        Raises:
+            CampaignFolderError: its cell or its excitation is another one.
+        """
+        own = cell.with_urdf(self.folder.cell, self.folder.urdf.name)
+        same = (own.text, own.urdf) == (self.cell.text, self.cell.urdf)
+        if isinstance(wanted, CampaignPlan):
+            fits = self.plan.to_text() == wanted.to_text()
+        else:
+            fits = json.dumps(self.plan.excitation.to_dict()) == json.dumps(wanted.to_dict())
+        if not same or not fits:
+            what = "excitation" if same else "cell"
+            raise CampaignFolderError(
+                self.folder.root, f"holds a campaign with another {what}", "name a new folder"
+            )
+        return self
 
     def __repr__(self) -> str:
         return f"Campaign({str(self.folder.root)!r}, cell {self.cell.name!r})"

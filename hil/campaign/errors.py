@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -145,4 +146,7 @@ class ArmChangedError(RepetitionsRejectedError):
 
 def write_error(failed: Failed) -> ArchiveWriteError:
     """What is raised where the archive process cannot write."""
-    return ArchiveWriteError(failed.path or None, failed.problem, remedy=failed.remedy)
+    error = ArchiveWriteError(failed.path or None, failed.problem, remedy=failed.remedy)
+    if failed.errno is not None:
+        error.__cause__ = OSError(failed.errno, os.strerror(failed.errno))
+    return error

@@ -8,7 +8,7 @@ with the first motion that is missing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -236,8 +236,10 @@ class _Run:
         require_joined(joined)
         seen = None if self._choices.unrehearsed else seen_in_dry_run(self._folder)
         ways = Ways(self._cell, checks, joined, seen)
-        slow = sum(one.trajectory.duration for one in dry) / OVERRIDE
-        total = slow + sum(one.trajectory.duration for one in joined[len(dry) :])
+        times = _times(joined, len(dry), ways, self._cell.campaign.approach_speed)
+        if any(one.kind != "standstill" for one in missing):
+            times += self._warm_up.expected()
+        total = sum(times)
         with self._reporter.task("running the campaign (s of motion)", total) as task:
             runner = Runner(
                 self._cell,
@@ -250,7 +252,7 @@ class _Run:
                 where,
                 archives,
             )
-            self._watch.time_left = total
+            self._watch.time_left, self._watch.motions_left = total, len(times)
             if dry:
                 self._dry_run.run(runner, self._entering)
                 self._settle_dry_run()
@@ -320,6 +322,21 @@ class _Run:
             cycles=cycles,
             notes=tuple(notes),
         )
+
+
+def _times(joined: Sequence[Interval], dry: int, ways: Ways, approach_speed: float) -> list[float]:
+    """Seconds of each motion and way: slow are the first `dry`, and ways that nobody has seen."""
+    times, first = [], dry > 0
+    slow_way = min(1.0, OVERRIDE / approach_speed)
+    for one in joined:
+        share = OVERRIDE if dry else 1.0
+        if one.kind == "move":
+            unseen = one.from_arm if first else ways.unseen(one)
+            share = slow_way if dry or unseen else 1.0
+        elif dry:
+            dry -= 1
+        times.append(one.trajectory.duration / share)
+    return times
 
 
 def _is_virtual(cell: Cell) -> bool:

@@ -102,7 +102,6 @@ class Runner:
         if self.stop.requested:
             raise MotionFailedError(str(interval), "stopped", "it had not begun")
         spec, duration = self.archiving.spec(interval), interval.trajectory.duration
-        self.watch.time_left = max(0.0, self.watch.time_left - duration / most)
         self.watch.begin(interval.kind, number, total, duration, most)
         ended = self.link.run(
             player_of(self.cell, interval.trajectory),

@@ -27,7 +27,8 @@ class RunWatch:
     Attributes:
         operator: who looks.
         stop: brings the arm to rest on its path.
-        time_left: s of motion after the present one, at full speed.
+        time_left: s of motion after the present one, each at the largest override it may have.
+        motions_left: after the present one.
         drift: of the warm-up so far.
         began: when the present motion began, or the last one [s since 1970]; later than it was
             asked for where it was held.
@@ -38,6 +39,7 @@ class RunWatch:
     operator: Operator
     stop: Stop
     time_left: float = 0.0
+    motions_left: int = 0
     drift: DriftCurve | None = None
     began: float = 0.0
     blind: Exception | None = None
@@ -52,6 +54,11 @@ class RunWatch:
     _wish: Wish = field(default_factory=Wish)
     _notes: tuple[str, ...] = ()
 
+    def expect(self, seconds: float) -> None:
+        """One more motion is to come, of so many s."""
+        self.time_left += seconds
+        self.motions_left += 1
+
     def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
         """The next motion.
 
@@ -62,6 +69,8 @@ class RunWatch:
             duration: at full speed [s].
             most: largest override.
         """
+        self.time_left = max(0.0, self.time_left - duration / most)
+        self.motions_left = max(0, self.motions_left - 1)
         self._phase, self._number, self._total = _phase_of(kind), number, total
         self._duration, self._most = duration, most
         self._shown, self.began = False, time.time()
@@ -69,6 +78,7 @@ class RunWatch:
 
     def note(self, text: str) -> None:
         """A line on the quality of a motion."""
+        self._duration = 0.0  # notes are written between motions
         self._notes = (*self._notes, text)[-NOTES:]
         self._tell(None)
 
@@ -109,8 +119,8 @@ class RunWatch:
         if self.blind is not None:
             return
         done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
-        speed = max(min(self._most, self._wish.override), 0.01)
-        left = (max(self._duration - done, 0.0) + self.time_left) / speed
+        wished = max(self._wish.override, 0.01)
+        left = max(self._duration - done, 0.0) / min(self._most, wished) + self.time_left / wished
         status = RunStatus(
             self._phase,
             self._number,
@@ -119,6 +129,7 @@ class RunWatch:
             motion=progress,
             drift=self.drift,
             notes=self._notes,
+            motions_left=self.motions_left,
         )
         try:
             self.operator.show(status)

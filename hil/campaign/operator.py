@@ -42,8 +42,9 @@ class RunStatus:
         phase: what the motion is for.
         number: which of its kind, from 1.
         total: how many there are of its kind; of a warm-up, how many there may be.
-        time_left: of motion to the end of the run, the present one at its override [s]; a warm-up
-            counts motion by motion, for nobody knows its length.
+        time_left: of motion to the end of the run, the present one at its override [s]; of a
+            warm-up, whose length nobody knows, at least as many motions as it has to have.
+        motions_left: after the present one.
         motion: of the motion that is being run; None between two.
         drift: of the warm-up so far, None where there is none.
         notes: on the quality of the last repetitions, newest last.
@@ -56,6 +57,7 @@ class RunStatus:
     motion: MotionProgress | None = None
     drift: DriftCurve | None = None
     notes: tuple[str, ...] = field(default=())
+    motions_left: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,7 +92,7 @@ def play_until_good(
             warmth.moved()
         if problem is None:
             return name
-        watch.time_left += interval.trajectory.duration
+        watch.expect(interval.trajectory.duration)
         watch.note(f"{interval}: rejected, {problem.sentence}")
         reporter.say(
             f"{interval} ({name}) is rejected: {problem.sentence}; the motion is run again"

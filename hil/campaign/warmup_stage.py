@@ -73,6 +73,15 @@ class WarmUpStage:
             return None
         return self._interval(self._found() or self._new())
 
+    def expected(self) -> list[float]:
+        """Durations [s] of the motions that it runs at least."""
+        motion = self.next_motion()
+        state = self._found() or self._new()
+        if motion is None or state.outcome != "going on":
+            return []
+        missing = self._cell.campaign.warmup_least - len(state.motions)
+        return [motion.trajectory.duration] * max(missing, 0)
+
     def run(self, runner: Runner, entering: Entering) -> None:
         """Run as many motions as it takes; none where the arm is warm, or none are wanted.
 
@@ -85,7 +94,8 @@ class WarmUpStage:
         self._watch.drift = state.curve
         while state.outcome == "going on":
             interval = self._interval(state)
-            self._watch.time_left += interval.trajectory.duration
+            if len(state.motions) >= self._cell.campaign.warmup_least:
+                self._watch.expect(interval.trajectory.duration)
             name = play_until_good(
                 runner,
                 entering,

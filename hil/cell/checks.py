@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 URDF_ROUNDING = 1e-5
 """Relative; a data sheet's degrees and a URDF's radians are rounded differently."""
 
+_SAME_NUMBER = 0.01  # relative
+_FULL_TURN = 6.3  # degrees; as radians it is one turn
+
 _MAY_BE_EMPTY = {
     "nominal.third",
     "limits.torque",
@@ -116,6 +119,7 @@ def check_built(cell: Cell) -> None:
         return
     if file.drive_train is not None or file.limits.frame == "urdf":
         _build(cell, "limits", "joint_limits")
+        _check_degrees(cell)
         _check_against_urdf(cell)
         _check_postures(cell)
     if file.drive_train is not None:
@@ -134,6 +138,15 @@ def _build(cell: Cell, table: str, attribute: str) -> None:
 def _check_postures(cell: Cell) -> None:
     """Postures named in the file lie inside its limits."""
     limits, file = cell.joint_limits, cell.file
+    table = file.limits
+    assert table is not None
+    remedy = "name a posture that the arm can take"
+    if np.abs([table.lower_deg, table.upper_deg]).max() < _FULL_TURN:
+        remedy += (
+            ", or correct the limits: no joint may go further than "
+            f"{np.abs([table.lower_deg, table.upper_deg]).max():.4g}°; are they in rad? "
+            "1 rad is 57.2958°"
+        )
     postures = {}
     if file.campaign is not None:
         postures["campaign.home_deg"] = cell.home
@@ -147,8 +160,29 @@ def _check_postures(cell: Cell) -> None:
                     field,
                     None,
                     f"{name} stands outside [limits]",
-                    "name a posture that the arm can take",
+                    remedy,
                 )
+
+
+def _check_degrees(cell: Cell) -> None:
+    """No list in degrees holds what the URDF states in radians."""
+    table, allowed = cell.file.limits, urdf_limits(cell.urdf, cell.joint_names)
+    assert table is not None
+    ranges = np.subtract(table.upper_deg, table.lower_deg)
+    for field, given, radians, unit in (
+        ("lower_deg", ranges, allowed.upper - allowed.lower, "rad"),
+        ("velocity_deg", np.array(table.velocity_deg), allowed.velocity, "rad/s"),
+    ):
+        stated = np.isfinite(radians)
+        if stated.any() and np.allclose(given[stated], radians[stated], rtol=_SAME_NUMBER):
+            raise CellError(
+                cell.path,
+                f"limits.{field}",
+                getattr(table, field),
+                f"is in degrees, and the URDF has these numbers in {unit}",
+                "multiply them by 57.2958"
+                + (" (those of upper_deg too)" if field == "lower_deg" else ""),
+            )
 
 
 def _check_against_urdf(cell: Cell) -> None:

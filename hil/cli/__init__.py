@@ -1,9 +1,9 @@
 """The command line: a thin shell over the package.
 
-Exit status: 0 done, 1 internal error or a result that cannot be written, 2 bad input, 3 refused as
-unsafe, 4 controller fault, 5 done, but not good (a model, a PC that is not fit for the cycle,
-archives of a batch that could not be used), 130 stopped by the operator. With `--json` stdout is
-one JSON object, also where the command fails (`hil.cli.failing`).
+Exit status: 0 done, 1 internal error or a disk that is full or refuses to be written, 2 bad input,
+3 refused as unsafe, 4 controller fault, 5 done, but not good (a model, a PC that is not fit for
+the cycle, archives of a batch that could not be used), 130 stopped by the operator. With `--json`
+stdout is one JSON object, also where the command fails (`hil.cli.failing`).
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
-from hil.errors import HilError, OperatorStopError
+from hil.errors import DISK_REFUSES, HilError, OperatorStopError
 from hil.printable import printable
 from hil.version import software
 from identification import IdentificationError
 from planner import PlannerError
 
-from .failing import asks_for_json, exit_code_of, told_as_json
-from .lazy import LazyCommands
+from .failing import INTERNAL, asks_for_json, exit_code_of, told_as_json
+from .lazy import LazyCommands, without_flag_types
 
 COMMANDS = LazyCommands(
     (
@@ -60,6 +60,7 @@ class Group(TyperGroup):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**{**settings, "commands": COMMANDS})
+        without_flag_types(self)
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """The context of one call, which knows whether JSON is asked for."""
@@ -115,6 +116,11 @@ def main() -> None:
         app(standalone_mode=True)
     except (HilError, IdentificationError, PlannerError) as error:
         _fail(str(error), exit_code_of(error), stopped=isinstance(error, OperatorStopError))
+    except OSError as error:
+        if error.errno not in DISK_REFUSES:
+            raise
+        file = f"{error.filename}: " if error.filename else ""
+        _fail(f"{file}cannot be written ({error.strerror}); make room", INTERNAL)
     except KeyboardInterrupt:
         _fail("interrupted", 130, stopped=True)
 

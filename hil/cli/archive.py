@@ -13,6 +13,7 @@ from hil.archive.check import ASPECTS, Check, check_archive
 from hil.archive.overview import Overview, overview
 from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
+from hil.cli.failing import exit_code_of
 from hil.errors import ArchiveError, InputError
 from hil.printable import printable
 
@@ -35,7 +36,7 @@ def info(files: Files, as_json: Json = False) -> None:
         try:
             found = overview(path)
         except ArchiveError as error:
-            failed = error.exit_code
+            failed = exit_code_of(error)
             _say_error(path, error, as_json=as_json)
             continue
         typer.echo(json.dumps(found.to_dict()) if as_json else _shown(_info_lines(found)))

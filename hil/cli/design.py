@@ -17,6 +17,7 @@ from hil.campaign.from_design import campaign_of_design, require_replaceable
 from hil.campaign.stop import Stop, stop_on_interrupt
 from hil.cell import Cell
 from hil.design import DesignSettings, Method, load_settings, preset
+from hil.design.advice import NoExcitationError
 from hil.design.compare import references
 from hil.design.earlier import known_from
 from hil.design.folder import DesignFolder, require_same
@@ -174,18 +175,26 @@ def design(
         words.draw(folder, done, loaded, beside, together=known is not None)
 
     with _stoppable(folder) as stop:
-        done = run_design(
-            folder,
-            loaded,
-            asked,
-            reporter,
-            workers=workers or len(os.sched_getaffinity(0)),
-            known=known,
-            stop=lambda: stop.requested,
-            resume=resume,
-            force=force,
-            then=finish,
-        )
+        try:
+            done = run_design(
+                folder,
+                loaded,
+                asked,
+                reporter,
+                workers=workers or len(os.sched_getaffinity(0)),
+                known=known,
+                stop=lambda: stop.requested,
+                resume=resume,
+                force=force,
+                then=finish,
+            )
+        except NoExcitationError as error:
+            if not folder.settings.exists():  # nothing was begun
+                raise
+            raise NoExcitationError(
+                f"{error}; then repeat the command with --force, or with --resume where cell and "
+                "settings stay as they are"
+            ) from error
     if not done.design.complete:
         raise OperatorStopError(
             f"stopped before the end of the search; the best motion so far is in {folder.result}; "

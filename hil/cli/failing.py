@@ -12,10 +12,12 @@ from typing import Any
 
 import typer
 
-from hil.errors import HilError, InputError, OperatorStopError
+from hil.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
 from identification import IdentificationError
 from planner import PlannerError
 
+INTERNAL = 1
+"""Exit status of an internal error, and where a disk is full or refuses to be written."""
 USAGE = 2
 """Exit status where something that was typed or given cannot be used."""
 
@@ -28,6 +30,11 @@ def asks_for_json(arguments: Sequence[str]) -> bool:
 
 def exit_code_of(error: BaseException) -> int:
     """The exit status that an error ends the command line with."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in DISK_REFUSES:
+            return INTERNAL
+        cause = cause.__cause__
     if isinstance(error, PlannerError | IdentificationError):
         return USAGE
     code = getattr(error, "exit_code", 1)  # HilError, and what typer says of a wrong command line

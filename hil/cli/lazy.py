@@ -44,4 +44,16 @@ def _command(name: str, module: str) -> Any:
         alone.command(name)(getattr(found, name))
     group = typer.main.get_command(alone)
     assert isinstance(group, TyperGroup)
-    return group.commands[name]
+    return without_flag_types(group.commands[name])
+
+
+def without_flag_types(command: Any) -> Any:
+    """The command, in whose help nothing stands behind a flag: nothing is typed there."""
+    help_option = command.get_help_option(typer.Context(command))
+    for option in (*command.params, help_option):
+        if getattr(option, "is_flag", False):
+            option.metavar = ""
+    if not isinstance(commands := getattr(command, "commands", {}), LazyCommands):
+        for one in commands.values():
+            without_flag_types(one)
+    return command

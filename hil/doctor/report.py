@@ -20,7 +20,7 @@ _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.
 _BAR = 40
 _OTHERWISE = (
     "If it is still not fit after that: switch off C-states, frequency stepping and "
-    "hyper-threading in the firmware set-up (BIOS); isolate a processor; use 2 ms; use another PC."
+    "hyper-threading in the firmware set-up (BIOS); isolate a processor; {}use another PC."
 )
 
 
@@ -36,7 +36,8 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
     for line in remedies(diagnosis.checks):
         console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     if not diagnosis.wanted.fit:
-        console.print(f"\n{_OTHERWISE}", markup=False, highlight=False, soft_wrap=True)
+        otherwise = _OTHERWISE.format("use 2 ms; " if diagnosis.two.fit else "")
+        console.print(f"\n{otherwise}", markup=False, highlight=False, soft_wrap=True)
     console.print()
     colour = "green" if diagnosis.fit else "red"
     console.print(

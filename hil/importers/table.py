@@ -93,8 +93,15 @@ class Table:
         if _FORTRAN.search(lines[0]):
             lines = [_FORTRAN.sub("e", line) for line in lines]
         width = len(_cells(lines[0], delimiter))
-        if not names and width > 1 and not _cells(lines[0], delimiter)[-1].strip():
+        if len(names) < width > 1 and not _cells(lines[0], delimiter)[-1].strip():
             width -= 1  # each line ends with a delimiter
+        if names and len(names) < width:
+            raise SourceError(
+                path,
+                f"has {len(names)} names ({', '.join(names)}) above rows of {width} numbers",
+                remedy="give the others their names, or count columns from 0: [format] header = "
+                "false and skip_rows",
+            )
         return cls(path, names, width, lines, numbers, delimiter, form.missing == "drop")
 
     def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:

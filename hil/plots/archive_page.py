@@ -27,7 +27,7 @@ def archive_page(view: ArchiveView) -> bytes:
     shown = f"{view.start:.3f} s to {view.stop:.3f} s of {facts.duration:.3f} s"
     rows = [
         ("shown", shown),
-        ("angles", view.angles),
+        ("frame", view.frame),
         ("joints", ", ".join(facts.joint_names)),
         ("cycle", "not fixed" if facts.period is None else f"{1e3 * facts.period:g} ms"),
         ("samples", str(facts.samples)),

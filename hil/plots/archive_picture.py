@@ -171,7 +171,7 @@ def _headline(figure: Figure, view: ArchiveView, height: float) -> None:
         cell,
         f"{shown:.2f} s {part}",
         f"{facts.samples} samples",
-        view.angles,
+        view.frame,
         _missed(view),
         facts.lost,
         facts.damage or "",

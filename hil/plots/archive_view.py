@@ -88,7 +88,7 @@ class ArchiveView:
         states: (from [s], to [s], name) of the session; none in an imported recording.
         events: (s, name, text, whether it is a warning or worse) within the time shown.
         gaps: s at which packets were missed.
-        angles: whose angles, in words.
+        frame: of positions, speeds and torques, in words.
     """
 
     facts: Overview
@@ -99,7 +99,7 @@ class ArchiveView:
     states: tuple[tuple[float, float, str], ...] = ()
     events: tuple[tuple[float, str, str, bool], ...] = ()
     gaps: Array = field(default_factory=lambda: np.zeros(0))
-    angles: str = ""
+    frame: str = ""
 
 
 def view_of(
@@ -155,7 +155,7 @@ def view_of(
         states=tuple(collected.states),
         events=events,
         gaps=np.array(collected.gaps),
-        angles=scales.whose,
+        frame=scales.frame,
     )
 
 
@@ -192,7 +192,7 @@ class _Scales:
     sign: Array
     offset: Array
     slides: NDArray[np.bool_]
-    whose: str
+    frame: str
     motor_from_joint: Array | None
     limits: Mapping[str, tuple[Array, Array]]
 
@@ -218,7 +218,7 @@ class _Scales:
         motors = None
         if cell is not None and cell.file.drive_train is not None:
             motors = cell.drive_train.motor_from_joint
-        return cls(frame.sign, frame.offset, slides, frame.whose, motors, limits)
+        return cls(frame.sign, frame.offset, slides, _words(frame), motors, limits)
 
     def limit(self, name: str, joint: int) -> tuple[float | None, float | None]:
         if name not in self.limits:
@@ -233,11 +233,20 @@ class _Scales:
     def rate(self, rate: Array) -> Array:
         return np.where(self.slides, 1e3 * rate, np.degrees(rate * self.sign))
 
+    def torque(self, torque: Array) -> Array:
+        """As the joint turns, so that torque times speed stays the power."""
+        return np.where(self.slides, torque, torque * self.sign)
+
     def following(self, error: Array) -> Array:
         """Motor revolutions where the drive train is known, else as positions."""
         if self.motor_from_joint is None:
             return self.rate(error)
         return np.asarray(error @ self.motor_from_joint.T / _TURN)
+
+
+def _words(frame: AngleFrame) -> str:
+    whose = "as on the teach pendant" if frame.name == "controller" else "of the URDF"
+    return f"angles, speeds and torques {whose}"
 
 
 def _both(limit: Array) -> tuple[Array, Array]:
@@ -363,7 +372,7 @@ def _shown(columns: Mapping[str, NDArray[Any]], scales: _Scales) -> Iterator[tup
     if current is not None:
         yield "current", current
     if "torque" in columns:
-        yield "torque", columns["torque"]
+        yield "torque", scales.torque(columns["torque"])
     if "target_position" in columns and "position" in columns:
         error = scales.following(columns["target_position"] - columns["position"])
         # Before the drive is on the controller reports no target.

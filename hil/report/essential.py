@@ -8,7 +8,9 @@ from typing import Any, Final
 
 from hil.report import numbers
 from hil.report.figures.elimination import elimination_panels
+from hil.report.parameters import deviation, mark
 from hil.results import BlindResult, EssentialResult, ParameterResult, Results
+from hil.results.essential import EssentialParameter
 
 _WELL: Final = 0.1
 _ROUGHLY: Final = 0.5
@@ -41,6 +43,10 @@ class EssentialRow:
     full: str
     """The same parameter in the model with all parameters."""
     truth: str
+    deviation: str
+    """From the truth, in standard deviations."""
+    mark: str
+    """`out2` or `out3` where that is more than 2 or 3, as in the table of all parameters."""
     learned: str
     """Whether the data say more than the nominal figures; empty without these."""
     refused: bool
@@ -120,12 +126,19 @@ def essential_part(results: Results, essential: EssentialResult) -> EssentialPar
                 ),
                 full=numbers.beside(full[one.name].estimate, full[one.name].std),
                 truth=numbers.beside(full[one.name].truth, one.std),
+                deviation=numbers.fixed(_deviation(one, full[one.name]), 2, sign=True),
+                mark=mark(_deviation(one, full[one.name])),
                 learned=_LEARNED[full[one.name].learned],
                 refused=one.name in essential.refused,
             )
             for one in kept
         ],
     )
+
+
+def _deviation(one: EssentialParameter, full: ParameterResult) -> float | None:
+    """Of the essential model's estimate from the truth; None without one."""
+    return deviation(full.model_copy(update={"estimate": one.estimate, "std": one.std}))
 
 
 def _blind(blind: BlindResult | None) -> str:

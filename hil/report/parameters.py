@@ -155,12 +155,13 @@ def _row(p: ParameterResult, factor: float) -> ParameterRow:
         relative_std=numbers.percent(p.std / abs(p.estimate) if p.estimate else math.inf),
         repetition_mean=numbers.beside(p.repetition_mean, p.std),
         repetition_std=numbers.significant(p.repetition_std, 2),
-        mark=_mark(z),
+        mark=mark(z),
         significant=is_significant(p, factor),
     )
 
 
-def _mark(z: float | None) -> str:
+def mark(z: float | None) -> str:
+    """`out3` or `out2` for a deviation beyond 3 or 2 standard deviations; "" for any other."""
     if z is None or abs(z) <= 2.0:
         return ""
     return "out3" if abs(z) > 3.0 else "out2"

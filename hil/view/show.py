@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from hil.arm import Arm
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.version import install_command
 from identification.excitation.excitation import Excitation
 from planner import Trajectory
 
@@ -32,7 +33,7 @@ def require_viewer() -> None:
             None,
             "the 3D view needs the package viser, which is not installed",
             field="--view",
-            remedy="install it with: pip install 'hil[view]'",
+            remedy=f"install it with: {install_command('view')}",
         )
 
 

@@ -42,6 +42,12 @@ class PredictionError:
     torque_sum: Array
     torque_squared: Array
 
+    def __str__(self) -> str:
+        """As a person reads it: relative errors over all joints and of each, and of what."""
+        each = ", ".join(f"{100.0 * one:.1f}" for one in self.relative)
+        rows = "no rows" if not self.rows.size else f"{self.rows.min()} to {self.rows.max()} rows"
+        return f"{100.0 * self.overall:.1f} % of the torque ({each} % by joint; {rows} of a joint)"
+
     @classmethod
     def between(
         cls, measured: Array, predicted: Array, usable: NDArray[np.bool_] | None = None

@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,41 @@ def test_what_is_of_another_type_is_refused_as_a_type_error(
         Campaign.create(**given)  # type: ignore[arg-type]
     assert isinstance(refused.value, hil.errors.InputError)
     assert not (tmp_path / "c").exists()
+
+
+class TestExistOk:
+    """`exist_ok` opens a campaign that fits, so that a script can be run again."""
+
+    def test_what_fits_is_opened_with_what_it_holds(
+        self, campaign: Campaign, designed: Campaign
+    ) -> None:
+        pass_rehearsal(campaign.folder)
+        for excitation in (designed.plan, designed.plan.excitation):
+            again = Campaign.create(campaign.folder.root, designed.cell, excitation, exist_ok=True)
+            assert again.folder.plan_hash == campaign.folder.plan_hash
+            assert again.folder.rehearsal.exists()
+
+    def test_another_cell_or_excitation_is_refused(
+        self, campaign: Campaign, designed: Campaign, tmp_path: Path
+    ) -> None:
+        root, cell = campaign.folder.root, fast_cell(tmp_path, repetitions=7)
+        with pytest.raises(hil.errors.InputError, match="a campaign with another cell"):
+            Campaign.create(root, cell, designed.plan, exist_ok=True)
+        other = replace(designed.plan, validation=designed.plan.validation[:0])
+        with pytest.raises(hil.errors.InputError, match="a campaign with another excitation"):
+            Campaign.create(root, designed.cell, other, exist_ok=True)
+
+    def test_without_it_and_for_other_things_in_the_folder(
+        self, campaign: Campaign, designed: Campaign, tmp_path: Path
+    ) -> None:
+        with pytest.raises(hil.errors.InputError, match="is not empty"):
+            Campaign.create(campaign.folder.root, designed.cell, designed.plan)
+        (tmp_path / "mine").mkdir()
+        (tmp_path / "mine" / "notes.txt").touch()
+        with pytest.raises(hil.errors.InputError, match="is not empty"):
+            Campaign.create(tmp_path / "mine", designed.cell, designed.plan, exist_ok=True)
+        made = Campaign.create(tmp_path / "new", designed.cell, designed.plan, exist_ok=True)
+        assert made.folder.plan.exists()
 
 
 def test_what_is_shown_at_a_prompt_is_one_line(designed: Campaign) -> None:

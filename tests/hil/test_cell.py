@@ -115,6 +115,43 @@ def test_a_bad_field_gets_a_sentence(
     assert remedy in sentence
 
 
+class TestRadians:
+    """A figure in rad where degrees belong is guessed in the message."""
+
+    def typed(self, folder: Path, field: str, urdf_radians: list[float]) -> str:
+        values = ", ".join(f"{value:.4g}" for value in urdf_radians)
+        return complaint(folder, rf"^{field} = .*", f"{field} = [{values}]")
+
+    def test_speeds(self, folder: Path) -> None:
+        velocity = Cell.load(folder / "cell.toml").joint_limits.velocity
+        sentence = self.typed(folder, "velocity_deg", velocity.tolist())
+        assert "limits.velocity_deg" in sentence
+        assert "the URDF has these numbers in rad/s; multiply them by 57.2958" in sentence
+
+    def test_angles(self, folder: Path) -> None:
+        upper = np.radians(Cell.load(folder / "cell.toml").file.limits.upper_deg)
+        lower = np.radians(Cell.load(folder / "cell.toml").file.limits.lower_deg)
+        text = (folder / "cell.toml").read_text("utf-8")
+        joined = ", ".join(f"{value:.4g}" for value in lower)
+        text = re.sub(r"(?m)^lower_deg = .*", f"lower_deg = [{joined}]", text)
+        (folder / "cell.toml").write_text(text, "utf-8")
+        sentence = self.typed(folder, "upper_deg", upper.tolist())
+        assert "the URDF has these numbers in rad; multiply them by 57.2958" in sentence
+
+    def test_narrower_angles_that_the_home_posture_leaves(self, folder: Path) -> None:
+        text = (folder / "cell.toml").read_text("utf-8")
+        text = re.sub(r"(?m)^lower_deg = .*", "lower_deg = [-3, -0.8, -2.9, -3, -2, -3]", text)
+        (folder / "cell.toml").write_text(text, "utf-8")
+        sentence = self.typed(folder, "upper_deg", [3.0, 1.6, 1.9, 3.0, 2.0, 3.0])
+        assert "no joint may go further than 3°; are they in rad? 1 rad is 57.2958°" in sentence
+
+    def test_a_narrow_range_in_degrees_is_none(self, folder: Path) -> None:
+        text = (folder / "cell.toml").read_text("utf-8")
+        text = re.sub(r"(?m)^velocity_deg = .*", "velocity_deg = [3, 3, 3, 3, 3, 3]", text)
+        (folder / "cell.toml").write_text(text, "utf-8")
+        Cell.load(folder / "cell.toml")
+
+
 def test_a_missing_file_and_a_missing_table_are_named(folder: Path) -> None:
     with pytest.raises(CellError, match=r"nothing\.toml.*cannot be read"):
         Cell.load(folder / "nothing.toml")

@@ -20,6 +20,7 @@ from hil.archive import open_archive
 from hil.campaign import Campaign
 from hil.cli import COMMANDS, app, main
 from hil.results import Results
+from hil.version import install_command
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 
 
@@ -38,6 +39,44 @@ def test_help_says_where_to_start() -> None:
     for command in COMMANDS:
         assert f" {command} " in done.stdout
         assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
+
+
+@pytest.mark.parametrize("arguments", [[], ["run"], ["import", "log"], ["archive", "check"]])
+def test_a_flag_has_no_type_in_the_help(arguments: list[str]) -> None:
+    """Nothing is to be typed behind it."""
+    told = CliRunner().invoke(app, [*arguments, "--help"], env={"COLUMNS": "200"})
+    assert "--" in told.stdout
+    assert "<bool>" not in told.stdout
+
+
+class TestInstallCommand:
+    """An extra is installed from where `hil` itself came."""
+
+    class Distribution:
+        def __init__(self, text: str | None) -> None:
+            self._text = text
+
+        def read_text(self, name: str) -> str | None:
+            assert name == "direct_url.json"
+            return self._text
+
+    @pytest.mark.parametrize(
+        ("direct", "command"),
+        [
+            (None, "pip install 'hil[live]'"),
+            (
+                '{"url": "file:///home/a%20b/hil", "dir_info": {"editable": true}}',
+                "pip install -e '/home/a b/hil[live]'",
+            ),
+            ('{"url": "file:///home/hil", "dir_info": {}}', "pip install '/home/hil[live]'"),
+            ('{"url": "https://x.org/hil.whl", "archive_info": {}}', "pip install 'hil[live]'"),
+        ],
+    )
+    def test_is_what_works(
+        self, direct: str | None, command: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("hil.version.distribution", lambda _: self.Distribution(direct))
+        assert install_command("live") == command
 
 
 def test_the_version_is_that_of_the_package_and_of_what_its_numbers_depend_on() -> None:

@@ -328,6 +328,7 @@ def test_no_feasible_motion_says_what_forbids_it_where_and_what_to_change(
     ratio = r"What can be changed: the shortest motion tried is \d\d times too long: allow more "
     assert re.search(ratio + r"time \(\[constraints\] max_duration\)", said)
     assert "search longer" not in said
+    assert "repeat the command with --force, or with --resume where cell and settings" in said
     assert caught.value.exit_code == 3
     assert not (tmp_path / "out" / "excitation.toml").exists()
 

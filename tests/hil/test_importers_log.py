@@ -243,6 +243,12 @@ class TestBadInput:
         with pytest.raises(SourceError, match=r"time: line 3 has ('.*'|nothing) for the time"):
             import_log(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
 
+    def test_rows_longer_than_the_header_are_refused(self, tmp_path, robot):
+        """Which of the numbers have no name cannot be known: the first, as pandas writes them?"""
+        file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3")
+        with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; give the others"):
+            import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+
     def test_files_of_different_length_are_refused(self, tmp_path, robot):
         file = log(tmp_path / "q.csv", VALUES, HEADER)
         log(tmp_path / "tau.csv", VALUES[:-1], HEADER)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from hil.archive import Samples, write_samples
+from hil.archive.commands import Failed
 from hil.campaign import Campaign
+from hil.campaign.errors import write_error
 from hil.cli import COMMANDS, app, main
 from hil.cli.failing import as_json, exit_code_of
-from hil.errors import ControllerFault, InputError
+from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError
+from hil.files import make_folder, writing_to
 from planner import PlannerError
 
 NOWHERE = "/nowhere"
@@ -87,6 +94,42 @@ def test_an_error_of_input_tells_its_parts() -> None:
 def test_exit_codes_are_those_of_the_errors() -> None:
     found = [exit_code_of(error) for error in (ControllerFault(""), PlannerError(), OSError())]
     assert found == [4, 2, 1]
+
+
+class TestDisk:
+    """What a disk refuses is no bad input: exit status 1, as the docs say, whoever was writing."""
+
+    @pytest.fixture(params=[errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG])
+    def refusal(self, request: pytest.FixtureRequest) -> OSError:
+        return OSError(request.param, os.strerror(request.param))
+
+    def test_an_archive_that_cannot_grow(
+        self, refusal: OSError, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def refuse(*_: object) -> int:
+            raise refusal
+
+        samples = Samples(np.arange(3) * 10**7, np.zeros((3, 1)))
+        monkeypatch.setattr("hil.archive.file_writer.os.write", refuse)
+        with pytest.raises(ArchiveWriteError) as caught:
+            write_samples(tmp_path / "a.mcap", samples, joint_names=("a",), metadata={})
+        assert exit_code_of(caught.value) == 1
+        assert as_json(caught.value)["exit_code"] == 1
+
+    def test_one_that_the_archive_process_could_not_write(self, refusal: OSError) -> None:
+        failed = Failed(1, "a.mcap", "cannot be written further", "make room", refusal.errno)
+        assert exit_code_of(write_error(failed)) == 1
+        assert exit_code_of(write_error(Failed(1, "a.mcap", "exists already", "", None))) == 2
+
+    def test_folder_and_tables(self, refusal: OSError, tmp_path: Path) -> None:
+        with pytest.raises(HilError) as caught, writing_to(tmp_path):
+            raise refusal
+        assert exit_code_of(caught.value) == 1
+
+    def test_a_name_that_cannot_be_used_is_bad_input(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError) as caught:
+            make_folder(tmp_path / ("a" * 300))
+        assert exit_code_of(caught.value) == 2
 
 
 @pytest.mark.parametrize(("raised", "code"), [(KeyboardInterrupt(), 130), (MemoryError(), 1)])

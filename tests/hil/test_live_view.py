@@ -172,7 +172,7 @@ def test_a_port_that_is_taken_is_told() -> None:
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "foxglove", None)
-    with pytest.raises(LiveViewError, match=r"hil\[live\]"):
+    with pytest.raises(LiveViewError, match=r"pip install .*\[live\]"):
         live.LivePublisher(Serve(1, LiveView(port=0), NAMES, PERIOD, drives()))
 
 

@@ -48,11 +48,32 @@ def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
         assert trace.high == campaign.cell.drive_table.current_limit[joint]
     pendant = np.degrees(campaign.cell.controller_angles(columns["position"]))
     assert view.quantities[0].traces[1].value.max() == pytest.approx(pendant[:, 1].max())
-    assert view.angles == "teach pendant angles"
     assert [name for _, _, name in view.states] == [
         "closed", "opening", "open", "exiting", "closed"
     ]  # fmt: skip
     assert any(name == "MotionEnded" for _, name, _, _ in view.events)
+
+
+class TestFrame:
+    """Positions, speeds and torques of a page are in one frame, which the page names."""
+
+    def test_a_torque_turns_as_its_joint_does(self, excitation: Path, campaign: Campaign) -> None:
+        """Torque times speed is the power of the joint, whoever looks at it."""
+        columns = open_archive(excitation).columns
+        sign = np.array(campaign.cell.drive_table.joint_sign)
+        assert -1 in sign
+        drawn = {q.title.partition(" [")[0]: q.traces for q in view_of(excitation).quantities}
+        for joint, trace in enumerate(drawn["torque at the joint"]):
+            shown = columns["torque"][:, joint] * sign[joint]
+            assert np.nanmax(trace.value) == shown.max()
+            assert np.nanmin(trace.value) == shown.min()
+
+    def test_it_is_named(self, excitation: Path) -> None:
+        view = view_of(excitation, bins=BINS)
+        frame = "angles, speeds and torques as on the teach pendant"
+        assert view.frame == frame
+        assert frame in html.unescape(archive_page(view).decode("utf-8"))
+        assert any(frame in text.get_text() for text in draw_archive(view).texts)
 
 
 def test_following_errors_are_those_of_the_motors(excitation: Path, campaign: Campaign) -> None:

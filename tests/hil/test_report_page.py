@@ -65,6 +65,34 @@ def traces_in(html: str) -> list[dict[str, Any]]:
     return [json.loads(html_module.unescape(t)) for t in re.findall(r'data-traces="([^"]*)"', html)]
 
 
+class TestOrder:
+    """Verdict, errors, friction curves and parameters come first; figures of detail are folded."""
+
+    def test_what_decides_stands_before_the_appendix(self, html: str) -> None:
+        first = ["Torque error over all joints", 'id="judgement"', 'id="friction"',
+                 'id="parameters"', 'id="trust"', '<details id="appendix">']  # fmt: skip
+        folded = ['id="run"', 'id="excitation"', 'id="estimation"', 'id="residuals"',
+                  'id="uncertainty"', 'id="correlation"', 'id="validation"']  # fmt: skip
+        places = [html.index(mark) for mark in (*first, *folded) if mark in html]
+        assert len(places) >= 10  # friction and judgement only where the results have them
+        assert places == sorted(places)
+        assert html.rindex("</details>") > places[-1]
+
+    @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+    def test_the_page_is_at_most_9000_pixels_high(self, html: str, tmp_path: Path) -> None:
+        assert CHROMIUM is not None
+        told = "<script>document.title = document.documentElement.scrollHeight</script></body>"
+        text = re.sub(r"<meta http-equiv=[^>]*>", "", html).replace("</body>", told)
+        (tmp_path / "page.html").write_text(text, encoding="utf-8")
+        shown = subprocess.run(
+            [CHROMIUM, "--headless", "--no-sandbox", "--window-size=1300,900", "--dump-dom",
+             (tmp_path / "page.html").as_uri()],
+            capture_output=True, text=True, timeout=120, check=True,
+        ).stdout  # fmt: skip
+        (height,) = re.findall(r"<title>(\d+)</title>", shown)
+        assert 1000 < int(height) <= 9000
+
+
 def test_the_policy_lets_the_pages_own_script_run_and_no_other(html: str, page: Page) -> None:
     (script,) = re.findall(r"<script>(.*?)</script>", html, re.S)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

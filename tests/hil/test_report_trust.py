@@ -72,6 +72,20 @@ def essential_part(sections: Sections) -> EssentialResult:
     return sections.essential
 
 
+def test_essential_estimates_far_from_the_truth_are_marked(arm: IdentifiedArm) -> None:
+    """In standard deviations, and with the marks of the table of all parameters."""
+    sections = Sections(arm)
+    one, other = essential_part(sections).parameters[:2]
+    truths = {one.name: one.estimate - 4.0 * one.std, other.name: other.estimate + 2.5 * other.std}
+    sections.parameters = [
+        parameter.model_copy(update={"truth": truths.get(parameter.name)})
+        for parameter in sections.parameters
+    ]
+    rows = essential.essential_part(sections, essential_part(sections)).rows  # type: ignore[arg-type]
+    assert [(row.deviation, row.mark) for row in rows[:2]] == [("+4.00", "out3"), ("-2.50", "out2")]
+    assert {row.mark for row in rows[2:]} == {""}
+
+
 def test_every_parameter_has_one_grade(arm: IdentifiedArm) -> None:
     found = essential.trust(Sections(arm))  # type: ignore[arg-type]
     graded = [*found.well, *found.roughly, *found.hardly, *found.undetermined]

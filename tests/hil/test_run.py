@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hil.screen.screen import Pace
 from numpy.typing import NDArray
 
 from drivers.transports import SimulatedTransport
@@ -20,12 +21,18 @@ from hil.archive.amend import amend_outcome
 from hil.archive.check import check_archive
 from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError
 from hil.campaign.dry_run import OVERRIDE, DryRun
-from hil.campaign.errors import AgainstGravityError, DryRunError, RepetitionsRejectedError
+from hil.campaign.errors import (
+    AgainstGravityError,
+    DryRunError,
+    MotionFailedError,
+    RepetitionsRejectedError,
+)
 from hil.campaign.execution_result import RunResult
 from hil.campaign.gravity_check import agreement
 from hil.campaign.motion_watch import Wish
 from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.campaign.quality import FIELDS, Played, RepetitionCheck
+from hil.campaign.stop import Stop
 from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_motion
 from hil.cell import Cell
 from hil.identify.sources import gather_sources
@@ -213,6 +220,45 @@ def test_a_person_is_asked_and_a_no_ends_the_run(make: Make) -> None:
     assert list(dict.fromkeys(phases)) == ["move", "standstill", "repetition", "validation"]
     assert somebody.seen[0].time_left > somebody.seen[-1].time_left
     assert any(status.motion is not None for status in somebody.seen)
+
+
+class TestTimeLeft:
+    """After the first tenth of a run the time left is right within a fifth, and counts down."""
+
+    @pytest.mark.parametrize("warmup_drift", [0.0, 0.002])
+    @pytest.mark.parametrize("first_repetitions", [0, 3])
+    def test_is_right(self, make: Make, warmup_drift: float, first_repetitions: int) -> None:
+        """With its dry run, and of a run that resumes what an earlier one did."""
+        campaign = make(repetitions=6, warmup_drift=warmup_drift)
+        stop = Stop()
+        if first_repetitions:
+
+            def stopping(status: RunStatus) -> Wish:
+                begun = status.phase == "repetition" and status.number > first_repetitions
+                stop.requested = stop.requested or begun
+                return Wish()
+
+            with pytest.raises(MotionFailedError, match="stopped"):
+                campaign.run(stop=stop, operator=Person(wishes=stopping), durable=False)
+        link = simulated_link(campaign.cell)
+        pace, told = Pace(virtual=False), list[tuple[float, float]]()
+
+        class Clock(Person):
+            def show(self, status: RunStatus) -> None:
+                now = link.cycles * 0.002
+                pace.take(status, now, held=False)
+                left = pace.left(status)
+                assert left is not None
+                told.append((now, left))
+
+        campaign.run(link, operator=Clock(), durable=False)
+        now, left = np.array(told).T
+        true = now[-1] - now
+        known = now - now[0] > 0.1 * true[0]
+        assert known.sum() > 20
+        off = np.abs(left - true)[known] / (0.2 * true[known] + 1.0)
+        assert off.max() < 1.0, (true[known][off.argmax()], left[known][off.argmax()])
+        assert np.diff(left[known]).max() < 0.1 * true[0]
 
 
 # --- what slow torques say

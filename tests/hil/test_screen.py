@@ -16,6 +16,7 @@ import termios
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -137,17 +138,30 @@ def test_the_far_end_of_a_cell_is_simulated_or_has_an_address() -> None:
 
 def test_in_virtual_time_what_is_left_is_the_time_that_a_person_waits() -> None:
     """A run of 100 s of motion that takes 25 s, with a pause of a person in between."""
-    pace, real = Pace(virtual=True), Pace(virtual=False)
+    pace = Pace(virtual=True)
+    moving = status().motion
     for tenth in range(121):
         now, left = tenth / 10.0, 100.0 - 4.0 * tenth / 10.0
-        pace.take(RunStatus("dry run", 1, 1, left), now, held=False)
+        one = RunStatus("dry run", 1, 1, left, moving)
+        pace.take(one, now, held=False)
         if tenth == 10:
-            assert pace.left(left) is None
+            assert pace.left(one) is None
     pace.pause()
+    one = RunStatus("repetition", 1, 3, 60.0, moving)
     for tenth in range(11):  # a rejected repetition made it longer; nothing moves while held
-        pace.take(RunStatus("repetition", 1, 3, 60.0), 500.0 + tenth, held=tenth > 0)
-    assert pace.left(60.0) == pytest.approx(15.0)
-    assert real.left(60.0) == 60.0
+        pace.take(one, 500.0 + tenth, held=tenth > 0)
+    assert pace.left(one) == pytest.approx(15.0)
+
+
+def test_the_time_between_motions_counts_in_what_is_left() -> None:
+    """Motions of 10 s, 3 s after each other: the third begins, two more follow."""
+    pace, moving = Pace(virtual=False), status().motion
+    for begin, left in ((0.0, 40.0), (13.0, 30.0), (26.0, 20.0)):
+        pace.take(RunStatus("repetition", 1, 5, left + 10.0), begin - 3.0, held=False)
+        for second in range(11):
+            one = RunStatus("repetition", 1, 5, left + 10.0 - second, moving)
+            pace.take(one, begin + second, held=False)
+    assert pace.left(replace(one, motions_left=2)) == pytest.approx(20.0 + 2 * 3.0, rel=0.1)
 
 
 def test_a_terminal_breaks_lines_between_words_and_a_file_gets_them_whole() -> None:

@@ -30,6 +30,7 @@ from identification.excitation.sampling import sampled
 from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
+from tests.hil.simulated_logs import urdf_path
 
 NOWHERE = Workspace(floor=None, margin=0.0)
 
@@ -603,3 +604,14 @@ def test_postures_of_another_arm_are_refused():
 def test_obstacles_that_mean_nothing_are_refused(build):
     with pytest.raises(WorkspaceError):
         build()
+
+
+def test_base_and_shoulder_of_a_ur5_are_not_checked_against_the_floor() -> None:
+    """Base and shoulder stand there in every posture; what can reach the floor is checked."""
+    path = urdf_path("ur5_robot.urdf")
+    checker = CollisionChecker(
+        path.read_text(), Workspace(floor=0.0), mesh_folders=(str(path.parents[4]),)
+    )
+    near = {first for first, second in checker.pairs if second == "floor"}
+    assert not near & {"base_link", "shoulder_link"}
+    assert {"upper_arm_link", "forearm_link", "wrist_3_link"} <= near

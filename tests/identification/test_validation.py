@@ -96,6 +96,12 @@ def test_the_mean_absolute_error_lies_between_mean_and_rms(m: Array, p: Array) -
     assert (error.mean_absolute <= error.rms * (1 + 1e-12)).all()
 
 
+def test_an_error_is_printed_as_a_person_reads_it() -> None:
+    measured = np.array([[3.0, 0.0], [4.0, 2.0]])
+    error = PredictionError.between(measured, 0.9 * measured)
+    assert str(error) == "10.0 % of the torque (10.0, 10.0 % by joint; 2 to 2 rows of a joint)"
+
+
 def test_zero_for_everything_predicts_with_an_error_of_one() -> None:
     measured = np.random.default_rng(0).standard_normal((50, 3))
     assert PredictionError.between(measured, np.zeros((50, 3))).overall == pytest.approx(1.0)

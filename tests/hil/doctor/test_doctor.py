@@ -201,6 +201,17 @@ def test_the_page_shows_brackets_as_they_are_and_every_bar() -> None:
     assert "2000-5000 µs        1 █" in text
 
 
+def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit() -> None:
+    def page(two: bool) -> str:
+        console = Console(record=True, width=100, file=io.StringIO())
+        show(Diagnosis((), (latency(3e-3),), verdict(1, False), verdict(2, two), 1, 60.0), console)
+        return console.export_text()
+
+    assert "use 2 ms" in page(two=True)
+    assert "Neither 1 ms nor 2 ms is fit." in page(two=False)
+    assert "use 2 ms" not in page(two=False)
+
+
 def test_one_stall_among_many_still_has_a_bar() -> None:
     lines = list(histogram(latency(*np.full(60_000, 30e-6), 8e-3)))
     assert "█" in lines[-1]
