@@ -93,7 +93,7 @@ def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
             None,
             f"{text!r} is no delay",
             field="--delay",
-            remedy=f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, auto or stated",
+            remedy=f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, stated or auto",
         )
     return value
 
