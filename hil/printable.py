@@ -1,4 +1,4 @@
-"""Texts that may be a stranger's, for a terminal: names of files, joints, fields, events."""
+"""Untrusted texts, for a terminal: names of files, joints, fields, events."""
 
 from __future__ import annotations
 

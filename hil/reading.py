@@ -1,4 +1,4 @@
-"""Files that a stranger may have left in a folder: read only if they are files, and of a size.
+"""Untrusted files in a folder: read only if they are files, and of a size.
 
 A pipe without a writer is waited for without end, and a device has none. What is refused is an
 `OSError` whose `strerror` says why, so that whoever reads has one kind of trouble to name.

@@ -1,4 +1,4 @@
-"""Whole numbers that a stranger may have written, in an archive or on a command line."""
+"""Untrusted whole numbers, in an archive or on a command line."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ SAFETY: Final = (
     "hil/test_run_trust.py",
     "process_death",
     "simulate",
-    "strangers",
+    "untrusted",
     "test_controller_variants.py",
     "test_fault_matrix.py",
 )

@@ -26,7 +26,7 @@ class Listening:
     """Lets the link forget its peer where that one does not lead to a session.
 
     Before the init packet, whoever gets answers is listened to alone until it sends something
-    that gets none, or falls silent: a stranger cannot take over a start that is going on, and one
+    that gets none, or falls silent: another host cannot take over a start that is going on, and one
     that does not go on cannot keep the controller out.
     """
 

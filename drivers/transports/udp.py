@@ -42,7 +42,7 @@ _CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 _CLOCK_SET: Final = 1e-3
 """s that the wall clock moves against the monotonic one if it was set; else they run alike."""
 MOST_PASSED_OVER: Final = 1000
-"""Datagrams of strangers passed over once the time is up, more than a queue usually holds."""
+"""Datagrams of other hosts passed over once the time is up, more than a queue usually holds."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class UdpTransport:
     def receive(self, timeout: float) -> bytes | None:
         """The next datagram of the peer, or None after `timeout` s without one.
 
-        One that is there already is found behind any number of strangers up to
+        One that is there already is found behind any number of datagrams of other hosts up to
         `MOST_PASSED_OVER`, also with a time-out of 0.
 
         Raises:

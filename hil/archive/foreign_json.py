@@ -1,4 +1,4 @@
-"""JSON that a stranger may have written."""
+"""Untrusted JSON."""
 
 from __future__ import annotations
 

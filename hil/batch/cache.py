@@ -40,7 +40,7 @@ BESIDE: Final = ".hil-cache"
 
 _MAGIC: Final = b"HILCACH1"
 _NUMBERS: Final = re.compile(r"[<|][biuf][1-8]")
-"""Codes of the arrays that are kept. numpy would evaluate what else a stranger may have sealed."""
+"""Codes of the arrays that are kept. numpy would evaluate what else an untrusted file may hold."""
 _HEAD: Final = struct.Struct("<8sQI")  # magic, length of the rest, its checksum
 _TEXT: Final = struct.Struct("<I")  # length of the JSON text in front of the arrays
 

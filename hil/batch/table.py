@@ -300,7 +300,7 @@ def _cell(value: Any) -> Any:
 def _replaced(path: Path) -> Iterator[Path]:
     """A file to write in place of another, which is kept if the writing fails."""
     temporary = path.with_name(f"{path.name}.tmp")
-    temporary.unlink(missing_ok=True)  # in a stranger's folder it may be a link
+    temporary.unlink(missing_ok=True)  # in an untrusted folder it may be a link
     try:
         yield temporary
         temporary.replace(path)

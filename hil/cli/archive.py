@@ -126,7 +126,7 @@ def _say_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
 
 
 def _shown(lines: Sequence[str]) -> str:
-    """Lines for a terminal, which texts of a stranger must not steer."""
+    """Lines for a terminal, which untrusted texts must not steer."""
     return "\n".join(printable(line, keep="") for line in lines)
 
 

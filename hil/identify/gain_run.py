@@ -85,7 +85,7 @@ def find_gains(
             turns = _turns(cell, source.recording)
             if first is None:
                 first = cell, replace(cell.model, payload=None), turns
-            _refuse_stranger(archive, cell, turns, first)
+            _refuse_other_arm(archive, cell, turns, first)
             settings = stated_settings(cell, options)
             try:
                 samples = samples_of(source, cell, settings, first[1])
@@ -126,7 +126,7 @@ def _turns(cell: Cell, recording: Recording) -> Array:
     return motor_from_joint(recording)
 
 
-def _refuse_stranger(
+def _refuse_other_arm(
     archive: Archive, cell: Cell, turns: Array, first: tuple[Cell, RobotModel, Array]
 ) -> None:
     """One robot with one drive train; only what it carries may differ."""

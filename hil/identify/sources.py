@@ -152,7 +152,7 @@ def gather_sources(
             remedy="name archives of kind excitation or imported",
         )
     cell = cell_of(fitted[0])
-    _refuse_strangers(archives)
+    _refuse_other_arms(archives)
     rest = [source_of(archive, cell, to_fit=False) for archive in by_kind.get("standstill", [])]
     every = all_fitted(
         cell,
@@ -282,7 +282,7 @@ def _refuse_duplicates(paths: Sequence[Path]) -> None:
         seen[digest] = path
 
 
-def _refuse_strangers(archives: Sequence[Archive]) -> None:
+def _refuse_other_arms(archives: Sequence[Archive]) -> None:
     """All archives belong to one robot, described in the same words."""
     first = archives[0]
     for archive in archives[1:]:

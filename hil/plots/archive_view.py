@@ -254,7 +254,7 @@ def _both(limit: Array) -> tuple[Array, Array]:
 
 
 def _limit_in(table: Any, key: str, n: int) -> Array | None:
-    """Limits (n,) of a table that a stranger may have written; None where they are none."""
+    """Limits (n,) of a table of an untrusted file; None where they are none."""
     try:
         limit = np.array(table[key], dtype=np.float64)
     except (KeyError, TypeError, ValueError, OverflowError):
@@ -357,7 +357,7 @@ class _Collected:
 
 
 def _state_name(number: int) -> str:
-    """A state of the session; the number itself of one that a stranger's archive made up."""
+    """A state of the session; the number itself of one that an untrusted archive made up."""
     known = number in State.__members__.values()
     return State(number).name.lower().replace("_", " ") if known else f"state {number}"
 

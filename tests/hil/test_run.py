@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hil.screen.screen import Pace
 from numpy.typing import NDArray
 
 from drivers.transports import SimulatedTransport
@@ -36,6 +35,7 @@ from hil.campaign.stop import Stop
 from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_motion
 from hil.cell import Cell
 from hil.identify.sources import gather_sources
+from hil.screen.screen import Pace
 from hil.simulation import planted_truth, simulated_controller, simulated_link
 from sim_fixtures.controller_faults import Faultable
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal

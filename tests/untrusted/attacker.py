@@ -1,6 +1,6 @@
 """A stranger on the network of the controller: what is sent to the PC, from where, and how often.
 
-``python -m tests.strangers.attacker --to 10.0.0.1:1000 --as 10.0.0.2:4000 init`` sends init packets
+``python -m tests.untrusted.attacker --to 10.0.0.1:1000 --as 10.0.0.2:4000 init`` sends init packets
 under another's address (raw sockets: root). Only for networks of one's own making.
 """
 

@@ -26,7 +26,7 @@ from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from hil.cell.link import with_link
 from tests.hil.fast_cell import fast_cell
-from tests.strangers.wire import BROADCAST, HOSTS, Wire, missing, wire
+from tests.untrusted.wire import BROADCAST, HOSTS, Wire, missing, wire
 
 pytestmark = pytest.mark.slow
 
@@ -99,7 +99,7 @@ class Hosts:
         host = "controller" if self._attack[0] == "record" else "stranger"
         known = () if self._session is None else ("--session", str(self._session))
         target = ("--to", WHERE, "--seconds", "600")
-        return self._start(host, "tests.strangers.attacker", *target, *known, *self._attack)
+        return self._start(host, "tests.untrusted.attacker", *target, *known, *self._attack)
 
     def controller(self) -> Process:
         """With a simulated arm; for one motion."""
