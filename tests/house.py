@@ -1,0 +1,212 @@
+"""Size and order of the source code, beside the targets of its rebuilding.
+
+Run with ``python -m tests.house [--list NAME]``; NAME is a row of the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+PACKAGES: Final = ("drivers", "planner", "identification", "sim_fixtures", "hil")
+TARGETS: Final[Mapping[str, int | None]] = {
+    "product lines": 62_000,
+    "product files": 380,
+    "test lines": 55_000,
+    "test files": 260,
+    "import circles": 0,
+    "imports inside functions": None,
+    "files with one importer": None,
+    "banned names": 0,
+    "functions over 60 lines": None,
+}
+BANNED: Final = {
+    *("kept", "told", "taken", "answers", "announced", "standing", "sight", "wish", "doubts"),
+    *("strangers", "plain", "ways", "drawn", "listed", "counted", "settling"),
+}
+_LONG: Final = 60
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Python files of the five packages by module name."""
+
+    files: Mapping[str, Path]
+
+    @classmethod
+    def read(cls) -> Sources:
+        """Those of this checkout."""
+        found = {}
+        for package in PACKAGES:
+            for path in sorted((ROOT / package).rglob("*.py")):
+                name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+                found[name.removesuffix(".__init__")] = path
+        return cls(found)
+
+    @cached_property
+    def trees(self) -> dict[str, ast.Module]:
+        """Syntax tree of each module."""
+        return {name: ast.parse(path.read_text("utf-8")) for name, path in self.files.items()}
+
+    @cached_property
+    def imports(self) -> dict[str, set[str]]:
+        """Modules of ours that each module imports when it is loaded."""
+        return {
+            name: {
+                target
+                for node in _loaded(tree)
+                for target in self._targets(name, node)
+                if target != name
+            }
+            for name, tree in self.trees.items()
+        }
+
+    def _targets(self, name: str, node: ast.AST) -> Iterator[str]:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in self.files)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                own = name.split(".")
+                package = self.files[name].name == "__init__.py"
+                parents = own[: len(own) - node.level + package]
+                base = ".".join([*parents, *([base] if base else [])])
+            for alias in node.names:
+                whole = f"{base}.{alias.name}"
+                if whole in self.files:
+                    yield whole
+                elif base in self.files:
+                    yield base
+
+    def circles(self) -> list[str]:
+        """Groups of modules that import one another (Tarjan's components of more than one)."""
+        index: dict[str, int] = {}
+        low: dict[str, int] = {}
+        stack: list[str] = []
+        found = []
+
+        def visit(name: str) -> None:
+            index[name] = low[name] = len(index)
+            stack.append(name)
+            for other in sorted(self.imports[name]):
+                if other not in index:
+                    visit(other)
+                    low[name] = min(low[name], low[other])
+                elif other in stack:
+                    low[name] = min(low[name], index[other])
+            if low[name] == index[name]:
+                group = [stack.pop()]
+                while group[-1] != name:
+                    group.append(stack.pop())
+                if len(group) > 1:
+                    found.append(", ".join(sorted(group)))
+
+        for name in self.files:
+            if name not in index:
+                visit(name)
+        return found
+
+    def inner_imports(self) -> list[str]:
+        """Imports of ours inside functions."""
+        return [
+            f"{name}:{node.lineno} {target}"
+            for name, tree in self.trees.items()
+            for function in ast.walk(tree)
+            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+            for node in ast.walk(function)
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for target in self._targets(name, node)
+        ]
+
+    def single_importers(self) -> list[str]:
+        """Modules that one other module imports, in the same folder."""
+        users: dict[str, set[str]] = {name: set() for name in self.files}
+        for name, targets in self.imports.items():
+            for target in targets:
+                users[target].add(name)
+        return [
+            f"{name} <- {user}"
+            for name, (user,) in ((n, tuple(u)) for n, u in users.items() if len(u) == 1)
+            if user.rpartition(".")[0] == name.rpartition(".")[0]
+        ]
+
+    def banned_names(self) -> list[str]:
+        """Modules, functions, classes, arguments and variables with an idiom for a name."""
+        found = []
+        for name, tree in self.trees.items():
+            names = [(1, name.rpartition(".")[2])]
+            for node in ast.walk(tree):
+                if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
+                    names.append((node.lineno, node.name))
+                elif isinstance(node, ast.arg):
+                    names.append((node.lineno, node.arg))
+                elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                    names.append((node.lineno, node.id))
+            found += [
+                f"{name}:{line} {one}"
+                for line, one in names
+                if BANNED.intersection(re.findall("[a-z]+", one.lower()))
+            ]
+        return found
+
+    def long_functions(self) -> list[str]:
+        """Functions of more lines than `_LONG`, docstring included."""
+        return [
+            f"{name}:{node.lineno} {node.name}, {node.end_lineno - node.lineno + 1} lines"
+            for name, tree in self.trees.items()
+            for node in ast.walk(tree)
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            and node.end_lineno is not None
+            and node.end_lineno - node.lineno >= _LONG
+        ]
+
+
+def _loaded(tree: ast.AST) -> Iterator[ast.AST]:
+    """Nodes that run when a module is loaded."""
+    for node in ast.iter_child_nodes(tree):
+        typing_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        if not typing_only and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+            yield from _loaded(node)
+
+
+def main() -> None:
+    """Print the table, or one row in full."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--list", choices=[name for name in TARGETS if "lines" not in name[-6:]])
+    wanted = parser.parse_args().list
+    sources = Sources.read()
+    product = [*sources.files.values()]
+    tests = sorted((ROOT / "tests").rglob("*.py"))
+    listed = {
+        "product files": [str(path.relative_to(ROOT)) for path in product],
+        "test files": [str(path.relative_to(ROOT)) for path in tests],
+        "import circles": sources.circles(),
+        "imports inside functions": sources.inner_imports(),
+        "files with one importer": sources.single_importers(),
+        "banned names": sources.banned_names(),
+        "functions over 60 lines": sources.long_functions(),
+    }
+    if wanted is not None:
+        print(*listed[wanted], sep="\n")
+        return
+    figures = {name: len(lines) for name, lines in listed.items()}
+    figures["product lines"] = _lines(product)
+    figures["test lines"] = _lines(tests)
+    for name, target in TARGETS.items():
+        print(f"{name:26}{figures[name]:8}" + ("" if target is None else f"   target {target}"))
+
+
+def _lines(paths: list[Path]) -> int:
+    return sum(len(path.read_text("utf-8").splitlines()) for path in paths)
+
+
+if __name__ == "__main__":
+    main()
