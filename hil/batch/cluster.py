@@ -8,6 +8,7 @@ from time import monotonic
 from typing import Any, Final
 
 from hil.errors import HilError, InputError
+from hil.version import install_command
 
 LOOK: Final = 2.0
 """s between looks at the cluster while nothing comes from it."""
@@ -136,7 +137,7 @@ def require_dask() -> None:
             None,
             "a cluster needs the package distributed, which is not installed",
             field="--dask",
-            remedy="install it with: pip install 'hil[cluster]'",
+            remedy=f"install it with: {install_command('cluster')}",
         )
 
 

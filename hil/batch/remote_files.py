@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 from hil.errors import InputError
+from hil.version import install_command
 
 from .errors import UnavailableError
 
@@ -116,7 +117,7 @@ def _asked(url: str, question: Callable[[], T]) -> T:
             None,
             "an address needs the package fsspec, which is not installed",
             field=url,
-            remedy="install it with: pip install 'hil[cluster]'",
+            remedy=f"install it with: {install_command('cluster')}",
         )
     for pause in _PAUSES:
         try:
