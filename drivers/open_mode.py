@@ -22,7 +22,7 @@ from drivers.guard import FIRST_FRACTION, Guard
 from drivers.packets import Mode
 from drivers.reading import Reading
 from drivers.replies import D1, D2, D4, D5, ReplyFrame
-from drivers.taken import REPEATS, TakenSetPoints
+from drivers.set_points import REPEATS, SentSetPoints
 
 Array = NDArray[np.float64]
 Joints = NDArray[np.bool_]
@@ -154,7 +154,7 @@ class PositionMode(OpenMode):
     ) -> None:
         super().__init__(guard, wire, frame)
         self._max_gap = max_gap
-        self._taken = TakenSetPoints(guard, max_gap + 1)
+        self._taken = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
         self._rate = np.zeros(len(self._still))

@@ -33,7 +33,7 @@ answered packet, whatever was missed; more than `max_gap` missed in a row, stale
 bring it to rest on its path, if the controller carried it on. Time counts as well as numbers: a
 packet that comes `PAUSE_CYCLES` later by the clock than they account for is answered by a further
 set-point only if the arm moves as it was commanded to. What is watched meanwhile, and when open
-mode is left, stands at the head of `drivers.answers`.
+mode is left, stands at the head of `drivers.reply_policy`.
 
 In every state an axis that is open with its drive on, of whichever arm, is answered by its target
 only if that is a number; if it is none, drive-off is asked for. In a pause a wanted axis that is
@@ -48,14 +48,13 @@ from typing import Final
 
 import numpy as np
 
-from drivers.answers import Answers
 from drivers.arm_wire import Ages
+from drivers.counters import Tally
 from drivers.drive_train import DriveTrain
 from drivers.errors import ModeRefused, PacketError, RefusalError, RequestError, as_refusal
 from drivers.events import Counters, Event, InitReceived, LinkLost, Refused
 from drivers.execution import execution_of
 from drivers.guard import Guard
-from drivers.machine import Machine
 from drivers.motion_source import CorrectionSource, MotionSource
 from drivers.packets import (
     DRIVE_ON,
@@ -71,9 +70,10 @@ from drivers.packets import (
 )
 from drivers.record import CycleRecords
 from drivers.replies import MODE, words_of
+from drivers.reply_policy import ReplyPolicy
 from drivers.sequence import Sequence
+from drivers.state_machine import Machine
 from drivers.states import CORRECTION_MODES, POSITION_MODES, Input, State
-from drivers.tally import Tally
 
 FLIGHT_RECORDER: Final = 50
 """Records that go with a refusal."""
@@ -157,7 +157,7 @@ class Session:
         self._other_axes = frozenset(other_axes)
         self._machine = Machine(self.counters)
         self._sequence = Sequence()
-        self._answers: Answers | None = None
+        self._policy: ReplyPolicy | None = None
         self._cold_start = False
         self._heard_at: float | None = None
         self._last_packet = b""
@@ -182,17 +182,17 @@ class Session:
     @property
     def init(self) -> InitPacket | None:
         """The controller's init packet, None before it."""
-        return None if self._answers is None else self._answers.init
+        return None if self._policy is None else self._policy.init
 
     @property
     def period(self) -> float:
         """The controller's cycle, s; before its init packet the one the guard was built for."""
-        return self._guard.period if self._answers is None else self._answers.init.period
+        return self._guard.period if self._policy is None else self._policy.init.period
 
     @property
     def drive_train(self) -> DriveTrain:
         """In force: the cell's, or the one with the controller's values that were adopted."""
-        return self._drive_train if self._answers is None else self._answers.announced.drive_train
+        return self._drive_train if self._policy is None else self._policy.announced.drive_train
 
     @property
     def requested(self) -> bool:
@@ -216,7 +216,7 @@ class Session:
         execution = execution_of(source, self._mode, n, self._settle_cycles, stop_cycles)
         if isinstance(execution, str):
             raise RequestError(self.state.name.lower(), execution)
-        self._machine.request(execution, self._answers.unusable if self._answers else None)
+        self._machine.request(execution, self._policy.unusable if self._policy else None)
 
     def override(self, fraction: float) -> None:
         """Run the requested motion at this fraction (0..1) of its speed from now on.
@@ -308,10 +308,10 @@ class Session:
         self._machine.take(Input.INIT)
         arm = (self._drive_train, self._guard, self._arm, self._mode)
         options = (self._accept_init, self._other_axes, self._max_gap)
-        self._answers = answers = Answers(init, *arm, *options)
+        self._policy = policy = ReplyPolicy(init, *arm, *options)
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self._machine.cycle = 0
-        told = answers.announced
+        told = policy.announced
         self._machine.events.append(
             InitReceived(init, told.unusable, told.differences, told.adopted)
         )
@@ -337,14 +337,14 @@ class Session:
             raise PacketError("length", len(packet), f"less than {INIT_LENGTH} bytes")
         self._machine.take(Input.SYNC)
         if self.state is State.SYNC:
-            self._answers = None
+            self._policy = None
         self._sequence.accept(number)
         return self._answered(packet, echo(packet), now)
 
     def _cyclic(self, packet: bytes, number: int, now: float, ages: Ages | None) -> bytes | None:
-        answers, machine, ring = self._answers, self._machine, self._ring
-        assert answers is not None
-        decoded = CyclicPacket.decode(packet, answers.init.n_axes)
+        policy, machine, ring = self._policy, self._machine, self._ring
+        assert policy is not None
+        decoded = CyclicPacket.decode(packet, policy.init.n_axes)
         if self._sequence.is_duplicate(number) and packet == self._last_packet:
             self.counters.duplicates += 1
             return self._last_reply
@@ -358,13 +358,13 @@ class Session:
         words = words_of(decoded)
         # After a corrupted number the controller's own look stale for a while.
         unanswered, self._unanswered = missed + self._unanswered, 0
-        reading = answers.reader.read(decoded.status, words[:, MODE])
+        reading = policy.reader.read(decoded.status, words[:, MODE])
         row = ring.slot
         ring.arrival[row] = now
         ring.number[row] = number
         ring.gap[row] = missed
         ring.cycle[row] = machine.cycle
-        answers.record(ring, row, reading, words, ages)
+        policy.record(ring, row, reading, words, ages)
         refusal: RefusalError | None = None
         try:
             machine.note_gap(missed, unanswered, self._max_gap)
@@ -373,14 +373,14 @@ class Session:
             machine.take(reading.input)
             if machine.state is State.FAULTED and before is not State.FAULTED:
                 refusal = ModeRefused(*reading.faulty, machine.cycle)
-            answers.note_gap(unanswered, paused, machine, reading)
+            policy.note_gap(unanswered, paused, machine, reading)
             measured, commanded = ring.measured[row], ring.commanded[row]
-            status = answers.answer(machine, reading, words, measured, commanded)
+            status = policy.answer(machine, reading, words, measured, commanded)
         except BaseException as error:
             # Whatever it was, the controller is told to stop, by the answer that is due now.
             refusal = as_refusal(error, machine.cycle)
             ring.commanded[row] = math.nan
-            status = answers.refuse(machine, refusal, reading, words)
+            status = policy.refuse(machine, refusal, reading, words)
         machine.in_interval = machine.in_interval and reading.any_open
         ring.interval[row] = machine.interval if machine.in_interval else -1
         ring.state[row] = machine.state
@@ -389,7 +389,7 @@ class Session:
             self.counters.refused += 1
             machine.events.append(Refused(refusal, ring.last(FLIGHT_RECORDER)))
             machine.end("refused", str(refusal))
-        return self._answered(packet, answers.finish(number, status), now)
+        return self._answered(packet, policy.finish(number, status), now)
 
     def _answered(self, packet: bytes, reply: bytes, now: float) -> bytes:
         self.counters.answered += 1

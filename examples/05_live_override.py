@@ -15,7 +15,7 @@ import numpy as np
 from hil import Cell
 from hil.archive import open_archive
 from hil.campaign import stop_on_interrupt
-from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.campaign.motion_watch import MotionProgress, OperatorRequest
 from hil.cell_link import cell_link
 from hil.move import send, straight_way
 
@@ -26,15 +26,15 @@ class Person:
     """Slows the motion down from a quarter to half of the way."""
 
     def __init__(self) -> None:
-        self.wishes, self.seen = Wish(), []
+        self.wishes, self.seen = OperatorRequest(), []
 
     def show(self, progress: MotionProgress) -> None:
         """Look where the motion is, about ten times a second."""
         done = (progress.motion_time or 0.0) / (progress.duration or 1.0)
-        self.wishes = Wish(override=0.25 if 0.25 < done < 0.5 else 1.0)
+        self.wishes = OperatorRequest(override=0.25 if 0.25 < done < 0.5 else 1.0)
         self.seen.append((progress.cycles, self.wishes.override, progress.rate or 0.0))
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """What it shall do now."""
         return self.wishes
 

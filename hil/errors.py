@@ -35,7 +35,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar, Final, Self
 
-from hil.printable import printable
+from hil.terminal_text import printable
 
 DISK_REFUSES: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG})
 """Numbers of an OSError that nothing typed or given can mend: full, over quota, broken."""

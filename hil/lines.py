@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from hil.printable import printable
+from hil.terminal_text import printable
 
 
 def put(console: Console, text: str) -> None:

@@ -8,7 +8,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.announced import narrower, shown
+from drivers.init_check import narrower, shown
 from hil.cell import AngleFrame, Cell, CellError
 from hil.violation_text import always_so, violation_text
 from identification.excitation import (

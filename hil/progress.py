@@ -21,7 +21,7 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-from hil.printable import printable
+from hil.terminal_text import printable
 
 # Columns that a bar takes at least.
 _NARROWEST = 8

@@ -21,7 +21,7 @@ from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import PlantDiverged, SettingError
 from sim_fixtures.far_end import FarEnd, FarEndError, UdpFarEnd
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import KNOCK_INTERVAL, PATIENCE, Wish, serve
+from sim_fixtures.serve import KNOCK_INTERVAL, PATIENCE, Request, serve
 from sim_fixtures.tally import ServeSummary, Tally
 
 _PR_SET_TIMERSLACK: Final = 29
@@ -108,12 +108,12 @@ class Buttons:
         self._drive_on = False
         self._emergency_stop = False
 
-    def wish(self) -> Wish:
+    def wish(self) -> Request:
         """Go on; or end, by a signal or because the time is over; or give up."""
         if self._at_once:
-            return Wish.GIVE_UP
+            return Request.GIVE_UP
         over = self._until is not None and time.monotonic() >= self._until
-        return Wish.END if self.interrupted or over else Wish.GO_ON
+        return Request.END if self.interrupted or over else Request.GO_ON
 
     def press(self, signum: int, frame: FrameType | None = None) -> None:
         """Take a signal: SIGINT or SIGTERM end, the second one at once; SIGUSR1, 2 are buttons."""
@@ -244,7 +244,7 @@ def serve_session(
             raise InputError(None, str(error)) from error
         except PlantDiverged as error:
             raise ControllerFault(str(error)) from error
-        if record.started or not summary.ended or pressed.wish() is not Wish.GO_ON:
+        if record.started or not summary.ended or pressed.wish() is not Request.GO_ON:
             return Served(
                 summary,
                 phase=controller.phase,
@@ -293,5 +293,5 @@ class _Observed:
 
 def _pause(seconds: float, pressed: Buttons) -> None:
     until = time.monotonic() + seconds
-    while time.monotonic() < until and pressed.wish() is Wish.GO_ON:
+    while time.monotonic() < until and pressed.wish() is Request.GO_ON:
         time.sleep(0.05)

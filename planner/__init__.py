@@ -34,7 +34,7 @@ from planner.errors import (
 )
 from planner.fourier import FourierSeries, harmonic_bounds
 from planner.interpolator import Interpolator
-from planner.isolation import PlanningChild, close_child, in_child, plan_in_child
+from planner.isolation import WorkerProcess, close_child, in_child, plan_in_child
 from planner.limits import JointLimits
 from planner.motion_csv import from_csv, to_csv
 from planner.motion_plan import MotionPlan, TargetPassage
@@ -63,7 +63,7 @@ __all__ = [
     "plan_in_child",
     "in_child",
     "close_child",
-    "PlanningChild",
+    "WorkerProcess",
     "map_in_children",
     "chunks_of",
     "pack",

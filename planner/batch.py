@@ -21,7 +21,7 @@ from planner.children import chunks_of, map_in_children
 from planner.commands import FlyPercent
 from planner.corners import FIRST_SHARES, LAST_SHARES, LEAST_SHARE, ranked
 from planner.errors import InvalidSetting, InvalidViaPoints, PlannerError, PlanningError
-from planner.isolation import PlanningChild
+from planner.isolation import WorkerProcess
 from planner.joins import Join, Solutions, finish_many, solve_many
 from planner.legs import SEGMENT_ACCELERATION, SEGMENT_JERK, SEGMENT_VELOCITY
 from planner.limits import JointLimits
@@ -327,7 +327,7 @@ class PlanningPool:
     def __init__(self, workers: int = 1, *, timeout: float = 10.0) -> None:
         if workers < 0:
             raise InvalidSetting("workers", workers, "a number of processes, 0 or more")
-        self.children = [PlanningChild(timeout=timeout) for _ in range(workers)]
+        self.children = [WorkerProcess(timeout=timeout) for _ in range(workers)]
 
     def __enter__(self) -> Self:
         return self

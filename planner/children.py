@@ -9,7 +9,7 @@ from time import monotonic
 from typing import Any, Final, Generic, TypeVar
 
 from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
-from planner.isolation import PlanningChild
+from planner.isolation import WorkerProcess
 
 T = TypeVar("T")
 Chunk = Sequence[int]
@@ -27,7 +27,7 @@ def chunks_of(count: int, size: int) -> list[range]:
 
 
 def map_in_children(
-    children: Sequence[PlanningChild],
+    children: Sequence[WorkerProcess],
     function: Callable[..., Iterable[T]],
     chunks: Sequence[Chunk],
     arguments: Callable[[Chunk], tuple[Any, ...]],
@@ -56,7 +56,7 @@ def map_in_children(
         Exception: whatever the function itself raised.
     """
     work, idle = _Work[T](chunks, done), list(children)
-    busy: dict[Any, tuple[PlanningChild, Chunk]] = {}
+    busy: dict[Any, tuple[WorkerProcess, Chunk]] = {}
     try:
         while work.waiting or busy:
             while work.waiting and idle:
@@ -87,7 +87,7 @@ class _Work(Generic[T]):
         self._crashes: Counter[int] = Counter()
         self._not_started: Counter[int] = Counter()
 
-    def fetch(self, child: PlanningChild, chunk: Chunk) -> None:
+    def fetch(self, child: WorkerProcess, chunk: Chunk) -> None:
         """Take the results of a chunk from a child, or have it tried again."""
         try:
             found = list(child.receive())
@@ -123,7 +123,7 @@ class _Work(Generic[T]):
             self._done(len(chunk))
 
 
-def _begin(child: PlanningChild, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+def _begin(child: WorkerProcess, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
     """Give a child a task; one that died while idle, or while it was started, is replaced."""
     for _ in range(_FRESH_STARTS):
         try:

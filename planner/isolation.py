@@ -48,7 +48,7 @@ _ONE_THREAD: Final = dict.fromkeys(
 _SERVE = "import sys; from planner.remote import serve; serve(int(sys.argv[1]))"
 
 
-class PlanningChild:
+class WorkerProcess:
     """A process that calls functions for this one, one at a time.
 
     A function is known to the child by the name it is imported under, so it must belong to a
@@ -210,7 +210,7 @@ class PlanningChild:
 
 
 _lock = threading.Lock()
-_warm: list[PlanningChild] = []
+_warm: list[WorkerProcess] = []
 
 
 def in_child(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -242,9 +242,9 @@ def in_child_now(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs)
         return result
 
 
-def _warm_child() -> PlanningChild:
+def _warm_child() -> WorkerProcess:
     if not _warm:
-        _warm.append(PlanningChild())
+        _warm.append(WorkerProcess())
     return _warm[0]
 
 

@@ -143,7 +143,7 @@ _LOOKS: Final = 100
 """Stray packets looked at after a cycle is over, so that a flood cannot hold the cycle up."""
 
 
-class Wish(IntEnum):
+class Request(IntEnum):
     """What the person in front of the cabinet wants."""
 
     GO_ON = auto()
@@ -183,7 +183,7 @@ def serve(
     far_end: FarEnd,
     *,
     faults: FaultyLink | None = None,
-    wish: Callable[[], Wish] = lambda: Wish.GO_ON,
+    wish: Callable[[], Request] = lambda: Request.GO_ON,
     watch: Callable[[Tally], None] = lambda _: None,
     clock: Clock | None = None,
     patience: float = PATIENCE,
@@ -238,13 +238,13 @@ class _Server:
         self._patience = 0.0
         self._deserted = False
 
-    def knock(self, wish: Callable[[], Wish]) -> bool:
+    def knock(self, wish: Callable[[], Request]) -> bool:
         """Repeat the first packet until it is answered; False if told to end before."""
         packet = self._peer.next_packet()
         if packet is None:
             self.tally.ended = True
             return False
-        while wish() is Wish.GO_ON:
+        while wish() is Request.GO_ON:
             sent = self._clock.now()
             self._wire.send(0 if self.tally.knocks == 0 else _NO_CYCLE, packet)
             self.tally.knocks += 1
@@ -256,16 +256,18 @@ class _Server:
                 return True
         return False
 
-    def _patient_reply(self, packet: bytes, until: float, wish: Callable[[], Wish]) -> bytes | None:
+    def _patient_reply(
+        self, packet: bytes, until: float, wish: Callable[[], Request]
+    ) -> bytes | None:
         """An answer to the first packet, in steps short enough to notice a wish to end."""
-        while wish() is Wish.GO_ON and (now := self._clock.now()) < until:
+        while wish() is Request.GO_ON and (now := self._clock.now()) < until:
             reply = self._reply(packet, min(until, now + 0.1))
             self._watch(self.tally)
             if reply is not None:
                 return reply
         return None
 
-    def run(self, wish: Callable[[], Wish], patience: float) -> None:
+    def run(self, wish: Callable[[], Request], patience: float) -> None:
         """Cycle by cycle to the end."""
         late_by_missing = False
         while True:
@@ -306,9 +308,9 @@ class _Server:
         self._peer.accept(None)
         return True
 
-    def _heed(self, wish: Wish, patience: float) -> bool:
+    def _heed(self, wish: Request, patience: float) -> bool:
         """Ask the controller to end; take its drive away if the arm does not come to rest."""
-        if wish is Wish.END:
+        if wish is Request.END:
             now = self._clock.now()
             if self._finish_by is None:
                 self._finish_by = now + patience
@@ -319,7 +321,7 @@ class _Server:
                 self._peer.lose_drive(
                     f"the arm did not stand within {self._patience:g} s of the end"
                 )
-        return wish is not Wish.GIVE_UP
+        return wish is not Request.GIVE_UP
 
     def _note_lateness(self, *, excused: bool) -> None:
         """Count a cycle that begins late; go on from here if a whole period is gone."""

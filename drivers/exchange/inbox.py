@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.errors import RequestError
-from drivers.exchange import program
+from drivers.exchange import motion_transfer
 from drivers.motion_source import MotionSource
 
 LONGEST_MESSAGE: Final = 1 << 16
@@ -33,7 +33,7 @@ class HandedOver:
     def unpacked(self) -> MotionSource:
         """The motion source; the descriptor is closed, the memory stays mapped as needed."""
         try:
-            return program.unpack(self.fd)
+            return motion_transfer.unpack(self.fd)
         finally:
             os.close(self.fd)
 
@@ -93,7 +93,7 @@ class Inbox:
 
 def hand_over(channel: socket.socket, identity: int, source: MotionSource) -> None:
     """Send a program, from the supervisor's end."""
-    fd = program.pack(source)
+    fd = motion_transfer.pack(source)
     try:
         socket.send_fds(channel, [_IDENTITY.pack(identity)], [fd])
     finally:

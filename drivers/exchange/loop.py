@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Final
 
 from drivers.errors import TransportClosed
-from drivers.exchange.intake import Intake
 from drivers.exchange.listening import Listening
 from drivers.exchange.punctuality import MAX_LATE, Punctuality
+from drivers.exchange.receive_queue import Intake
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport

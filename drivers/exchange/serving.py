@@ -16,8 +16,8 @@ from drivers.exchange.control import PATIENCE, STALE, ArchiveState, ControlBlock
 from drivers.exchange.digest import Digest
 from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import WITHDRAWN, Inbox
-from drivers.exchange.intake import POLL
 from drivers.exchange.latency import bin_of
+from drivers.exchange.liveness import Pulse
 from drivers.exchange.notices import (
     NO_ARCHIVE,
     NO_SUPERVISOR,
@@ -27,7 +27,7 @@ from drivers.exchange.notices import (
     OverrideRefused,
     ResumeRefused,
 )
-from drivers.exchange.pulse import Pulse
+from drivers.exchange.receive_queue import POLL
 from drivers.exchange.shared_ring import SharedCycleRing
 from drivers.motion_source import MotionSource, progress_of
 from drivers.packets import InitPacket

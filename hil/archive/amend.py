@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import IO, BinaryIO
 
 from hil.archive.repair import ArchiveCopy
+from hil.archive.rewrite import write_anew
 from hil.archive.survey import survey
-from hil.archive.written_anew import write_anew
 from hil.errors import ArchiveError
 
 REJECTED = "rejected"

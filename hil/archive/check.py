@@ -23,10 +23,10 @@ from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
 from hil.archive.chunk import ChunkParser, Messages
 from hil.archive.container import ChannelRecord, Damage, Record
 from hil.archive.description import Description, DescriptionError
+from hil.archive.intact import Survey
 from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
 from hil.archive.names import KINDS, ArchiveName
 from hil.archive.order import checksums
-from hil.archive.standing import Survey
 from hil.archive.survey import survey
 from hil.errors import NotAnArchiveError
 from hil.reading import opened

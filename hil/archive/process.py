@@ -31,7 +31,7 @@ from drivers.exchange import (
     PacketReader,
     RingReader,
 )
-from drivers.exchange.pulse import Pulse
+from drivers.exchange.liveness import Pulse
 from hil.archive.commands import (
     Answer,
     Channel,
@@ -45,7 +45,7 @@ from hil.archive.commands import (
     Serving,
 )
 from hil.archive.live import LivePublisher
-from hil.archive.recent import Recent
+from hil.archive.pre_trigger_buffer import Recent
 from hil.archive.recorder import Recorder
 from hil.errors import ArchiveError, InputError
 

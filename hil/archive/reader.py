@@ -23,10 +23,10 @@ from hil.archive.container import Damage, Record
 from hil.archive.description import Description, DescriptionError
 from hil.archive.events import ArchivedEvent
 from hil.archive.index import Summary
+from hil.archive.intact import NUMBERS
 from hil.archive.messages import check_joints, decode_log, joint_state_of
 from hil.archive.order import Contested, Order, Written
 from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, LATER_FIELDS, METADATA
-from hil.archive.standing import NUMBERS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import opened
 

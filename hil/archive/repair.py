@@ -22,11 +22,11 @@ from hil.archive import container, foreign_json, index, schema
 from hil.archive.container import Record
 from hil.archive.description import Description, DescriptionError
 from hil.archive.index import IndexBuilder, MessageHead
+from hil.archive.intact import Piece, Survey, announced_attachments
 from hil.archive.order import listed
 from hil.archive.reader import open_archive
-from hil.archive.standing import Piece, Survey, announced_attachments
+from hil.archive.rewrite import write_anew
 from hil.archive.survey import HEADER, survey
-from hil.archive.written_anew import write_anew
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from hil.whole_number import whole_number
 

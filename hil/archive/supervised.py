@@ -15,7 +15,7 @@ from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 from typing import IO, Protocol
 
 from drivers.exchange import ControlBlock
-from drivers.exchange.pulse import Pulse
+from drivers.exchange.liveness import Pulse
 from hil.archive.commands import Answer, Channel, Command, End
 
 END_TIMEOUT = 30.0

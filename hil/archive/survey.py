@@ -23,8 +23,8 @@ from hil.archive import container, index, schema
 from hil.archive.announced import Announced
 from hil.archive.container import Damage, Record
 from hil.archive.index import IndexBuilder, MessageHead, Summary
+from hil.archive.intact import NUMBERS, Fault, Piece, Survey, announced_attachments
 from hil.archive.order import Contested, Order, Written
-from hil.archive.standing import NUMBERS, Fault, Piece, Survey, announced_attachments
 from hil.errors import ArchiveError
 from hil.reading import opened
 

@@ -27,7 +27,7 @@ from drivers.exchange import (
     ResumeRefused,
 )
 from hil.archive.events import Level
-from hil.counted import counted
+from hil.plural import counted
 
 
 def describe(event: ExchangeEvent) -> str:

@@ -9,8 +9,8 @@ from hil.identify.settings import Settings
 from planner.plain import DAMAGED, text
 
 from .cache import Entry, Where
+from .cache_codec import phase_entry, phase_from, require_one_model, summary_entry, summary_from
 from .factors import BUNDLE, reduce_bundle
-from .kept_forms import phase_entry, phase_from, require_one_model, summary_entry, summary_from
 from .keys import settings_digest, sum_key, summary_key
 from .types import ArchiveRef, Broken, Bundle
 

@@ -9,7 +9,7 @@ from typing import Any, Final, Self, TypeVar
 
 from planner.children import map_in_children
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.isolation import PlanningChild
+from planner.isolation import WorkerProcess
 
 from .on_workers import ArchiveTask, Part, Summed, run_task
 from .types import Broken
@@ -35,7 +35,7 @@ class LocalWorkers(Workers):
     def __init__(self, count: int | None = None, *, timeout: float = TIMEOUT) -> None:
         self.count = count or len(os.sched_getaffinity(0))
         self._timeout = timeout
-        self._children: list[PlanningChild] = []
+        self._children: list[WorkerProcess] = []
 
     def __enter__(self) -> Self:
         return self
@@ -68,7 +68,7 @@ class LocalWorkers(Workers):
         """
         tasks = [task for group in groups for task in group]
         while len(self._children) < min(self.count, len(tasks)):
-            self._children.append(PlanningChild(timeout=self._timeout))
+            self._children.append(WorkerProcess(timeout=self._timeout))
         found = iter(self._done(tasks, done))
         return [summed([next(found) for _ in group], add) for group in groups]
 

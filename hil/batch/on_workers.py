@@ -23,7 +23,7 @@ from hil.batch.tree import sum_run, sum_tree
 from hil.batch.types import Broken
 from hil.errors import HilError
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.isolation import PlanningChild
+from planner.isolation import WorkerProcess
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -156,7 +156,7 @@ def release_children() -> None:
 
 
 def _attempt(
-    child: PlanningChild,
+    child: WorkerProcess,
     task: ArchiveTask[T, S],
     timeout: float,
     identity: Identity,
@@ -190,15 +190,15 @@ def _checked(
 
 
 _lock = threading.Lock()
-_idle: defaultdict[float, list[PlanningChild]] = defaultdict(list)
+_idle: defaultdict[float, list[WorkerProcess]] = defaultdict(list)
 
 
 @contextmanager
-def _borrowed(timeout: float) -> Iterator[PlanningChild]:
+def _borrowed(timeout: float) -> Iterator[WorkerProcess]:
     """A child of one's own, warm where one is idle; a worker may have several threads."""
     with _lock:
         child = _idle[timeout].pop() if _idle[timeout] else None
-    child = child or PlanningChild(timeout=timeout + _START)
+    child = child or WorkerProcess(timeout=timeout + _START)
     try:
         yield child
     finally:

@@ -21,7 +21,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from hil.batch.types import Arm, BatchResult, LevelEstimate
-from hil.instant import instant
+from hil.timestamps import instant
 from hil.version import software
 
 SCHEMA_VERSION: Final = 1

@@ -19,7 +19,7 @@ from hil.batch.axis_figures import friction_of, friction_weights
 from hil.batch.chart import Drift, Limits, chart, drift
 from hil.batch.payload_trend import LEAST_EFFECT, PayloadTrend, payload_trend
 from hil.batch.types import BatchResult, Broken, LevelEstimate
-from hil.instant import instant
+from hil.timestamps import instant
 from identification import RobotModel
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from .errors import CacheError
 from .factors import opened, without_sum
 from .keeping import bundle_with_cache, bundles, is_kept, kept_bundle
 from .on_workers import ArchiveTask, Part, Summed
-from .settling import Settled, consulted, known_settings, settle
+from .settings import Settled, consulted, known_settings, settle
 from .tree_sum import TreeSum
 from .types import ArchiveRef, Broken, Bundle, GroupKey
 from .workers import Workers

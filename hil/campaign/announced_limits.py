@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.announced import AnnouncedLimits, narrower, shown
+from drivers.init_check import AnnouncedLimits, narrower, shown
 from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from hil.archive import ArchiveName, open_archive
-from hil.counted import counted
 from hil.errors import ArchiveError, HilError
+from hil.plural import counted
 from hil.results.conduct import ConductResult, RecordedResult, StepResult, WarmUpResult
 from hil.whole_number import whole_number
 

@@ -21,9 +21,9 @@ from hil.whole_number import whole_number
 from .errors import CampaignFolderError
 from .folder import CampaignFolder
 from .gravity_check import AGAINST, GravityCheck
-from .kind_of_arm import made_by
 from .operator import DryRunSummary
 from .read_back import read_back
+from .simulation_flag import made_by
 
 OVERRIDE: Final = 0.2
 """Largest share of the planned speed."""

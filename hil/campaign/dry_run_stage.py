@@ -14,9 +14,9 @@ from .execution_runner import Runner
 from .folder import CampaignFolder
 from .gates import not_accepted
 from .intervals import Interval
-from .kind_of_arm import made_by
 from .operator import Operator
 from .quality_entry import Entering
+from .simulation_flag import made_by
 from .stop import Stop
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive.commands import Failed
-from hil.counted import counted
 from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError, UnsafeError
+from hil.plural import counted
 
 
 class CampaignFolderError(InputError):

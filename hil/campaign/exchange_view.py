@@ -24,12 +24,12 @@ from drivers.exchange import (
     ExchangeStatus,
     Leaving,
 )
-from drivers.exchange.pulse import Pulse
+from drivers.exchange.liveness import Pulse
 from drivers.states import State
-from hil.counted import counted
+from hil.plural import counted
 
-from .beginning import Beginning
 from .motion_link import Connection
+from .start_timeout import Beginning
 
 HUNG = 5.0
 """s without a sign of life after which an exchange process is ended: the controller, unanswered

@@ -42,8 +42,8 @@ from .operator import Operator, Unattended
 from .quality_entry import Entering
 from .repeating import any_warmth, play_until_good
 from .stop import Stop
+from .straight_moves import Ways, seen_in_dry_run
 from .warmup_stage import WarmUpStage
-from .ways import Ways, seen_in_dry_run
 
 if TYPE_CHECKING:
     from .campaign import Campaign

@@ -14,8 +14,8 @@ from hil.version import software
 
 from .folder import CampaignFolder
 from .intervals import Interval
-from .kind_of_arm import SIMULATED, said_of
 from .plan import CampaignPlan, moves_to_dict
+from .simulation_flag import SIMULATED, said_of
 
 REPEATED = ("excitation", "warmup")
 """Kinds that run the excitation as it was designed."""

@@ -18,7 +18,7 @@ from .execution_watch import RunWatch
 from .intervals import Interval, ends, player_of
 from .motion_link import MotionLink
 from .stop import Stop
-from .ways import Ways
+from .straight_moves import Ways
 
 Array = NDArray[np.float64]
 

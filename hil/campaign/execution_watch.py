@@ -8,7 +8,7 @@ from typing import cast
 
 from hil.archive.names import WORDS
 
-from .motion_watch import MotionProgress, Wish
+from .motion_watch import MotionProgress, OperatorRequest
 from .operator import DriftCurve, Operator, Phase, RunStatus
 from .stop import Stop
 
@@ -51,7 +51,7 @@ class RunWatch:
     _total: int = 1
     _duration: float = 0.0
     _most: float = 1.0
-    _wish: Wish = field(default_factory=Wish)
+    _wish: OperatorRequest = field(default_factory=OperatorRequest)
     _notes: tuple[str, ...] = ()
 
     def expect(self, seconds: float) -> None:
@@ -88,11 +88,11 @@ class RunWatch:
             self._shown, self.began = True, time.time()
         self._tell(progress)
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """See `MotionWatch.wish`."""
         try:
             wish: object = self.operator.wish()
-            if not isinstance(wish, Wish):
+            if not isinstance(wish, OperatorRequest):
                 raise TypeError(f"{wish!r} is no wish")
             self._wish = wish
         except Exception as error:  # the arm moves: a screen must not decide how it ends

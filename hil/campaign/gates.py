@@ -19,9 +19,9 @@ from .dry_run import DryRun
 from .errors import AgainstGravityError, CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .gravity_check import AGAINST
-from .kind_of_arm import SIMULATED, said_of
 from .motion_link import MotionLink
 from .rehearsal import Rehearsal
+from .simulation_flag import SIMULATED, said_of
 
 _ADDRESS: Final = ("transport", "host", "port", "bind", "can", "packets")
 """Keys of `[controller]` that say where it is, and not what is exchanged."""

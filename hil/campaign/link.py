@@ -30,7 +30,6 @@ from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
 from hil.cell import Cell
 from hil.errors import ControllerFault, OperatorStopError
 
-from .beginning import Beginning
 from .motion_link import (
     END_TIMEOUT,
     Connection,
@@ -42,7 +41,8 @@ from .motion_link import (
     unwatched,
 )
 from .motion_watch import MotionWatch, unwatched_motion
-from .sight import Counted, Sight, duration_of
+from .progress import Counted, Sight, duration_of
+from .start_timeout import Beginning
 from .steering import ASKED_EVERY, NOT_BEGUN, Polite, Steering
 from .stop import Stop
 

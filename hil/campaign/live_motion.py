@@ -18,7 +18,7 @@ from hil.errors import ControllerFault
 from .errors import write_error
 from .motion_link import drives_in_force
 from .motion_watch import MotionWatch
-from .sight import Counted, Sight, duration_of, guard_in_force
+from .progress import Counted, Sight, duration_of, guard_in_force
 from .steering import NOT_BEGUN, Steering
 from .stop import Stop
 

@@ -10,10 +10,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.announced import compare
 from drivers.drive_train import DriveTrain
 from drivers.events import InitReceived, MotionEnded, Refused
 from drivers.exchange import ExchangeEvent
+from drivers.init_check import compare
 from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.states import State

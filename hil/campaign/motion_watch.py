@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Wish:
+class OperatorRequest:
     """What the person wants of the motion, until another wish.
 
     Attributes:
@@ -105,7 +105,7 @@ class MotionWatch(Protocol):
         """Look; called about ten times a second."""
         ...
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """The latest wish."""
         ...
 
@@ -116,9 +116,9 @@ class Unwatched:
     def show(self, progress: MotionProgress) -> None:
         """Nobody looks."""
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """The motion as it was planned."""
-        return Wish()
+        return OperatorRequest()
 
 
 unwatched_motion = Unwatched()

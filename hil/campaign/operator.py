@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .motion_watch import MotionProgress, Wish
+from .motion_watch import MotionProgress, OperatorRequest
 
 Array = NDArray[np.float64]
 
@@ -113,7 +113,7 @@ class Operator(Protocol):
         """Show where the run stands."""
         ...
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """Return what the person wishes now: override and hold."""
         ...
 
@@ -134,9 +134,9 @@ class Unattended:
         """Show nothing."""
         del status
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """Full speed."""
-        return Wish()
+        return OperatorRequest()
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
         """Nobody has seen it."""

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from hil.archive import ArchiveName
-from hil.counted import counted
 from hil.errors import HilError
+from hil.plural import counted
 from hil.reading import lies_there
 from hil.results import Results
 

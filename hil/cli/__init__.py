@@ -18,7 +18,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from hil.errors import DISK_REFUSES, HilError, OperatorStopError
-from hil.printable import printable
+from hil.terminal_text import printable
 from hil.version import software
 from identification import IdentificationError
 from planner import PlannerError

@@ -15,7 +15,7 @@ from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
 from hil.cli.failing import exit_code_of
 from hil.errors import ArchiveError, InputError
-from hil.printable import printable
+from hil.terminal_text import printable
 
 app = typer.Typer(help="Look into archives, check and repair them.", no_args_is_help=True)
 

@@ -13,8 +13,8 @@ from hil.compare import compare_campaigns, gather
 from hil.compare.record import to_dict
 from hil.compare.words import caveat, told, verdict
 from hil.files import make_folder, write_together
-from hil.printable import printable
 from hil.progress import reporter as make_reporter
+from hil.terminal_text import printable
 
 CHANGED: Final = 5
 """Exit status with --fail-on-change: something has changed."""

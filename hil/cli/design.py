@@ -24,8 +24,8 @@ from hil.design.folder import DesignFolder, require_same
 from hil.design.run import Designed, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
-from hil.printable import printable
 from hil.progress import reporter as make_reporter
+from hil.terminal_text import printable
 
 from . import design_words as words
 

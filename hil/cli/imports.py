@@ -24,7 +24,7 @@ from hil.importers import (
     recorded_joints,
 )
 from hil.lines import say
-from hil.printable import printable
+from hil.terminal_text import printable
 from identification import FrictionLaw
 
 FRICTION = "coulomb,viscous,offset"

@@ -16,17 +16,17 @@ import typer
 from drivers.events import MotionEnded
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
 from hil.campaign.announced_limits import checks_in_force, narrower_thresholds
-from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.campaign.motion_watch import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
 from hil.lines import say
 from hil.move import THERE, Way, posture, send, straight_way, turned
-from hil.printable import printable
 from hil.progress import Task
 from hil.progress import reporter as make_reporter
 from hil.recording import archive_path
+from hil.terminal_text import printable
 
 
 def move(
@@ -187,9 +187,9 @@ class _Shown:
             self._task.advance(progress.motion_time - self._done)
             self._done = progress.motion_time
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """The motion as it was planned; only Ctrl-C stops it."""
-        return Wish()
+        return OperatorRequest()
 
 
 @contextmanager

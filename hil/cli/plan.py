@@ -21,8 +21,8 @@ from hil.cli.plan_input import (
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import check_format, draw_plan, save
-from hil.printable import printable
 from hil.random_motion import random_via_points
+from hil.terminal_text import printable
 from planner.motion_csv import to_csv
 from planner.moves import Fly, FlyDistance, FlyPercent, MotionPlan, plan_moves
 from planner.plan_file import PlanFile

@@ -16,7 +16,7 @@ from hil.plots.archive_panels import BINS as PAGE_BINS
 from hil.plots.archive_picture import draw_archive
 from hil.plots.archive_view import BINS, view_of
 from hil.plots.plan_picture import FORMATS
-from hil.printable import printable
+from hil.terminal_text import printable
 
 PAGE = ".html"
 

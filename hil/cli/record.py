@@ -20,9 +20,9 @@ from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
 from hil.errors import ControllerFault, HilError, OperatorStopError
 from hil.lines import say
-from hil.printable import printable
 from hil.recording import archive_path
 from hil.recording import record as record_motion
+from hil.terminal_text import printable
 
 LINE_PERIOD = 5.0
 """s between two lines where there is no terminal."""

@@ -32,9 +32,9 @@ from hil.cli.identify_options import (
 )
 from hil.files import make_folder, writing_to
 from hil.identify.options import Options, friction_from
-from hil.printable import printable
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
+from hil.terminal_text import printable
 
 SOME_BROKEN: Final = 5
 """Exit status: done, but some archives could not be used."""

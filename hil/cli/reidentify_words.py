@@ -14,7 +14,7 @@ from hil.batch.table import relative_error
 from hil.batch.trend import ArmTrend, Trends
 from hil.batch.trend_words import findings, summary
 from hil.batch.types import Arm, BatchResult, Broken, LevelEstimate
-from hil.counted import counted
+from hil.plural import counted
 
 _LISTED: Final = 20
 _WIDTH: Final = 42

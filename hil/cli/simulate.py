@@ -13,9 +13,9 @@ from drivers.transports.faults import FaultyLink
 from hil.cell import Cell
 from hil.cli.simulation_status import Status
 from hil.errors import InputError
-from hil.printable import printable
 from hil.serving import Served, buttons, open_far_end, serve_session, undisturbed
 from hil.simulation import controller_settings, own_postures, simulated_controller
+from hil.terminal_text import printable
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import SettingError
 from sim_fixtures.fault_script import Fault, FaultScriptError, parse_fault, split_faults

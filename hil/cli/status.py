@@ -13,7 +13,7 @@ from rich.text import Text
 
 from hil.campaign import Campaign
 from hil.campaign.status import CampaignStatus
-from hil.printable import printable
+from hil.terminal_text import printable
 
 _MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("waits", "dim")}
 

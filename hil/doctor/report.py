@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from hil.printable import printable
+from hil.terminal_text import printable
 
 from .check import Check, Status
 from .fitness import CRITERIA, Fitness

@@ -28,7 +28,7 @@ from hil.importers.column_map import Column
 from hil.importers.mcap_messages import Topic
 from hil.reading import opened, text_of
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.isolation import PlanningChild
+from planner.isolation import WorkerProcess
 
 STAMP = "stamp"
 """Name of the time of a topic's messages [ns]: that of their header, or else the file's."""
@@ -598,7 +598,7 @@ def _elsewhere(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T
     """Call scipy's reader in a process of its own: a damaged file can kill it."""
     with _lock:
         if not _readers:
-            _readers.append(PlanningChild(timeout=_PATIENCE))
+            _readers.append(WorkerProcess(timeout=_PATIENCE))
         try:
             return _readers[0].call(_within_memory, partial(function, *args, **kwargs))
         except PlannerCrashed as error:
@@ -619,7 +619,7 @@ def _close() -> None:
 
 
 _lock = threading.Lock()
-_readers: list[PlanningChild] = []
+_readers: list[WorkerProcess] = []
 atexit.register(_close)
 
 

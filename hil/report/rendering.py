@@ -12,7 +12,7 @@ from typing import Final
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from hil.printable import written_out
+from hil.terminal_text import written_out
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 _STYLE: Final = "report.css"

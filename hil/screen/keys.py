@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Final, Literal, TextIO
 
-from hil.campaign.motion_watch import Wish
+from hil.campaign.motion_watch import OperatorRequest
 
 STEP: Final = 0.1
 """Of override, per key."""
@@ -62,7 +62,7 @@ def _urgent(after_escape: re.Match[str]) -> str:
     return after_escape[1] if _is_urgent(after_escape[1]) else "\x1b"
 
 
-def after(wish: Wish, key: str, override: float) -> Wish:
+def after(wish: OperatorRequest, key: str, override: float) -> OperatorRequest:
     """The wish after a key.
 
     Args:

@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 from rich.text import Text
 
-from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.campaign.motion_watch import MotionProgress, OperatorRequest
 from hil.campaign.operator import DriftCurve, RunStatus
-from hil.printable import printable
+from hil.terminal_text import printable
 
 from . import marks
 from .keys import HELP, SHORT_HELP
@@ -53,7 +53,7 @@ class Shown:
     title: str
     joint_names: tuple[str, ...]
     status: RunStatus | None = None
-    wish: Wish = field(default_factory=Wish)
+    wish: OperatorRequest = field(default_factory=OperatorRequest)
     stopping: bool = False
     age: float = 0.0
     said: tuple[str, ...] = ()

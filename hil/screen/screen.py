@@ -25,14 +25,14 @@ from rich.table import Table
 from rich.text import Text
 
 from hil.campaign.gravity_check import AGAINST
-from hil.campaign.motion_watch import Wish
+from hil.campaign.motion_watch import OperatorRequest
 from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.campaign.stop import Stop
 from hil.cell import Cell
-from hil.counted import counted
 from hil.lines import put
-from hil.printable import printable
+from hil.plural import counted
 from hil.progress import Silent, Task
+from hil.terminal_text import printable
 
 from . import marks, plain
 from .keys import Keyboard, after, can_read, stops
@@ -276,7 +276,7 @@ class Screen:
         self._full = not quiet and self._console.is_terminal and not self._console.is_dumb_terminal
         self._quiet = quiet
         self._stop = stop
-        self._wish = Wish()
+        self._wish = OperatorRequest()
         self._shown = Shown(title, tuple(joint_names), keys=False, far_end=far_end)
         self._pace = Pace(virtual=virtual)
         self._came = time.monotonic()
@@ -321,7 +321,7 @@ class Screen:
         if self._undrawn is not None:
             raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """What the person wishes.
 
         Raises:

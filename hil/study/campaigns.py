@@ -31,7 +31,7 @@ from identification.excitation import (
 from planner import FourierSeries, PlanFile, PlannerError
 from planner.children import map_in_children
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.isolation import PlanningChild
+from planner.isolation import WorkerProcess
 
 from .searches import (
     AP,
@@ -396,7 +396,7 @@ def execute(execution: Execution) -> str | None:
 class Workers:
     """Child processes; without any, all is done in this process."""
 
-    children: tuple[PlanningChild, ...]
+    children: tuple[WorkerProcess, ...]
 
     def map(
         self,
@@ -433,7 +433,7 @@ class Workers:
 @contextmanager
 def workers_of(count: int) -> Iterator[Workers]:
     """So many processes, ended when this is left; one is this process itself."""
-    children = [PlanningChild(timeout=LONGEST) for _ in range(count if count > 1 else 0)]
+    children = [WorkerProcess(timeout=LONGEST) for _ in range(count if count > 1 else 0)]
     try:
         yield Workers(tuple(children))
     finally:

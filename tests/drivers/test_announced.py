@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers import DriveTrain, InitPacket
-from drivers.announced import Announced, AnnouncedLimits, compare, shown
+from drivers.init_check import Announced, AnnouncedLimits, compare, shown
 from tests.drivers.rig import PERIOD, drive_train
 
 COUPLING = (0.02, 0.003, 0.04)

@@ -26,7 +26,7 @@ from drivers.exchange import (
     SharedCycleRing,
     control,
     event_log,
-    program,
+    motion_transfer,
 )
 from drivers.exchange.digest import Digest
 from drivers.record import CycleRing, cycle_dtype
@@ -266,7 +266,7 @@ class TestControlBlock:
 
 class TestProgram:
     def test_it_plays_as_the_original_does(self):
-        there = program.unpack(program.pack(still(5000)))
+        there = motion_transfer.unpack(motion_transfer.pack(still(5000)))
         here = still(5000)
         there.begin(there.start)
         here.begin(here.start)
@@ -275,14 +275,14 @@ class TestProgram:
 
     def test_large_arrays_are_mapped_and_read_only_small_ones_are_not(self):
         source = still(5000)
-        there = program.unpack(program.pack(source))
+        there = motion_transfer.unpack(motion_transfer.pack(source))
         assert not there.positions.flags.writeable
         assert isinstance(_root(there.positions), mmap.mmap)
-        small = program.unpack(program.pack(Cruise()))
+        small = motion_transfer.unpack(motion_transfer.pack(Cruise()))
         small.start += 1.0
 
     def test_its_memory_cannot_change_any_more(self):
-        fd = program.pack(still(10))
+        fd = motion_transfer.pack(still(10))
         with pytest.raises(OSError, match="not permitted"):
             os.pwrite(fd, b"x", 0)
         with pytest.raises(PermissionError):
@@ -291,13 +291,13 @@ class TestProgram:
 
     def test_memory_that_could_still_change_is_refused(self):
         with pytest.raises((ValueError, OSError)):
-            program.unpack(control.create())
+            motion_transfer.unpack(control.create())
 
     def test_what_does_not_pickle_is_not_handed_over(self):
         source = still(10)
         source.callback = lambda: None
         with pytest.raises((pickle.PicklingError, AttributeError)):
-            program.pack(source)
+            motion_transfer.pack(source)
 
 
 def _root(array):

@@ -22,7 +22,7 @@ from drivers.exchange import (
     event_log,
 )
 from drivers.exchange.control import PATIENCE, STALE
-from drivers.exchange.intake import POLL
+from drivers.exchange.receive_queue import POLL
 from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Serving
 from drivers.states import State
 from tests.drivers.rig import N

@@ -16,7 +16,7 @@ from drivers.events import (
     StateChanged,
 )
 from drivers.execution import Execution, execution_of
-from drivers.machine import LOSS_WINDOW, Machine
+from drivers.state_machine import LOSS_WINDOW, Machine
 from drivers.states import Input
 from tests.drivers.rig import START, Cruise, N
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from drivers.exchange.pulse import LONGEST_LOOK, Pulse
+from drivers.exchange.liveness import LONGEST_LOOK, Pulse
 
 
 class Machine:

@@ -13,7 +13,7 @@ from drivers import (
     Refused,
     RequestError,
     State,
-    answers,
+    reply_policy,
 )
 from drivers.errors import (
     ExitNotGranted,
@@ -230,8 +230,8 @@ class TestLeaving:
 
     @pytest.fixture(autouse=True)
     def short(self, monkeypatch):
-        monkeypatch.setattr(answers, "EXIT_RETRY_CYCLES", self.RETRY)
-        monkeypatch.setattr(answers, "EXIT_TIMEOUT", self.TIMEOUT * PERIOD)
+        monkeypatch.setattr(reply_policy, "EXIT_RETRY_CYCLES", self.RETRY)
+        monkeypatch.setattr(reply_policy, "EXIT_TIMEOUT", self.TIMEOUT * PERIOD)
 
     def test_the_end_of_open_mode_is_asked_for_again_until_that_is_a_fault(self):
         rig = Rig()

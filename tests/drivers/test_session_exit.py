@@ -16,8 +16,8 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.answers import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
 from drivers.errors import ExitNotGranted, FirstSetPointUnknown
+from drivers.reply_policy import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
 from drivers.states import CORRECTION_MODES
 from tests.drivers.rig import (
     PERIOD,

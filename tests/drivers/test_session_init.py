@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers import InitReceived, Mode, RequestError, State
-from drivers.announced import narrower, shown
+from drivers.init_check import narrower, shown
 from drivers.packets import NO_SLOT
 from tests.drivers.rig import START, N, Rig, drive_train, init_packet, smooth_move, still
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-import drivers.machine
+import drivers.state_machine
 from drivers import Guard, State
-from drivers.machine import Machine
+from drivers.state_machine import Machine
 from drivers.states import TRANSITIONS, Input
 from tests.drivers.model_controller import PERIOD, N
 from tests.drivers.session_machine import SessionMachine
@@ -115,7 +115,11 @@ RATES = "velocity|acceleration|jerk|position|finite"
             Guard, "check_feedback", skip, "following error|current|not there|finite", id="feedback"
         ),
         pytest.param(
-            drivers.machine, "TRANSITIONS", OPEN_AT_ONCE, "closed axes", id="closed after a fault"
+            drivers.state_machine,
+            "TRANSITIONS",
+            OPEN_AT_ONCE,
+            "closed axes",
+            id="closed after a fault",
         ),
     ],
 )

@@ -13,8 +13,8 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.answers import EXIT_RETRY_CYCLES
 from drivers.packets import NO_SLOT
+from drivers.reply_policy import EXIT_RETRY_CYCLES
 from tests.drivers.rig import (
     START,
     Cruise,

@@ -10,7 +10,7 @@ import pytest
 
 from drivers import Guard
 from drivers.errors import MotionNotCarriedOn, NotFinite
-from drivers.taken import LONGEST_CARRY, TakenSetPoints
+from drivers.set_points import LONGEST_CARRY, SentSetPoints
 from tests.drivers.rig import PERIOD, N, limits
 
 TURNS = np.array([40.0, -30.0, 20.0, -10.0, 5.0, -2.0])
@@ -23,7 +23,7 @@ class Sent:
     """Set-points of a joint from TURNS on, each `step` further; the other joints stand."""
 
     def __init__(self, step: float, depth: int = 3, count: int = 8, joint: int = 1):
-        self.taken = TakenSetPoints(Guard(limits(), PERIOD), depth)
+        self.taken = SentSetPoints(Guard(limits(), PERIOD), depth)
         self.step = step * np.eye(N)[joint]
         self.last = TURNS
         self.taken.begin(TURNS)

@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.states import State
 from hil.campaign import stop_on_interrupt
-from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.campaign.motion_watch import MotionProgress, OperatorRequest
 from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.screen import Screen
 
@@ -24,7 +24,7 @@ LONGEST = 60.0
 NAMES = ("joint_1", "joint_2")
 
 
-def status(wish: Wish) -> RunStatus:
+def status(wish: OperatorRequest) -> RunStatus:
     """In the third repetition, doing as wished."""
     share, zero = np.array([0.1, 0.9]), np.zeros(2)
     motion = MotionProgress(
@@ -39,7 +39,7 @@ def main() -> int:
     file, ending = Path(sys.argv[1]), sys.argv[2]
     with stop_on_interrupt() as stop, Screen(NAMES, stop, title="rig") as screen:
         with file.open("w", buffering=1) as told:
-            last: Wish | None = None
+            last: OperatorRequest | None = None
             until = time.monotonic() + LONGEST
             if ending in ("question", "contradiction"):
                 summary = DryRunSummary(

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.batch.cache import Store, Where, decoded, encoded
+from hil.batch.cache_codec import settings_from, settings_header
 from hil.batch.errors import CacheError
 from hil.batch.keeping import BUNDLE, bundles
-from hil.batch.kept_forms import settings_from, settings_header
 from hil.batch.keys import arm_digest, settings_digest, sum_key
 from hil.batch.local import LocalWorkers
 from hil.batch.on_workers import ArchiveTask, Part

@@ -104,7 +104,7 @@ def test_what_is_drawn_towards_a_machine_is_that_of_hil_identify(
         return found._replace(settings=replace(found.settings, shrinkage=Shrinkage(0.1)))
 
     monkeypatch.setattr("hil.identify.prepared.decide", drawn)
-    monkeypatch.setattr("hil.batch.settling.decide", drawn)
+    monkeypatch.setattr("hil.batch.settings.decide", drawn)
     options = replace(FIXED, estimator="auto")
     prepared = prepare_sources(gather_sources(archives(campaign), 0.7), options, Silent())
     one = estimate_with(prepared, options, Silent()).result
@@ -188,7 +188,7 @@ def test_settings_are_decided_once_for_each_arm(
         read.append([source.name for source in sources.training])
         return decide(sources, options, reporter)
 
-    monkeypatch.setattr("hil.batch.settling.decide", spied)
+    monkeypatch.setattr("hil.batch.settings.decide", spied)
     found = batch(tmp_path, plan=Plan(replace(FIXED, friction="auto"), keep=False))
     assert read == [["excitation_001_a1.mcap"]]
     assert [Path(one.campaign).name for one in found.campaigns] == ["b", "c"]

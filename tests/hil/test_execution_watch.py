@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hil.campaign.execution_watch import RunWatch
-from hil.campaign.motion_watch import Wish
+from hil.campaign.motion_watch import OperatorRequest
 from hil.campaign.operator import RunStatus
 from hil.campaign.stop import Stop
 
@@ -14,14 +14,14 @@ class Failing:
     can_answer = False
 
     def __init__(self) -> None:
-        self.shown, self.answer, self.fails = 0, Wish(), False
+        self.shown, self.answer, self.fails = 0, OperatorRequest(), False
 
     def show(self, _: RunStatus) -> None:
         self.shown += 1
         if self.fails:
             raise RuntimeError("no picture")
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         return self.answer
 
     def accept_dry_run(self, _: object) -> bool:
@@ -35,8 +35,8 @@ def test_a_screen_that_shows_nothing_is_still_asked_for_wishes() -> None:
     for _ in range(3):
         watch.note("good")
     assert operator.shown == 1
-    operator.answer = Wish(0.4, held=True)
-    assert watch.wish() == Wish(0.4, held=True)
+    operator.answer = OperatorRequest(0.4, held=True)
+    assert watch.wish() == OperatorRequest(0.4, held=True)
     assert not stop.requested
     assert len(watch.troubles) == 1
     assert "no picture" in watch.troubles[0]
@@ -45,12 +45,12 @@ def test_a_screen_that_shows_nothing_is_still_asked_for_wishes() -> None:
 def test_a_wish_that_is_none_leaves_the_last_and_is_asked_for_anew() -> None:
     operator, stop = Failing(), Stop()
     watch = RunWatch(operator, stop)
-    operator.answer = Wish(0.4)
+    operator.answer = OperatorRequest(0.4)
     watch.wish()
     operator.answer = None  # type: ignore[assignment]
-    assert watch.wish() == Wish(0.4)
-    operator.answer = Wish(0.3)
-    assert watch.wish() == Wish(0.3)
+    assert watch.wish() == OperatorRequest(0.4)
+    operator.answer = OperatorRequest(0.3)
+    assert watch.wish() == OperatorRequest(0.3)
     assert "None is no wish" in watch.troubles[0]
     assert not stop.requested
 
@@ -58,7 +58,7 @@ def test_a_wish_that_is_none_leaves_the_last_and_is_asked_for_anew() -> None:
 def test_a_hold_that_nobody_can_release_becomes_a_stop() -> None:
     operator, stop = Failing(), Stop()
     watch = RunWatch(operator, stop)
-    operator.answer = Wish(held=True)
+    operator.answer = OperatorRequest(held=True)
     watch.wish()
     assert not stop.requested
     operator.answer = None  # type: ignore[assignment]

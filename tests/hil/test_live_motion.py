@@ -19,7 +19,7 @@ from hil.archive.live_view import LiveView, LiveViewError
 from hil.campaign import Stop
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.live_link import LiveLink
-from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.campaign.motion_watch import MotionProgress, OperatorRequest
 from hil.cell import Cell
 from hil.cell.link import stays_here
 from hil.cli.record import record
@@ -46,10 +46,10 @@ class Person:
         self._rested += progress.held and progress.rate == 0.0
         self._stop.requested = self._rested >= 6
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         time = (self.seen[-1].motion_time or 0.0) if self.seen else 0.0
         first, second = time > 0.5 and self._rested < 3, time > 1.2
-        return Wish(0.5 if time > 0.2 else 1.0, held=first or second)
+        return OperatorRequest(0.5 if time > 0.2 else 1.0, held=first or second)
 
 
 def test_a_motion_is_slowed_held_and_stopped_in_a_hold_while_a_viewer_looks(
@@ -133,11 +133,11 @@ class Pressed:
     """Wishes what it is set to."""
 
     def __init__(self) -> None:
-        self.now = Wish()
+        self.now = OperatorRequest()
 
     def show(self, progress: MotionProgress) -> None: ...
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         return self.now
 
 
@@ -159,7 +159,7 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
 
             def press(what: str = what, stop: Stop = stop, person: Pressed = person) -> None:
                 stop.requested = what.startswith("stop")
-                person.now = Wish(held=what.startswith("hold"))
+                person.now = OperatorRequest(held=what.startswith("hold"))
                 threading.Timer(1.5, setattr, (stop, "requested", True)).start()
 
             def opened(*spec: ArchiveSpec, what: str = what, **how: bool) -> None:

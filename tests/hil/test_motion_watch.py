@@ -16,7 +16,7 @@ from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.campaign import Stop
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.link import Link
-from hil.campaign.motion_watch import MotionProgress, Wish
+from hil.campaign.motion_watch import MotionProgress, OperatorRequest
 from hil.cell import Cell
 from hil.errors import ControllerFault
 from hil.simulation import simulated_link
@@ -26,7 +26,7 @@ from planner import Move, PiecewiseCubic, TrajectoryPlayer, plan_moves
 class Person:
     """Wishes what a script says at a moment of the motion."""
 
-    def __init__(self, script: Callable[[float], Wish]) -> None:
+    def __init__(self, script: Callable[[float], OperatorRequest]) -> None:
         self._script, self._time, self._held = script, 0.0, 0
         self.seen: list[MotionProgress] = []
 
@@ -34,7 +34,7 @@ class Person:
         self.seen.append(progress)
         self._time = progress.motion_time or 0.0
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         return self._script(self._time)
 
 
@@ -93,7 +93,7 @@ def require_on_path(arm: Arm, points: np.ndarray) -> None:
 
 
 def test_a_dry_run_is_slow_from_its_first_cycle(arm: Arm, tmp_path: Path) -> None:
-    person = Person(lambda _: Wish())
+    person = Person(lambda _: OperatorRequest())
     ended = arm.run(tmp_path / "a.mcap", person, override=0.2)
     assert ended.outcome == "completed"
     points = commanded(open_archive(tmp_path / "a.mcap"))
@@ -106,7 +106,7 @@ def test_a_dry_run_is_slow_from_its_first_cycle(arm: Arm, tmp_path: Path) -> Non
 
 
 def test_the_person_may_slow_a_dry_run_and_not_speed_it_up(arm: Arm, tmp_path: Path) -> None:
-    person = Person(lambda time: Wish(0.1 if time > 0.3 else 1.0))
+    person = Person(lambda time: OperatorRequest(0.1 if time > 0.3 else 1.0))
     arm.run(tmp_path / "a.mcap", person, override=0.2)
     assert {progress.override for progress in person.seen} == {0.2, 0.1}
     assert person.seen[-2].rate == pytest.approx(0.1)
@@ -115,11 +115,11 @@ def test_the_person_may_slow_a_dry_run_and_not_speed_it_up(arm: Arm, tmp_path: P
 def test_a_hold_rests_on_the_path_and_is_gone_on_from(arm: Arm, tmp_path: Path) -> None:
     asked = 0
 
-    def script(time: float) -> Wish:
+    def script(time: float) -> OperatorRequest:
         nonlocal asked
         held = time > 0.4 and asked < 12
         asked += held
-        return Wish(0.5, held)
+        return OperatorRequest(0.5, held)
 
     person = Person(script)
     ended = arm.run(tmp_path / "a.mcap", person)
@@ -138,11 +138,11 @@ def test_a_hold_rests_on_the_path_and_is_gone_on_from(arm: Arm, tmp_path: Path) 
 def test_a_stop_ends_a_hold(arm: Arm, tmp_path: Path) -> None:
     stop, asked = Stop(), 0
 
-    def script(time: float) -> Wish:
+    def script(time: float) -> OperatorRequest:
         nonlocal asked
         asked += time > 0.4
         stop.requested = asked > 20
-        return Wish(held=time > 0.4)
+        return OperatorRequest(held=time > 0.4)
 
     ended = arm.run(tmp_path / "a.mcap", Person(script), stop)
     assert ended.outcome == "stopped"
@@ -154,11 +154,11 @@ def test_a_stop_ends_a_hold(arm: Arm, tmp_path: Path) -> None:
 def test_nothing_begins_while_a_hold_is_wished_for(arm: Arm, tmp_path: Path) -> None:
     stop, asked = Stop(), 0
 
-    def script(_: float) -> Wish:
+    def script(_: float) -> OperatorRequest:
         nonlocal asked
         asked += 1
         stop.requested = asked > 5
-        return Wish(held=True)
+        return OperatorRequest(held=True)
 
     person = Person(script)
     ended = arm.run(tmp_path / "a.mcap", person, stop)
@@ -180,11 +180,11 @@ def test_what_is_pressed_while_the_archive_is_created_comes_in_time(
         stop.requested = what == "stop"
         return opened(given)
 
-    def script(_: float) -> Wish:
+    def script(_: float) -> OperatorRequest:
         nonlocal pressed
         pressed += pressed > 0
         stop.requested = stop.requested or pressed > 5
-        return Wish(held=pressed > 0)
+        return OperatorRequest(held=pressed > 0)
 
     monkeypatch.setattr(arm.link, "_open", slowly)
     ended = arm.run(tmp_path / "a.mcap", Person(script), stop)
@@ -199,12 +199,12 @@ def test_a_motion_held_before_it_begins_rests_and_what_was_wished_is_archived(
 ) -> None:
     asked = 0
 
-    def script(_: float) -> Wish:
+    def script(_: float) -> OperatorRequest:
         nonlocal asked
         asked += 1
         if asked <= 2:  # until it was asked for
-            return Wish()
-        return Wish(0.5, held=asked < 20)
+            return OperatorRequest()
+        return OperatorRequest(0.5, held=asked < 20)
 
     ended = arm.run(tmp_path / "a.mcap", Person(script))
     assert ended.outcome == "completed"
@@ -219,7 +219,7 @@ def test_a_motion_held_before_it_begins_rests_and_what_was_wished_is_archived(
 
 
 def test_what_is_shown_is_what_is_archived(arm: Arm, tmp_path: Path) -> None:
-    person = Person(lambda _: Wish())
+    person = Person(lambda _: OperatorRequest())
     arm.run(tmp_path / "a.mcap", person)
     columns = open_archive(tmp_path / "a.mcap").columns
     moving = [progress for progress in person.seen if progress.state is State.OPEN]
@@ -269,7 +269,7 @@ def test_a_motion_that_knows_no_override_is_not_run_slowly(arm: Arm, tmp_path: P
 @pytest.mark.parametrize("override", [-0.1, 1.1, float("nan")])
 def test_an_override_is_a_fraction(override: float) -> None:
     with pytest.raises(ValueError, match="override"):
-        Wish(override)
+        OperatorRequest(override)
 
 
 def test_percentiles_of_latencies_are_never_too_short_and_little_too_long() -> None:

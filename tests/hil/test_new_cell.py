@@ -15,7 +15,7 @@ import pinocchio as pin
 import pytest
 from typer.testing import CliRunner
 
-from drivers.announced import compare
+from drivers.init_check import compare
 from drivers.packets import InitPacket
 from drivers.transports.udp import UdpSpec
 from hil.archive import Samples, write_samples

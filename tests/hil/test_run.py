@@ -28,7 +28,7 @@ from hil.campaign.errors import (
 )
 from hil.campaign.execution_result import RunResult
 from hil.campaign.gravity_check import agreement
-from hil.campaign.motion_watch import Wish
+from hil.campaign.motion_watch import OperatorRequest
 from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.campaign.quality import FIELDS, Played, RepetitionCheck
 from hil.campaign.stop import Stop
@@ -55,7 +55,9 @@ class Person:
     can_answer = True
 
     def __init__(
-        self, accepts: bool = True, wishes: Callable[[RunStatus], Wish] = lambda _: Wish()
+        self,
+        accepts: bool = True,
+        wishes: Callable[[RunStatus], OperatorRequest] = lambda _: OperatorRequest(),
     ) -> None:
         self.accepts, self.wishes = accepts, wishes
         self.seen: list[RunStatus] = []
@@ -64,7 +66,7 @@ class Person:
     def show(self, status: RunStatus) -> None:
         self.seen.append(status)
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         return self.wishes(self.seen[-1])
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
@@ -233,10 +235,10 @@ class TestTimeLeft:
         stop = Stop()
         if first_repetitions:
 
-            def stopping(status: RunStatus) -> Wish:
+            def stopping(status: RunStatus) -> OperatorRequest:
                 begun = status.phase == "repetition" and status.number > first_repetitions
                 stop.requested = stop.requested or begun
-                return Wish()
+                return OperatorRequest()
 
             with pytest.raises(MotionFailedError, match="stopped"):
                 campaign.run(stop=stop, operator=Person(wishes=stopping), durable=False)
@@ -325,10 +327,10 @@ def test_a_repetition_that_was_slowed_is_rejected_with_its_reason_and_run_again(
     campaign = make(repetitions=2)
     slowed: list[RunStatus] = []
 
-    def wish(status: RunStatus) -> Wish:
+    def wish(status: RunStatus) -> OperatorRequest:
         if status.phase == "repetition" and status.number == 2 and status.motion is not None:
             slowed.append(status)
-        return Wish(override=0.5 if len(slowed) in range(1, 4) else 1.0)
+        return OperatorRequest(override=0.5 if len(slowed) in range(1, 4) else 1.0)
 
     result = campaign.run(operator=Person(wishes=wish), unrehearsed=True)
     (rejected,) = result.rejected
@@ -355,7 +357,9 @@ def test_a_motion_that_is_never_of_use_ends_the_run_after_as_many_tries_as_allow
     make: Make,
 ) -> None:
     campaign = make(bad_repetitions=2)
-    slow = Person(wishes=lambda status: Wish(0.5 if status.phase == "repetition" else 1.0))
+    slow = Person(
+        wishes=lambda status: OperatorRequest(0.5 if status.phase == "repetition" else 1.0)
+    )
     with pytest.raises(RepetitionsRejectedError, match="of no use 3 times") as ended:
         campaign.run(operator=slow, unrehearsed=True)
     assert ended.value.exit_code == 5

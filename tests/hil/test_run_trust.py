@@ -40,7 +40,7 @@ from hil.campaign.execution_result import RunResult
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.folder_lock import LOCK
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.motion_watch import Wish
+from hil.campaign.motion_watch import OperatorRequest
 from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.stop import Stop
@@ -67,15 +67,17 @@ class Person:
 
     can_answer = True
 
-    def __init__(self, wishes: Callable[[RunStatus], Wish] = lambda _: Wish()) -> None:
+    def __init__(
+        self, wishes: Callable[[RunStatus], OperatorRequest] = lambda _: OperatorRequest()
+    ) -> None:
         self.wishes = wishes
         self.status: RunStatus | None = None
 
     def show(self, status: RunStatus) -> None:
         self.status = status
 
-    def wish(self) -> Wish:
-        return Wish() if self.status is None else self.wishes(self.status)
+    def wish(self) -> OperatorRequest:
+        return OperatorRequest() if self.status is None else self.wishes(self.status)
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
         del summary
@@ -478,8 +480,8 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
 ) -> None:
     campaign = make(repetitions=2)
 
-    def slow_second(status: RunStatus) -> Wish:
-        return Wish(0.5 if (status.phase, status.number) == ("repetition", 2) else 1.0)
+    def slow_second(status: RunStatus) -> OperatorRequest:
+        return OperatorRequest(0.5 if (status.phase, status.number) == ("repetition", 2) else 1.0)
 
     def dies(*_: object) -> None:
         raise Killed
@@ -597,9 +599,9 @@ def finished(campaign: Campaign) -> Campaign:
 def slowed_once(phase: str) -> Person:
     """Somebody who slows motions of a kind until one is rejected for it."""
 
-    def wishes(status: RunStatus) -> Wish:
+    def wishes(status: RunStatus) -> OperatorRequest:
         told = any("rejected" in note for note in status.notes)
-        return Wish(0.5 if status.phase == phase and not told else 1.0)
+        return OperatorRequest(0.5 if status.phase == phase and not told else 1.0)
 
     return Person(wishes)
 
@@ -611,21 +613,21 @@ def test_a_repetition_that_somebody_slowed_is_no_attempt_while_he_has_let_go(mak
     assert len(result.rejected) == 1
     kept = make("kept", bad_repetitions=0)
     with pytest.raises(RepetitionsRejectedError, match="of no use 1 time,"):
-        kept.run(operator=Person(lambda status: Wish(0.5)), unrehearsed=True)
+        kept.run(operator=Person(lambda status: OperatorRequest(0.5)), unrehearsed=True)
 
 
 def test_a_script_that_slows_each_repetition_for_a_moment_does_not_move_the_arm_for_ever(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hil.campaign.repeating.MOST_BY_HAND", 2)
-    monkeypatch.setattr("hil.campaign.sight.SHOWN_EVERY", 0.0)
+    monkeypatch.setattr("hil.campaign.progress.SHOWN_EVERY", 0.0)
     campaign, stop = make(), Stop()
 
-    def at_its_begin(status: RunStatus) -> Wish:
+    def at_its_begin(status: RunStatus) -> OperatorRequest:
         stop.requested = len(list(campaign.folder.archives.glob("excitation*"))) > 4
         done = None if status.motion is None else status.motion.motion_time
         begins = status.phase == "repetition" and done is not None and done < 0.5
-        return Wish(0.5 if begins else 1.0)
+        return OperatorRequest(0.5 if begins else 1.0)
 
     with pytest.raises(RepetitionsRejectedError, match=r"of no use 2 times.* held or slowed"):
         campaign.run(operator=Person(at_its_begin), stop=stop, unrehearsed=True)

@@ -26,7 +26,7 @@ import pytest
 from rich.console import Console, Group
 
 from drivers.states import State
-from hil.campaign.motion_watch import Latency, MotionProgress, Wish
+from hil.campaign.motion_watch import Latency, MotionProgress, OperatorRequest
 from hil.campaign.operator import DriftCurve, RunStatus
 from hil.campaign.stop import Stop
 from hil.cell import Cell
@@ -66,7 +66,7 @@ def status(**changes: Any) -> RunStatus:
 
 def drawn(width: int, height: int, shown: Shown | None = None) -> list[str]:
     if shown is None:
-        shown = Shown("ns16-october", NAMES, status(), Wish(0.8))
+        shown = Shown("ns16-october", NAMES, status(), OperatorRequest(0.8))
     console = Console(width=width, height=height, file=StringIO(), color_system=None)
     with console.capture() as capture:
         console.print(Group(*lines(shown, width, height)))
@@ -109,7 +109,7 @@ def test_at_any_size_nothing_is_wider_or_higher_than_the_terminal(width: int, he
 
 def test_stop_hold_and_silence_are_said() -> None:
     at = status()
-    assert "HELD" in drawn(80, 24, Shown("x", NAMES, at, Wish(held=True)))[2]
+    assert "HELD" in drawn(80, 24, Shown("x", NAMES, at, OperatorRequest(held=True)))[2]
     assert "STOPPING" in drawn(80, 24, Shown("x", NAMES, at, stopping=True))[2]
     assert "no news for 3 s" in drawn(80, 24, Shown("x", NAMES, at, age=3.2))[2]
 
@@ -214,7 +214,7 @@ def test_a_plain_line_says_the_same() -> None:
     ],
 )  # fmt: skip
 def test_what_keys_mean(keys: str, override: float, held: bool) -> None:
-    wish = Wish()
+    wish = OperatorRequest()
     for key in keys:
         wish = after(wish, key, wish.override)
     assert wish.override == pytest.approx(override)
@@ -251,9 +251,9 @@ def test_the_override_of_a_dry_run_ends_with_it_and_a_hold_does_not() -> None:
         screen.show(RunStatus(phase, 1, 1, 1.0))
         screen.press("1")
         screen.press("h")
-    assert screen.wish() == Wish(0.1, held=True)
+    assert screen.wish() == OperatorRequest(0.1, held=True)
     screen.show(RunStatus("warm-up", 1, 1, 1.0))
-    assert screen.wish() == Wish(1.0, held=True)
+    assert screen.wish() == OperatorRequest(1.0, held=True)
     screen.press("5")
     screen.show(RunStatus("repetition", 1, 4, 1.0))
     assert screen.wish().override == 0.5
@@ -516,7 +516,7 @@ def test_a_picture_that_cannot_be_drawn_is_told_and_ends_nothing(
             while time.monotonic() < until:
                 screen.show(status())
                 time.sleep(0.01)
-        assert screen.wish() == Wish()
+        assert screen.wish() == OperatorRequest()
 
 
 # --- no terminal -----------------------------------------------------------------------------
@@ -529,7 +529,7 @@ def test_without_a_terminal_there_are_lines_and_nobody_accepts() -> None:
         screen.say("first [things] first")
         screen.show(status())
         await_text(out, "repetition 7 of 30")
-        assert screen.wish() == Wish()
+        assert screen.wish() == OperatorRequest()
     assert out.getvalue().splitlines()[0] == "first [things] first"
     assert "\x1b" not in out.getvalue()
     assert out.getvalue().count("repetition 7 of 30") == 1  # not ten a second

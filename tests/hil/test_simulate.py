@@ -34,7 +34,7 @@ from hil.serving import Buttons, open_far_end
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
 from sim_fixtures.ns16 import CELL_PATH
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import Wish
+from sim_fixtures.serve import Request
 
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
 SLOW_MACHINE = ["--missed", "300"]
@@ -449,16 +449,16 @@ def test_bad_input_is_one_sentence_and_exit_status_2():
 
 def test_the_first_signal_asks_for_the_end_and_the_second_gives_up():
     buttons = Buttons()
-    assert buttons.wish() is Wish.GO_ON
+    assert buttons.wish() is Request.GO_ON
     buttons.press(signal.SIGINT)
-    assert buttons.wish() is Wish.END
+    assert buttons.wish() is Request.END
     buttons.press(signal.SIGTERM)
-    assert buttons.wish() is Wish.GIVE_UP
+    assert buttons.wish() is Request.GIVE_UP
 
 
 def test_a_duration_that_is_over_asks_for_the_end_but_is_no_interrupt():
     buttons = Buttons(duration=0.0)
-    assert buttons.wish() is Wish.END
+    assert buttons.wish() is Request.END
     assert not buttons.interrupted
 
 

@@ -24,7 +24,7 @@ from planner import (
     FourierSeries,
     JointLimits,
     PiecewiseCubic,
-    PlanningChild,
+    WorkerProcess,
     check_limits,
     plan,
     plan_moves,
@@ -104,7 +104,7 @@ def test_company_changes_no_bit_of_a_motion(genome):
 
 
 def test_a_motion_is_the_same_in_another_process():
-    with PlanningChild(timeout=60.0) as child:
+    with WorkerProcess(timeout=60.0) as child:
         for genome in (OPEN, CLOSED, BARE, RAMPED):
             genes = some_genes(genome, 2)
             theirs = child.call(genome.motions, genes)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planner import PlannerCrashed, PlanningChild, chunks_of, map_in_children
+from planner import PlannerCrashed, WorkerProcess, chunks_of, map_in_children
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def test_chunks_hold_every_index_once_in_order_and_only_the_last_is_short(count,
 
 
 def test_results_come_in_order_whoever_was_free():
-    with PlanningChild() as one, PlanningChild() as other:
+    with WorkerProcess() as one, WorkerProcess() as other:
         results = map_in_children(
             [one, other], np.negative, chunks_of(50, 3), lambda chunk: (np.array(chunk),)
         )
@@ -36,7 +36,7 @@ def test_results_come_in_order_whoever_was_free():
 
 
 def test_what_the_function_raises_ends_the_map_and_the_children_go_on():
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         with pytest.raises(ZeroDivisionError):
             map_in_children([child], operator.truediv, chunks_of(3, 2), lambda _: (1, 0))
         assert map_in_children([child], list, chunks_of(3, 2), lambda chunk: (chunk,)) == [0, 1, 2]
@@ -55,7 +55,7 @@ def killed_so_often(indices, folder, often):
 @pytest.mark.parametrize("size", [1, 4])
 def test_an_item_whose_process_was_killed_from_outside_is_tried_again(size, tmp_path, importable):
     """A chunk of one as much as one of several, in whose company it was killed before."""
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         results = map_in_children(
             [child],
             killed_so_often,
@@ -66,7 +66,7 @@ def test_an_item_whose_process_was_killed_from_outside_is_tried_again(size, tmp_
 
 
 def test_an_item_that_ends_every_process_is_believed_at_last(tmp_path, importable):
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         results = map_in_children(
             [child],
             killed_so_often,
@@ -79,7 +79,7 @@ def test_an_item_that_ends_every_process_is_believed_at_last(tmp_path, importabl
 
 
 def test_a_child_killed_while_it_starts_is_started_again():
-    with PlanningChild() as one, PlanningChild() as other:
+    with WorkerProcess() as one, WorkerProcess() as other:
         os.kill(one.pid, signal.SIGKILL)
         results = map_in_children([one, other], list, chunks_of(9, 3), lambda chunk: (chunk,))
     assert results == list(range(9))
@@ -87,6 +87,6 @@ def test_a_child_killed_while_it_starts_is_started_again():
 
 def test_what_is_done_is_told_as_it_comes():
     told = []
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         map_in_children([child], list, chunks_of(7, 3), lambda chunk: (chunk,), done=told.append)
     assert told == [3, 3, 1]

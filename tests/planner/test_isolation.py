@@ -22,7 +22,7 @@ from planner.errors import (
     PlannerOutOfStep,
     PlanningTimedOut,
 )
-from planner.isolation import PlanningChild, close_child, in_child, plan_in_child
+from planner.isolation import WorkerProcess, close_child, in_child, plan_in_child
 from planner.limits import JointLimits
 
 # Legal states that crash community ruckig 0.19.4: |a| exactly at its limit.
@@ -158,7 +158,7 @@ plan([one, -one, one / 2], JointLimits(-one, one, one, one, one), speed={CREEP})
 
 def test_a_solver_that_aborts_ends_the_child_only(aborting_solver, six_axis_limits, random_points):
     points = random_points(5)
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         before = child.call(os.getpid)
         assert child.call(os.getpid) == before == child.pid  # kept warm
         for _ in range(2):
@@ -182,7 +182,7 @@ def killed(child):
 
 
 def test_a_child_that_died_idle_is_replaced_and_told_only_to_who_begins_a_call():
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         pid = killed(child)
         assert child.call(os.getpid) != pid
         pid = killed(child)
@@ -198,7 +198,7 @@ def test_a_process_that_cannot_start_is_not_the_fault_of_what_it_was_to_plan(
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(PlannerNotStarted, match="status 3"):
         plan_many([random_points(0)] * 3, six_axis_limits, workers=2)
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         with pytest.raises(PlannerNotStarted, match="status 3"):
             child.call(abs, -1)
         assert child.pid is None
@@ -207,7 +207,7 @@ def test_a_process_that_cannot_start_is_not_the_fault_of_what_it_was_to_plan(
 
 
 def test_a_call_that_takes_too_long_is_ended():
-    with PlanningChild(timeout=2.0) as child:
+    with WorkerProcess(timeout=2.0) as child:
         pid = child.call(os.getpid)
         with pytest.raises(PlanningTimedOut, match="2 s"):
             child.call(time.sleep, 60.0)
@@ -219,8 +219,8 @@ def test_a_call_that_takes_too_long_is_ended():
 def test_a_child_ends_with_its_parent_even_in_the_middle_of_a_long_call(task):
     script = f"""
 import os, signal, time
-from planner.isolation import PlanningChild
-child = PlanningChild(timeout=3600.0)
+from planner.isolation import WorkerProcess
+child = WorkerProcess(timeout=3600.0)
 print(child.call(os.getpid), flush=True)
 {task}
 time.sleep(0.2)
@@ -324,7 +324,7 @@ def in_fork(check) -> bool:
 
 
 def test_a_fork_has_a_child_of_its_own_and_leaves_the_other_alone():
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         theirs = child.call(os.getpid)
 
         def has_its_own() -> bool:
@@ -337,7 +337,7 @@ def test_a_fork_has_a_child_of_its_own_and_leaves_the_other_alone():
 
 
 def test_a_fork_cannot_take_the_answer_that_its_parent_waits_for():
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         child.send(os.getpid)
 
         def refused() -> bool:
@@ -390,7 +390,7 @@ def test_a_fork_taken_while_a_thread_plans_can_plan_and_end():
 
 
 def test_an_answer_to_another_call_is_refused_and_the_next_one_is_right(monkeypatch):
-    with PlanningChild() as child:
+    with WorkerProcess() as child:
         child.call(os.getpid)
         honest = planner.isolation.numbered
         monkeypatch.setattr(

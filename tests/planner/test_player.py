@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.exchange.program import pack, unpack
+from drivers.exchange.motion_transfer import pack, unpack
 from planner import (
     InvalidSetting,
     JointLimits,

@@ -26,7 +26,7 @@ from hil.simulation import controller_settings, simulated_controller
 from sim_fixtures import SimulatedController
 from sim_fixtures.far_end import UdpFarEnd
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import Wish
+from sim_fixtures.serve import Request
 from sim_fixtures.tally import Tally
 from tests.process_death.product import ArchivedSoFar, listening
 from tests.process_death.rounds import Round
@@ -217,10 +217,10 @@ class _Wishes(Buttons):
         super().__init__()
         self._page = page
 
-    def wish(self) -> Wish:
+    def wish(self) -> Request:
         if self._page.given_up:
-            return Wish.GIVE_UP
-        return Wish.END if self._page.finished else Wish.GO_ON
+            return Request.GIVE_UP
+        return Request.END if self._page.finished else Request.GO_ON
 
 
 def serve(cell: Cell, played: Round, page: Page) -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from drivers.packets import CyclicPacket, echo, next_number, packet_number
 from drivers.transports.faults import Corrupt, Delay, Duplicate, FaultyLink, Lose
 from sim_fixtures.far_end import UdpFarEnd
-from sim_fixtures.serve import Wish, serve
+from sim_fixtures.serve import Request, serve
 from sim_fixtures.tally import Histogram, Tally
 
 T = 0.001
@@ -310,10 +310,10 @@ def test_patience_ends_and_what_comes_then_is_missing():
 
 
 def test_at_the_end_a_pc_that_has_left_is_waited_for_once():
-    wishes = iter([Wish.GO_ON] * 5)
+    wishes = iter([Request.GO_ON] * 5)
     summary, cabinet, _ = served(
         lambda k, p: prompt(k, p) if k < 10 else [],
-        wish=lambda: next(wishes, Wish.END),
+        wish=lambda: next(wishes, Request.END),
         stretch=0.5,
         patience=1.0,
         standing=False,
@@ -339,7 +339,8 @@ def test_the_first_packet_is_repeated_until_somebody_listens():
 def test_a_wish_to_end_before_anybody_answered_ends_at_once():
     asked = iter(range(100))
     summary, cabinet, _ = served(
-        lambda k, p: [], wish=lambda: Wish.END if next(asked) > 10 else Wish.GO_ON
+        lambda k, p: [],
+        wish=lambda: Request.END if next(asked) > 10 else Request.GO_ON,
     )
     assert not summary.ended
     assert (summary.cycles, cabinet.accepted) == (0, [])
@@ -352,7 +353,7 @@ def test_a_wish_to_end_lets_the_controller_finish():
         cabinet,
         VirtualLink(clock),
         clock=clock,
-        wish=lambda: Wish.END if clock.time > 100.05 else Wish.GO_ON,
+        wish=lambda: Request.END if clock.time > 100.05 else Request.GO_ON,
     )
     assert summary.ended
     assert cabinet.finished and not cabinet.stopped
@@ -363,8 +364,8 @@ def test_an_arm_that_never_stands_loses_its_drive_when_patience_is_over():
     cabinet = Cabinet(clock, cycles=10_000)
     cabinet.stands = False
 
-    def wish() -> Wish:
-        return Wish.END if len(cabinet.accepted) > 5 else Wish.GO_ON
+    def wish() -> Request:
+        return Request.END if len(cabinet.accepted) > 5 else Request.GO_ON
 
     summary = serve(cabinet, VirtualLink(clock), clock=clock, wish=wish, patience=0.5)
     assert summary.ended and cabinet.stopped
@@ -379,7 +380,7 @@ def test_giving_up_stops_in_the_middle():
         cabinet,
         VirtualLink(clock),
         clock=clock,
-        wish=lambda: Wish.GIVE_UP if len(cabinet.accepted) == 7 else Wish.GO_ON,
+        wish=lambda: Request.GIVE_UP if len(cabinet.accepted) == 7 else Request.GO_ON,
     )
     assert (summary.cycles, summary.ended) == (7, False)
 

@@ -16,7 +16,7 @@ from time import monotonic
 from typing import Any, Final
 
 from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
-from planner.isolation import PlanningChild
+from planner.isolation import WorkerProcess
 from tests.journal import Journal, entries
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage, Verdict
@@ -109,7 +109,7 @@ class _Desk:
 
     def __init__(self, groups: deque[deque[int]], root: str, shrink: bool) -> None:
         self._groups, self._root, self._shrink = groups, root, shrink
-        self._child = PlanningChild(timeout=LONGEST)
+        self._child = WorkerProcess(timeout=LONGEST)
         self._seeds: deque[int] = deque()
         self._again: set[int] = set()
         self._seed = -1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hil.campaign.motion_watch import Wish
+from hil.campaign.motion_watch import OperatorRequest
 from hil.campaign.operator import DryRunSummary, RunStatus
 from tests.simulate.script import Script
 
@@ -37,7 +37,7 @@ class Person:
         """See `Operator`."""
         del status
 
-    def wish(self) -> Wish:
+    def wish(self) -> OperatorRequest:
         """See `Operator`; a hold ends when it was asked after often enough."""
         cycle = self._cycle()
         while self._overrides and self._overrides[0].at <= cycle:
@@ -52,7 +52,7 @@ class Person:
             if not held:
                 self._holds.pop(0)
                 self._asked = 0
-        return Wish(self._speed, held)
+        return OperatorRequest(self._speed, held)
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
         """See `Operator`."""

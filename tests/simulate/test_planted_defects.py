@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.exchange.intake import Intake
+from drivers.exchange.receive_queue import Intake
 from drivers.guard import Guard
-from drivers.machine import Machine
 from drivers.sequence import Sequence
+from drivers.state_machine import Machine
 from hil.archive.recorder import Recorder
 from hil.campaign.execution_runner import Runner
 from hil.campaign.folder import CampaignFolder, Entry

@@ -15,8 +15,8 @@ import pytest
 
 from hil.archive import Archive
 from hil.batch.cache import Where
+from hil.batch.cache_codec import phase_entry, summary_entry
 from hil.batch.keeping import _Shelf, kept_bundle
-from hil.batch.kept_forms import phase_entry, summary_entry
 from hil.batch.keys import settings_digest, sum_key, summary_key
 from hil.batch.types import ArchiveRef, Bundle, Fit, Summary
 from hil.errors import ArchiveError

@@ -13,12 +13,12 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hil.batch.trend import ArmTrend, AxisTrend, ParameterTrend, Watched
-from hil.instant import instant
 from hil.report import numbers
 from hil.report.figures.canvas import TICK_SIZE, blank, headed, place, ruled
 from hil.report.figures.palette import BAND, FIRST, MUTED, OUTSIDE_3, SECOND
 from hil.report.figures.sparkline import sparkline
 from hil.report.figures.svg import Panel, drawing, label, to_panel
+from hil.timestamps import instant
 
 Array = NDArray[np.float64]
 

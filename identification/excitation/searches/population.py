@@ -18,8 +18,8 @@ from planner import (
     FourierSeries,
     PiecewiseCubic,
     PlannerCrashed,
-    PlanningChild,
     PlanningTimedOut,
+    WorkerProcess,
     chunks_of,
     load,
     map_in_children,
@@ -59,7 +59,7 @@ class Population:
             raise DesignError("workers", workers, "at least 1")
         self.problem = problem
         self._packed = pack(problem)
-        self._children = [PlanningChild(timeout=timeout) for _ in range(workers)]
+        self._children = [WorkerProcess(timeout=timeout) for _ in range(workers)]
 
     def __enter__(self) -> Self:
         return self

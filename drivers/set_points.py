@@ -31,7 +31,7 @@ REPEATS: Final = 10
 """Times in a row that a set-point may be sent again."""
 
 
-class TakenSetPoints:
+class SentSetPoints:
     """The set-points sent last, in motor revolutions.
 
     Args:

@@ -36,7 +36,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.announced import compare
 from drivers.arm_wire import Ages, ArmWire
 from drivers.correction_mode import CorrectionMode
 from drivers.drive_train import DriveTrain
@@ -49,12 +48,13 @@ from drivers.errors import (
     TargetNotFinite,
 )
 from drivers.guard import Guard
-from drivers.machine import Machine
+from drivers.init_check import compare
 from drivers.open_mode import OpenMode, PositionMode
 from drivers.packets import EXIT_FROM_OPEN, InitPacket
 from drivers.reading import Reader, Reading
 from drivers.record import CycleRecords
 from drivers.replies import D1, ReplyFrame, Words
+from drivers.state_machine import Machine
 from drivers.states import CORRECTION_MODES, HAS_SET_POINTS, Input, State
 
 Array = NDArray[np.float64]
@@ -65,7 +65,7 @@ EXIT_TIMEOUT: Final = 10.0
 """s that a controller has to open the last axis, and to leave open mode once asked."""
 
 
-class Answers:
+class ReplyPolicy:
     """Set up anew from each init packet, which it matches to the arm.
 
     The guard is narrowed to the controller's own limits on following error and current.

@@ -18,8 +18,8 @@ from hil.progress import Silent
 from identification import IdentificationError
 
 from .cache import Where
+from .cache_codec import settings_from, settings_header
 from .factors import cell_in, source_in
-from .kept_forms import settings_from, settings_header
 from .keys import decision_digest
 from .types import ArchiveRef, Broken
 
