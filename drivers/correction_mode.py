@@ -68,18 +68,11 @@ class CorrectionMode(OpenMode):
         self._corrections.note_target(self.held, self._still, self._sent_in(cycle))
         self._note(self._still, measured, commanded)
 
-    def observe(
-        self,
-        execution: Execution | None,  # noqa: ARG002  no target is ours
-        cycle: int,
-    ) -> None:
-        """Whether the arm follows the controller's own target."""
-        self._check_arm(cycle)
-
     def next(
         self, execution: Execution | None, measured: Array, commanded: Array, cycle: int
     ) -> None:
         """The next correction, or none."""
+        self._check_arm(cycle)
         self.held = measured[0].copy()
         if execution is None:
             self._corrections.check_position(self.held, cycle)

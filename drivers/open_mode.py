@@ -11,18 +11,13 @@ from numpy.typing import NDArray
 from drivers.arm_wire import ArmWire
 from drivers.checks import require
 from drivers.correction_guard import CorrectionGuard
-from drivers.errors import (
-    FirstSetPointUnknown,
-    GuardError,
-    MotionNotCarriedOn,
-    MotionUnknown,
-)
+from drivers.errors import FirstSetPointUnknown, GuardError, MotionUnknown
 from drivers.execution import Execution, MotionExecution
-from drivers.guard import FIRST_FRACTION, Guard
+from drivers.guard import Guard
 from drivers.packets import Mode
 from drivers.reading import Reading
 from drivers.replies import D1, D2, D4, D5, ReplyFrame
-from drivers.set_points import REPEATS, SentSetPoints
+from drivers.set_points import SentSetPoints
 
 Array = NDArray[np.float64]
 Joints = NDArray[np.bool_]
@@ -86,21 +81,13 @@ class OpenMode(ABC):
         """
 
     @abstractmethod
-    def observe(self, execution: Execution | None, cycle: int) -> None:
-        """What the packet shows of arm and target, before a motion is stopped or goes on.
-
-        Raises:
-            RefusalError: the arm does not follow, or the target is none of ours.
-        """
-
-    @abstractmethod
     def next(
         self, execution: Execution | None, measured: Array, commanded: Array, cycle: int
     ) -> None:
         """One period on: what the source gives, or rest where nothing was begun.
 
         Raises:
-            RefusalError: the source failed or the guard said no.
+            RefusalError: the arm does not follow, the source failed or the guard said no.
         """
 
     @abstractmethod
@@ -153,12 +140,9 @@ class PositionMode(OpenMode):
         self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int, max_gap: int
     ) -> None:
         super().__init__(guard, wire, frame)
-        self._max_gap = max_gap
         self._taken = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
-        self._rate = np.zeros(len(self._still))
-        self._fed = (self._still, self._still)
         self._kept = np.ones(len(self._still), dtype=np.bool_)
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
@@ -187,22 +171,6 @@ class PositionMode(OpenMode):
         raw = self._wire.raw
         self._guard.check_start(self._sent, raw[ACTUAL], raw[1:4:2], cycle)
 
-    def observe(self, execution: Execution | None, cycle: int) -> None:
-        """Whether the arm follows and the controller takes the set-points.
-
-        Set-points that it passed by itself in a long gap are left out, so that a stop goes on from
-        where its target is.
-        """
-        raw = self._wire.raw
-        self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
-        self._check_taken(cycle)
-        if execution is None or not self._taken.ahead:
-            return
-        for _ in range(self._taken.ahead):
-            self._advance(execution, cycle)
-        bound = FIRST_FRACTION * self._guard.following_error
-        require(self._every, np.abs(raw[TARGET] - self._sent), bound, MotionNotCarriedOn, cycle)
-
     def next(
         self,
         execution: Execution | None,
@@ -210,55 +178,26 @@ class PositionMode(OpenMode):
         commanded: Array,
         cycle: int,
     ) -> None:
-        """The motion's next set-point, or the last one where nothing moves.
-
-        One that the controller did not take is sent again, so that its target goes on by one step
-        instead of all those lost.
-        """
+        """The motion's next set-point, or the last one where nothing moves."""
+        raw = self._wire.raw
+        self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
+        self._check_taken(cycle)
         if execution is None:
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
             return
-        if self.lost:
-            self._send_again(cycle)
-        else:
-            self._advance(execution, cycle)
-        frame, wire = self._frame.floats, self._wire
-        wire.write(frame, self._sent, self._step)
-        if self._feed_forward is not None:
-            velocity, current = self._fed
-            wire.put(frame, D4, velocity)
-            wire.put(frame, D5, current)
-        commanded[0] = self.held
-        commanded[1] = self._rate
-
-    def _send_again(self, cycle: int) -> None:
-        """The set-point sent last is the next one for the controller, too.
-
-        Raises:
-            MotionHeld: so many were lost in a row that the arm stands.
-            MotionNotCarriedOn: the controller takes none.
-        """
-        raw, repeats = self._wire.raw, self._taken.repeat()
-        if repeats > REPEATS:
-            off, bound = np.abs(raw[TARGET] - self._sent), self._guard.limits.standstill
-            require(self._every, off, self._still + bound, MotionNotCarriedOn, cycle)
-        elif repeats > self._max_gap:
-            velocity = np.array((self._step, raw[ACTUAL_VELOCITY]))
-            own = self._sent, velocity, self._sent, self._step
-            self._guard.check_after_gap(*own, cycle, self._every)
-
-    def _advance(self, execution: Execution, cycle: int) -> None:
-        """One set-point further."""
         assert isinstance(execution, MotionExecution)
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
-        self._step = motor - self._sent
-        np.subtract(position, self.held, out=self._rate)
-        self._rate /= self._guard.period
+        self._step = step = motor - self._sent
+        np.subtract(position, self.held, out=commanded[1])
+        commanded[1] /= self._guard.period
+        commanded[0] = position
+        frame = self._frame.floats
+        self._wire.write(frame, motor, step)
         if self._feed_forward is not None:
-            self._fed = self._next_feed_forward(self._feed_forward, execution, cycle)
+            self._write_feed_forward(self._feed_forward, execution, step, cycle)
         self.held = position
         self._sent = motor
         self._taken.add(motor)
@@ -273,27 +212,28 @@ class PositionMode(OpenMode):
         # The answer to the packet may have been taken all the same if the target is older.
         self.lost = lost if lost and (age is None or not age[TARGET].any()) else 0
 
-    def _next_feed_forward(
-        self, guard: CorrectionGuard, execution: MotionExecution, cycle: int
-    ) -> tuple[Array, Array]:
-        """Velocity (n,) in motor revolutions per cycle and current (n,) A of the set-point."""
+    def _write_feed_forward(
+        self, guard: CorrectionGuard, execution: MotionExecution, step: Array, cycle: int
+    ) -> None:
+        frame, wire = self._frame.floats, self._wire
         if not execution.feeds_forward:
-            return self._step, self._still
+            wire.put(frame, D4, step)
+            return
         velocity, current = execution.feed_forward(cycle)
         guard.check_motion(velocity, execution.granted, cycle)
         guard.check_current(current, None, cycle)
         if execution.finished:
             guard.check_end(cycle)
-        return self._wire.motor_difference(velocity) * self._guard.period, current
+        wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
+        wire.put(frame, D5, current)
 
     def require_carried_on(self, reading: Reading, cycle: int) -> None:
-        """Target and velocity received against the set-point sent last, as it was carried on."""
+        """Target and velocity received against the set-point sent last."""
         where = self._kept & reading.ready
         self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle, where)
         raw = self._wire.raw
         velocity, step = raw[1:4:2], self._step
-        carried = self._taken.carried_on(raw[TARGET], self.missed)
-        self._guard.check_after_gap(raw[TARGET], velocity, carried, step, cycle, where)
+        self._guard.check_after_gap(raw[TARGET], velocity, self._sent, step, cycle, where)
 
     def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
         """Axes open all the time keep the last set-point; those open again, their target."""

@@ -9,7 +9,7 @@ error and current are watched, and that the controller takes the set-points: the
 (D1) is within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent, or of
 the last carried on by as many steps as packets were missed, and within 25 % of the last. An older
 one than the last is an answer lost, which is counted and told; more than `max_gap` of them in 100
-cycles bring a motion to rest on its path. What was lost is sent again instead of the next.
+cycles bring a motion to rest on its path.
 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave
 open mode, move the arm and come back; one set-point further at full speed would then be a jump.
@@ -234,13 +234,11 @@ class ReplyPolicy:
             machine.entering = False
             open_mode.enter(measured, commanded, cycle)
         else:
-            if execution is not None and not moving:
+            if execution is not None and moving and machine.stop_reason is not None:
+                execution.stop(machine.stop_reason, cycle)
+            elif execution is not None and not moving:
                 open_mode.require_start(cycle)
-            begun = execution if moving else None
-            open_mode.observe(begun, cycle)
-            if begun is not None and machine.stop_reason is not None:
-                begun.stop(machine.stop_reason, cycle)
-            open_mode.next(begun, measured, commanded, cycle)
+            open_mode.next(execution if moving else None, measured, commanded, cycle)
             machine.note_answers(open_mode.lost, self._max_gap)
         if execution is None:
             return machine.stop_reason is not None

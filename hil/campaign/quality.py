@@ -27,8 +27,7 @@ from .standstill import ARM_MOVED
 
 Array = NDArray[np.float64]
 
-_COMMANDED: Final = ("commanded_position", "commanded_velocity")
-FIELDS: Final = ("cycle", "gap", "position", "target_current", *_COMMANDED)
+FIELDS: Final = ("cycle", "gap", "position", "target_current", "commanded_position")
 """Columns of an archive that are looked at."""
 MISSED_SHARE: Final = 0.01
 """Of all cycles: more missed packets than that, and the recording is too torn."""
@@ -112,31 +111,22 @@ class Played:
     def of(cls, archive: Archive) -> Played:
         """Its rows from the first set-point of the motion on.
 
-        A controller may open its axes before a motion is asked for; it is held there till then. Of
-        a set-point that was sent again, as the controller had not taken it, the last row counts.
+        A controller may open its axes before a motion is asked for; it is held there till then.
 
         Raises:
             ArchiveError: it is no archive of a motion of ours.
         """
-        columns = archive.recorded(*_COMMANDED, "target_current", "gap")
+        columns = archive.recorded("commanded_position", "target_current", "gap")
         began = [event.time for event in archive.events if event.name == MotionStarted.__name__]
         rows = ~np.isnan(columns["commanded_position"]).any(axis=1)
         if began:
             rows &= columns["stamp"] >= round(began[-1] * 1e9)
-        rows[:-1] &= ~_sent_again(columns["commanded_position"], columns["commanded_velocity"])
         return cls(
             position=columns["position"][rows],
             current=columns["target_current"][rows],
             commanded=columns["commanded_position"][rows],
             missed=int(columns["gap"][rows].sum()),
         )
-
-
-def _sent_again(position: Array, velocity: Array) -> NDArray[np.bool_]:
-    """(m - 1,) whether a set-point of (m, n) that moves on is followed by itself."""
-    same = (position[1:] == position[:-1]).all(axis=1)
-    same &= (velocity[1:] == velocity[:-1]).all(axis=1)
-    return np.asarray(same & (velocity[1:] != 0.0).any(axis=1))
 
 
 def problem_of(

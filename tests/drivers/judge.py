@@ -63,7 +63,6 @@ class Conduct:
     motor: np.ndarray | None = None
     motors: list[np.ndarray] = field(default_factory=list)
     max_gap: int = 2
-    step: np.ndarray = field(default_factory=lambda: np.zeros(0))
     lag: int = 0
     lost: int = 0
     exiting: bool = False
@@ -244,7 +243,6 @@ class Conduct:
                 assert answer.axes[slot] == received.axes[slot].keep(1), "first: target, at rest"
             self.sent = [q, q, q, q]
             self.motors, self.lag, self.lost = [], 0, 0
-            self.step = np.zeros(len(q))
         else:
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
             late = self.max_gap + 1
@@ -252,18 +250,10 @@ class Conduct:
             assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
             low, high = np.float32(motor - rounding), np.float32(motor + rounding)
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
-            again = np.array_equal(q, self.sent[-1]) and bool(a[1].any())
-            step = self.step if again else motor - self.motor
-            self.step = step
+            step = motor - self.motor
             # Positions are compared in float64; both carry the rounding of their making.
             slack = 3 * rounding + np.spacing(np.float32(np.abs(a[1])))
             assert (np.abs(a[1] - step) <= slack).all(), "D2 is not the step"
-            if again:
-                assert (np.abs(r[0] - self.motor) > self.limits.standstill).any(), "not lost"
-                self.lost += 1
-                self.stopping = self.stopping or self.lost > self.max_gap
-                self._count("sent again")
-                return
             self.sent.append(q)
         if np.any(q != self.sent[-2]):
             assert self.entitled, "moved without a motion requested"

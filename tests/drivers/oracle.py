@@ -10,8 +10,6 @@ import math
 import struct
 from typing import NamedTuple
 
-import numpy as np
-
 DRIVE_ON = 5
 ZERO = bytes(4)
 HOLDS_A_POSITION = (1, 4, 5, 11, 14, 15)
@@ -135,13 +133,3 @@ def differences(ours: Packet, expected: Packet) -> list[str]:
             found.append(f"mode[{slot}]")
         found += [f"{n}[{slot}]" for n, x, y in zip(names, a.d, b.d, strict=True) if x != y]
     return found
-
-
-def sent_once(q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """(k,) rows of set-points (k, n) without those that were sent again: the last of each counts.
-
-    A set-point that moves on, and is followed by itself, was not taken; one at rest is a new one.
-    """
-    same = (q[1:] == q[:-1]).all(axis=1) & (velocity[1:] == velocity[:-1]).all(axis=1)
-    same &= (velocity[1:] != 0.0).any(axis=1)
-    return np.append(~same, True)[: len(q)]

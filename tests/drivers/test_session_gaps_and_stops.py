@@ -146,11 +146,10 @@ class TestLongGaps:
         rig, _, _ = self.after_gap(3, lambda d: d[0].__setitem__(3, 0.3 * d[0, 3]))
         assert rig.state is State.OPEN
 
-    @pytest.mark.parametrize("carried", [0, 3])
-    def test_one_whose_target_went_elsewhere_is_not_one_that_stands(self, carried):
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_one_whose_target_went_elsewhere_is_not_one_that_stands(self, sign):
         def change(d):
-            along = np.sign(d[0, 1])
-            d[0, [0, 2]] += carried * d[0, 1] + (along if carried else -along) * 0.201
+            d[0, [0, 2]] += sign * 0.201
 
         rig, _, answer = self.after_gap(3, change)
         error = self.refused(answer, rig, MotionNotCarriedOn)
@@ -164,7 +163,6 @@ class TestLongGaps:
         rig, source, _ = self.after_gap(3, change)
         assert rig.state is State.OPEN
         assert source.stops == 1
-        assert source.advances == 304, "three set-points that the controller passed by itself"
 
     def test_a_short_gap_is_bridged_even_so(self):
         rig, source, _ = self.after_gap(2, self.held)

@@ -287,18 +287,21 @@ HEADING: Final = (
     "| fault | " + " | ".join(SITUATIONS) + " |\n" + "|---" * (len(SITUATIONS) + 1) + "|\n"
 )
 
+_STOPPED: Final = "505 MotionHeld / stopped / 505 MotionHeld"
+_TOO_FAR: Final = "505 MotionHeld / 505 MotionNotCarriedOn / 505 MotionHeld"
+_WENT_ON: Final = "stopped / completed / stopped"
 AT_SPEED: Final = {
-    "3 packets lost": "505 MotionHeld / stopped / 505 MotionHeld",
-    "5 packets lost": "505 MotionHeld / stopped / 505 MotionHeld",
-    "3 answers lost": "stopped / completed / stopped",
-    "5 answers lost": "stopped / completed / stopped",
+    "3 packets lost": (_STOPPED,) * 4,
+    "5 packets lost": (_STOPPED, _STOPPED, _TOO_FAR, _TOO_FAR),
+    "3 answers lost": (_WENT_ON,) * 4,
+    "5 answers lost": (_WENT_ON,) * 4,
 }
-"""Outcomes by fault, the same at every share of full speed."""
+"""Outcomes by fault, at each share of full speed."""
 
 
 def at_speed() -> str:
     """The table of `AT_SPEED` in Markdown."""
     speeds = [f"{share:.0%}".replace("%", " %") for share in SPEEDS]
     lines = ["| fault | " + " | ".join(speeds) + " |", "|---" * (len(speeds) + 1) + "|"]
-    lines += [f"| {fault} |" + f" {text} |" * len(speeds) for fault, text in AT_SPEED.items()]
+    lines += [f"| {fault} | {' | '.join(texts)} |" for fault, texts in AT_SPEED.items()]
     return "\n".join(lines) + "\n"

@@ -7,7 +7,6 @@ from collections import Counter
 import numpy as np
 
 from drivers import State
-from tests.drivers.oracle import sent_once
 from tests.drivers.rig import limits
 
 PERIOD = 0.002
@@ -55,8 +54,6 @@ def check_records(rows: np.ndarray, mode: int, plan_only: bool, tally: Counter[s
     interval = np.where(whole & in_open, rows["interval"], -1)
     for index in np.unique(interval[interval >= 0]):
         q = sent[interval == index]
-        if mode in POSITION_MODES:
-            q = q[sent_once(q, rows["commanded_velocity"][interval == index])]
         # An interval begins at rest: its first set-point, at zero velocity.
         q = np.vstack([q[:1]] * 3 + [q])
         for k, bound in enumerate(rates):

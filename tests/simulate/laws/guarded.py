@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import AnswersLost, MotionEnded
-from tests.drivers import oracle
 from tests.simulate.observed import Broken, Observed
 
 from .conversation import talks_of
@@ -34,8 +33,6 @@ _FIRST: Final = 0.1
 """Share of the following-error threshold that target and arm may differ by at first."""
 _LEAP: Final = 0.25
 """Share that the controller's target may ever be off the set-point sent last."""
-_LONGEST_CARRY: Final = 10
-"""Packets missed in a row for which a controller may have carried its target on."""
 _ORDERS: Final = ("velocity", "acceleration", "jerk")
 
 
@@ -99,35 +96,23 @@ def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) 
     span = 0.5 * (limits.upper - limits.lower) * _TOLERANCE
     if np.any(q > limits.upper + span) or np.any(q < limits.lower - span):
         yield f"a set-point outside the joints' range: {q.min(axis=0)} to {q.max(axis=0)}"
-    once = oracle.sent_once(q, stretch.step[led])
-    factors, across = factors[: len(once)][once], _across_long_gaps(stretch)[once]
     # What is held afterwards ends the motion: nobody may be brought to rest by a jump.
-    rests = q[-1:].repeat(min(3, len(stretch.sent) - len(q)), axis=0)
-    held = np.concatenate((q[once], rests))
+    held = np.concatenate((q, q[-1:].repeat(min(3, len(stretch.sent) - len(q)), axis=0)))
     record_rounding = np.full_like(held, 8.0 * _EPS) * np.abs(held).max(axis=0)
-    yield from _rates(held, limits.rates, factors, record_rounding, period, across, "recorded")
-    wire = gears.joint(stretch.sent[led][once])
+    yield from _rates(held, limits.rates, factors, record_rounding, period, "recorded")
+    wire = gears.joint(stretch.sent[led])
     ulps = 0.5 * np.spacing(np.abs(stretch.sent[led]).astype(np.float32)).astype(np.float64)
     wire_rounding = ulps @ np.abs(np.linalg.inv(gears.matrix)).T
-    yield from _rates(wire, limits.rates, factors, wire_rounding, period, across, "float32")
+    yield from _rates(wire, limits.rates, factors, wire_rounding, period, "float32")
     yield from _only_when_requested(stretch, q)
     yield from _after_long_gaps(stretch)
     yield from _held_at_the_end(stretch)
 
 
 def _rates(
-    q: Array,
-    rates: Array,
-    factors: Array,
-    rounding: Array,
-    period: float,
-    across: Flags,
-    what: str,
+    q: Array, rates: Array, factors: Array, rounding: Array, period: float, what: str
 ) -> Iterator[str]:
-    """Differences of set-points (k, n), each known to `rounding` (k, n) [rad].
-
-    None leads `across` a long gap, (k,): what the controller passed by itself was not sent.
-    """
+    """Differences of set-points (k, n), each known to `rounding` (k, n) [rad]."""
     rows = np.concatenate((q[:1].repeat(3, axis=0), q))  # before the first one it stands
     worst = rounding.max(axis=0)
     for order, (name, bound) in enumerate(zip(_ORDERS, rates, strict=True), 1):
@@ -137,8 +122,6 @@ def _rates(
             more = allowed[-1:].repeat(len(found) - len(allowed), axis=0)
             allowed = np.concatenate((allowed, more))
         over = found > allowed + 2.0**order * worst / period**order
-        for beyond in np.flatnonzero(across):
-            over[beyond : beyond + order] = False
         if over.any():
             row, joint = (int(index[0]) for index in np.nonzero(over))
             yield (
@@ -183,12 +166,6 @@ def _unanswered_before(stretch: Stretch) -> NDArray[np.intp]:
     return np.asarray(gaps + silent)
 
 
-def _across_long_gaps(stretch: Stretch) -> Flags:
-    """(leading,) rows after so many packets missed that a motion goes on from the target."""
-    most = int(stretch.talk.life.settings.get("max_gap", 2))
-    return np.asarray(_unanswered_before(stretch)[: stretch.leading] > most)
-
-
 def _first(stretch: Stretch, threshold: Array) -> Iterator[str]:
     """The first set-point is the target received, at rest, where the arm is."""
     target, velocity, actual, actual_velocity = stretch.received[:4, 0]
@@ -210,8 +187,7 @@ def _feedback(stretch: Stretch, threshold: Array, current: Array) -> Iterator[st
         yield "a set-point was sent to an arm that does not follow"
     if np.any(np.abs(amperes) > current * (1.0 + 2.0 * _TOLERANCE)):
         yield "a set-point was sent to a motor beyond its current limit"
-    short = ~_across_long_gaps(stretch)[1:]
-    if np.any(np.abs(target - last)[short] > _LEAP * wide):
+    if np.any(np.abs(target - last) > _LEAP * wide):
         yield "a set-point was sent although the controller's target is elsewhere"
     nearest = _distance_to_last(stretch)
     if np.any(nearest > _FIRST * wide):
@@ -241,17 +217,16 @@ def _distance_to_last(stretch: Stretch) -> Array:
     """(k-1, n) from each target received to the nearest set-point it may be."""
     depth = int(stretch.talk.life.settings.get("max_gap", 2)) + 1
     k = stretch.leading
-    once = oracle.sent_once(stretch.sent[:k], stretch.step[:k])
-    sent = stretch.sent[:k][once]
-    last = np.cumsum(once)[:-1] - once[:-1]  # of those sent once, the one sent before each packet
+    sent = stretch.sent[:k]
     target = stretch.received[0, 1:k]
     nearest = np.full(target.shape, np.inf)
-    for back in range(depth):
-        nearest = np.fmin(nearest, np.abs(target - sent[np.maximum(last - back, 0)]))
-    missed = _unanswered_before(stretch)[1:k]
-    step = sent[last] - sent[np.maximum(last - 1, 0)]
-    for ahead in range(1, max(depth, _LONGEST_CARRY + 1)):
-        carried = np.abs(target - (sent[last] + ahead * step))
+    for back in range(1, depth + 1):
+        rows = np.maximum(np.arange(1, k) - back, 0)
+        nearest = np.fmin(nearest, np.abs(target - sent[rows]))
+    missed = np.minimum(_unanswered_before(stretch)[1:k], depth - 1)
+    step = sent[:-1] - sent[np.maximum(np.arange(k - 1) - 1, 0)]
+    for ahead in range(1, depth):
+        carried = np.abs(target - (sent[:-1] + ahead * step))
         nearest = np.where((missed >= ahead)[:, np.newaxis], np.fmin(nearest, carried), nearest)
     return nearest
 
@@ -265,14 +240,10 @@ def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]
     sent = stretch.sent[: len(q)]
     if np.any(sent < low) or np.any(sent > high):
         yield "the set-point on the wire is not the recorded one"
-    once = oracle.sent_once(q, stretch.step[: len(q)])
-    motor, rounding = motor[once], rounding[once]
     step = np.diff(motor, axis=0, prepend=motor[:1])
-    told = stretch.step[: len(q)][once]
+    told = stretch.step[: len(q)]
     slack = 3.0 * rounding + np.spacing(np.abs(told).astype(np.float32))
-    # Across a long gap it is the step from the last set-point that the controller passed.
-    off = np.abs(told - step)[~_across_long_gaps(stretch)[once]]
-    if np.any(off > slack[~_across_long_gaps(stretch)[once]]):
+    if np.any(np.abs(told - step) > slack):
         yield "D2 is not the step from one set-point to the next"
 
 
