@@ -160,6 +160,7 @@ class Session:
         self._policy: ReplyPolicy | None = None
         self._cold_start = False
         self._heard_at: float | None = None
+        self._arrived_at: float | None = None
         self._last_packet = b""
         self._last_reply = b""
         self._unanswered = 0
@@ -395,6 +396,7 @@ class Session:
         self.counters.answered += 1
         self._last_packet = packet
         self._last_reply = reply
+        self._arrived_at = now
         self._heard(now)
         return reply
 
@@ -403,7 +405,8 @@ class Session:
         self._heard(now)
 
     def _cycles_since_answer(self, now: float) -> float:
-        return 0.0 if self._heard_at is None else (now - self._heard_at) / self._guard.period
+        """From the arrival of the packet answered last: however late its answer left."""
+        return 0.0 if self._arrived_at is None else (now - self._arrived_at) / self._guard.period
 
     def _heard(self, now: float) -> None:
         self._heard_at = now
