@@ -13,7 +13,7 @@ cycles bring a motion to rest on its path.
 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave
 open mode, move the arm and come back; one set-point further at full speed would then be a jump.
-Hence, after a gap longer than `max_gap` and after a pause by the clock, open mode goes on only if
+Hence, after a gap longer than `max_gap`, open mode goes on only if
 D1 is within those 10 % of the set-point sent last, and its velocity (D2) within half the velocity
 sent last or what counts as standstill; an arm that itself stands (D4) is held against the latter
 too. Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such
@@ -270,11 +270,11 @@ class ReplyPolicy:
         ring.age[row] = 0 if ages is None else ages[self.wire.joint_slots].max(axis=0)
         self.wire.read(words.view(np.float32), ring.measured[row], ages)
 
-    def note_gap(self, unanswered: int, paused: bool, machine: Machine, reading: Reading) -> None:
-        """So many packets before this one were not answered, or it came late by the clock.
+    def note_gap(self, unanswered: int, machine: Machine, reading: Reading) -> None:
+        """So many packets before this one were not answered.
 
-        After a long gap or a pause open mode goes on only where the controller carried it on,
-        moving, at rest or on the way out: meanwhile it may have left, moved the arm, come back.
+        After a long gap open mode goes on only where the controller carried it on, moving, at
+        rest or on the way out: meanwhile it may have left, moved the arm, come back.
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: it did not.
@@ -282,7 +282,7 @@ class ReplyPolicy:
         if self._open_mode is None:
             return
         self._open_mode.missed = unanswered
-        if unanswered <= self._max_gap and not paused:
+        if unanswered <= self._max_gap:
             return
         in_open = machine.state in (State.OPEN, State.EXITING) and machine.in_interval
         if in_open and not machine.entering:

@@ -30,10 +30,8 @@ controller has to report closed axes first, and a new motion has to be requested
 Every fresh, well-formed packet gets exactly one answer, a duplicate (the same bytes) the same
 bytes again; stale and malformed ones get none and are counted. Motion advances one period per
 answered packet, whatever was missed; more than `max_gap` missed in a row, stale ones among them,
-bring it to rest on its path, if the controller carried it on. Time counts as well as numbers: a
-packet that comes `PAUSE_CYCLES` later by the clock than they account for is answered by a further
-set-point only if the arm moves as it was commanded to. What is watched meanwhile, and when open
-mode is left, stands at the head of `drivers.reply_policy`.
+bring it to rest on its path, if the controller carried it on. What is watched meanwhile, and when
+open mode is left, stands at the head of `drivers.reply_policy`.
 
 In every state an axis that is open with its drive on, of whichever arm, is answered by its target
 only if that is a number; if it is none, drive-off is asked for. In a pause a wanted axis that is
@@ -83,8 +81,6 @@ MAX_GAP: Final = 100
 """Largest `max_gap`."""
 SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
 """Open modes a motion can run in."""
-PAUSE_CYCLES: Final = 2.0
-"""Cycles that a packet may come later, by the clock, than its number and `max_gap` account for."""
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
 
 
@@ -160,7 +156,6 @@ class Session:
         self._policy: ReplyPolicy | None = None
         self._cold_start = False
         self._heard_at: float | None = None
-        self._arrived_at: float | None = None
         self._last_packet = b""
         self._last_reply = b""
         self._unanswered = 0
@@ -355,7 +350,6 @@ class Session:
             return None
         missed = self._sequence.accept(number)
         machine.cycle = self._sequence.cycle
-        paused = self._cycles_since_answer(now) > max(missed, self._max_gap) + PAUSE_CYCLES
         words = words_of(decoded)
         # After a corrupted number the controller's own look stale for a while.
         unanswered, self._unanswered = missed + self._unanswered, 0
@@ -374,7 +368,7 @@ class Session:
             machine.take(reading.input)
             if machine.state is State.FAULTED and before is not State.FAULTED:
                 refusal = ModeRefused(*reading.faulty, machine.cycle)
-            policy.note_gap(unanswered, paused, machine, reading)
+            policy.note_gap(unanswered, machine, reading)
             measured, commanded = ring.measured[row], ring.commanded[row]
             status = policy.answer(machine, reading, words, measured, commanded)
         except BaseException as error:
@@ -396,17 +390,12 @@ class Session:
         self.counters.answered += 1
         self._last_packet = packet
         self._last_reply = reply
-        self._arrived_at = now
         self._heard(now)
         return reply
 
     def sent(self, now: float) -> None:
         """The answer given last left at `now`: silence counts from there, not from the packet."""
         self._heard(now)
-
-    def _cycles_since_answer(self, now: float) -> float:
-        """From the arrival of the packet answered last: however late its answer left."""
-        return 0.0 if self._arrived_at is None else (now - self._arrived_at) / self._guard.period
 
     def _heard(self, now: float) -> None:
         self._heard_at = now

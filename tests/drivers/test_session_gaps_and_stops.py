@@ -20,23 +20,12 @@ from tests.drivers.rig import (
     PERIOD,
     START,
     Cruise,
-    N,
     Rig,
-    all_drive_off,
     assert_refused,
-    limits,
     moving,
     smooth_move,
     still,
 )
-
-
-def assert_asked_off(rig: Rig, answer) -> RefusalError:
-    """Drive-off was asked for although no motion goes on; returns why."""
-    assert all_drive_off(answer)
-    assert rig.state is State.FAULTED
-    return rig.refusal
-
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 
@@ -181,67 +170,6 @@ class TestLongGaps:
         rig.miss(30)
         rig.cycle()
         assert rig.state is State.OPEN
-
-
-class TestPauses:
-    """The controller's numbers go on without a gap, but its packets come late by the clock."""
-
-    @pytest.mark.parametrize("speed", [0.3, 1.9])
-    @pytest.mark.parametrize("pause", [0.02, 0.9])
-    def test_an_arm_that_came_to_rest_is_not_driven_on(self, speed, pause):
-        """From rest to a full step in one cycle is a jump, however the numbers look."""
-        rig = Rig(guard_limits=limits(lower=np.full(N, -6.0), upper=np.full(N, 6.0)))
-        rig.session.request(type("Faster", (Cruise,), {"SPEED": speed, "RAMP": 1.0})())
-        rig.open()
-        rig.cycle(600)
-        rig.now += pause
-        rig.axes["d"][:, 3] = 0.0
-        assert_refused(rig, rig.cycle(), MotionHeld)
-
-    def test_a_target_that_came_to_rest_is_not_driven_on_either(self):
-        rig, _ = moving()
-        rig.now += 0.9
-        rig.axes["d"][:, 1] = 0.0
-        assert_refused(rig, rig.cycle(), MotionHeld)
-
-    def test_an_arm_that_is_elsewhere_is_not_pulled_back(self):
-        rig = Rig()
-        rig.open()
-        rig.cycle(3)
-        rig.now += 0.9
-        rig.axes["d"][0, [0, 2]] += 0.3
-        assert type(assert_asked_off(rig, rig.cycle())) is MotionNotCarriedOn
-
-    def test_an_arm_that_moves_as_commanded_is_driven_on(self):
-        """A simulated controller whose cycle was stretched looks like that."""
-        rig, source = moving()
-        rig.now += 0.9
-        rig.cycle(10)
-        assert (rig.state, source.stops) == (State.OPEN, 0)
-
-    def test_a_packet_a_few_cycles_late_is_no_pause(self):
-        rig, source = moving()
-        rig.now += 2.9 * PERIOD
-        rig.axes["d"][:, 3] = 0.0
-        rig.cycle()
-        assert (rig.state, source.stops) == (State.OPEN, 0)
-
-    def test_the_pause_begins_when_the_packet_arrives(self):
-        """However late the answer left: the arm may have come to rest meanwhile."""
-        rig, _ = moving()
-        rig.now += 0.9
-        rig.session.sent(rig.now)
-        rig.axes["d"][:, 3] = 0.0
-        assert type(assert_asked_off(rig, rig.cycle())) is MotionHeld
-
-    def test_an_arm_on_its_way_out_is_compared_too(self):
-        rig, _ = moving()
-        rig.session.stop()
-        rig.cycle(2000)
-        assert rig.state is State.EXITING
-        rig.now += 0.5
-        rig.axes["d"][0, [0, 2]] += 0.3
-        assert type(assert_asked_off(rig, rig.cycle())) is MotionNotCarriedOn
 
 
 class TestCorruptedNumbers:
