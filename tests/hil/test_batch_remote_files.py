@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import re
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -16,6 +17,7 @@ from hil.batch import remote_files
 from hil.batch.errors import UnavailableError
 from hil.batch.remote_files import is_url, listed, local_copy
 from hil.errors import InputError
+from hil.version import install_command
 from tests.hil.web_folder import served
 
 CONTENT = {"a/first.mcap": b"one" * 1_000_000, "b/c/second.mcap": b"", "b/notes.txt": b"no archive"}
@@ -162,7 +164,7 @@ def test_what_a_server_does_not_give_is_asked_for_once(
 
 def test_without_fsspec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote_files, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match=r"pip install 'hil\[cluster\]'"):
+    with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
         listed("memory://store")
 
 
