@@ -28,7 +28,7 @@ _FLOOR: Final = float(np.spacing(np.float32(1.0)))
 
 
 @dataclass(frozen=True, eq=False)
-class Announced:
+class InitCheck:
     """An init packet held against the cell.
 
     Attributes:
@@ -83,7 +83,7 @@ def compare(
     arm: int,
     accept: bool,
     other_axes: frozenset[tuple[int, int]] = frozenset(),
-) -> Announced:
+) -> InitCheck:
     """Hold an init packet against what the cell says of the arm.
 
     Motor positions made with a wrong ratio, calibration or coupling send the arm elsewhere, so
@@ -104,7 +104,7 @@ def compare(
     unknown = _unknown_axes(drive_train.n_joints, init, arm, other_axes)
     values = _values(drive_train, init, arm)
     differences = (*fixed, *unknown, *values)
-    refused = Announced(drive_train, differences, "; ".join(differences) or None, False)
+    refused = InitCheck(drive_train, differences, "; ".join(differences) or None, False)
     if not (unknown or values) or not accept:
         return refused
     theirs = drive_train
@@ -116,7 +116,7 @@ def compare(
         fixed = (*fixed, f"the controller's values cannot be accepted: {error}")
     if fixed:
         return replace(refused, unusable="; ".join(fixed))
-    return Announced(theirs, differences, None, True)
+    return InitCheck(theirs, differences, None, True)
 
 
 def _timing(period: float, init: InitPacket) -> tuple[str, ...]:

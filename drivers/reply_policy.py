@@ -75,7 +75,7 @@ class ReplyPolicy:
         reader: reads status and modes of its packets.
         wire: the joints in a packet; None if the packet cannot be matched to them, or is of an arm
             with other gears, calibration or coupling.
-        announced: the init packet against the cell, and the drive train in force.
+        init_check: the init packet against the cell, and the drive train in force.
         unusable: why this arm cannot be moved in this session, or None.
 
     Args:
@@ -101,8 +101,8 @@ class ReplyPolicy:
         max_gap: int,
     ) -> None:
         self.init = init
-        self.announced = compare(drive_train, guard.period, init, arm, accept, other_axes)
-        self.unusable = self.announced.unusable
+        self.init_check = compare(drive_train, guard.period, init, arm, accept, other_axes)
+        self.unusable = self.init_check.unusable
         self.wire: ArmWire | None = None
         self._arm = arm
         self._max_gap = max_gap
@@ -115,7 +115,7 @@ class ReplyPolicy:
         if self.unusable is not None:
             self.reader = _reader_without_joints(init, arm, mode)
             return
-        self.wire = ArmWire(self.announced.drive_train, init, arm)
+        self.wire = ArmWire(self.init_check.drive_train, init, arm)
         arms = tuple(axis.arm for axis in init.open_axes())
         self.reader = Reader(self.wire.joint_slots, arms, arm, mode)
         kind = CorrectionMode if mode in CORRECTION_MODES else PositionMode

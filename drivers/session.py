@@ -188,7 +188,7 @@ class Session:
     @property
     def drive_train(self) -> DriveTrain:
         """In force: the cell's, or the one with the controller's values that were adopted."""
-        return self._drive_train if self._policy is None else self._policy.announced.drive_train
+        return self._drive_train if self._policy is None else self._policy.init_check.drive_train
 
     @property
     def requested(self) -> bool:
@@ -307,9 +307,9 @@ class Session:
         self._policy = policy = ReplyPolicy(init, *arm, *options)
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self._machine.cycle = 0
-        told = policy.announced
+        check = policy.init_check
         self._machine.events.append(
-            InitReceived(init, told.unusable, told.differences, told.adopted)
+            InitReceived(init, check.unusable, check.differences, check.adopted)
         )
         return self._answered(packet, echo(packet), now)
 

@@ -71,7 +71,7 @@ class _Checker:
         self._joints = description.joint_names
         self._period_ns = None if description.period is None else description.period * 1e9
         self._parser = ChunkParser()
-        self._announced = self._parser.announced
+        self._known = self._parser.known
         self._layouts: dict[str, MessageLayout | None] = {}
         self._last_cycle: int | None = None
         self._gaps = 0
@@ -79,8 +79,8 @@ class _Checker:
 
     def run(self, stream: BinaryIO) -> Iterator[Fault]:
         """All faults."""
-        for record in self._found.announced:
-            self._announced.take(record.opcode, record.body, record.offset)
+        for record in self._found.definitions:
+            self._known.take(record.opcode, record.body, record.offset)
         for piece in self._found.pieces:
             record = container.record_at(stream, piece.offset, piece.length)
             if piece.opcode == container.CHUNK:
@@ -89,14 +89,14 @@ class _Checker:
                 except Damage as damage:
                     yield "chunks", f"the record at byte {damage.offset} {damage}"
             elif piece.opcode in (container.SCHEMA, container.CHANNEL):
-                self._announced.take(record.opcode, record.body, record.offset)
-        if self._announced.channels:
+                self._known.take(record.opcode, record.body, record.offset)
+        if self._known.channels:
             yield from self._channels()
         yield from self._outcome()
 
     def _channels(self) -> Iterator[Fault]:
         """Check topics, types and encodings."""
-        channels = {channel.topic: channel for channel in self._announced.channels.values()}
+        channels = {channel.topic: channel for channel in self._known.channels.values()}
         needed = {schema.MEASURED, schema.EVENTS}
         if not self._imported:
             needed |= {schema.CYCLE, schema.COMMANDED}
@@ -112,7 +112,7 @@ class _Checker:
         name, definition = expected
         if channel.encoding != "cdr":
             yield "channels", f"{channel.topic} is encoded as {channel.encoding!r}, not 'cdr'"
-        found = self._announced.schemas.get(channel.schema_id)
+        found = self._known.schemas.get(channel.schema_id)
         if found is None:
             yield "schemas", f"{channel.topic} has none"
             return
@@ -157,10 +157,10 @@ class _Checker:
     def _layout(self, topic: str, messages: Messages) -> MessageLayout | None:
         try:
             if topic not in _STATES:
-                announced = self._announced.schema(topic)
-                if announced is None:
+                record = self._known.schema(topic)
+                if record is None:
                     return None
-                layout = fixed_layout(announced.definition)
+                layout = fixed_layout(record.definition)
                 schema.check_fields(topic, layout, len(self._joints))
                 return layout
             names, layout = joint_state_of(messages.first())

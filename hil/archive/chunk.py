@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import container
-from hil.archive.announced import Announced
 from hil.archive.container import Damage
+from hil.archive.known_channels import KnownChannels
 
 Bytes = NDArray[np.uint8]
 
@@ -81,7 +81,7 @@ class ChunkParser:
     """Finds messages, chunk after chunk, and takes the schemas and channels among them."""
 
     def __init__(self) -> None:
-        self.announced = Announced()
+        self.known = KnownChannels()
         self._pattern: list[_Place] = []
 
     def repeats(self, chunk: bytes) -> bool:
@@ -131,15 +131,15 @@ class ChunkParser:
                 data = np.frombuffer(chunk, np.uint8, end - at - _HEAD.size, at + _HEAD.size)
                 _append(found, channel, data[None], np.array([sequence], np.uint32))
             else:
-                self.announced.take(opcode, chunk[at + _RECORD.size : end], offset)
+                self.known.take(opcode, chunk[at + _RECORD.size : end], offset)
             at = end
         return self._by_topic(found, offset)
 
     def _by_topic(self, found: dict[int, Messages], offset: int) -> dict[str, Messages]:
-        unknown = found.keys() - self.announced.channels.keys()
+        unknown = found.keys() - self.known.channels.keys()
         if unknown:
             raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
-        return {self.announced.topic(channel): messages for channel, messages in found.items()}
+        return {self.known.topic(channel): messages for channel, messages in found.items()}
 
     def _run(self, chunk: bytes, at: int) -> Bytes | None:
         """As many repetitions of the pattern as follow from `at` on, shape (k, size)."""

@@ -271,13 +271,13 @@ class Summary:
     """The summary of a file as far as reading needs it.
 
     Attributes:
-        announced: schema and channel records.
+        definitions: schema and channel records.
         chunks: in the order of the file.
         others: offset and length of attachments and metadata.
         statistics: the record's body, empty where there is none.
     """
 
-    announced: tuple[Record, ...]
+    definitions: tuple[Record, ...]
     chunks: tuple[ChunkEntry, ...]
     others: tuple[tuple[int, int], ...]
     statistics: bytes = b""
@@ -332,13 +332,13 @@ class Summary:
 
     @classmethod
     def _parsed(cls, body: bytes, start: int) -> Summary:
-        announced, chunks, others, statistics = [], [], [], b""
+        definitions, chunks, others, statistics = [], [], [], b""
         for item in messages(body, start):
             if isinstance(item, MessageHead):
                 raise Damage(start, "has messages in its summary")
             fields = Fields(item.body, start)
             if item.opcode in (container.SCHEMA, container.CHANNEL):
-                announced.append(item)
+                definitions.append(item)
             elif item.opcode == container.CHUNK_INDEX:
                 chunks.append(_chunk_entry(fields))
             elif item.opcode in (container.ATTACHMENT_INDEX, container.METADATA_INDEX):
@@ -346,7 +346,7 @@ class Summary:
             elif item.opcode == container.STATISTICS:
                 statistics = item.body
         chunks.sort(key=lambda entry: entry.offset)
-        return cls(tuple(announced), tuple(chunks), tuple(sorted(others)), statistics)
+        return cls(tuple(definitions), tuple(chunks), tuple(sorted(others)), statistics)
 
 
 def _chunk_entry(fields: Fields) -> ChunkEntry:

@@ -58,7 +58,7 @@ class Survey:
         outcome: entries of ``hil.outcome``, likewise.
         attachments: names of those that stand.
         pieces: records that stand, but for ``hil`` and ``hil.outcome``, in the order of the file.
-        announced: schemas and channels that only the summary still has.
+        definitions: schemas and channels that only the summary still has.
         faults: what is wrong.
         counts: messages that stand, by topic.
         types: of their messages, by topic.
@@ -72,7 +72,7 @@ class Survey:
     outcome: dict[str, str] | None = None
     attachments: list[str] = field(default_factory=list)
     pieces: list[Piece] = field(default_factory=list)
-    announced: tuple[Record, ...] = ()
+    definitions: tuple[Record, ...] = ()
     faults: list[Fault] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     types: dict[str, str] = field(default_factory=dict)

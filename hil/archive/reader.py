@@ -168,7 +168,7 @@ class Content:
         elif record.opcode == container.METADATA:
             self._take_metadata(record)
         elif record.opcode in (container.SCHEMA, container.CHANNEL):
-            self.parser.announced.take(record.opcode, record.body, record.offset)
+            self.parser.known.take(record.opcode, record.body, record.offset)
 
     def _take_metadata(self, record: Record) -> None:
         name, entries = container.metadata(record)
@@ -228,7 +228,7 @@ class Content:
 
     def _decode(self, found: dict[str, Messages], offset: int, compressed: int) -> None:
         """Decode messages, if they are what must follow now; else nothing of them counts."""
-        recorded = self.parser.announced.topics
+        recorded = self.parser.known.topics
         wanted = tuple(topic for topic in self._selection.numbers(recorded) if topic in recorded)
         counts = {len(found[topic]) if topic in found else 0 for topic in wanted}
         if len(counts) > 1:
@@ -276,7 +276,7 @@ class Content:
 
     def _grows(self, topic: str) -> bool:
         """Whether the messages of a topic are of cycles, one each."""
-        return topic in schema.PER_CYCLE and schema.CYCLE in self.parser.announced.topics
+        return topic in schema.PER_CYCLE and schema.CYCLE in self.parser.known.topics
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout:
         assert self.description is not None
@@ -285,7 +285,7 @@ class Content:
             names, layout = joint_state_of(messages.first())
             check_joints(names, layout, joints)
             return layout
-        known = self.parser.announced.schema(topic)
+        known = self.parser.known.schema(topic)
         if known is None:
             raise LayoutError("their schema is missing")
         layout = fixed_layout(known.definition)
@@ -319,7 +319,7 @@ class Content:
         counts = {"samples": max([channel.read for channel in self._channels.values()], default=0)}
         if self._selection.events:
             counts["events"] = self._n_events
-        if not self._selection.numbers(self.parser.announced.topics):
+        if not self._selection.numbers(self.parser.known.topics):
             del counts["samples"]
         elif schema.PACKETS in (self._selection.topics or ()):
             counts["packets"] = counts.pop("samples")
@@ -623,17 +623,17 @@ def _by_index(
         return None
     content = Content(selection, Order(written, gapless=False), gapless=False)
     try:
-        for record in summary.announced:
-            content.parser.announced.take(record.opcode, record.body, record.offset)
+        for record in summary.definitions:
+            content.parser.known.take(record.opcode, record.body, record.offset)
     except Damage:
         return None
-    announced = content.parser.announced
-    topics = {*selection.numbers(announced.topics)}
+    known = content.parser.known
+    topics = {*selection.numbers(known.topics)}
     if selection.events:
         topics.add(EVENTS)
     if selection.topics is None:
         topics.update(NUMBERS)  # a chunk that has others than those wanted is to be seen, too
-    wanted = {channel.id for channel in announced.channels.values() if channel.topic in topics}
+    wanted = {channel.id for channel in known.channels.values() if channel.topic in topics}
     start, stop = selection.times
     chunks = [chunk for chunk in summary.chunks if chunk.channels & wanted]
     taken = [chunk for chunk in chunks if chunk.start_time < stop and chunk.end_time >= start]
@@ -646,7 +646,7 @@ def _by_index(
 
 def _check_topics(path: Path, content: Content, selection: Selection) -> None:
     """Check that the archive has the channels wanted."""
-    recorded = sorted(content.parser.announced.topics)
+    recorded = sorted(content.parser.known.topics)
     for topic in selection.topics or ():
         if recorded and topic not in recorded:
             raise ArchiveError(

@@ -153,7 +153,7 @@ class ArchiveCopy:
         for piece in found.pieces:
             if piece.opcode == container.CHUNK and not announced:
                 announced = True
-                for record in found.announced:
+                for record in found.definitions:
                     self._announce(record)
             self._piece(piece)
         self._metadata(schema.OUTCOME, _outcome(found, self._checksums))

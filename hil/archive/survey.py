@@ -20,10 +20,10 @@ import zstandard
 from numpy.typing import NDArray
 
 from hil.archive import container, index, schema
-from hil.archive.announced import Announced
 from hil.archive.container import Damage, Record
 from hil.archive.index import IndexBuilder, MessageHead, Summary
 from hil.archive.intact import NUMBERS, Fault, Piece, Survey, announced_attachments
+from hil.archive.known_channels import KnownChannels
 from hil.archive.order import Contested, Order, Written
 from hil.errors import ArchiveError
 from hil.reading import opened
@@ -41,7 +41,7 @@ class Inside:
         offset: where it stands in the file, for errors.
         numbered: sequence numbers of its messages, by channel.
         places: where their data begin, by channel.
-        announced: its other records.
+        definitions: its other records.
         logged: log times of all messages [ns].
     """
 
@@ -49,7 +49,7 @@ class Inside:
     offset: int
     numbered: dict[int, list[int]] = field(default_factory=dict)
     places: dict[int, list[int]] = field(default_factory=dict)
-    announced: list[Record] = field(default_factory=list)
+    definitions: list[Record] = field(default_factory=list)
     logged: list[int] = field(default_factory=list)
 
     @classmethod
@@ -66,7 +66,7 @@ class Inside:
                 found.places.setdefault(item.channel, []).append(item.data)
                 found.logged.append(item.log_time)
             else:
-                found.announced.append(item)
+                found.definitions.append(item)
         return found
 
     @property
@@ -122,7 +122,7 @@ class _Surveyor:
         self._stream = stream
         self._summary = Summary.read(stream, survey.size)
         self._decompressor = zstandard.ZstdDecompressor()
-        self._announced = Announced()
+        self._known = KnownChannels()
         self._next: dict[int, int] = {}
         self._shift: dict[int, int] = {}
         self._seen: set[int] = set()
@@ -240,7 +240,7 @@ class _Surveyor:
         self._keep(record)
 
     def _announce(self, opcode: int, body: bytes, offset: int) -> None:
-        self._announced.take(opcode, body, offset)
+        self._known.take(opcode, body, offset)
         self._index.announce(opcode, body)
 
     def _chunk(self, record: Record) -> None:
@@ -254,14 +254,14 @@ class _Surveyor:
         head = container.chunk(record)
         self._order.check_chunk(head.crc, record.offset)
         inside = Inside.of(data, record.offset)
-        known = Announced(self._announced), self.survey.announced
+        known = KnownChannels(self._known), self.survey.definitions
         try:
-            for item in inside.announced:
+            for item in inside.definitions:
                 if item.opcode in (container.SCHEMA, container.CHANNEL):
                     self._announce(item.opcode, item.body, record.offset)
             shift = self._continued(inside, record.offset)
         except Damage:
-            self._announced, self.survey.announced = known  # what it announces goes with it
+            self._known, self.survey.definitions = known  # what it announces goes with it
             raise
         if (head.start_time, head.end_time) != inside.times:
             self._fault("index", Damage(record.offset, "(chunk) states other times"), loss=False)
@@ -287,7 +287,7 @@ class _Surveyor:
         numbers = {
             topic: (len(sequence), shift[channel])
             for channel, sequence in numbered.items()
-            if (topic := self._announced.topic(channel)) in NUMBERS
+            if (topic := self._known.topic(channel)) in NUMBERS
         }
         if len({*numbers.values()}) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
@@ -301,7 +301,7 @@ class _Surveyor:
         if len(stamps):
             self._order.take(int(stamps[-1]))
         for channel, sequence in numbered.items():
-            topic = self._announced.topic(channel)
+            topic = self._known.topic(channel)
             self._next[channel] = sequence[-1] + 1
             self.survey.counts[topic] = self.survey.counts.get(topic, 0) + len(sequence)
             missing = self.survey.missing.get(topic, 0) + gaps[channel]
@@ -313,7 +313,7 @@ class _Surveyor:
 
         Where there are no cycles, none; but then all channels must have the same.
         """
-        channels = {self._announced.topic(channel): channel for channel in inside.places}
+        channels = {self._known.topic(channel): channel for channel in inside.places}
         if schema.CYCLE in channels:
             channel = channels[schema.CYCLE]
             found = inside.stamps(channel)
@@ -325,20 +325,20 @@ class _Surveyor:
         return np.zeros(0, np.int64)
 
     def _standing(self, channel: int) -> int:
-        return self.survey.counts.get(self._announced.topic(channel), 0)
+        return self.survey.counts.get(self._known.topic(channel), 0)
 
     def _recover_channels(self, numbered: dict[int, list[int]], offset: int) -> None:
         """Take channels that no record before announces from the summary."""
-        if numbered.keys() <= self._announced.channels.keys():
+        if numbered.keys() <= self._known.channels.keys():
             return
         summary = self._summary or self._moved_summary()
-        announced = summary.announced if summary else ()
-        for item in announced:
+        definitions = summary.definitions if summary else ()
+        for item in definitions:
             self._announce(item.opcode, item.body, offset)
-        unknown = numbered.keys() - self._announced.channels.keys()
+        unknown = numbered.keys() - self._known.channels.keys()
         if unknown:
             raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
-        self.survey.announced = announced
+        self.survey.definitions = definitions
 
     def _moved_summary(self) -> Summary | None:
         """The summary where a chunk of another length has come before it."""
@@ -350,8 +350,8 @@ class _Surveyor:
 
     def _gap(self, gaps: dict[int, int], offset: int) -> None:
         """Note that messages are missing; a gap in samples must show in the samples behind it."""
-        topics = {self._announced.topic(channel) for channel, gap in gaps.items() if gap}
-        if topics & {*NUMBERS} and schema.CYCLE not in self._announced.topics:
+        topics = {self._known.topic(channel) for channel, gap in gaps.items() if gap}
+        if topics & {*NUMBERS} and schema.CYCLE not in self._known.topics:
             self._ended = True
             raise Damage(offset, "(chunk) comes after a gap that nothing would show")
         if not self._lost_since:
@@ -368,8 +368,8 @@ class _Surveyor:
         survey = self.survey
         if survey.metadata is None:
             return
-        for topic in self._announced.topics:
-            found = self._announced.schema(topic)
+        for topic in self._known.topics:
+            found = self._known.schema(topic)
             survey.types[topic] = found.name if found else ""
         if survey.header != (schema.PROFILE, schema.LIBRARY):
             self._fault("container", "the header is not that of the profile", loss=False)
@@ -386,7 +386,7 @@ class _Surveyor:
             return
         if self.survey.mixed:
             self._fault("outcome", "the outcome is that of another recording", loss=True)
-        topic = self._announced.topic
+        topic = self._known.topic
         cycles = [at for channel, at in self._next.items() if topic(channel) == schema.CYCLE]
         if str(max(cycles, default=0)) == outcome.get("samples"):
             self._order.check_end(self.survey.size)

@@ -49,7 +49,7 @@ class Person:
 
     Args:
         accepts: what is answered to a dry run.
-        wishes: override and hold by what is being run.
+        requests: override and hold by what is being run.
     """
 
     can_answer = True
@@ -57,9 +57,9 @@ class Person:
     def __init__(
         self,
         accepts: bool = True,
-        wishes: Callable[[RunStatus], OperatorRequest] = lambda _: OperatorRequest(),
+        requests: Callable[[RunStatus], OperatorRequest] = lambda _: OperatorRequest(),
     ) -> None:
-        self.accepts, self.wishes = accepts, wishes
+        self.accepts, self.requests = accepts, requests
         self.seen: list[RunStatus] = []
         self.asked: list[DryRunSummary] = []
 
@@ -67,7 +67,7 @@ class Person:
         self.seen.append(status)
 
     def wish(self) -> OperatorRequest:
-        return self.wishes(self.seen[-1])
+        return self.requests(self.seen[-1])
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
         self.asked.append(summary)
@@ -241,7 +241,7 @@ class TestTimeLeft:
                 return OperatorRequest()
 
             with pytest.raises(MotionFailedError, match="stopped"):
-                campaign.run(stop=stop, operator=Person(wishes=stopping), durable=False)
+                campaign.run(stop=stop, operator=Person(requests=stopping), durable=False)
         link = simulated_link(campaign.cell)
         pace, told = Pace(virtual=False), list[tuple[float, float]]()
 
@@ -332,7 +332,7 @@ def test_a_repetition_that_was_slowed_is_rejected_with_its_reason_and_run_again(
             slowed.append(status)
         return OperatorRequest(override=0.5 if len(slowed) in range(1, 4) else 1.0)
 
-    result = campaign.run(operator=Person(wishes=wish), unrehearsed=True)
+    result = campaign.run(operator=Person(requests=wish), unrehearsed=True)
     (rejected,) = result.rejected
     assert rejected.archive == "excitation_001_a1.mcap"
     assert "held or slowed" in rejected.reason
@@ -358,7 +358,7 @@ def test_a_motion_that_is_never_of_use_ends_the_run_after_as_many_tries_as_allow
 ) -> None:
     campaign = make(bad_repetitions=2)
     slow = Person(
-        wishes=lambda status: OperatorRequest(0.5 if status.phase == "repetition" else 1.0)
+        requests=lambda status: OperatorRequest(0.5 if status.phase == "repetition" else 1.0)
     )
     with pytest.raises(RepetitionsRejectedError, match="of no use 3 times") as ended:
         campaign.run(operator=slow, unrehearsed=True)

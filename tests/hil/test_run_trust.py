@@ -68,16 +68,16 @@ class Person:
     can_answer = True
 
     def __init__(
-        self, wishes: Callable[[RunStatus], OperatorRequest] = lambda _: OperatorRequest()
+        self, requests: Callable[[RunStatus], OperatorRequest] = lambda _: OperatorRequest()
     ) -> None:
-        self.wishes = wishes
+        self.requests = requests
         self.status: RunStatus | None = None
 
     def show(self, status: RunStatus) -> None:
         self.status = status
 
     def wish(self) -> OperatorRequest:
-        return OperatorRequest() if self.status is None else self.wishes(self.status)
+        return OperatorRequest() if self.status is None else self.requests(self.status)
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
         del summary
@@ -599,11 +599,11 @@ def finished(campaign: Campaign) -> Campaign:
 def slowed_once(phase: str) -> Person:
     """Somebody who slows motions of a kind until one is rejected for it."""
 
-    def wishes(status: RunStatus) -> OperatorRequest:
+    def requests(status: RunStatus) -> OperatorRequest:
         told = any("rejected" in note for note in status.notes)
         return OperatorRequest(0.5 if status.phase == phase and not told else 1.0)
 
-    return Person(wishes)
+    return Person(requests)
 
 
 def test_a_repetition_that_somebody_slowed_is_no_attempt_while_he_has_let_go(make: Make) -> None:

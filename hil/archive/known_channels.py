@@ -6,14 +6,14 @@ from hil.archive import container
 from hil.archive.container import ChannelRecord, Damage, SchemaRecord
 
 
-class Announced:
+class KnownChannels:
     """Schemas and channels by their numbers; what is announced once stays what it is.
 
     Were a number or a topic to change its meaning in mid-file, samples of one channel would be
     taken for those of another.
     """
 
-    def __init__(self, known: Announced | None = None) -> None:
+    def __init__(self, known: KnownChannels | None = None) -> None:
         self.schemas: dict[int, SchemaRecord] = dict(known.schemas) if known else {}
         self.channels: dict[int, ChannelRecord] = dict(known.channels) if known else {}
 
