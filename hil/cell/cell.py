@@ -146,7 +146,7 @@ class Cell:
         """
         table = self.file.robot.friction
         joints = {
-            name: one.model_copy(update=dict.fromkeys(changes))
+            name: one.model_copy(update=dict.fromkeys(changes.keys() & type(one).model_fields))
             for name, one in table.joints.items()
         }
         friction = table.model_copy(update={**changes, "joints": joints})

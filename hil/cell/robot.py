@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from identification.model.elements import (
     ExtensionSpring,
     GasCylinder,
     JointElements,
+    TorqueRipple,
     TorsionSpring,
 )
 from identification.model.friction import FrictionLaw
@@ -39,6 +41,8 @@ from .schema import (
 )
 
 Array = NDArray[np.float64]
+
+_GEARED: Final = 10.0  # turns of the motor per turn of the joint
 
 
 def robot_model(
@@ -65,6 +69,8 @@ def robot_model(
     coupling = _coupling(path, robot.coupling, chain, drive_train)
     payload = _payload(path, robot.payload, chain)
     elements = [_element(path, place, table, chain) for place, table in enumerate(robot.elements)]
+    if robot.friction.ripple:
+        elements += ripples(chain.joint_names, drive_train(), robot.friction.ripple)
     laws = {
         name: _law(path, f"robot.friction.joints.{name}", _override(robot.friction, name))
         for name in robot.friction.joints
@@ -87,6 +93,17 @@ def robot_model(
         )
 
 
+def ripples(
+    joints: Sequence[str], motor_from_joint: Array, orders: Sequence[int]
+) -> list[TorqueRipple]:
+    """Torque ripple of every joint that has a gear: without one it has the form of a weight."""
+    return [
+        TorqueRipple(name, tuple(zip(joints, row, strict=True)), tuple(orders))
+        for k, (name, row) in enumerate(zip(joints, motor_from_joint.tolist(), strict=True))
+        if abs(row[k]) >= _GEARED
+    ]
+
+
 def _all_names(urdf: str) -> tuple[str, ...]:
     """Every joint that moves, also of kinds that the model knows only when they are locked."""
     return tuple(pinocchio_model(urdf).names)[1:]
@@ -99,7 +116,7 @@ def _override(friction: FrictionTable, name: str) -> FrictionTable:
 
 def _law(path: Path, field: str, table: FrictionTable) -> FrictionLaw:
     with _blamed(path, field, None, "correct that table"):
-        return FrictionLaw.from_table(table.model_dump(exclude={"joints"}))
+        return FrictionLaw.from_table(table.model_dump(exclude={"joints", "ripple"}))
 
 
 def _coupling(

@@ -172,7 +172,13 @@ class FrictionTable(Table):
     presliding: NonNegative = Field(
         default=0.0,
         description="displacement in rad (m) over which dry friction turns round at a reversal "
-        "(Dahl), 0 for a jump; identification chooses its own unless it is told otherwise",
+        "(Dahl), 0 for a jump; identification chooses its own unless one is given",
+    )
+    ripple: list[Annotated[Whole, Field(ge=1, le=24)]] = Field(
+        default_factory=list,
+        description="periods per motor turn of a torque ripple that is identified, such as [1, 2]; "
+        "of every joint with a gear of 10 or more; nothing for none, unless identification finds "
+        "one",
     )
     joints: dict[str, JointFrictionTable] = Field(
         default_factory=dict, description="tables of what is different for a joint, by its name"

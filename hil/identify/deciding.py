@@ -12,10 +12,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.cell import Cell
+from hil.cell.robot import ripples
 from hil.progress import Reporter
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delays
 from identification.estimators.torque_channel import possible_low_passes
+from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Question, choose_settings
 from identification.selection.inner_prediction import Settings as Candidate
@@ -33,6 +36,8 @@ MOST_READ: Final = 32
 _REPETITIONS: Final = 1
 # Where the delay is stated it is looked for all the same, to be reported: in so many samples.
 _DELAY_SAMPLES: Final = 8000
+RIPPLE: Final = (1, 2)
+"""Periods per motor turn of a torque ripple: a rotor out of centre, a wave generator."""
 
 
 class Decided(NamedTuple):
@@ -144,6 +149,7 @@ def _questions(sources: Sources, options: Options) -> set[Question]:
         "rows": options.standstill == "auto",
         # A cell file with a drive train says which terms are wanted.
         "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
+        "ripple": options.friction == "auto" and bool(_ripples(sources.cell)),
         # A controller's own currents come through no low-pass.
         "low-pass": options.torque_bandwidth == "auto"
         and options.method == "default"
@@ -185,13 +191,15 @@ def _chosen(
 
     start = Candidate(cell.model, settings.preprocessing)
     with reporter.task("choosing settings by inner prediction", 1) as task:
-        best, choices = choose_settings(ready, start, questions, low_passes)
+        best, choices = choose_settings(ready, start, questions, low_passes, _ripples(cell))
         task.advance(1)
     law, friction = best.model.friction.laws[0], dict(settings.friction)
     if "presliding" in questions:
         friction |= {"presliding": law.presliding}
     if "friction" in questions:
         friction |= {"third": law.third or "none", "stribeck": law.stribeck or 0.0}
+    if "ripple" in questions and best.rippled:
+        friction |= {"ripple": [*RIPPLE]}
     return replace(
         settings,
         preprocessing=best.preprocessing,
@@ -199,6 +207,13 @@ def _chosen(
         shrinkage=best.shrinkage,
         choices=choices,
     )
+
+
+def _ripples(cell: Cell) -> Sequence[TorqueRipple]:
+    """Torque ripple that the cell's gears may have; none where it has some, or no gear is known."""
+    if cell.file.drive_train is None or cell.file.robot.friction.ripple:
+        return ()
+    return ripples(cell.joint_names, cell.drive_train.motor_from_joint, RIPPLE)
 
 
 def _read_to_choose(sources: Sources) -> Sequence[Source]:

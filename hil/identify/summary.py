@@ -179,13 +179,16 @@ def summarise(
 def planted_in(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
     """What was planted in the simulated arm (p,): as the archive says, or else its cell.
 
-    None where neither says it, and where the archive does not say it of each parameter.
+    None where neither says it, and where the archive does not say it of each parameter. That of a
+    torque ripple, whose phase is drawn, is NaN.
     """
     if "planted" in metadata:
-        told, names = foreign_json.loads(metadata["planted"]), cell.model.parameter_names
-        if not isinstance(told, dict) or not all(_is_number(told.get(name)) for name in names):
+        planted, model = foreign_json.loads(metadata["planted"]), cell.model
+        named = model.parameter_names[: model.element_part.start]
+        if not isinstance(planted, dict) or not all(_is_number(planted.get(n)) for n in named):
             return None
-        return np.array([told[name] for name in names], dtype=np.float64)
+        given = [planted.get(name) for name in model.parameter_names]
+        return np.array([v if _is_number(v) else np.nan for v in given], dtype=np.float64)
     return planted_values(cell) if cell.file.simulation else None
 
 
@@ -306,7 +309,7 @@ def _parameters(cell: Cell, estimation: Estimation, truth: Array | None) -> list
             std=float(pooled.std[i]),
             repetition_mean=float(estimate.mean[i]),
             repetition_std=None if std is None else float(std[i]),
-            truth=None if truth is None else float(truth[i]),
+            truth=None if truth is None or np.isnan(truth[i]) else float(truth[i]),
             undetermined=parameter in pooled.undetermined,
             of_this_run=bool(model.friction_columns[i]),
             prior_std=None if isinstance(posterior, str) else float(posterior.prior_std[i]),
@@ -381,8 +384,8 @@ def _delays(prepared: Prepared) -> DelaysResult | None:
 
 
 def _coverage(values: Array, std: Array, truth: Array) -> CoverageResult:
-    """Of the parameters that the data determine."""
-    determined = np.isfinite(std)
+    """Of the parameters that the data determine and whose truth is known."""
+    determined = np.isfinite(std) & np.isfinite(truth)
     distance = np.abs(values - truth)[determined]
     std = std[determined]
     return CoverageResult(

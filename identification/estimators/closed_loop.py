@@ -202,7 +202,7 @@ class _Elements:
 
     def torque(self, q: Array) -> Array:
         """Torque (n,) that the drives hold at a position (n,)."""
-        if not self.elements.elements:
+        if not self.elements.placed:
             return np.zeros(len(q))
         row = q[None]
         return np.asarray((self.elements.torque(self.values, row) + self.elements.known(row))[0])

@@ -236,16 +236,13 @@ def _payload(model: RobotModel) -> dict[str, Any] | None:
 
 def _elements(model: RobotModel) -> list[dict[str, Any]]:
     """Return the springs and balancers, and the parameters that belong to each."""
-    names: dict[int, tuple[str, ...]] = {}
-    for element, _, place in model.elements.identified():
-        names[id(element)] = model.elements.names[place]
     return [
         {
-            "law": type(element).__name__,
-            **dataclasses.asdict(element),
-            "parameters": list(names.get(id(element), ())),
+            "law": type(one.element).__name__,
+            **dataclasses.asdict(one.element),
+            "parameters": list(model.elements.names[one.part]),
         }
-        for element in model.elements.elements
+        for one in model.elements.placed
     ]
 
 

@@ -1,18 +1,20 @@
-r"""Springs and balancers that put a torque on a joint beside the rigid body.
+r"""Springs, balancers and gear ripple: torques on a joint beside the rigid body.
 
-The torque of an element depends on the position q of its joint alone. As with a payload it is
-counted as what the *drive* has to hold against: for a spring under the tension F between an anchor
-on the base side and one on the link side, at the distance l, that is :math:`F\,dl/dq`.
+The torque of an element depends on the angle q of its joint, or of the joint's motor, alone. As
+with a payload it is counted as what the *drive* has to hold against: for a spring under the tension
+F between an anchor on the base side and one on the link side, at the distance l, that is
+:math:`F\,dl/dq`.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,38 +31,43 @@ class ElementError(ModelError):
     """An element whose parameters the others stand for already."""
 
 
-class Element(Protocol):
-    """A torque on one joint: c parameters that are identified, and a part that is known."""
+@dataclass(frozen=True)
+class Element(ABC):
+    """A torque on one joint: c parameters that are identified, and a part that is known.
 
-    __dataclass_fields__: ClassVar[dict[str, Any]]
+    Attributes:
+        joint: name.
+    """
+
+    joint: str
 
     @property
-    def joint(self) -> str:
-        """Name of the joint."""
-        ...
+    def turns(self) -> Mapping[str, float]:
+        """The angle that it depends on, per angle of each joint by name."""
+        return {self.joint: 1.0}
 
     @property
+    @abstractmethod
     def symbols(self) -> tuple[str, ...]:
         """Names of the c identified parameters, without the number of the joint."""
-        ...
 
     @property
+    @abstractmethod
     def units(self) -> tuple[str, ...]:
         """Their units (c,)."""
-        ...
 
     @property
+    @abstractmethod
     def nominal(self) -> tuple[float, ...]:
         """Their values (c,) as far as they are given, else zero."""
-        ...
 
+    @abstractmethod
     def columns(self, q: Array) -> Array:
-        """Return the torque per unit of each identified parameter, at positions (m,): (m, c)."""
-        ...
+        """Return the torque per unit of each identified parameter, at angles (m,): (m, c)."""
 
+    @abstractmethod
     def known(self, q: Array) -> Array:
         """Return the part of the torque [N·m] that is known (m,)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -111,7 +118,7 @@ class Anchors:
 
 
 @dataclass(frozen=True)
-class TorsionSpring:
+class TorsionSpring(Element):
     """A spring about the axis; the drive holds ``stiffness (q - rest)``.
 
     Attributes:
@@ -124,7 +131,6 @@ class TorsionSpring:
         ModelError: a known spring has no stiffness, or a number is not finite.
     """
 
-    joint: str
     rest: float
     stiffness: float | None = None
     identified: bool = False
@@ -160,7 +166,7 @@ class TorsionSpring:
 
 
 @dataclass(frozen=True)
-class ExtensionSpring:
+class ExtensionSpring(Element):
     """A spring between two anchors, of tension ``stiffness (l - free_length) + preload``.
 
     Attributes:
@@ -176,7 +182,6 @@ class ExtensionSpring:
         ModelError: a known spring has no stiffness, or a number is not finite.
     """
 
-    joint: str
     anchors: Anchors
     free_length: float
     stiffness: float | None = None
@@ -217,7 +222,7 @@ class ExtensionSpring:
 
 
 @dataclass(frozen=True)
-class GasCylinder:
+class GasCylinder(Element):
     """A piston against gas between two anchors, of constant temperature.
 
     With the stroke s, by which the anchors compress the gas from the length at which pressure and
@@ -238,7 +243,6 @@ class GasCylinder:
         ModelError: a figure is not positive, or the gas has no volume left at some angle.
     """
 
-    joint: str
     anchors: Anchors
     length: float
     area: float
@@ -296,16 +300,88 @@ class GasCylinder:
 
 
 @dataclass(frozen=True)
+class TorqueRipple(Element):
+    """A torque that repeats with the turns of the joint's motor: cogging, teeth, wave generators.
+
+    Each order has a cosine and a sine of the motor's angle, so that amplitude and phase are
+    identified. The phase holds as long as nobody takes the gear apart. That a coupled motor passes
+    some of it on to other joints is left out.
+
+    Attributes:
+        joint: name.
+        motor: turns of the motor per turn of each joint that turns it, with the joints' names.
+        orders: periods per turn of the motor.
+    """
+
+    motor: tuple[tuple[str, float], ...]
+    orders: tuple[int, ...]
+
+    @property
+    def turns(self) -> Mapping[str, float]:
+        """The motor's angle, per angle of each joint."""
+        return dict(self.motor)
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """``ripple_cos2`` and ``ripple_sin2`` of the second order."""
+        return tuple(f"ripple_{wave}{order}" for order in self.orders for wave in ("cos", "sin"))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of an amplitude."""
+        return ("N·m",) * len(self.symbols)
+
+    @property
+    def nominal(self) -> tuple[float, ...]:
+        """Zeros: no maker states them."""
+        return (0.0,) * len(self.symbols)
+
+    def columns(self, q: Array) -> Array:
+        """Return cosine and sine of each order (m, c)."""
+        angles = q[:, None] * np.array(self.orders, dtype=np.float64)
+        return np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(q), -1)
+
+    def known(self, q: Array) -> Array:
+        """Return zeros (m,)."""
+        return np.zeros(len(q))
+
+
+class PlacedElement(NamedTuple):
+    """An element among the joints and parameters of an arm.
+
+    Attributes:
+        element: which.
+        joint: that it acts on, from 0.
+        turns: the angle that it depends on, per angle of each joint (n,).
+        part: where its parameters stand among the e of all elements.
+    """
+
+    element: Element
+    joint: int
+    turns: tuple[float, ...]
+    part: slice
+
+    def columns(self, q: Array) -> Array:
+        """Return the columns (m, c) at joint positions (m, n)."""
+        return self.element.columns(self._angle(q))
+
+    def known(self, q: Array) -> Array:
+        """Return the known torque [N·m] (m,) at joint positions (m, n)."""
+        return self.element.known(self._angle(q))
+
+    def _angle(self, q: Array) -> Array:
+        return np.asarray(q @ np.array(self.turns))
+
+
+@dataclass(frozen=True)
 class JointElements:
     """All elements of an arm: e identified parameters, element by element.
 
     Attributes:
-        elements: in the order of the parameters.
-        joints: which joint each acts on, from 0.
+        placed: in the order of the parameters.
     """
 
-    elements: tuple[Element, ...] = ()
-    joints: tuple[int, ...] = ()
+    placed: tuple[PlacedElement, ...] = ()
 
     @classmethod
     def of(
@@ -328,16 +404,32 @@ class JointElements:
                     " turn",
                     joint=element.joint,
                 )
-        return cls(tuple(elements), tuple(joint_names.index(one.joint) for one in elements))
+        placed, first = [], 0
+        for element in elements:
+            part = slice(first, first + len(element.symbols))
+            turns = tuple(element.turns.get(name, 0.0) for name in joint_names)
+            placed.append(PlacedElement(element, joint_names.index(element.joint), turns, part))
+            first = part.stop
+        return cls(tuple(placed))
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """The elements in the order of the parameters."""
+        return tuple(one.element for one in self.placed)
+
+    @property
+    def identified(self) -> tuple[PlacedElement, ...]:
+        """Those that have parameters."""
+        return tuple(one for one in self.placed if one.element.symbols)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the e parameters: ``spring_2``, then ``spring_2b`` of another on that joint."""
         found: Counter[str] = Counter()
         names = []
-        for element, joint in zip(self.elements, self.joints, strict=True):
-            for symbol in element.symbols:
-                name = f"{symbol}_{joint + 1}"
+        for one in self.placed:
+            for symbol in one.element.symbols:
+                name = f"{symbol}_{one.joint + 1}"
                 names.append(name + ("" if not found[name] else chr(ord("a") + found[name])))
                 found[name] += 1
         return tuple(names)
@@ -352,27 +444,18 @@ class JointElements:
         """Values of the e parameters as far as they are given, else zero."""
         return np.array([value for one in self.elements for value in one.nominal], dtype=np.float64)
 
-    def identified(self) -> Iterator[tuple[Element, int, slice]]:
-        """Yield elements with parameters, the joint of each, and where its parameters stand."""
-        first = 0
-        for element, joint in zip(self.elements, self.joints, strict=True):
-            count = len(element.symbols)
-            if count:
-                yield element, joint, slice(first, first + count)
-            first += count
-
     def torque(self, values: Array, q: Array) -> Array:
         """Return the torque (m, n) [N·m] for e parameter values, without what is known."""
         torque = np.zeros(q.shape)
-        for element, joint, place in self.identified():
-            torque[:, joint] += element.columns(q[:, joint]) @ values[place]
+        for one in self.identified:
+            torque[:, one.joint] += one.columns(q) @ values[one.part]
         return torque
 
     def known(self, q: Array) -> Array:
         """Return the known part of the torque (m, n) [N·m] at positions (m, n)."""
         torque = np.zeros(q.shape)
-        for element, joint in zip(self.elements, self.joints, strict=True):
-            torque[:, joint] += element.known(q[:, joint])
+        for one in self.placed:
+            torque[:, one.joint] += one.known(q)
         return torque
 
 

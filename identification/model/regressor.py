@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.model.elements import Element, JointElements
+from identification.model.elements import JointElements, PlacedElement
 from identification.model.friction import FrictionLaw, JointFriction, JointTerm
 from identification.model.kinematics import Chain
 from identification.model.link_motion import LinkMotion
@@ -96,7 +96,7 @@ class RegressorPlan:
         self.rotors = tuple(rotors)
         self.friction = friction
         self.couplings = tuple(couplings)
-        self.elements = tuple(elements.identified()) if elements is not None else ()
+        self.elements = elements.identified if elements is not None else ()
         # Order in the working array: columns of the links, then of the joint's drive: friction,
         # motor friction, rotor, coupling inertias, elements, response.
         self.first_own = sum(len(kept) for kept in links)
@@ -204,7 +204,7 @@ class _OwnRows(NamedTuple):
         others = [sum(pair) - joint for pair in plan.couplings if joint in pair]
         couplings = {other: row + k for k, other in enumerate(others)}
         row += len(others)
-        acting_here = [len(one.symbols) for one, owner, _ in plan.elements if owner == joint]
+        acting_here = [len(one.element.symbols) for one in plan.elements if one.joint == joint]
         elements = slice(row, row + sum(acting_here))
         return cls(friction, motors, rotor, couplings, elements, elements.stop)
 
@@ -296,14 +296,14 @@ class _Workspace:
                 parts.append((acceleration[other], self.rows[joint, row]))
         return parts
 
-    def _element_parts(self, plan: RegressorPlan) -> list[tuple[Element, int, Array]]:
-        """Return springs and balancers, the joint of each, and the rows that they write."""
+    def _element_parts(self, plan: RegressorPlan) -> list[tuple[PlacedElement, Array]]:
+        """Return springs and balancers, and the rows that they write."""
         free = [own.elements.start for own in self._own]
         parts = []
-        for element, joint, place in plan.elements:
-            first = free[joint]
-            free[joint] += place.stop - place.start
-            parts.append((element, joint, self.rows[joint, first : free[joint]]))
+        for one in plan.elements:
+            first = free[one.joint]
+            free[one.joint] += one.part.stop - one.part.start
+            parts.append((one, self.rows[one.joint, first : free[one.joint]]))
         return parts
 
     def _write_motor_friction(self, friction: JointFriction) -> None:
@@ -351,8 +351,8 @@ class _Workspace:
             target[...] = law.columns(velocity, turned)
         for source, target in self._drives:
             np.copyto(target, source)
-        for element, joint, target in self._elements:
-            target[:, : len(q)] = element.columns(q[:, joint]).T
+        for element, target in self._elements:
+            target[:, : len(q)] = element.columns(q).T
         if self._joint_friction is not None and self._joint_friction.motors:
             self._write_motor_friction(self._joint_friction)
 
@@ -415,9 +415,10 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
         for other in own.couplings:
             pair = (min(joint, other), max(joint, other))
             columns[joint].append(offsets[-1] + plan.couplings.index(pair))
-        for _, owner, span in plan.elements:
-            if owner == joint:
-                columns[joint] += range(first_element + span.start, first_element + span.stop)
+        for one in plan.elements:
+            if one.joint == joint:
+                part = one.part
+                columns[joint] += range(first_element + part.start, first_element + part.stop)
         rows[joint] += range(plan.first_own, own.response)
     return (
         tuple(_as_slice(r) for r in rows),

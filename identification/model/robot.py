@@ -265,17 +265,25 @@ class RobotModel:
             ModelError: some joint's law would be none, see :class:`FrictionLaw`.
         """
         laws = tuple(replace(law, **changes) for law in self.friction.laws)
-        friction = replace(self.friction, laws=laws)
+        return self._beside(replace(self.friction, laws=laws), self.elements)
+
+    def with_elements(self, more: Sequence[Element]) -> RobotModel:
+        """Return the model with these elements behind its own, see :meth:`from_urdf`."""
+        elements = JointElements.of(
+            [*self.elements.elements, *more], self.joint_names, self.friction.revolute
+        )
+        return self._beside(self.friction, elements)
+
+    def _beside(self, friction: JointFriction, elements: JointElements) -> RobotModel:
         return replace(
             self,
             friction=friction,
-            parameter_names=self.base.names + friction.names + self.elements.names,
+            elements=elements,
+            parameter_names=self.base.names + friction.names + elements.names,
             units=tuple(self.layout.units[k] for k in self.base.kept)
             + friction.units
-            + self.elements.units,
-            plan=_plan(
-                self.chain, self.gravity, self.layout, self.base.kept, friction, self.elements
-            ),
+            + elements.units,
+            plan=_plan(self.chain, self.gravity, self.layout, self.base.kept, friction, elements),
         )
 
     @property
@@ -370,7 +378,7 @@ class RobotModel:
     @property
     def has_load(self) -> bool:
         """Whether a payload or an element has a known torque."""
-        return self._load is not None or bool(self.elements.elements)
+        return self._load is not None or bool(self.elements.placed)
 
     def load_torque(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the known torque [N·m, N] of payload, springs and balancers (m, n).
@@ -436,7 +444,7 @@ def _base_parameters(
     rows = plan.evaluate(q, qd, qdd).dense(layout.size).reshape(-1, layout.size)
     base = select_base(rows, layout.names, layout.units)
     _refuse_weight_as_offset(chain, friction, rows[:, base.kept])
-    _refuse_known_shape(chain, friction, elements, rows[:, base.kept], q)
+    _refuse_known_shape(friction, elements, rows[:, base.kept], q)
     return base
 
 
@@ -458,23 +466,23 @@ def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Arr
 
 
 def _refuse_known_shape(
-    chain: Chain, friction: JointFriction, elements: JointElements, columns: Array, q: Array
+    friction: JointFriction, elements: JointElements, columns: Array, q: Array
 ) -> None:
     """Refuse an element whose column the others contain, such as a weight's or an offset's."""
     m, n = q.shape
     offsets = [j for j, law in enumerate(friction.laws) if Offset.symbol in law.symbols]
     columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])
-    for element, joint, place in elements.identified():
-        own = element.columns(q[:, joint])
-        for k, name in enumerate(elements.names[place]):
+    for one in elements.identified:
+        own, owner = one.columns(q), one.element.joint
+        for k, name in enumerate(elements.names[one.part]):
             torque = np.zeros((m, n))
-            torque[:, joint] = own[:, k]
+            torque[:, one.joint] = own[:, k]
             column = torque.reshape(-1, 1)
             if share_left(column, columns)[0] <= TOLERANCE:
                 raise ElementError(
-                    f"the torque of {name} on joint {element.joint!r} has the same form as that of"
+                    f"the torque of {name} on joint {owner!r} has the same form as that of"
                     " other parameters, such as a weight, and cannot be separated from it; give its"
                     " figures, with identified = false",
-                    joint=chain.joint_names[joint],
+                    joint=owner,
                 )
             columns = np.column_stack([columns, column])

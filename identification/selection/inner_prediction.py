@@ -24,6 +24,7 @@ from identification.estimators.shrinkage import Shrinkage, consistent_centre, sh
 from identification.factor.augmented_rows import augmented_rows
 from identification.factor.estimation import joint_weights, solve
 from identification.factor.gram import Factor
+from identification.model.elements import Element, TorqueRipple
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.masks import LeftOut
@@ -31,7 +32,7 @@ from identification.signals.samples import Preprocessing, Samples, VelocitySourc
 
 Array = NDArray[np.float64]
 Question = Literal[
-    "bandwidth", "velocity", "presliding", "rows", "friction", "low-pass", "estimator"
+    "bandwidth", "velocity", "presliding", "rows", "friction", "ripple", "low-pass", "estimator"
 ]
 
 FOLDS: Final = 5
@@ -81,9 +82,19 @@ class Settings:
     shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
 
     @property
-    def key(self) -> tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage]:
-        """What tells settings of one robot apart."""
-        return self.model.friction.laws, self.preprocessing, self.shrinkage
+    def key(self) -> tuple[Columns, Preprocessing, Shrinkage]:
+        """What differs between settings of one robot."""
+        return *self.factor_key, self.shrinkage
+
+    @property
+    def factor_key(self) -> tuple[Columns, Preprocessing]:
+        """What of it factors depend on."""
+        return (self.model.friction.laws, self.model.elements.elements), self.preprocessing
+
+    @property
+    def rippled(self) -> bool:
+        """Whether a torque ripple is among what is estimated."""
+        return any(isinstance(one, TorqueRipple) for one in self.model.elements.elements)
 
     def describe(self) -> tuple[str, ...]:
         """The settings in words, part by part."""
@@ -92,6 +103,7 @@ class Settings:
             f"{how.rigid_bandwidth:g} Hz",
             "measured velocity" if how.velocity == "measured" else "velocity from positions",
             *self.model.friction.laws[0].words(),
+            "torque ripple" if self.rippled else "no torque ripple",
             {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
                 how.left_out or "", "by the friction law"
             ),
@@ -192,6 +204,9 @@ class Folds:
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
 """What is fitted, prepared for a model, and nothing else."""
 
+Columns = tuple[tuple[FrictionLaw, ...], tuple[Element, ...]]
+"""What columns a model of one robot has beside the rigid body's."""
+
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
 """Settings with low-passes that the torque may have come through."""
 
@@ -201,6 +216,7 @@ def choose_settings(
     start: Settings,
     questions: Collection[Question],
     low_passes: LowPasses,
+    ripples: Sequence[TorqueRipple] = (),
 ) -> tuple[Settings, tuple[Choice, ...]]:
     """Choose settings one question after the other, each with what was chosen before it.
 
@@ -209,6 +225,7 @@ def choose_settings(
         start: what is not asked for stays as it is here.
         questions: what is chosen.
         low_passes: looked for where "low-pass" is among them.
+        ripples: added to the model where "ripple" is among them and they help.
 
     Returns:
         The settings, and how they were chosen; those of `start` where what is fitted is too short
@@ -246,6 +263,10 @@ def choose_settings(
     if "friction" in questions:
         found = trial.decide("friction at speed", _friction_terms(now), TERM_WORTHWHILE)
         now, choices = found.settings, [*choices, found.choice]
+    if "ripple" in questions:
+        with_them = replace(now, model=now.model.with_elements(ripples))
+        found = trial.decide("torque ripple", [now, with_them])
+        now, choices = found.settings, [*choices, found.choice]
     if "estimator" in questions:
         trial.renew_centres()
         weights = PRIOR_WEIGHTS if now.shrinkage.strength > 0.0 else (now.shrinkage.prior_weight,)
@@ -268,8 +289,8 @@ class _Trial:
     def __init__(self, ready: Ready) -> None:
         self._ready = ready
         self._samples: dict[Preprocessing, list[Samples]] = {}
-        self._folds: dict[tuple[tuple[FrictionLaw, ...], Preprocessing], Folds] = {}
-        self._errors: dict[tuple[tuple[FrictionLaw, ...], Preprocessing, Shrinkage], Errors] = {}
+        self._folds: dict[tuple[Columns, Preprocessing], Folds] = {}
+        self._errors: dict[tuple[Columns, Preprocessing, Shrinkage], Errors] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
         self._near: dict[tuple[str, ...], Array] = {}  # a solution, from which others are found
 
@@ -329,7 +350,7 @@ class _Trial:
         self._errors.clear()
 
     def _reduced(self, settings: Settings) -> Folds:
-        key = settings.model.friction.laws, settings.preprocessing
+        key = settings.factor_key
         if key not in self._folds:
             if settings.preprocessing not in self._samples:
                 samples = self._ready(settings.model, settings.preprocessing)

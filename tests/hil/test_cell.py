@@ -412,6 +412,13 @@ class TestElements:
         torque = cell.model.load_torque(q, np.zeros_like(q), np.zeros_like(q))
         np.testing.assert_allclose(torque[0, 1], 0.16 / length * force)
 
+    def test_ripple_is_of_every_joint_with_a_gear(self, folder: Path) -> None:
+        cell = Cell.load(folder / "cell.toml")
+        rippled = cell.with_friction(ripple=[2]).model
+        assert rippled.n_parameters == cell.model.n_parameters + 2 * 6
+        wrist = rippled.elements.elements[5]
+        assert [*wrist.turns.values()] == cell.drive_train.motor_from_joint[5].tolist()
+
 
 ROBOT_FAULTS = {
     '[robot.friction.joints.joint_9]\nthird = "none"': ("robot.friction.joints", "joint_9"),

@@ -22,6 +22,7 @@ from identification.model.elements import (
     ExtensionSpring,
     GasCylinder,
     JointElements,
+    TorqueRipple,
     TorsionSpring,
 )
 from identification.model.friction import FrictionLaw
@@ -177,6 +178,19 @@ class TestElementModel:
         np.testing.assert_allclose(dense, expected, atol=1e-9)
         other = model.with_friction(coulomb=False)
         assert other.parameter_names[other.element_part] == model.elements.names
+
+    def test_ripple_turns_with_the_motor(self) -> None:
+        """Cosine and sine of each order of the motor's angle, which several joints may turn."""
+        motor = tuple(zip(JOINTS, (20.0, -30.0), strict=True))
+        model, motion = with_elements(TorqueRipple(JOINTS[1], motor, (1, 2))), two_link.a_motion()
+        assert model.parameter_names[model.element_part] == tuple(
+            f"ripple_{wave}{order}_2" for order in (1, 2) for wave in ("cos", "sin")
+        )
+        values = np.concatenate([two_link.truth(), [0.0, 0.0, 0.3, 0.4]])
+        angle = 20.0 * motion.position[:, 0] - 30.0 * motion.position[:, 1]
+        expected = two_link.MODEL.torque(two_link.truth(), *motion[1:])
+        expected[:, 1] += 0.5 * np.sin(2.0 * angle + np.arctan2(0.3, 0.4))
+        np.testing.assert_allclose(model.torque(values, *motion[1:]), expected, atol=1e-9)
 
     def test_known_ones_are_load_and_no_parameter(self) -> None:
         known = with_elements(replace(SPRING, identified=False))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Choice, Question, Settings, choose_settings
 from identification.signals.recording import Recording
@@ -31,7 +33,11 @@ def a_recording(model: RobotModel = MODEL, values: np.ndarray | None = None) -> 
 
 
 def chosen(
-    recording: Recording, questions: set[Question], *, leaks: bool = False
+    recording: Recording,
+    questions: set[Question],
+    *,
+    leaks: bool = False,
+    ripple: Sequence[TorqueRipple] = (),
 ) -> tuple[Settings, tuple[Choice, ...]]:
     """Settings chosen on the rows before CUT; on all of them where those behind it leak."""
 
@@ -39,7 +45,8 @@ def chosen(
         samples = prepare(recording, model, options=how)
         return [samples if leaks else samples.between(0, CUT)]
 
-    return choose_settings(ready, Settings(MODEL, Preprocessing()), questions, lambda *_: None)
+    start = Settings(MODEL, Preprocessing())
+    return choose_settings(ready, start, questions, lambda *_: None, ripple)
 
 
 class TestChosenSettings:
@@ -57,6 +64,15 @@ class TestChosenSettings:
     def test_a_term_that_is_not_there_is_not_claimed(self) -> None:
         settings, _ = chosen(a_recording(), {"friction"})
         assert settings.model.friction.laws[0].third is None
+
+    def test_torque_ripple_is_estimated_only_where_it_is(self) -> None:
+        ripple = [TorqueRipple(name, ((name, 40.0),), (2,)) for name in MODEL.joint_names]
+        rippled = MODEL.with_elements(ripple)
+        strong = a_recording(rippled, np.append(truth(), [0.0, 0.4, 0.3, 0.0]))
+        settings, _ = chosen(strong, {"ripple"}, ripple=ripple)
+        assert settings.model.parameter_names == rippled.parameter_names
+        settings, _ = chosen(a_recording(), {"ripple"}, ripple=ripple)
+        assert settings.model.parameter_names == MODEL.parameter_names
 
     def test_least_squares_stays_where_it_predicts_as_well(self) -> None:
         settings, choices = chosen(a_recording(), {"estimator"})

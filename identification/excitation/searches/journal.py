@@ -68,7 +68,7 @@ def _feed(summary: hashlib._Hash, value: object) -> None:
     if isinstance(value, RobotModel):
         # The rest of a model is computed from these, maybe with another last bit elsewhere.
         own = (value.chain, value.gravity, value.rotor_inertia, value.friction, value.payload)
-        beside = (value.elements,) if value.elements.elements else ()
+        beside = (value.elements,) if value.elements.placed else ()
         _feed(summary, ("RobotModel", *own, *beside, value.parameter_names))
     elif isinstance(value, np.ndarray | np.generic):
         array = np.asarray(value)
