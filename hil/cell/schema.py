@@ -132,6 +132,9 @@ class JointFrictionTable(Table):
     stribeck: Annotated[Number, Field(ge=0)] | None = Field(
         default=None, description="speed in rad/s of a Stribeck term, 0 for none"
     )
+    tanh: Annotated[Number, Field(ge=0)] | None = Field(
+        default=None, description="speed vt in rad/s of f0 tanh(qd / vt), 0 for f0 sgn(qd)"
+    )
     asymmetric: Choice | None = Field(
         default=None, description="true or false: Coulomb and viscous friction by direction"
     )
@@ -157,6 +160,9 @@ class FrictionTable(Table):
     offset: Choice = Field(default=False, description="true or false: a constant torque per joint")
     stribeck: Annotated[Number, Field(ge=0)] = Field(
         default=0.0, description="speed in rad/s of a Stribeck term, 0 for none"
+    )
+    tanh: Annotated[Number, Field(ge=0)] = Field(
+        default=0.0, description="speed vt in rad/s of f0 tanh(qd / vt), 0 for f0 sgn(qd)"
     )
     asymmetric: Choice = Field(
         default=False, description="true or false: Coulomb and viscous friction by direction"

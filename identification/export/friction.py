@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.model.friction import FrictionLaw, Kind
+from identification.model.friction import FrictionLaw, Kind, Tanh
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
@@ -77,6 +77,8 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         "  # rad/s or m/s: slower, the sign was fitted as linear",
     ]
     kinds = friction.kinds
+    if Tanh in kinds:
+        lines[1:1] = ["", "from math import tanh"]
     if any(" E " in kind.code for kind in kinds):
         lines.append(f"E = {math.e!r}")
     for kind in kinds:

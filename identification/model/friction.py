@@ -145,10 +145,30 @@ class Coulomb(FrictionTerm):
     basis, code = "sgn(v)", " * sign"
     urdf, of_motor, not_negative = "friction", True, True
 
+    @classmethod
+    def _setting(cls, law: FrictionLaw) -> Any:
+        return law.coulomb and law.tanh is None
+
     def _column(self, at: Sliding) -> Array:
         return at.s
 
     _slope = _column
+
+
+class Tanh(FrictionTerm):
+    """Dry friction that passes smoothly through zero, in place of Coulomb's."""
+
+    symbol, option, label = "f0", "tanh", "tanh"
+    words = "Coulomb friction f0 with a smooth sign"
+    basis, code = "tanh(v/vt)", " * tanh(v / TANH_SPEED[joint])"
+    speed_symbol = "vt"
+    urdf, of_motor, not_negative = "friction", True, True
+
+    def _column(self, at: Sliding) -> Array:
+        return np.tanh(at.v / self.speed)
+
+    def _slope(self, at: Sliding) -> Array:
+        return np.asarray((1.0 - np.tanh(at.v / self.speed) ** 2) / self.speed)
 
 
 class Viscous(FrictionTerm):
@@ -250,12 +270,21 @@ class Offset(FrictionTerm):
 
 
 Kind = type[FrictionTerm]
-TERMS: Final[tuple[Kind, ...]] = (Coulomb, Viscous, Asymmetric, Quadratic, Cubic, Stribeck, Offset)
+TERMS: Final[tuple[Kind, ...]] = (
+    Coulomb,
+    Tanh,
+    Viscous,
+    Asymmetric,
+    Quadratic,
+    Cubic,
+    Stribeck,
+    Offset,
+)
 """All terms that a joint can have, in the order of the parameters."""
 
 _SYMBOLS: Final = tuple(dict.fromkeys(kind.symbol for kind in TERMS))
 
-ABSENT: Final[Mapping[str, Any]] = {"third": "none", "stribeck": 0.0}
+ABSENT: Final[Mapping[str, Any]] = {"third": "none", "stribeck": 0.0, "tanh": 0.0}
 """How a cell file writes None, by option."""
 
 
@@ -272,6 +301,8 @@ class FrictionLaw:
             any value there; see `zone`.
         stribeck: fixed speed v_s [rad/s, m/s] of a term ``fs sgn(v) exp(-(v / v_s)**2)``, by which
             friction is larger at low speed; none without it.
+        tanh: fixed speed v_t [rad/s, m/s] of ``f0 tanh(v / v_t)`` in place of ``f0 sgn(v)``; none
+            for the latter.
         asymmetric: friction differs by direction, viscous by a term ``fd |v|``. Coulomb friction is
             f0 + fo forwards and f0 - fo backwards: its asymmetry is the constant column of the
             offset, which is there then too, and the two cannot be distinguished.
@@ -286,6 +317,7 @@ class FrictionLaw:
     offset: bool = False
     standstill: float = 0.01
     stribeck: float | None = None
+    tanh: float | None = None
     asymmetric: bool = False
     zone: Zone = "exclude"
     presliding: float = 0.0
@@ -347,6 +379,8 @@ class FrictionLaw:
             for term in self.terms
         )
         reversal = f"presliding over {self.presliding:g} rad" if self.presliding else "sgn(v)"
+        if self.tanh is not None:
+            reversal = f"tanh(v / {self.tanh:g} rad/s)"
         return listed or "no friction", reversal
 
     def sign(self, velocity: Array, out: Array | None = None) -> Array:

@@ -79,8 +79,9 @@ class TestFrictionTerms:
 
     def test_source_code_computes_the_column(self, kind: type[FrictionTerm]) -> None:
         term = kind(0.4)
-        speeds = {f"{kind.label.upper()}_SPEED": [term.speed], "joint": 0, "E": math.e}
-        code = [eval("1.0" + kind.code, {"v": v, "sign": np.sign(v), **speeds}) for v in self.SPEED]
+        names = {f"{kind.label.upper()}_SPEED": [term.speed], "joint": 0}
+        names |= {"E": math.e, "tanh": math.tanh}
+        code = [eval("1.0" + kind.code, {"v": v, "sign": np.sign(v), **names}) for v in self.SPEED]
         np.testing.assert_allclose(code, term.column(self.SPEED, np.sign(self.SPEED)), rtol=1e-14)
 
     def test_slope_is_the_derivative_of_the_column(self, kind: type[FrictionTerm]) -> None:

@@ -103,11 +103,12 @@ def in_source(model: RobotModel, coefficients: np.ndarray) -> dict[str, object]:
     return namespace
 
 
-def test_the_source_knows_every_term_and_coupled_motors() -> None:
+@pytest.mark.parametrize("tanh", [None, 0.02])
+def test_the_source_knows_every_term_and_coupled_motors(tanh: float | None) -> None:
     model = RobotModel.from_urdf(
         URDF,
         friction=FrictionLaw(asymmetric=True, stribeck=0.4, zone="linear", standstill=0.1),
-        joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic")},
+        joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic", tanh=tanh)},
         coupling=Coupling(np.array([[1.0, 0.0], [0.5, -2.0]]), inertia=False),
     )
     rng = np.random.default_rng(3)
