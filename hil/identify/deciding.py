@@ -20,7 +20,7 @@ from identification.estimators.delay import DelayEstimate, estimate_delays
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import Question, choose_settings
+from identification.selection.inner_prediction import DELAY, Question, choose_settings
 from identification.selection.inner_prediction import Settings as Candidate
 from identification.signals.repetition_noise import repetition_noise
 from identification.signals.samples import Preprocessing, Samples
@@ -99,7 +99,12 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     chosen = _chosen(sources, settings, undelayed, options, reporter)
     how = chosen.preprocessing
     lags = how.torque_bandwidth is not None and how.torque_shape.causal
-    if found is not None and (lags or how.torque_delay != settings.preprocessing.torque_delay):
+    if any(one.name == DELAY for one in chosen.choices):
+        found, notes = (
+            None,
+            [f"a delay of {how.torque_delay * 1e3:.3g} ms of all axes was compensated"],
+        )
+    elif found is not None and (lags or how.torque_delay != settings.preprocessing.torque_delay):
         # It was found without the low-pass, and may be nothing but the lag of that.
         found, notes = (
             None,

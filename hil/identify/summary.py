@@ -42,6 +42,7 @@ from identification.excitation import (
     information,
     log10_det,
 )
+from identification.model.elements import TorqueRipple
 from identification.selection.essential_choice import EssentialChoice
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
@@ -189,7 +190,13 @@ def planted_in(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
             return None
         given = [planted.get(name) for name in model.parameter_names]
         return np.array([v if _is_number(v) else np.nan for v in given], dtype=np.float64)
-    return planted_values(cell) if cell.file.simulation else None
+    if cell.file.simulation is None:
+        return None
+    values = planted_values(cell)
+    for one in cell.model.elements.identified:
+        if isinstance(one.element, TorqueRipple):
+            values[cell.model.element_part][one.part] = np.nan
+    return values
 
 
 def _is_number(value: object) -> bool:

@@ -13,7 +13,7 @@ from hil.cell import Cell
 from identification.estimators.nominal_prior import NOMINAL_SHARE
 from identification.factor.estimation import Estimate
 from identification.model.urdf_tree import urdf_tree
-from identification.selection.inner_prediction import LOW_PASS
+from identification.selection.inner_prediction import DELAY, LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.validation.evidence import Surroundings
 from identification.validation.findings.finding import Finding, listed
@@ -54,7 +54,7 @@ def surroundings_of(paths: Sequence[Path], prepared: Prepared, estimate: Estimat
         ),
         delays=prepared.delays,
         assumed_delay=prepared.assumed_delay,
-        mended=(*_clock(prepared), *_low_pass(prepared), *_resolution(prepared)),
+        mended=(*_clock(prepared), *_torque_channel(prepared), *_resolution(prepared)),
     )
 
 
@@ -73,12 +73,21 @@ def _clock(prepared: Prepared) -> Iterator[Finding]:
     )
 
 
-def _low_pass(prepared: Prepared) -> Iterator[Finding]:
-    """A low-pass of the torque that was found, and not stated."""
-    found = any(one.name == LOW_PASS and one.chosen for one in prepared.settings.choices)
+def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
+    """A delay or a low-pass of the torque that prediction chose, and nobody stated."""
+    chosen = [one.name for one in prepared.settings.choices if one.chosen]
     how = prepared.settings.preprocessing
+    if DELAY in chosen:
+        yield Finding(
+            "delay",
+            "doubtful",
+            f"the fitted part is predicted best with a torque that lags the position by"
+            f" {1e3 * how.torque_delay:.3g} ms; that was compensated",
+            "state it (`hil identify --delay SECONDS`), or correct it where it arises",
+            "condition",
+        )
     width = how.torque_bandwidth
-    if found and width is not None:
+    if LOW_PASS in chosen and width is not None:
         yield Finding(
             "torque bandwidth",
             "doubtful",

@@ -37,7 +37,8 @@ Question = Literal[
 
 FOLDS: Final = 5
 LOW_PASS: Final = "low-pass of the torque"
-"""Name of that choice."""
+DELAY: Final = "delay of the torque"
+"""Names of those choices."""
 # What a rigid model leaves out (elasticity of gears, the clock of a logger, the servo) begins at
 # some 10 Hz on most arms: the first candidate, which others have to beat.
 BANDWIDTHS: Final = (10.0, 5.0, 7.0, 14.0, 20.0, 40.0)  # Hz
@@ -107,6 +108,7 @@ class Settings:
             {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
                 how.left_out or "", "by the friction law"
             ),
+            f"delay of {1e3 * how.torque_delay:.3g} ms",
             "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
             self.shrinkage.describe(),
         )
@@ -257,6 +259,13 @@ def choose_settings(
             filtered = trial.decide("", _widths(filtered), share=0.0).settings
             # All joints come through the same channel: the largest errors are not to decide alone.
             found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
+            if found.choice.chosen and filtered.preprocessing.torque_shape.causal:
+                # What its lag alone predicts as well is a delay.
+                late = trial.decide("", _lags(now, filtered), share=0.0).settings
+                delay = trial.decide(DELAY, [now, late], LOW_PASS_WORTHWHILE, by_joint=True)
+                both = trial.decide(LOW_PASS, [late, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
+                if delay.choice.chosen and not both.choice.chosen:
+                    now, choices, found = late, [*choices, delay.choice], both
             if found.choice.chosen:
                 now, choices = filtered, behind
             choices = [*choices, found.choice]
@@ -429,6 +438,13 @@ def _friction_terms(now: Settings) -> list[Settings]:
 def _widths(now: Settings) -> list[Settings]:
     width = now.preprocessing.torque_bandwidth or math.nan
     return [_with(now, torque_bandwidth=share * width) for share in NEARBY]
+
+
+def _lags(now: Settings, filtered: Settings) -> list[Settings]:
+    """Delays in place of a causal low-pass, about its lag."""
+    how, width = filtered.preprocessing, filtered.preprocessing.torque_bandwidth or math.inf
+    lag = how.torque_shape.lag(width)
+    return [_with(now, torque_delay=how.torque_delay + share * lag) for share in NEARBY]
 
 
 def _shrinkages(prior_weights: Sequence[float]) -> list[Shrinkage]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -33,6 +34,10 @@ class LowPassShape:
 
     order: int
     causal: bool = False
+
+    def lag(self, bandwidth: float) -> float:
+        """Return the time [s] by which a causal low-pass [Hz] delays slow signals."""
+        return 1.0 / (2.0 * math.pi * bandwidth * math.sin(math.pi / (2.0 * self.order)))
 
     def __str__(self) -> str:
         poles = "one pole" if self.order == 1 else f"{self.order} poles"

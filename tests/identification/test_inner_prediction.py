@@ -10,11 +10,20 @@ import pytest
 
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import Choice, Question, Settings, choose_settings
+from identification.selection.inner_prediction import (
+    DELAY,
+    LOW_PASS,
+    Choice,
+    Question,
+    Settings,
+    choose_settings,
+)
+from identification.signals.low_passes import LowPassShape, low_passed
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
 from tests.identification.two_link import MODEL, a_motion, truth
 
+CAUSAL = LowPassShape(order=2, causal=True)
 CUT = 1400  # of 2000 rows: what is fitted
 
 
@@ -38,6 +47,7 @@ def chosen(
     *,
     leaks: bool = False,
     ripple: Sequence[TorqueRipple] = (),
+    low_passes: Sequence[Preprocessing] = (),
 ) -> tuple[Settings, tuple[Choice, ...]]:
     """Settings chosen on the rows before CUT; on all of them where those behind it leak."""
 
@@ -46,7 +56,7 @@ def chosen(
         return [samples if leaks else samples.between(0, CUT)]
 
     start = Settings(MODEL, Preprocessing())
-    return choose_settings(ready, start, questions, lambda *_: None, ripple)
+    return choose_settings(ready, start, questions, lambda *_: low_passes, ripple)
 
 
 class TestChosenSettings:
@@ -73,6 +83,24 @@ class TestChosenSettings:
         assert settings.model.parameter_names == rippled.parameter_names
         settings, _ = chosen(a_recording(), {"ripple"}, ripple=ripple)
         assert settings.model.parameter_names == MODEL.parameter_names
+
+    @pytest.mark.parametrize(("shape", "name"), [(None, DELAY), (CAUSAL, LOW_PASS)])
+    def test_a_late_torque_is_not_called_a_low_pass(
+        self, shape: LowPassShape | None, name: str
+    ) -> None:
+        """A delay and a low-pass of that lag each predict best where they are the cause."""
+        recording = a_recording()
+        time, torque = recording.time, recording.torque
+        assert torque is not None
+        if shape is None:
+            late = [np.interp(time - CAUSAL.lag(6.0), time, one) for one in torque.T]
+            changed = replace(recording, torque=np.column_stack(late))
+        else:
+            changed = replace(recording, torque=low_passed(time, torque, 6.0, shape))
+        filtered = Preprocessing(torque_bandwidth=6.0, torque_shape=CAUSAL)
+        settings, choices = chosen(changed, {"low-pass"}, low_passes=(filtered,))
+        assert name in [one.name for one in choices if one.chosen]
+        assert (settings.preprocessing.torque_bandwidth is None) == (name == DELAY)
 
     def test_least_squares_stays_where_it_predicts_as_well(self) -> None:
         settings, choices = chosen(a_recording(), {"estimator"})
