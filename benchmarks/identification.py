@@ -53,8 +53,7 @@ from benchmarks.regressor import SAMPLES, sine_motion
 from identification import Motion, RobotModel
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.estimation import Estimate, estimate, joint_weights
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor, estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw

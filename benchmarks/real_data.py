@@ -55,8 +55,7 @@ from identification.estimators.nominal_prior import nominal_prior
 from identification.estimators.prior import fit_with_prior
 from identification.estimators.robust import robust_estimate
 from identification.estimators.torque_channel import possible_low_passes
-from identification.factor.estimation import Estimate, joint_weights, solve
-from identification.factor.gram import NormalEquations
+from identification.factor.factor import Estimate, Factor, NormalEquations, joint_weights, solve
 from identification.factor.phases import PhaseFactor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
@@ -153,7 +152,7 @@ Estimator = Callable[[RobotModel, Samples], Array]
 
 def _consistent(model: RobotModel, samples: Samples) -> Array:
     free = fit_least_squares(model, [samples])
-    return consistent_estimate(model, samples.factor(model), free).estimate.values
+    return consistent_estimate(model, Factor.of(model, samples), free).estimate.values
 
 
 def _values(fit: Callable[[RobotModel, Sequence[Samples]], Estimate]) -> Estimator:

@@ -18,8 +18,7 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.losses import Huber, Tukey
 from identification.estimators.repetitions import estimate_repetitions
 from identification.estimators.robust import robust_estimate
-from identification.factor.estimation import Estimate
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor
 from identification.factor.instruments import InstrumentFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Preprocessing, Samples, prepare
@@ -117,7 +116,7 @@ class Study:
         )
         total = empty.validation
         for path in validation_paths(folder, cell, condition):
-            total = total + empty.samples(Kept.load(path)).factor(cell.model)
+            total = total + Factor.of(cell.model, empty.samples(Kept.load(path)))
         return replace(empty, validation=total)
 
     def samples(self, kept: Kept) -> Samples:

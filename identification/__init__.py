@@ -20,7 +20,6 @@ from identification.estimators.instrumental import InstrumentalEstimate, estimat
 from identification.estimators.least_squares import (
     fit_least_squares,
     ordinary_least_squares,
-    weighted_least_squares,
 )
 from identification.estimators.losses import Huber, Tukey
 from identification.estimators.nominal_prior import nominal_prior
@@ -35,11 +34,9 @@ from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.export.friction import friction_in_words, friction_source
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
-from identification.factor.estimation import Estimate, estimate
-from identification.factor.gram import Factor, NormalEquations
+from identification.factor.factor import Estimate, Factor, NormalEquations, QRFactor, estimate
 from identification.factor.instruments import InstrumentFactor
 from identification.factor.phases import PhaseFactor
-from identification.factor.qr import QRFactor
 from identification.model.base_parameters import BaseParameters
 from identification.model.coupling import Coupling
 from identification.model.elements import (
@@ -122,7 +119,6 @@ __all__ = [
     # estimators: from factors
     "estimate",
     "ordinary_least_squares",
-    "weighted_least_squares",
     "with_prior",
     "with_block_covariance",
     "Consistency",

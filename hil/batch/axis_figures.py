@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification import RobotModel
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor
 from identification.model.friction import Viscous
 
 Array = NDArray[np.float64]

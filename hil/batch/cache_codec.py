@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from hil.identify.settings import Settings
-from identification.factor.estimation import Estimate
+from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor
 from planner.plain import number, table, text, texts, whole
 

@@ -16,19 +16,20 @@ from hil.identify.settings import Settings
 from identification import IdentificationError
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.delay_compensation import with_uncertain_delay
-from identification.estimators.least_squares import Weighting, fit_least_squares, weights_of
+from identification.estimators.least_squares import Weighting, fit_least_squares
 from identification.estimators.prior import fit_with_prior, with_prior
 from identification.estimators.repetitions import no_narrower
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
-from identification.factor.estimation import (
+from identification.factor.factor import (
+    QR_CONDITION,
     Estimate,
+    Factor,
+    joint_weights,
     mark_undetermined,
     nothing_usable,
     solve,
 )
-from identification.factor.gram import Factor
 from identification.factor.phases import PhaseFactor
-from identification.factor.qr import QR_CONDITION
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 
@@ -174,7 +175,7 @@ class Estimator:
         """Weight of each joint's rows (n,)."""
         if self._weighting == "ordinary":
             return np.ones(self.model.n_joints)
-        return weights_of(total)
+        return joint_weights(total)
 
     @property
     def _weighting(self) -> Weighting:

@@ -26,8 +26,8 @@ from hil.importers import Findings
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay_compensation import rate_products
-from identification.estimators.least_squares import Weighting, fit_least_squares, weights_of
-from identification.factor.estimation import Estimate
+from identification.estimators.least_squares import Weighting, fit_least_squares
+from identification.factor.factor import Estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -234,7 +234,7 @@ def _fits(model: RobotModel, samples: Samples, phase: PhaseFactor) -> dict[str, 
 def design_effect(estimate: Estimate, phase: PhaseFactor, weighting: Weighting) -> float:
     """Mean ratio of the estimate's variances to those of white residuals."""
     total = phase.total
-    weights = np.ones(phase.n_joints) if weighting == "ordinary" else weights_of(total)
+    weights = np.ones(phase.n_joints) if weighting == "ordinary" else joint_weights(total)
     if estimate.undetermined:
         return block_covariance(phase, weights, estimate.values).design_effect
     information = total.weighted(weights).A

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from identification.factor.estimation import Estimate
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor
 from identification.factor.phases import PhaseFactor
 from identification.model.payload import Payload
 

@@ -27,6 +27,7 @@ from hil.identify.sources import cell_of, gather_sources
 from hil.progress import Reporter
 from hil.reading import digest_of
 from identification.excitation import SAMPLE_PERIOD
+from identification.factor.factor import Factor
 
 from .fingerprint import fingerprint
 from .knowledge import Knowledge
@@ -85,7 +86,7 @@ def _information(prepared: Prepared, weights: Array, reporter: Reporter) -> tupl
         for source in motions:
             # A second is to count alike, whatever the rate of an archive.
             share = float(np.median(np.diff(source.recording.time))) / SAMPLE_PERIOD
-            factor = samples_of(source, cell, settings).factor(model)
+            factor = Factor.of(model, samples_of(source, cell, settings))
             gram += share * factor.weighted(weights).A
             samples += share * float(factor.samples.max())
             task.advance(1, source.name)

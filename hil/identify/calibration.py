@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hil.results import CalibrationResult
 from identification.errors import IdentificationError
 from identification.estimators.shrinkage import Shrinkage, fitted_values
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
 from identification.validation.residual_blocks import BLOCK
 

@@ -9,7 +9,7 @@ from identification import Factor, IdentificationError, RobotModel, estimate
 from identification.estimators.consistent import Consistency
 from identification.estimators.consistent_program import link_parameters
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.estimation import joint_weights
+from identification.factor.factor import joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.validation.consistency import ConsistencyCheck, check_consistency
 

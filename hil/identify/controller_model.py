@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from identification.factor.estimation import Estimate
+from identification.factor.factor import Estimate
 from identification.signals.samples import Samples
 from identification.validation.inertia_ratio import InertiaRatio, inertia_ratio
 from identification.validation.prediction import PredictionError, over_all

@@ -21,9 +21,8 @@ from identification.estimators.prior import GaussianPrior, PosteriorEstimate, fi
 from identification.estimators.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
-from identification.factor.estimation import Estimate, joint_weights, nothing_usable
+from identification.factor.factor import QR_CONDITION, Estimate, joint_weights, nothing_usable
 from identification.factor.phases import PhaseFactor, total_phase
-from identification.factor.qr import QR_CONDITION
 from identification.signals.samples import Samples
 from identification.validation.endogeneity import EndogeneityTest
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from identification import IdentificationError, RobotModel
 from identification.estimators.instrument_motion import planned_motion, same_plan
 from identification.estimators.instrumental import InstrumentalEstimate, estimate_instrumental
-from identification.factor.estimation import Estimate
+from identification.factor.factor import Estimate
 from identification.factor.instruments import InstrumentFactor
 from identification.signals.samples import Samples
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test

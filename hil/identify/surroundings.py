@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from identification.estimators.nominal_prior import NOMINAL_SHARE
-from identification.factor.estimation import Estimate
+from identification.factor.factor import Estimate
 from identification.model.urdf_tree import urdf_tree
 from identification.selection.inner_prediction import DELAY, LOW_PASS
 from identification.signals.masks import SATURATED

@@ -27,7 +27,7 @@ from hil.report.figures.svg import label
 from identification.excitation import correlation, coupling_index, coupling_index_max, information
 from identification.excitation.excitation import Excitation
 from identification.excitation.sampling import sampled
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from planner import Trajectory
 

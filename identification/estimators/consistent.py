@@ -39,8 +39,7 @@ from identification.estimators.consistent_program import (
     solve_program,
     square_root,
 )
-from identification.factor.estimation import Estimate, joint_weights
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor, joint_weights
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.factor.estimation import WORST_CONDITION
-from identification.factor.gram import NormalEquations
+from identification.factor.factor import WORST_CONDITION, NormalEquations
 from identification.model.friction import dissipation
 from identification.model.pseudo_inertia import inertial_from_pseudo
 from identification.model.reference_bodies import ReferenceBodies, reference_bodies

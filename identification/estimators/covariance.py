@@ -31,7 +31,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.factor.estimation import Estimate, mark_undetermined, solve
+from identification.factor.factor import Estimate, mark_undetermined, solve
 from identification.factor.phases import FINE_BLOCK, PhaseFactor, merged
 
 Array = NDArray[np.float64]

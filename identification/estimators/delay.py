@@ -30,7 +30,9 @@ from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
 from identification.estimators.delay_compensation import payload_torque, predicted_rate, read_at
-from identification.factor.estimation import (
+from identification.factor.factor import (
+    Factor,
+    NormalEquations,
     Solution,
     estimate,
     nothing_usable,
@@ -38,7 +40,6 @@ from identification.factor.estimation import (
     solve,
     total,
 )
-from identification.factor.gram import NormalEquations
 from identification.factor.phases import PhaseFactor, add_grams, equal_runs, joined, merged
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -388,7 +389,7 @@ class _Problem:
         heights, best = np.full(len(shifts), np.inf), np.zeros(self.model.n_parameters)
         for k, shift in enumerate(shifts):
             parts = [reader.at(self.model, float(shift)) for reader in self.readers]
-            factor = total([part.factor(self.model) for part in parts])
+            factor = total([Factor.of(self.model, part) for part in parts])
             moving = factor.samples > 0
             if moving.any():
                 found = estimate(self.model, factor)
@@ -409,7 +410,7 @@ class _Problem:
         if weights is None:
             q = phase.n_parameters
             here = np.append(values, np.zeros(q - len(values)))
-            variance = residual_variance(phase.total, here, np.zeros((q, q)), np.ones(len(shift)))
+            variance = residual_variance(phase.total, here, np.zeros((q, 0)), np.ones(len(shift)))
             weights = np.where(np.isnan(variance), 0.0, 1.0 / variance)
         return _Blocks(phase.weighted(weights), weights, max(1, int(phase.samples.sum())))
 

@@ -10,8 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.factor.estimation import Estimate, solve
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor, solve
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples

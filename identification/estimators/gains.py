@@ -30,9 +30,8 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
-from identification.factor.estimation import Solution, mark_undetermined, solve
+from identification.factor.factor import NormalEquations, Solution, mark_undetermined, solve
 from identification.factor.gains import GainFactor
-from identification.factor.gram import NormalEquations
 
 Array = NDArray[np.float64]
 GainMethod = Literal["weighted", "total"]

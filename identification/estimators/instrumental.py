@@ -28,15 +28,16 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread, with_block_covariance
-from identification.factor.estimation import (
+from identification.factor.factor import (
     WORST_CONDITION,
     Estimate,
+    Factor,
     estimate,
     joint_weights,
     mark_undetermined,
     residual_variance,
+    undetermined_names,
 )
-from identification.factor.gram import Factor
 from identification.factor.instruments import InstrumentFactor
 from identification.factor.phases import FINE_BLOCK, merged
 from identification.model.robot import RobotModel
@@ -175,8 +176,7 @@ def _weights(factor: InstrumentFactor, rows: Factor) -> Array:
     """Inverse residual variance per joint (n,) of an instrumental fit, zero without rows."""
     first = joint_weights(rows)
     solution = solve_cross(factor.total(first))
-    inverse = _inverse(rows.weighted(first).A)
-    variance = residual_variance(rows, solution.values, inverse, first)
+    variance = residual_variance(rows, solution.values, rows.solve(first).root, first)
     return np.where(np.isnan(variance), 0.0, 1.0 / variance)
 
 
@@ -195,8 +195,7 @@ def _with_covariance(
     moved = spread(cross, scores, solution.right, solution.left)
     covariance = moved.T @ moved
     mark_undetermined(covariance, solution.determined)
-    least = _inverse(rows.weighted(weights).A)
-    variance = residual_variance(rows, solution.values, least, weights)
+    variance = residual_variance(rows, solution.values, rows.solve(weights).root, weights)
     return Estimate(
         names=model.parameter_names,
         units=model.units,
@@ -207,10 +206,6 @@ def _with_covariance(
         method=f"instrumental variables, cluster-robust covariance over {len(scores)} blocks of"
         f" {length * FINE_BLOCK:g} s",
         condition=solution.condition,
-        undetermined=tuple(
-            name
-            for name, known in zip(model.parameter_names, solution.determined, strict=True)
-            if not known
-        ),
+        undetermined=undetermined_names(model.parameter_names, solution.determined),
         interval_factor=float(student_limit(0.025, max(1, len(scores) - 1))),
     )

@@ -20,12 +20,19 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError, ShapeError
 from identification.estimators.clustered import clustered_covariance
 from identification.estimators.covariance import block_covariance
-from identification.estimators.least_squares import variance_of, weights_of
-from identification.factor.estimation import Estimate, mark_undetermined, nothing_usable
-from identification.factor.gram import Factor
+from identification.factor.factor import (
+    Estimate,
+    Factor,
+    JointFactor,
+    joint_weights,
+    mark_undetermined,
+    nothing_usable,
+    reduced,
+    residual_variance,
+    solve_rows,
+    undetermined_names,
+)
 from identification.factor.phases import PhaseFactor, total_phase
-from identification.factor.qr import QRFactor, reduced, solve_weighted
-from identification.factor.row_solution import rows_of, solve_rows, undetermined_names
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -171,7 +178,7 @@ class PosteriorEstimate:
 
 def with_prior(
     model: RobotModel,
-    factor: Factor | QRFactor,
+    factor: JointFactor,
     prior: GaussianPrior,
     weights: Array | None = None,
     *,
@@ -195,7 +202,7 @@ def with_prior(
         raise ShapeError("prior mean", prior.mean.shape, f"({model.n_parameters},)")
     if weights is None:
         weights = _weights(factor)
-    rows, target = _rows(factor, weights)
+    rows, target = factor.rows(weights)
     believed = np.sqrt(1.0 / design_effect)
     # Solved for the change of the prior's mean: what nobody knows anything about stays there.
     posterior = solve_rows(
@@ -211,7 +218,9 @@ def with_prior(
         units=model.units,
         values=solution.values,
         covariance=covariance,
-        noise_std=np.sqrt(variance_of(factor, solution, weights / design_effect)),
+        noise_std=np.sqrt(
+            residual_variance(factor, solution.values, solution.root, weights / design_effect)
+        ),
         samples=factor.samples,
         method=f"weighted least squares with a Gaussian prior ({prior.words}),"
         " posterior covariance (white residuals)",
@@ -249,7 +258,7 @@ def fit_with_prior(
     if not factor.samples.any():
         raise IdentificationError(nothing_usable(model))
     weights = _weights(factor)
-    solution = solve_weighted(factor, weights)
+    solution = factor.solve(weights)
     clustered = (
         block_covariance(phase, weights, solution.values)
         if isinstance(factor, Factor)
@@ -268,21 +277,14 @@ def fit_with_prior(
     )
 
 
-def _rows(factor: Factor | QRFactor, weights: Array) -> tuple[Array, Array]:
-    """Rows (k, p) and target (k,) that stand for all samples."""
-    if isinstance(factor, QRFactor):
-        return factor.weighted(weights)[:2]
-    return rows_of(factor.weighted(weights))
-
-
-def _weights(factor: Factor | QRFactor) -> Array:
+def _weights(factor: JointFactor) -> Array:
     rows = int(factor.samples.sum())
     if 0 < rows < _FEWEST_ROWS * factor.n_parameters:
         raise IdentificationError(
             f"{rows} rows are too few to know the torque's noise from, for {factor.n_parameters}"
             " parameters; give the weights"
         )
-    return weights_of(factor) if rows else np.zeros(factor.n_joints)
+    return joint_weights(factor) if rows else np.zeros(factor.n_joints)
 
 
 def _inverse_root(covariance: Array) -> Array:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.least_squares import fit_least_squares
-from identification.factor.estimation import Estimate, estimate
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor, estimate
 from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples

@@ -21,11 +21,16 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.clustered import clustered_covariance
 from identification.estimators.losses import Huber, LeastSquares, Loss, Tukey
-from identification.factor.augmented_rows import augmented_rows, gram_factor
-from identification.factor.estimation import Estimate, Solution, nothing_usable
-from identification.factor.gram import Factor
-from identification.factor.qr import QRFactor, reduced, solve_weighted
-from identification.factor.row_solution import undetermined_names
+from identification.factor.augmented_rows import augmented_rows
+from identification.factor.factor import (
+    Estimate,
+    Factor,
+    JointFactor,
+    Solution,
+    nothing_usable,
+    reduced,
+    undetermined_names,
+)
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -89,7 +94,7 @@ class _State:
         converged: whether the last pass changed nothing.
     """
 
-    factor: Factor | QRFactor
+    factor: JointFactor
     solution: Solution
     scale: Array
     residuals: list[Array]
@@ -127,7 +132,7 @@ def robust_estimate(
     factor = reduced(model, recordings, gram)
     if not factor.samples.any():
         raise IdentificationError(nothing_usable(model))
-    solution = solve_weighted(factor, np.ones(model.n_joints))
+    solution = factor.solve(np.ones(model.n_joints))
     residuals = [np.full(samples.torque.shape, np.nan) for samples in recordings]
     state = _State(factor, solution, np.full(model.n_joints, np.inf), residuals, 1)
     if isinstance(loss, Tukey):
@@ -176,10 +181,9 @@ def _pass(model: RobotModel, recordings: Sequence[Samples], state: _State, loss:
     """Weight all rows by their residuals, solve, and find the scale of those, unless held."""
     residuals = [np.full(samples.torque.shape, np.nan) for samples in recordings]
     rows = _weighted_rows(model, recordings, state.solution.values, state.scale, loss, residuals)
-    kind = QRFactor.from_blocks if isinstance(state.factor, QRFactor) else gram_factor
-    factor = kind(model, rows, state.factor.samples)
+    factor = state.factor.from_blocks(model, rows, state.factor.samples)
     weights = _weights(state.scale)
-    solution = solve_weighted(factor, weights if weights.any() else np.ones(len(weights)))
+    solution = factor.solve(weights if weights.any() else np.ones(len(weights)))
     scale = state.scale
     if not state.held:
         scale = _scales(recordings, residuals, state.solution)
@@ -234,12 +238,9 @@ def _weights(scale: Array) -> Array:
     return np.where(known, 1.0 / np.where(known, scale, 1.0) ** 2, 0.0)
 
 
-def _deviations(factor: Factor | QRFactor, scale: Array, change: Array) -> float:
+def _deviations(factor: JointFactor, scale: Array, change: Array) -> float:
     """Change of parameters (p,) in standard deviations, root mean square over the parameters."""
-    if isinstance(factor, QRFactor):
-        squares = ((factor.triangle[:, :, :-1] @ change) ** 2).sum(axis=1)
-    else:
-        squares = np.einsum("i,jik,k->j", change, factor.gram[:, :-1, :-1], change)
+    squares = factor.products(change[:, None])[:, 0, 0]
     return float(np.sqrt(max(float(_weights(scale) @ squares), 0.0) / len(change)))
 
 
@@ -252,7 +253,6 @@ def _result(
     rows = np.where(np.isfinite(state.scale), np.count_nonzero(counted, axis=0), np.nan)
     doubt = np.where(counted, loss.weight(np.where(counted, scaled, 0.0)), 0.0)
     ended = "" if state.converged else ", NOT converged"
-    how = " by QR" if isinstance(state.factor, QRFactor) else ""
     return RobustEstimate(
         estimate=Estimate(
             names=model.parameter_names,
@@ -261,8 +261,8 @@ def _result(
             covariance=clustered.covariance,
             noise_std=state.scale,
             samples=state.factor.samples,
-            method=f"iteratively reweighted least squares{how}, {loss.name}, {state.passes} passes"
-            f"{ended}, {clustered.words}",
+            method=f"iteratively reweighted least squares{state.factor.words}, {loss.name},"
+            f" {state.passes} passes{ended}, {clustered.words}",
             condition=state.solution.condition,
             undetermined=undetermined_names(model.parameter_names, clustered.determined),
             interval_factor=clustered.interval_factor,

@@ -22,8 +22,14 @@ from numpy.typing import NDArray
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.estimators.consistent_program import Consistency
 from identification.estimators.covariance import block_covariance
-from identification.factor.estimation import Estimate, estimate, joint_weights, solve
-from identification.factor.gram import Factor, NormalEquations
+from identification.factor.factor import (
+    Estimate,
+    Factor,
+    NormalEquations,
+    estimate,
+    joint_weights,
+    solve,
+)
 from identification.factor.phases import PhaseFactor, total_phase
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples

@@ -12,8 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.factor.estimation import estimate
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor, estimate
 from identification.model.robot import RobotModel
 from identification.signals.low_passes import (
     FORWARDS,

@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor
 from planner.plain import number, whole
 
 Array = NDArray[np.float64]

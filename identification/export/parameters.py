@@ -22,7 +22,7 @@ from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import friction_in_words
 from identification.export.urdf import not_in_urdf
-from identification.factor.estimation import Estimate
+from identification.factor.factor import Estimate
 from identification.model.robot import RobotModel
 from identification.model.wrench import LINK_SYMBOLS
 

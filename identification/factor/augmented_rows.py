@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.factor.gram import Factor
 from identification.model.regressor import CHUNK, joint_arrays
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -49,43 +48,24 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
     )
     if samples.usable.shape != q.shape:
         raise ShapeError("usable", samples.usable.shape, str(q.shape))
-    chunks: Iterator[Rows]
+    chunks: Iterable[tuple[slice, list[Array]]]
     if samples.torque_bandwidth is None:
-        chunks = (
-            Rows(*chunk)
-            for chunk in model.plan.chunks(q, qd, qdd, samples.motion.direction, response=torque)
-        )
+        chunks = model.plan.chunks(q, qd, qdd, samples.motion.direction, response=torque)
     else:
         chunks = _filtered(model, samples)
+    return masked_rows(chunks, samples.usable)
+
+
+def masked_rows(
+    chunks: Iterable[tuple[slice, list[Array]]], usable: NDArray[np.bool_]
+) -> Iterator[Rows]:
+    """Yield rows in chunks, with zeros, in place, for what is not usable (m, n)."""
     for part, blocks in chunks:
-        for block, lost in zip(blocks, ~samples.usable[part].T, strict=True):
+        for block, lost in zip(blocks, ~usable[part].T, strict=True):
             if lost.any():
                 # Assigned, not multiplied: a row left out may hold NaN.
                 block[:, np.flatnonzero(lost)] = 0.0
         yield Rows(part, blocks)
-
-
-def gram_factor(
-    model: RobotModel, chunks: Iterable[list[Array]], samples: NDArray[np.intp]
-) -> Factor:
-    """Reduce rows as :func:`augmented_rows` gives them, which may have been weighted.
-
-    Args:
-        model: the robot.
-        chunks: per chunk and joint (c_j + 1, k).
-        samples: rows that count, per joint (n,).
-    """
-    columns = model.plan.columns
-    sums = [np.zeros((len(c) + 1, len(c) + 1)) for c in columns]
-    for blocks in chunks:
-        for total, block in zip(sums, blocks, strict=True):
-            total += block @ block.T
-    factor = Factor.zero(model)
-    for joint, (total, used) in enumerate(zip(sums, columns, strict=True)):
-        index = np.append(used, model.n_parameters)
-        factor.gram[joint][np.ix_(index, index)] = total
-    factor.samples[:] = samples
-    return factor
 
 
 def _filtered(model: RobotModel, samples: Samples) -> Iterator[Rows]:

@@ -3,7 +3,7 @@ r"""Gram matrices of [W | y] by short blocks of time: factor and covariance in o
 .. math:: G_{bj} = \sum_{t \in b} \begin{bmatrix} W_j & y_j \end{bmatrix}^T
                                   \begin{bmatrix} W_j & y_j \end{bmatrix}
 
-Summed over the blocks b they are the :class:`identification.factor.gram.Factor`; block by block
+Summed over the blocks b they are the :class:`identification.factor.factor.Factor`; block by block
 they give the scores of a cluster-robust covariance (:mod:`identification.estimators.covariance`)
 for any weights and parameters. Kept are only the columns that act on a joint, a third of all.
 """
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.factor.augmented_rows import augmented_rows
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

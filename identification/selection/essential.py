@@ -30,14 +30,15 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, with_block_covariance
-from identification.factor.estimation import (
+from identification.factor.factor import (
     Estimate,
+    Factor,
+    NormalEquations,
     Solution,
     joint_weights,
     residual_variance,
     solve,
 )
-from identification.factor.gram import Factor, NormalEquations
 from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 
@@ -380,7 +381,7 @@ def _estimate(model: RobotModel, training: PhaseFactor, weights: Array, left: In
         units=tuple(model.units[k] for k in left),
         values=solution.values,
         covariance=solution.inverse,
-        noise_std=np.sqrt(residual_variance(total, solution.values, solution.inverse, weights)),
+        noise_std=np.sqrt(residual_variance(total, solution.values, solution.root, weights)),
         samples=total.samples,
         method="",
         condition=solution.condition,

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.factor.estimation import joint_weights, solve
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor, joined
 from identification.model.robot import RobotModel
 from identification.selection.essential import CutRule, Elimination, EliminationStep, eliminate

@@ -8,7 +8,6 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.factor.gram import Factor
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
@@ -178,20 +177,6 @@ class Samples:
         for joint in range(model.n_joints):
             torque[:, joint] = self.as_measured(joint, torque[:, joint : joint + 1])[:, 0]
         return torque
-
-    def factor(self, model: RobotModel) -> Factor:
-        """All a fit needs of the usable rows."""
-        if self.torque_bandwidth is None:
-            return Factor.from_samples(model, self.motion, self.torque, self.usable)
-        blocks, columns = self.regressor(model)
-        factor = Factor.zero(model)
-        for joint, (block, used) in enumerate(zip(blocks, columns, strict=True)):
-            rows = self.usable[:, joint]
-            table = np.column_stack([block, self.torque[:, joint]])[rows]
-            index = np.append(used, model.n_parameters)
-            factor.gram[joint][np.ix_(index, index)] = table.T @ table
-            factor.samples[joint] = np.count_nonzero(rows)
-        return factor
 
 
 def smooth(

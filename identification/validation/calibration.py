@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from identification.distributions import normal_limit, student_limit
 from identification.errors import IdentificationError
 from identification.factor.augmented_rows import augmented_rows
-from identification.factor.estimation import Estimate
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor
 from identification.factor.phases import FINE_BLOCK, PhaseFactor, block_runs, counted, merged
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS

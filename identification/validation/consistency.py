@@ -21,8 +21,7 @@ from identification.estimators.consistent import (
     consistent_estimate,
 )
 from identification.estimators.consistent_program import link_parameters
-from identification.factor.estimation import Estimate
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor
 from identification.model.pseudo_inertia import pseudo_inertia
 from identification.model.reference_bodies import reference_bodies
 from identification.model.robot import RobotModel

@@ -31,8 +31,7 @@ from numpy.typing import NDArray
 from identification.distributions import fisher_tail, student_limit
 from identification.estimators.covariance import block_length, left_out, spread
 from identification.estimators.instrumental import InstrumentalEstimate, solve_cross
-from identification.factor.estimation import solve
-from identification.factor.gram import NormalEquations
+from identification.factor.factor import NormalEquations, solve
 from identification.factor.instruments import InstrumentFactor
 from identification.factor.phases import merged
 from identification.model.robot import RobotModel

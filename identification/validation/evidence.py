@@ -17,8 +17,7 @@ from identification.excitation.criteria import (
     coupling_index_max,
     information,
 )
-from identification.factor.estimation import Estimate, total
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor, total
 from identification.factor.standard_gram import StandardGram, gravity_loads, solve, squared_errors
 from identification.model.robot import RobotModel
 from identification.model.wrench import LINK_SYMBOLS
@@ -298,7 +297,7 @@ def gather(
     repeated = same_motion and len(result.repetitions) > 1
     velocity = np.concatenate([run.motion.velocity for run in held_out])
     position = np.concatenate([run.motion.position for run in held_out])
-    unseen = total([run.factor(model) for run in held_out])
+    unseen = total([Factor.of(model, run) for run in held_out])
     error = over_all(prediction_error(model, values, held_out))
     grams = [StandardGram.of(model, some[:_MOST_RECORDINGS]) for some in (training, held_out)]
     steady = repeatability(model, values, training, slow) if repeated else None

@@ -18,8 +18,8 @@ from benchmarks.study_recordings import (
 )
 from benchmarks.study_tables import Covered, coverage_table, markdown, size_table
 from hil.simulation import planted_values
-from identification.estimators.least_squares import weighted_least_squares
-from identification.factor.gram import Factor
+from identification.estimators.least_squares import estimate
+from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
@@ -171,7 +171,7 @@ def test_least_squares_is_what_numpy_makes_of_pinocchios_regressor(recorded: Pat
     samples = prepare(one.recording, model, noise_variance=one.noise_variance)
     weights = 1.0 / one.torque_variance
     expected = by_pinocchio.fitted_torque(cell.urdf, samples, weights)
-    values = weighted_least_squares(model, samples.factor(model), weights).values
+    values = estimate(model, Factor.of(model, samples), weights).values
     ours = model.torque(values, *samples.motion[1:])[samples.usable]
     assert np.abs(ours - expected).max() < 1e-6 * np.sqrt(np.mean(expected**2))
 

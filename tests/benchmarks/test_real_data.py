@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.real_data import ESTIMATORS, Case, error, load_case, splits_of
-from identification.estimators.least_squares import weighted_least_squares
+from identification.estimators.least_squares import estimate
+from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.samples import prepare
@@ -61,6 +62,6 @@ def test_least_squares_is_what_numpy_makes_of_pinocchios_regressor(
     samples = prepare(ur10.recording, model)
     weights = np.array([3.0, 0.5, 2.0, 10.0, 20.0, 7.0]) if weighted else np.ones(6)
     expected = by_pinocchio.fitted_torque(ur10.urdf, samples, weights)
-    values = weighted_least_squares(model, samples.factor(model), weights).values
+    values = estimate(model, Factor.of(model, samples), weights).values
     ours = model.torque(values, *samples.motion[1:])[samples.usable]
     assert np.abs(ours - expected).max() < 1e-6 * np.sqrt(np.mean(expected**2))

@@ -17,7 +17,7 @@ from hil.batch.types import LevelEstimate
 from hil.cell import Cell
 from identification import Motion, RobotModel
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.estimation import estimate, joint_weights
+from identification.factor.factor import estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.payload import Payload
 from identification.signals.samples import Samples

@@ -18,7 +18,7 @@ from hil.identify.essential import essential_of
 from hil.identify.exports import Exports, exports_of
 from identification import Estimate, Motion
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.estimation import estimate, joint_weights
+from identification.factor.factor import estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.selection.essential_choice import EssentialChoice
 from identification.signals.samples import Samples

@@ -18,6 +18,7 @@ from hil.identify.sources import gather_sources
 from hil.importers import ColumnMap, Robot, Use, import_log
 from hil.progress import Silent
 from identification import Estimate, FrictionLaw, estimate, prediction_error
+from identification.factor.factor import Factor
 from tests.hil.simulated_logs import (
     POSITION_NOISE,
     TORQUE_NOISE,
@@ -65,7 +66,7 @@ def identify(
     )
     prepared = prepare_sources(gather_sources([archive], 0.7), options, Silent())
     model = prepared.sources.cell.model
-    fit = estimate(model, prepared.fitted[0].factor(model))
+    fit = estimate(model, Factor.of(model, prepared.fitted[0]))
     (error,) = prediction_error(model, fit.values, prepared.held_out)
     return Found(prepared, fit, error.overall)
 

@@ -27,7 +27,7 @@ from identification.excitation import correlation, information
 from identification.excitation.criteria import Criteria
 from identification.excitation.excitation import Excitation
 from identification.excitation.sampling import sampled
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor
 from planner import FourierSeries, Trajectory, plan
 from sim_fixtures.ns16 import CELL_PATH
 

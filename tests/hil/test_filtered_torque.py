@@ -16,6 +16,7 @@ from hil.identify.sources import gather_sources
 from hil.importers import ColumnMap, Quantity, Robot, TimeColumn, import_log
 from hil.progress import Silent
 from identification import FrictionLaw, estimate, prediction_error
+from identification.factor.factor import Factor
 from tests.hil.simulated_logs import simulate
 
 RATE = 125.0  # Hz
@@ -47,7 +48,7 @@ def prepared(
 
 def held_out_error(found: Prepared) -> float:
     model = found.sources.cell.model
-    values = estimate(model, found.fitted[0].factor(model)).values
+    values = estimate(model, Factor.of(model, found.fitted[0])).values
     (error,) = prediction_error(model, values, found.held_out, all_rows=True)
     return error.overall
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter, filtfilt
 
 from identification.errors import ShapeError
-from identification.factor.estimation import estimate
+from identification.factor.factor import Factor, estimate
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.butterworth import butterworth_motion, choose_cutoff
@@ -145,12 +145,12 @@ def test_a_fit_to_it_is_as_good_as_one_to_the_spline(
     variance = np.full(2, (2e-5) ** 2)
     filtered = replace(BUTTERWORTH, torque_delay=2e-3)
     samples = prepare(recording, model, noise_variance=variance, options=filtered)
-    there = estimate(model, samples.factor(model))
+    there = estimate(model, Factor.of(model, samples))
 
     spline = prepare(
         recording, model, noise_variance=variance, options=Preprocessing(torque_delay=2e-3)
     )
-    other = estimate(model, spline.factor(model))
+    other = estimate(model, Factor.of(model, spline))
     assert np.all(np.abs(there.values - truth) < 5.0 * there.std + 2e-3 * np.abs(truth))
     assert there.noise_std == pytest.approx(other.noise_std, rel=0.05)
 
@@ -209,7 +209,7 @@ def test_on_a_real_ur10_it_is_as_good_as_the_spline(shared_data: Path) -> None:
     splined = prepare(recording, model)
     errors = []
     for samples in (filtered, splined):
-        fit = estimate(model, samples.factor(model))
+        fit = estimate(model, Factor.of(model, samples))
         errors.append(prediction_error(model, fit.values, [samples])[0].overall)
     assert errors[0] == pytest.approx(errors[1], abs=0.001)
     assert errors[0] < 0.0515  # what a plain fit with the quadratic term reaches on this bag

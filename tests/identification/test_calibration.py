@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.repetitions import estimate_repetitions
-from identification.factor.estimation import joint_weights, solve
-from identification.factor.gram import Factor
+from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor
 from identification.signals.masks import SATURATED, STANDSTILL, TORN, RowMask
 from identification.signals.samples import Samples
@@ -110,7 +109,7 @@ class TestInnerFolds:
         samples = replace(recording(noise, MOTION), usable=np.ones((LENGTH, 2), dtype=np.bool_))
         phase, means = PhaseFactor.from_samples(MODEL, samples), TorqueMeans.of(MODEL, [samples])
         errors = inner_errors(phase, means, least_squares)
-        rest = least_squares(samples.between(800, LENGTH).factor(MODEL))
+        rest = least_squares(Factor.of(MODEL, samples.between(800, LENGTH)))
         left = samples.torque[:800] - samples.predicted_torque(MODEL, rest)[:800]
         np.testing.assert_allclose(errors[:8], left.reshape(8, 100, 2).mean(axis=1), atol=1e-8)
 

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from identification.factor.estimation import estimate, total
+from identification.factor.factor import Factor, estimate, total
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -84,7 +84,7 @@ def of_one_kilogram(motion: Motion) -> Array:
 
 
 def causes(model: RobotModel, recordings: Sequence[Samples]) -> Causes:
-    values = estimate(model, total([one.factor(model) for one in recordings])).values
+    values = estimate(model, total([Factor.of(model, one) for one in recordings])).values
     return find_causes(model, recordings, values, [f"{k}.mcap" for k in range(len(recordings))])
 
 

@@ -20,7 +20,7 @@ from identification.estimators.losses import Huber, Tukey
 from identification.estimators.nominal_prior import nominal_prior
 from identification.estimators.prior import fit_with_prior
 from identification.estimators.robust import robust_estimate
-from identification.factor.estimation import Estimate
+from identification.factor.factor import Estimate
 from identification.factor.instruments import InstrumentFactor
 from identification.factor.phases import PhaseFactor, joined, total_phase
 from identification.model.motion import Motion

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.estimation import estimate, joint_weights
+from identification.factor.factor import estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel

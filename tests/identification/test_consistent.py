@@ -17,7 +17,7 @@ from identification.estimators.consistent import (
     consistent_estimate,
     square_root,
 )
-from identification.factor.estimation import Estimate, estimate, joint_weights
+from identification.factor.factor import Estimate, estimate, joint_weights
 from identification.model.pseudo_inertia import pseudo_inertia
 from sim_fixtures.ns16 import urdf_text
 from sim_fixtures.ns16.table2 import table2

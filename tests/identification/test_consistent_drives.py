@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from identification import Factor, FrictionLaw, Motion, RobotModel
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.export.urdf import NotConsistentError, not_in_urdf, write_urdf
-from identification.factor.estimation import estimate
+from identification.factor.factor import estimate
 from identification.model.coupling import Coupling
 from sim_fixtures.ns16 import urdf_text
 from sim_fixtures.ns16.truth import standard_parameters

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import Factor, FrictionLaw, ModelError, Motion, RobotModel
-from identification.factor.estimation import estimate
+from identification.factor.factor import estimate
 from identification.model.coupling import Coupling
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
 

@@ -13,7 +13,7 @@ from identification.estimators.covariance import (
     with_block_covariance,
 )
 from identification.estimators.repetitions import estimate_repetitions
-from identification.factor.estimation import estimate, joint_weights, solve
+from identification.factor.factor import Factor, estimate, joint_weights, solve
 from identification.factor.phases import PhaseFactor
 from identification.signals.samples import Samples
 from tests.identification.two_link import (
@@ -168,7 +168,7 @@ def test_blocks_grow_with_the_correlation_of_the_scores() -> None:
 def test_the_factor_of_all_blocks_is_the_factor_of_the_samples() -> None:
     motion = a_motion(4.0)
     samples = recording(np.zeros((len(motion.time), 2)), motion)
-    whole, blocks = samples.factor(MODEL), PhaseFactor.from_samples(MODEL, samples).total
+    whole, blocks = Factor.of(MODEL, samples), PhaseFactor.from_samples(MODEL, samples).total
     np.testing.assert_allclose(blocks.gram, whole.gram, rtol=1e-10, atol=1e-8)
     np.testing.assert_array_equal(blocks.samples, whole.samples)
 

@@ -13,7 +13,7 @@ from identification.estimators.delay_compensation import (
     rate_products,
     with_uncertain_delay,
 )
-from identification.factor.estimation import Estimate, estimate
+from identification.factor.factor import Estimate, Factor, estimate
 from identification.model.robot import RobotModel
 from identification.signals.samples import Preprocessing, Samples, prepare
 from tests.identification.test_delay import a_recording, model, motion, truth
@@ -57,7 +57,7 @@ class TestCompensation:
 
 class TestDelayUncertainty:
     def fit(self, model: RobotModel, samples: Samples) -> Estimate:
-        return estimate(model, samples.factor(model), np.array([1.0, 25.0]))
+        return estimate(model, Factor.of(model, samples), np.array([1.0, 25.0]))
 
     def test_the_sensitivity_is_the_slope_of_the_estimate(
         self, model: RobotModel, truth: Array
@@ -72,7 +72,7 @@ class TestDelayUncertainty:
         fitted = self.fit(model, samples(0.004))
         middle, weights = samples(0.004), np.array([1.0, 25.0])
         slope = delay_sensitivity(
-            middle.factor(model), rate_products(model, middle), weights, fitted.values
+            Factor.of(model, middle), rate_products(model, middle), weights, fitted.values
         )
         ends = [self.fit(model, samples(0.004 + side)).values for side in (-5e-4, 5e-4)]
         assert slope == pytest.approx((ends[1] - ends[0]) / 1e-3, rel=0.03)
@@ -81,7 +81,7 @@ class TestDelayUncertainty:
         self, model: RobotModel, truth: Array
     ) -> None:
         samples = prepare(a_recording(model, truth, 0.0), model)
-        fitted, factor = self.fit(model, samples), samples.factor(model)
+        fitted, factor = self.fit(model, samples), Factor.of(model, samples)
         products = rate_products(model, samples)
         weights = fitted.noise_std**-2.0
         sensitivity = delay_sensitivity(factor, products, weights, fitted.values)
@@ -96,6 +96,6 @@ class TestDelayUncertainty:
         covariance[0, :] = covariance[:, 0] = 0.0
         covariance[0, 0] = np.inf
         unknown = replace(fitted, covariance=covariance)
-        wider = with_uncertain_delay(unknown, samples.factor(model), products, 1.0)
+        wider = with_uncertain_delay(unknown, Factor.of(model, samples), products, 1.0)
         assert np.isinf(wider.covariance[0, 0])
         np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
-from identification.factor.estimation import estimate
+from identification.factor.factor import estimate
 from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion

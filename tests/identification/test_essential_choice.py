@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.factor.estimation import joint_weights
+from identification.factor.factor import joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.factor.estimation import (
+from identification.factor.factor import (
+    Factor,
     estimate,
     joint_weights,
     residual_variance,
     solve,
     total,
 )
-from identification.factor.gram import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -159,7 +159,7 @@ def test_parameters_that_always_move_together_are_both_named(
     gram[:, j, :] = 2.0 * gram[:, i, :]
     gram[:, :, j] = 2.0 * gram[:, :, i]
     gram[:, j, j] = 4.0 * factor.gram[:, i, i]
-    result = estimate(model, replace(factor, gram=gram))
+    result = estimate(model, replace(factor, matrices=gram))
     assert set(result.undetermined) == {"f0_1", "f1_1"}
     assert np.isinf(result.condition) or result.condition > 1e6
 
@@ -167,7 +167,7 @@ def test_parameters_that_always_move_together_are_both_named(
 def test_the_condition_does_not_depend_on_units(model: RobotModel, truth: Array) -> None:
     factor = noisy_factor(model, truth, 5)
     scale = np.append(np.logspace(-3, 3, model.n_parameters), 1.0)
-    scaled = replace(factor, gram=factor.gram * np.outer(scale, scale))
+    scaled = replace(factor, matrices=factor.gram * np.outer(scale, scale))
     first, second = (estimate(model, f) for f in (factor, scaled))
     assert second.condition == pytest.approx(first.condition, rel=1e-6)
     np.testing.assert_allclose(second.values, first.values / scale[:-1], rtol=1e-6)
@@ -185,7 +185,7 @@ def test_parameters_take_degrees_of_freedom_from_the_residual(
         factor = Factor.from_samples(model, motion, torque)
         weights = np.ones(2)
         solution = solve(factor.weighted(weights))
-        found.append(residual_variance(factor, solution.values, solution.inverse, weights))
+        found.append(residual_variance(factor, solution.values, solution.root, weights))
     np.testing.assert_allclose(np.mean(found, axis=0), 1.0, rtol=0.15)
 
 

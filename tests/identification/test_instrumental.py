@@ -20,6 +20,7 @@ from identification.estimators.instrumental import (
     estimate_instrumental,
     partial_r2,
 )
+from identification.factor.factor import Factor
 from identification.factor.instruments import InstrumentFactor
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
@@ -208,7 +209,7 @@ def test_the_part_without_instruments_is_what_least_squares_reads(
     samples = executed(model, truth, 1)
     factor = InstrumentFactor.from_samples(model, samples, PLAN)
     same_rows = replace(samples, usable=samples.usable & model.moving(PLAN.velocity))
-    expected = same_rows.factor(model)
+    expected = Factor.of(model, same_rows)
     np.testing.assert_allclose(factor.measured.total.gram, expected.gram, rtol=1e-9, atol=1e-7)
     np.testing.assert_array_equal(factor.measured.total.samples, expected.samples)
 

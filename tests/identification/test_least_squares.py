@@ -11,12 +11,10 @@ from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import (
     fit_least_squares,
     ordinary_least_squares,
-    weighted_least_squares,
 )
 from identification.estimators.robust import robust_estimate
-from identification.factor.estimation import estimate, joint_weights
+from identification.factor.factor import Factor, QRFactor, estimate, joint_weights
 from identification.factor.phases import PhaseFactor
-from identification.factor.qr import QRFactor
 from identification.model.motion import Motion
 from tests.identification.two_link import (
     MODEL,
@@ -36,7 +34,7 @@ def test_ordinary_least_squares_is_the_stacked_unweighted_solution() -> None:
     samples = recording(gaussian(np.random.default_rng(8), motion), motion)
     rows = MODEL.regressor(*motion[1:]).dense(P)[samples.usable]
     expected, *_ = np.linalg.lstsq(rows, samples.torque[samples.usable], rcond=None)
-    for factor in (samples.factor(MODEL), QRFactor.from_samples(MODEL, samples)):
+    for factor in (Factor.of(MODEL, samples), QRFactor.of(MODEL, samples)):
         result = ordinary_least_squares(MODEL, factor)
         np.testing.assert_allclose(result.values, expected, rtol=1e-8)
         assert result.method.startswith("ordinary least squares")
@@ -47,10 +45,10 @@ def test_its_covariance_is_that_of_many_trials_though_joints_differ_in_noise() -
     trials = []
     for seed in range(200):
         samples = recording(gaussian(np.random.default_rng(seed), motion), motion)
-        trials.append(ordinary_least_squares(MODEL, samples.factor(MODEL)))
+        trials.append(ordinary_least_squares(MODEL, Factor.of(MODEL, samples)))
     scatter = np.std([trial.values for trial in trials], axis=0)
     np.testing.assert_allclose(trials[0].std, scatter, rtol=0.2)
-    by_qr = ordinary_least_squares(MODEL, QRFactor.from_samples(MODEL, samples))
+    by_qr = ordinary_least_squares(MODEL, QRFactor.of(MODEL, samples))
     np.testing.assert_allclose(by_qr.covariance, trials[-1].covariance, rtol=1e-6, atol=1e-12)
 
 
@@ -89,8 +87,8 @@ def test_an_ill_conditioned_fit_is_done_by_qr_and_says_so() -> None:
 def test_weighted_least_squares_takes_either_factor() -> None:
     motion = a_motion(4.0)
     samples = recording(gaussian(np.random.default_rng(10), motion), motion)
-    by_gram = weighted_least_squares(MODEL, samples.factor(MODEL))
-    by_qr = weighted_least_squares(MODEL, QRFactor.from_samples(MODEL, samples))
+    by_gram = estimate(MODEL, Factor.of(MODEL, samples))
+    by_qr = estimate(MODEL, QRFactor.of(MODEL, samples))
     np.testing.assert_allclose(by_qr.values, by_gram.values, rtol=1e-9)
     with pytest.raises(IdentificationError, match="not one usable sample"):
         fit_least_squares(MODEL, [replace(samples, usable=np.zeros_like(samples.usable))])

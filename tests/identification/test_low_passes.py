@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt, sosfiltfilt
 
 from identification.estimators.torque_channel import possible_low_passes
-from identification.factor.estimation import estimate
+from identification.factor.factor import Factor, estimate
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Question, Settings, choose_settings
 from identification.signals.low_passes import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
@@ -59,7 +59,7 @@ def held_out_error(recording: Recording, settings: Settings) -> float:
         prepare(recording.between(*part), model, options=settings.preprocessing)
         for part in ((0, CUT), (CUT, recording.n_samples))
     )
-    values = estimate(model, fitted.factor(model)).values
+    values = estimate(model, Factor.of(model, fitted)).values
     error = rest.torque - rest.predicted_torque(model, values)
     return float(np.linalg.norm(error) / np.linalg.norm(rest.torque))
 

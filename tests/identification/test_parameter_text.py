@@ -13,7 +13,7 @@ from identification import Estimate, Factor, FrictionLaw, IdentificationError, M
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
 from identification.export.urdf import write_urdf
-from identification.factor.estimation import estimate
+from identification.factor.factor import estimate
 
 URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 PROVENANCE = {"recording": "run_1.mcap\nsha256 0a1b", "made by": "hil 0.1.0"}

@@ -8,8 +8,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from identification.factor.estimation import Estimate
-from identification.factor.gram import Factor
+from identification.factor.factor import Estimate, Factor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion

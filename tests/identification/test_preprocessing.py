@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.masks import REVERSAL
@@ -257,7 +258,7 @@ def test_factors_of_filtered_samples_hold_the_filtered_rows(
         a_recording(model, truth), model, options=Preprocessing(torque_bandwidth=20.0)
     )
     dense = samples.regressor(model).dense(model.n_parameters)
-    factor = samples.factor(model)
+    factor = Factor.of(model, samples)
     for joint in range(2):
         rows = samples.usable[:, joint]
         table = np.column_stack([dense[rows, joint], samples.torque[rows, joint]])

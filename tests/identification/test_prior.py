@@ -14,9 +14,7 @@ from scipy.signal import lfilter
 from identification.errors import IdentificationError, ShapeError
 from identification.estimators.nominal_prior import nominal_prior
 from identification.estimators.prior import LEARNED, GaussianPrior, fit_with_prior, with_prior
-from identification.factor.estimation import estimate
-from identification.factor.gram import Factor
-from identification.factor.qr import QRFactor
+from identification.factor.factor import Factor, QRFactor, estimate
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -128,7 +126,7 @@ def test_what_is_no_covariance_is_refused() -> None:
     with pytest.raises(ShapeError, match="std"):
         GaussianPrior.independent(np.zeros(2), np.ones(3))
     with pytest.raises(ShapeError, match="prior mean"):
-        with_prior(MODEL, noisy().factor(MODEL), GaussianPrior.independent([0.0], np.ones(1)))
+        with_prior(MODEL, Factor.of(MODEL, noisy()), GaussianPrior.independent([0.0], np.ones(1)))
 
 
 # The posterior ------------------------------------------------------------------------------
@@ -138,12 +136,12 @@ def test_what_is_no_covariance_is_refused() -> None:
 def test_it_is_the_textbook_posterior(seed: int, size: float) -> None:
     mean = np.random.default_rng(seed).standard_normal(P)
     covariance, weights = some_covariance(seed, size), 1.0 / NOISE**2
-    factor = noisy().factor(MODEL)
+    factor = Factor.of(MODEL, noisy())
     equations, precision = factor.weighted(weights), np.linalg.inv(covariance)
     posterior = np.linalg.inv(equations.A + precision)
     expected = posterior @ (equations.b + precision @ mean)
     prior = GaussianPrior.from_covariance(mean, covariance)
-    for kind in (factor, QRFactor.from_samples(MODEL, noisy())):
+    for kind in (factor, QRFactor.of(MODEL, noisy())):
         found = with_prior(MODEL, kind, prior, weights)
         np.testing.assert_allclose(found.estimate.values, expected, rtol=1e-6, atol=1e-7)
         np.testing.assert_allclose(found.estimate.std, np.sqrt(np.diag(posterior)), rtol=1e-6)
@@ -153,8 +151,8 @@ def test_it_is_the_textbook_posterior(seed: int, size: float) -> None:
 
 @pytest.mark.parametrize("kind", ["gram", "qr"])
 def test_an_infinite_prior_is_weighted_least_squares(kind: str) -> None:
-    factor = noisy().factor(MODEL) if kind == "gram" else QRFactor.from_samples(MODEL, noisy())
-    expected = estimate(MODEL, noisy().factor(MODEL))
+    factor = Factor.of(MODEL, noisy()) if kind == "gram" else QRFactor.of(MODEL, noisy())
+    expected = estimate(MODEL, Factor.of(MODEL, noisy()))
     for std in (1e7, np.inf):
         prior = GaussianPrior.independent(np.full(P, 3.0), np.full(P, std))
         found = with_prior(MODEL, factor, prior)
@@ -178,7 +176,7 @@ def test_without_data_it_is_the_prior(kind: str) -> None:
 
 def test_what_the_data_do_not_determine_keeps_the_prior_and_what_they_do_does_not() -> None:
     prior = nominal_prior(MODEL, known=KNOWN)
-    found = with_prior(MODEL, noisy(held_elbow=True).factor(MODEL), prior)
+    found = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
     at = {name: index for index, name in enumerate(found.estimate.names)}
     for name in ("f0_2", "f1_2"):  # the elbow stands still
         assert found.ratio[at[name]] == pytest.approx(1.0, rel=1e-9)
@@ -194,7 +192,7 @@ def test_what_the_data_do_not_determine_keeps_the_prior_and_what_they_do_does_no
 
 def test_what_neither_says_stays_at_the_prior_mean_and_is_named() -> None:
     prior = nominal_prior(MODEL, known=ROTORS)
-    found = with_prior(MODEL, noisy(held_elbow=True).factor(MODEL), prior)
+    found = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
     assert set(found.estimate.undetermined) == {"f0_2", "f1_2"}
     assert np.isinf(found.estimate.std[-3])
     unknown = np.array([name in found.estimate.undetermined for name in found.estimate.names])
@@ -209,12 +207,15 @@ def test_data_in_two_steps_are_data_at_once(seed: int) -> None:
     samples, weights = noisy(), 1.0 / NOISE**2
     half = len(samples.torque) // 2
     parts = [
-        replace(
-            samples,
-            motion=samples.motion.rows(s),
-            torque=samples.torque[s],
-            usable=samples.usable[s],
-        ).factor(MODEL)
+        Factor.of(
+            MODEL,
+            replace(
+                samples,
+                motion=samples.motion.rows(s),
+                torque=samples.torque[s],
+                usable=samples.usable[s],
+            ),
+        )
         for s in (slice(0, half), slice(half, None))
     ]
     prior = GaussianPrior.from_covariance(truth(), some_covariance(seed))
@@ -227,9 +228,9 @@ def test_data_in_two_steps_are_data_at_once(seed: int) -> None:
 
 
 def test_the_ratio_does_not_depend_on_units() -> None:
-    factor, std = noisy().factor(MODEL), np.linspace(0.1, 2.0, P)
+    factor, std = Factor.of(MODEL, noisy()), np.linspace(0.1, 2.0, P)
     scale = np.append(np.logspace(-4, 4, P), 1.0)
-    scaled = replace(factor, gram=factor.gram * np.outer(scale, scale))
+    scaled = replace(factor, matrices=factor.gram * np.outer(scale, scale))
     one = with_prior(MODEL, factor, GaussianPrior.independent(np.zeros(P), std))
     other = with_prior(MODEL, scaled, GaussianPrior.independent(np.zeros(P), std / scale[:-1]))
     np.testing.assert_allclose(other.ratio, one.ratio, rtol=1e-6)
@@ -242,8 +243,8 @@ def test_too_few_rows_to_know_the_noise_need_weights() -> None:
     )
     prior = nominal_prior(MODEL, known=KNOWN)
     with pytest.raises(IdentificationError, match="too few"):
-        with_prior(MODEL, few.factor(MODEL), prior)
-    found = with_prior(MODEL, few.factor(MODEL), prior, 1.0 / NOISE**2)
+        with_prior(MODEL, Factor.of(MODEL, few), prior)
+    found = with_prior(MODEL, Factor.of(MODEL, few), prior, 1.0 / NOISE**2)
     assert np.isfinite(found.estimate.values).all()
 
 
@@ -267,7 +268,7 @@ def test_if_prior_and_noise_are_as_stated_95_percent_intervals_hold_90_to_99_per
         values = prior.mean + spread @ rng.standard_normal(P)
         samples = recording(values, coloured(rng, len(motion.time), correlation), motion)
         result = fit_with_prior(MODEL, [samples], prior)
-        found, white = result.estimate, with_prior(MODEL, samples.factor(MODEL), prior).estimate
+        found, white = result.estimate, with_prior(MODEL, Factor.of(MODEL, samples), prior).estimate
         inside.append(np.abs(found.values - values) < found.interval_factor * found.std)
         naive.append(np.abs(white.values - values) < 1.96 * white.std)
         surprise.append(result.surprise[np.isfinite(result.surprise)])

@@ -12,23 +12,19 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
 from identification.factor.augmented_rows import augmented_rows
-from identification.factor.estimation import (
+from identification.factor.factor import (
+    QR_CONDITION,
+    Factor,
+    QRFactor,
     estimate,
     joint_weights,
+    reduced,
     residual_variance,
+    rows_of,
     solve,
+    solve_rows,
     total,
 )
-from identification.factor.gram import Factor
-from identification.factor.qr import (
-    QR_CONDITION,
-    QRFactor,
-    qr_estimate,
-    qr_joint_weights,
-    qr_residual_variance,
-    reduced,
-)
-from identification.factor.row_solution import rows_of, solve_rows
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -122,7 +118,7 @@ def test_rows_of_the_wrong_shape_are_refused_by_name() -> None:
 
 def test_the_triangles_are_triangular_and_their_squares_are_the_gram_matrices() -> None:
     samples = noisy(a_motion(), NOISE)
-    factor, gram = QRFactor.from_samples(MODEL, samples), samples.factor(MODEL)
+    factor, gram = QRFactor.of(MODEL, samples), Factor.of(MODEL, samples)
     assert np.array_equal(factor.triangle, np.triu(factor.triangle))
     size = np.abs(gram.gram).max(axis=(1, 2), keepdims=True)
     assert np.abs((factor.gram.gram - gram.gram) / size).max() < 1e-13
@@ -135,8 +131,8 @@ def test_where_gram_matrices_are_good_both_give_the_same_to_nine_digits(
     weights: Array | None,
 ) -> None:
     samples = noisy(a_motion(), NOISE)
-    gram, factor = samples.factor(MODEL), QRFactor.from_samples(MODEL, samples)
-    expected, found = estimate(MODEL, gram, weights), qr_estimate(MODEL, factor, weights)
+    gram, factor = Factor.of(MODEL, samples), QRFactor.of(MODEL, samples)
+    expected, found = estimate(MODEL, gram, weights), estimate(MODEL, factor, weights)
     np.testing.assert_allclose(found.values, expected.values, rtol=1e-9)
     scale = np.outer(expected.std, expected.std)
     assert np.abs((found.covariance - expected.covariance) / scale).max() < 1e-9
@@ -145,7 +141,7 @@ def test_where_gram_matrices_are_good_both_give_the_same_to_nine_digits(
     assert found.names == expected.names
     assert "QR" in found.method
     assert found.undetermined == ()
-    np.testing.assert_allclose(qr_joint_weights(factor), joint_weights(gram), rtol=1e-9)
+    np.testing.assert_allclose(joint_weights(factor), joint_weights(gram), rtol=1e-9)
 
 
 @given(pieces=st.integers(1, 1000), seed=st.integers(0, 2**16))
@@ -155,32 +151,32 @@ def test_one_chunk_or_a_thousand_give_the_same_to_nine_digits(pieces: int, seed:
     inner = np.random.default_rng(seed).integers(0, 1501, pieces - 1)
     edges = np.sort(np.concatenate([[0], inner, [1500]]))
     parts = cut(samples, np.unique(edges))
-    whole = qr_estimate(MODEL, QRFactor.from_samples(MODEL, samples))
+    whole = estimate(MODEL, QRFactor.of(MODEL, samples))
     summed = sum(
-        (QRFactor.from_samples(MODEL, part) for part in parts[1:]),
-        QRFactor.from_samples(MODEL, parts[0]),
+        (QRFactor.of(MODEL, part) for part in parts[1:]),
+        QRFactor.of(MODEL, parts[0]),
     )
-    many = qr_estimate(MODEL, summed)
+    many = estimate(MODEL, summed)
     np.testing.assert_allclose(many.values, whole.values, rtol=1e-9)
     np.testing.assert_allclose(many.std, whole.std, rtol=1e-9)
-    gram = estimate(MODEL, total([part.factor(MODEL) for part in parts]))
+    gram = estimate(MODEL, total([Factor.of(MODEL, part) for part in parts]))
     np.testing.assert_allclose(gram.values, whole.values, rtol=1e-9)
 
 
 def test_a_sum_may_start_from_zero() -> None:
     samples = noisy(a_motion(200))
-    one = QRFactor.from_samples(MODEL, samples)
+    one = QRFactor.of(MODEL, samples)
     again = QRFactor.zero(MODEL) + one
     np.testing.assert_allclose(again.gram.gram, one.gram.gram, rtol=1e-12, atol=1e-12)
 
 
 def test_factors_of_different_models_do_not_add_and_weights_are_one_per_joint() -> None:
-    one = QRFactor.from_samples(MODEL, noisy(a_motion(50)))
+    one = QRFactor.of(MODEL, noisy(a_motion(50)))
     other = QRFactor.zero(RobotModel.from_urdf(URDF, rotor_inertia=False))
     with pytest.raises(IdentificationError, match="cannot be added"):
         _ = one + other
     with pytest.raises(ShapeError, match="weights"):
-        one.weighted(np.ones(3))
+        one.rows(np.ones(3))
 
 
 # Ill-conditioned problems -------------------------------------------------------------------
@@ -193,14 +189,14 @@ def ill() -> Samples:
 
 def test_triangles_keep_digits_where_gram_matrices_have_lost_them() -> None:
     samples = ill()
-    factor = QRFactor.from_samples(MODEL, samples)
+    factor = QRFactor.of(MODEL, samples)
     ordinary = np.ones(2)
     exact = exact_solution(samples)
     found = factor.solve(ordinary)
     assert 3e6 < found.condition < 1e8
     assert found.determined.all()
     np.testing.assert_allclose(found.values, exact, rtol=1e-7)
-    equations = samples.factor(MODEL).weighted(ordinary)
+    equations = Factor.of(MODEL, samples).weighted(ordinary)
     by_gram = np.linalg.solve(equations.A, equations.b)
     assert np.abs(by_gram / exact - 1.0).max() > 1e-2
     # And the estimate on Gram matrices says so instead of printing those.
@@ -210,12 +206,13 @@ def test_triangles_keep_digits_where_gram_matrices_have_lost_them() -> None:
 def test_the_residual_does_not_drown_in_the_torque() -> None:
     # A residual 1e-9 of the torque: its square is below what a Gram matrix can hold.
     samples = noisy(a_motion(), 1e-9 * NOISE)
-    factor, ordinary = QRFactor.from_samples(MODEL, samples), np.ones(2)
-    variance = qr_residual_variance(factor, factor.solve(ordinary), ordinary)
+    factor, ordinary = QRFactor.of(MODEL, samples), np.ones(2)
+    solution = factor.solve(ordinary)
+    variance = residual_variance(factor, solution.values, solution.root, ordinary)
     np.testing.assert_allclose(np.sqrt(variance), 1e-9 * NOISE, rtol=0.05)
-    gram = samples.factor(MODEL)
+    gram = Factor.of(MODEL, samples)
     solution = solve(gram.weighted(ordinary))
-    by_gram = residual_variance(gram, solution.values, solution.inverse, ordinary)
+    by_gram = residual_variance(gram, solution.values, solution.root, ordinary)
     assert np.abs(np.sqrt(by_gram) / (1e-9 * NOISE) - 1.0).max() > 1.0
 
 
@@ -240,8 +237,8 @@ def test_what_is_dependent_by_construction_is_named() -> None:
     still = Motion(*(array.copy() for array in motion[:4]))
     still.position[:, 1], still.velocity[:, 1], still.acceleration[:, 1] = 0.4, 0.0, 0.0
     samples = replace(noisy(still), usable=np.ones((3000, 2), dtype=bool))
-    gram, qr = samples.factor(MODEL), QRFactor.from_samples(MODEL, samples)
-    found, expected = qr_estimate(MODEL, qr), estimate(MODEL, gram)
+    gram, qr = Factor.of(MODEL, samples), QRFactor.of(MODEL, samples)
+    found, expected = estimate(MODEL, qr), estimate(MODEL, gram)
     assert {"f0_2", "f1_2", "I2m"} <= set(found.undetermined)
     assert set(found.undetermined) == set(expected.undetermined)
     known = np.array([name not in found.undetermined for name in found.names])
@@ -252,15 +249,15 @@ def test_what_is_dependent_by_construction_is_named() -> None:
 
 def test_no_rows_are_an_error() -> None:
     with pytest.raises(IdentificationError, match="not one usable sample"):
-        qr_estimate(MODEL, QRFactor.zero(MODEL))
+        estimate(MODEL, QRFactor.zero(MODEL))
 
 
 def test_a_joint_without_rows_has_no_noise_and_no_weight() -> None:
     samples = noisy(a_motion(), NOISE)
     samples.usable[:, 1] = False
-    factor = QRFactor.from_samples(MODEL, samples)
-    assert qr_joint_weights(factor)[1] == 0.0
-    result = qr_estimate(MODEL, factor)
+    factor = QRFactor.of(MODEL, samples)
+    assert joint_weights(factor)[1] == 0.0
+    result = estimate(MODEL, factor)
     assert np.isnan(result.noise_std[1])
     assert "f0_2" in result.undetermined
 
@@ -282,7 +279,7 @@ def test_rows_are_solved_as_by_the_pseudo_inverse(k: int, p: int, seed: int) -> 
 
 
 def test_normal_equations_become_rows_with_the_same_squares() -> None:
-    equations = noisy(a_motion(), NOISE).factor(MODEL).weighted(1.0 / NOISE**2)
+    equations = Factor.of(MODEL, noisy(a_motion(), NOISE)).weighted(1.0 / NOISE**2)
     rows, target = rows_of(equations)
     scale = np.sqrt(np.diag(equations.A))
     np.testing.assert_allclose(

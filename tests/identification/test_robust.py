@@ -17,7 +17,7 @@ from hil.recordings import open_recording
 from identification.errors import IdentificationError
 from identification.estimators.losses import Huber, LeastSquares, Loss, Tukey
 from identification.estimators.robust import robust_estimate, robust_weights
-from identification.factor.estimation import estimate
+from identification.factor.factor import Factor, estimate
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples, prepare
@@ -45,7 +45,7 @@ def spoiled(rng: np.random.Generator, error: Array, share: float, size: float) -
 
 def distance(values: Array, samples: Samples) -> float:
     """Distance from the truth in standard deviations of a fit to good rows, rms."""
-    information = samples.factor(MODEL).weighted(1.0 / NOISE**2).A
+    information = Factor.of(MODEL, samples).weighted(1.0 / NOISE**2).A
     off = values - truth()
     return float(np.sqrt(off @ information @ off / P))
 
@@ -94,7 +94,7 @@ def test_on_gaussian_noise_it_is_within_sampling_error_of_weighted_least_squares
     motion = a_motion(5.0)
     samples = recording(gaussian(np.random.default_rng(seed), motion), motion)
     robust = robust_estimate(MODEL, [samples], loss)
-    plain = estimate(MODEL, samples.factor(MODEL))
+    plain = estimate(MODEL, Factor.of(MODEL, samples))
     # 95 % efficiency: the two differ by sqrt(1/0.95 - 1) = 0.23 standard deviations.
     assert np.sqrt(np.mean(((robust.estimate.values - plain.values) / plain.std) ** 2)) < 0.6
     np.testing.assert_allclose(robust.estimate.noise_std, NOISE, rtol=0.12)
@@ -112,7 +112,7 @@ def test_with_5_percent_of_gross_errors_it_is_far_better_than_least_squares(
     motion, rng = a_motion(5.0), np.random.default_rng(seed)
     samples = recording(spoiled(rng, gaussian(rng, motion), 0.05, size), motion)
     robust = robust_estimate(MODEL, [samples], loss)
-    plain = estimate(MODEL, samples.factor(MODEL))
+    plain = estimate(MODEL, Factor.of(MODEL, samples))
     error = distance(robust.estimate.values, samples)
     assert robust.converged
     assert error < distance(plain.values, samples) / 2.0
@@ -137,7 +137,7 @@ def test_tukeys_loss_leaves_no_trace_of_gross_errors_of_one_sign() -> None:
     plain, huber, tukey = (
         distance(values, bad)
         for values in (
-            estimate(MODEL, bad.factor(MODEL)).values,
+            estimate(MODEL, Factor.of(MODEL, bad)).values,
             robust_estimate(MODEL, [bad], Huber()).estimate.values,
             robust_estimate(MODEL, [bad], Tukey()).estimate.values,
         )
@@ -300,6 +300,6 @@ def test_on_a_real_arm_5_percent_of_gross_errors_hardly_cost_anything(
         (one,) = prediction_error(model, values, [last], all_rows=True)
         return one.overall
 
-    untouched = error(estimate(model, first.factor(model)).values)
-    assert error(estimate(model, bad.factor(model)).values) > 2.0 * untouched
+    untouched = error(estimate(model, Factor.of(model, first)).values)
+    assert error(estimate(model, Factor.of(model, bad)).values) > 2.0 * untouched
     assert error(robust_estimate(model, [bad], Huber()).estimate.values) < untouched + 0.005

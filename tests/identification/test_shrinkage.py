@@ -14,7 +14,7 @@ from identification.estimators.shrinkage import (
     fit_shrunk,
     shrunk_values,
 )
-from identification.factor.estimation import joint_weights
+from identification.factor.factor import joint_weights
 from identification.factor.phases import total_phase
 from identification.signals.samples import Samples
 from tests.identification.two_link import MODEL, a_motion, gaussian, recording, truth

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import FrictionLaw, Preprocessing, Recording, RobotModel, prepare
-from identification.factor.estimation import Estimate, estimate
+from identification.factor.factor import Estimate, Factor, estimate
 from identification.model.coupling import Coupling
 from identification.validation.prediction import PredictionError, prediction_error
 
@@ -47,7 +47,7 @@ def fitted(recording: Recording, coupling: Coupling | None) -> tuple[Estimate, P
     )
     options = Preprocessing(smooth_torque=True, torque_bandwidth=40.0)
     samples = prepare(recording, model, options=options)
-    found = estimate(model, samples.factor(model), np.ones(6))
+    found = estimate(model, Factor.of(model, samples), np.ones(6))
     (error,) = prediction_error(model, found.values, [samples], all_rows=True)
     return found, error
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.repetitions import estimate_repetitions
-from identification.factor.estimation import Estimate
+from identification.factor.factor import Estimate
 from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel

@@ -24,7 +24,7 @@ from hil.identify.settings import Settings
 from hil.study.analysis import class_in
 from hil.study.records import Record, read_record, write_record
 from identification.excitation import Journal, SearchSettings
-from identification.factor.estimation import Estimate
+from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor
 from identification.signals.samples import Preprocessing
 from tests.identification.searching import problem

@@ -1,0 +1,569 @@
+r"""What a fit needs of the samples, and least squares on it (the paper's eq. 4).
+
+Per joint j a :class:`Factor` holds the Gram matrix of the rows [W | y], a :class:`QRFactor` their
+triangular factor:
+
+.. math:: G_j = \sum_t \begin{bmatrix} W_j & y_j \end{bmatrix}^T
+                       \begin{bmatrix} W_j & y_j \end{bmatrix}, \qquad R_j^T R_j = G_j
+
+Both add: over chunks, repetitions, archives and machines (triangles by stacking them: Golub and
+Van Loan 2013, section 6.5). Joint weights, one value per joint, are applied afterwards, so no
+weight needs a second pass. A Gram matrix squares the condition number: from a scaled condition of
+1e5 on it leaves fewer than six of sixteen digits, where triangles keep eleven.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError, ShapeError
+from identification.factor.augmented_rows import augmented_rows, masked_rows
+from identification.model.motion import Motion
+from identification.model.regressor import joint_arrays
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+
+# Scaled regressors of condition 1e6 leave four of the sixteen digits of a Gram matrix, less than
+# any torque measurement has; a real rank deficiency shows as 1e8 and more.
+WORST_CONDITION: Final = 1e6
+# Rows of condition 1e10 leave six of sixteen digits. What is dependent by construction shows as
+# 1e14 and more.
+WORST_ROW_CONDITION: Final = 1e10
+QR_CONDITION: Final = 1e5
+_PARTICIPATION: Final = 1e-3
+
+
+class NormalEquations(NamedTuple):
+    """``A pi = b`` of a weighted least-squares problem.
+
+    Attributes:
+        A: sum of the weighted ``W^T W``, shape (p, p).
+        b: sum of the weighted ``W^T y``, shape (p,).
+        yy: sum of the weighted ``y^T y``.
+        n: number of rows (one joint at one instant) in the sums.
+    """
+
+    A: Array
+    b: Array
+    yy: float
+    n: int
+
+
+class Solution(NamedTuple):
+    """Solution of a least-squares problem, of normal equations ``A x = b`` or of rows.
+
+    Attributes:
+        values: (p,), of least (scaled) norm where the data leave a choice.
+        root: S (p, k) with S S' the inverse of A on the k directions the data determine.
+        condition: of the regressor with columns of unit length, infinite without some column.
+        determined: (p,).
+    """
+
+    values: Array
+    root: Array
+    condition: float
+    determined: NDArray[np.bool_]
+
+    @property
+    def inverse(self) -> Array:
+        """Inverse of A on what is determined, zero elsewhere (p, p)."""
+        return np.asarray(self.root @ self.root.T)
+
+
+@dataclass(frozen=True, eq=False)
+class JointFactor(ABC):
+    """Rows of [W | y], reduced joint by joint.
+
+    Attributes:
+        matrices: (n, p + 1, p + 1).
+        samples: rows per joint (n,).
+        parameter_names: the p columns of W.
+    """
+
+    matrices: Array
+    samples: NDArray[np.intp]
+    parameter_names: tuple[str, ...]
+
+    words: ClassVar[str]
+    """Behind the name of an estimator."""
+    smallest_noise: ClassVar[float]
+    """Share of the torque's own RMS below which a residual is rounding, not noise: it would make a
+    joint that happens to fit exactly the only one that counts."""
+
+    @classmethod
+    def zero(cls, model: RobotModel) -> Self:
+        """Return the factor of no samples: what a sum starts from."""
+        n, p = model.n_joints, model.n_parameters
+        return cls(np.zeros((n, p + 1, p + 1)), np.zeros(n, dtype=np.intp), model.parameter_names)
+
+    @classmethod
+    def of(cls, model: RobotModel, samples: Samples) -> Self:
+        """Reduce the usable rows of a recording.
+
+        Raises:
+            ShapeError: an array does not have the shape it should have.
+        """
+        return cls.from_blocks(
+            model,
+            (rows.blocks for rows in augmented_rows(model, samples)),
+            np.count_nonzero(samples.usable, axis=0),
+        )
+
+    @classmethod
+    def from_blocks(
+        cls, model: RobotModel, chunks: Iterable[Sequence[Array]], samples: NDArray[np.intp]
+    ) -> Self:
+        """Reduce rows as :func:`augmented_rows` gives them, which may have been weighted.
+
+        Args:
+            model: the robot.
+            chunks: per chunk and joint (c_j + 1, k).
+            samples: rows that count, per joint (n,).
+        """
+        columns = model.plan.columns
+        sums = [np.zeros((len(c) + 1, len(c) + 1)) for c in columns]
+        for blocks in chunks:
+            for joint, block in enumerate(blocks):
+                sums[joint] = cls._more(sums[joint], block)
+        factor = cls.zero(model)
+        for joint, (small, used) in enumerate(zip(sums, columns, strict=True)):
+            factor.matrices[joint] = cls._wide(
+                small, np.append(used, model.n_parameters), factor.matrices[joint]
+            )
+        factor.samples[:] = samples
+        return factor
+
+    @property
+    def n_joints(self) -> int:
+        """Number n of joints."""
+        return int(self.matrices.shape[0])
+
+    @property
+    def n_parameters(self) -> int:
+        """Number p of parameters."""
+        return int(self.matrices.shape[1]) - 1
+
+    def __add__(self, other: Self) -> Self:
+        """Return the factor of both sets of samples.
+
+        Raises:
+            IdentificationError: the two belong to different models.
+        """
+        same = self.matrices.shape == other.matrices.shape
+        if not same or self.parameter_names != other.parameter_names:
+            raise IdentificationError(
+                "two factors with different joints or parameters cannot be added: "
+                f"{self.n_joints} joints and {self.n_parameters} parameters, "
+                f"{other.n_joints} joints and {other.n_parameters} parameters"
+            )
+        both = self._both(other)
+        return type(self)(both, self.samples + other.samples, self.parameter_names)
+
+    @abstractmethod
+    def rows(self, weights: Array) -> tuple[Array, Array]:
+        """Rows (k, p) and target (k,) that stand for all samples, joints weighted (n,)."""
+
+    @abstractmethod
+    def solve(self, weights: Array) -> Solution:
+        """Solve the weighted least-squares problem, weights (n,)."""
+
+    @abstractmethod
+    def products(self, directions: Array) -> Array:
+        """Return ``D' G_j D`` (n, k, k) for directions D (p, k), or (p + 1, k) with the torque."""
+
+    @abstractmethod
+    def _both(self, other: Self) -> Array: ...
+
+    @staticmethod
+    @abstractmethod
+    def _more(matrix: Array, block: Array) -> Array: ...
+
+    @staticmethod
+    @abstractmethod
+    def _wide(matrix: Array, place: NDArray[np.intp], target: Array) -> Array: ...
+
+    def _checked(self, weights: Array) -> Array:
+        """Raises ShapeError where there is not one weight per joint."""
+        weights = np.asarray(weights, dtype=np.float64)
+        if weights.shape != (self.n_joints,):
+            raise ShapeError("weights", weights.shape, f"({self.n_joints},)")
+        return weights
+
+
+class Factor(JointFactor):
+    """Gram matrices of [W | y], one per joint."""
+
+    words = ""
+    smallest_noise = 1e-6
+
+    @classmethod
+    def from_samples(
+        cls,
+        model: RobotModel,
+        motion: Motion,
+        torque: Array,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> Factor:
+        """Reduce m samples.
+
+        Args:
+            model: the robot.
+            motion: m samples of its joints.
+            torque: what W pi should equal [N·m, N], shape (m, n).
+            mask: which rows count, shape (m, n); all without it. See :meth:`RobotModel.moving`.
+
+        Raises:
+            ShapeError: an array does not have the shape it should have.
+        """
+        q, qd, qdd, torque = joint_arrays(
+            model.n_joints,
+            position=motion.position,
+            velocity=motion.velocity,
+            acceleration=motion.acceleration,
+            torque=torque,
+        )
+        if mask is not None and mask.shape != q.shape:
+            raise ShapeError("mask", mask.shape, str(q.shape))
+        usable = np.ones(q.shape, dtype=np.bool_) if mask is None else mask
+        chunks = model.plan.chunks(q, qd, qdd, motion.direction, response=torque)
+        return cls.from_blocks(
+            model, (rows.blocks for rows in masked_rows(chunks, usable)), usable.sum(axis=0)
+        )
+
+    @property
+    def gram(self) -> Array:
+        """The Gram matrices (n, p + 1, p + 1), symmetric."""
+        return self.matrices
+
+    def weighted(self, weights: Array) -> NormalEquations:
+        """Return the normal equations with one weight per joint, shape (n,): 1/variance."""
+        total = np.tensordot(self._checked(weights), self.gram, axes=1)
+        return NormalEquations(
+            A=total[:-1, :-1], b=total[:-1, -1], yy=float(total[-1, -1]), n=int(self.samples.sum())
+        )
+
+    def rows(self, weights: Array) -> tuple[Array, Array]:
+        """Directions that hold nothing but the rounding of the Gram matrix are left out."""
+        return rows_of(self.weighted(weights))
+
+    def solve(self, weights: Array) -> Solution:
+        """Solve the normal equations."""
+        return solve(self.weighted(weights))
+
+    def products(self, directions: Array) -> Array:
+        """Products with the Gram matrices."""
+        size = len(directions)
+        return np.asarray(directions.T @ self.gram[:, :size, :size] @ directions)
+
+    def _both(self, other: Self) -> Array:
+        return self.matrices + other.matrices
+
+    @staticmethod
+    def _more(matrix: Array, block: Array) -> Array:
+        matrix += block @ block.T
+        return matrix
+
+    @staticmethod
+    def _wide(matrix: Array, place: NDArray[np.intp], target: Array) -> Array:
+        target[np.ix_(place, place)] = matrix
+        return target
+
+
+class QRFactor(JointFactor):
+    """Upper triangular factors of [W | y], one per joint."""
+
+    words = " by QR"
+    # A triangular factor gives the residual to about 1e-13 of the torque.
+    smallest_noise = 1e-12
+
+    @property
+    def triangle(self) -> Array:
+        """The triangles (n, p + 1, p + 1)."""
+        return self.matrices
+
+    @property
+    def gram(self) -> Factor:
+        """The same samples as Gram matrices, for what works on those; loses digits."""
+        products = np.asarray(self.triangle.transpose(0, 2, 1) @ self.triangle)
+        return Factor(products, self.samples, self.parameter_names)
+
+    def rows(self, weights: Array) -> tuple[Array, Array]:
+        """The triangle of all joints together."""
+        rows = np.sqrt(self._checked(weights))[:, None, None] * self.triangle
+        triangle = _triangle(rows.reshape(-1, rows.shape[2]))
+        return triangle[:-1, :-1], triangle[:-1, -1]
+
+    def solve(self, weights: Array) -> Solution:
+        """Solve the rows, without squaring their condition."""
+        return solve_rows(*self.rows(weights))
+
+    def products(self, directions: Array) -> Array:
+        """Squares of the triangles times the directions."""
+        through = self.triangle[:, :, : len(directions)] @ directions
+        return np.asarray(through.transpose(0, 2, 1) @ through)
+
+    def _both(self, other: Self) -> Array:
+        stacked = np.concatenate([self.matrices, other.matrices], axis=1)
+        return np.array([_triangle(joint) for joint in stacked])
+
+    @staticmethod
+    def _more(matrix: Array, block: Array) -> Array:
+        return _triangle(np.concatenate([matrix, block.T]))
+
+    @staticmethod
+    def _wide(matrix: Array, place: NDArray[np.intp], target: Array) -> Array:
+        wide = np.zeros((len(matrix), len(target)))
+        wide[:, place] = matrix
+        # Columns of a joint need not rise, and then the wide rows are not triangular.
+        return _triangle(wide)
+
+
+def _triangle(rows: Array) -> Array:
+    """Upper triangular R with R'R = rows'rows and as many rows as columns, missing ones zero."""
+    triangle = np.linalg.qr(rows, mode="r")
+    square = np.zeros((rows.shape[1], rows.shape[1]))
+    square[: len(triangle)] = triangle
+    return square
+
+
+def solve(equations: NormalEquations) -> Solution:
+    """Solve ``A x = b`` with columns scaled to unit length, naming what A does not determine.
+
+    Directions of the scaled parameter space in which the condition exceeds `WORST_CONDITION`
+    are left out; the parameters that take part in one of them are undetermined.
+    """
+    length = np.sqrt(np.diag(equations.A))
+    present = length > 0.0
+    scale = np.where(present, length, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
+    largest = eigenvalues[-1]
+    kept = eigenvalues > largest / WORST_CONDITION**2
+    lost = vectors[:, ~kept]
+    determined = present & (np.abs(lost).max(axis=1, initial=0.0) < _PARTICIPATION)
+    basis = vectors[:, kept]
+    root = basis / np.sqrt(eigenvalues[kept]) / scale[:, None]
+    smallest = eigenvalues[0] if present.all() else 0.0
+    return Solution(
+        values=root @ (root.T @ equations.b),
+        root=root,
+        condition=float(np.sqrt(largest / smallest)) if smallest > 0.0 else np.inf,
+        determined=np.asarray(determined),
+    )
+
+
+def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
+    """Solve ``rows @ x = target`` by least squares, naming what the rows do not determine.
+
+    By a singular value decomposition of the rows with columns scaled to unit length: forming
+    ``rows'rows`` would square the condition (Golub and Van Loan 2013, section 5.3).
+
+    Args:
+        rows: (k, p).
+        target: (k,).
+        worst: directions in which the condition exceeds this are left out; the parameters that
+            take part in one of them are undetermined.
+    """
+    length = np.linalg.norm(rows, axis=0)
+    present = length > 0.0
+    scale = np.where(present, length, 1.0)
+    left, singular, right = np.linalg.svd(rows / scale, full_matrices=True)
+    p = rows.shape[1]
+    padded = np.zeros(p)
+    padded[: len(singular)] = singular
+    kept = (padded > padded.max(initial=0.0) / worst) & (padded > 0.0)
+    lost = right[~kept]
+    determined = present & (np.abs(lost).max(axis=0, initial=0.0) < _PARTICIPATION)
+    root = right[kept].T / padded[kept] / scale[:, None]
+    smallest = padded.min(initial=np.inf) if present.all() else 0.0
+    return Solution(
+        values=root @ (left[:, : len(singular)].T @ target)[kept[: len(singular)]],
+        root=root,
+        condition=float(padded[0] / smallest) if smallest > 0.0 else np.inf,
+        determined=np.asarray(determined),
+    )
+
+
+def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
+    """Return rows (k, p) and target (k,) with ``rows'rows = A`` and ``rows'target = b``.
+
+    Directions in which A holds nothing but its own rounding (condition above `WORST_CONDITION`)
+    are left out: they carry no information.
+    """
+    length = np.sqrt(np.maximum(np.diag(equations.A), 0.0))
+    scale = np.where(length > 0.0, length, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
+    kept = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
+    singular = np.sqrt(eigenvalues[kept])
+    basis = vectors[:, kept].T
+    return singular[:, None] * basis * scale, (basis @ (equations.b / scale)) / singular
+
+
+def residual_variance(factor: JointFactor, values: Array, root: Array, weights: Array) -> Array:
+    """Variance of the torque residual per joint (n,), NaN for a joint without rows.
+
+    The parameters cost degrees of freedom, shared among the joints by how much each contributes
+    to the information: trace(w_j S' G_j S), with the root S (p, k) of a :class:`Solution`.
+    """
+    squares = factor.products(np.append(-values, 1.0)[:, None])[:, 0, 0]
+    spent = weights * np.trace(factor.products(root), axis1=1, axis2=2)
+    torque = factor.products(np.eye(factor.n_parameters + 1)[:, -1:])[:, 0, 0]
+    floor = factor.smallest_noise**2 * torque / np.maximum(factor.samples, 1)
+    floor = np.maximum(floor, np.finfo(np.float64).tiny)
+    variance = np.maximum(squares, 0.0) / np.maximum(factor.samples - spent, 1.0)
+    return np.where(factor.samples > 0, np.maximum(variance, floor), np.nan)
+
+
+def joint_weights(factor: JointFactor) -> Array:
+    """Inverse variance of each joint's residual in an ordinary fit (n,), zero without rows."""
+    ordinary = np.ones(factor.n_joints)
+    first = factor.solve(ordinary)
+    variance = residual_variance(factor, first.values, first.root, ordinary)
+    return np.where(np.isnan(variance), 0.0, 1.0 / variance)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters and how well they are known.
+
+    Attributes:
+        names: (p,).
+        units: (p,).
+        values: (p,).
+        covariance: (p, p); the variance of an undetermined parameter is infinite.
+        noise_std: standard deviation of the torque residual per joint (n,) [N·m or N].
+        samples: rows per joint (n,).
+        method: how it was made, in words, and what the covariance assumes.
+        condition: condition number of the weighted regressor with columns of unit length.
+        undetermined: parameters the data say nothing about, alone or as part of a combination.
+        interval_factor: standard deviations in half a 95 % interval: 1.96, more where the
+            covariance itself comes from few data.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    covariance: Array
+    noise_std: Array
+    samples: NDArray[np.intp]
+    method: str
+    condition: float
+    undetermined: tuple[str, ...] = ()
+    interval_factor: float = 1.96
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> Array:
+        """Correlation matrix (p, p); an undetermined parameter correlates with nothing."""
+        std = self.std
+        scale = np.where(np.isfinite(std) & (std > 0.0), std, 1.0)
+        correlation = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
+        correlation = correlation / np.outer(scale, scale)
+        np.fill_diagonal(correlation, 1.0)
+        return np.asarray(correlation)
+
+    def value(self, name: str) -> float:
+        """Value of one parameter by name."""
+        return float(self.values[self.names.index(name)])
+
+
+def estimate(model: RobotModel, factor: JointFactor, weights: Array | None = None) -> Estimate:
+    """Weighted least squares (eq. 4).
+
+    The covariance is the classical one, A^-1: honest only if the residuals are white. See
+    :mod:`identification.estimators.covariance` for the one that does not need that.
+
+    Args:
+        model: the robot.
+        factor: the samples; of one repetition, or a sum.
+        weights: per joint (n,); by default the inverse residual variance of an ordinary fit.
+
+    Raises:
+        IdentificationError: the factor holds no rows.
+    """
+    if not factor.samples.any():
+        raise IdentificationError(nothing_usable(model))
+    if weights is None:
+        weights = joint_weights(factor)
+    solution = factor.solve(weights)
+    variance = residual_variance(factor, solution.values, solution.root, weights)
+    covariance = solution.inverse
+    mark_undetermined(covariance, solution.determined)
+    return Estimate(
+        names=model.parameter_names,
+        units=model.units,
+        values=solution.values,
+        covariance=covariance,
+        noise_std=np.sqrt(variance),
+        samples=factor.samples,
+        method=f"weighted least squares{factor.words}, classical covariance (white residuals)",
+        condition=solution.condition,
+        undetermined=undetermined_names(model.parameter_names, solution.determined),
+    )
+
+
+def nothing_usable(model: RobotModel) -> str:
+    """What to say where no row can be fitted."""
+    slowest = float(np.min(model.friction.standstill))
+    return (
+        "there is not one usable sample: no joint moves faster than the standstill speed of"
+        f" {slowest:g} away from the ends and gaps of the recording"
+    )
+
+
+def mark_undetermined(covariance: Array, determined: NDArray[np.bool_]) -> None:
+    """Give undetermined parameters an infinite variance and no covariance, in place."""
+    covariance[~determined, :] = 0.0
+    covariance[:, ~determined] = 0.0
+    covariance[~determined, ~determined] = np.inf
+
+
+def undetermined_names(names: Sequence[str], determined: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Names (p,) of what is not determined (p,)."""
+    return tuple(name for name, known in zip(names, determined, strict=True) if not known)
+
+
+def total(factors: Sequence[Factor]) -> Factor:
+    """Sum of factors: all repetitions as one."""
+    return sum(factors[1:], factors[0])
+
+
+def reduced(
+    model: RobotModel, recordings: Iterable[Samples], gram: Factor | None = None
+) -> Factor | QRFactor:
+    """Reduce recordings to Gram matrices, or to triangles where the condition demands it.
+
+    The Gram matrices come first, being five times as fast; the samples are read a second time
+    only if the scaled condition of the ordinary problem exceeds `QR_CONDITION`.
+
+    Args:
+        model: the robot.
+        recordings: can be gone through twice: a sequence, not a generator.
+        gram: their factor, if it is known; without recordings all there is.
+
+    Raises:
+        IdentificationError: neither recordings nor factor, or they can be gone through only once.
+    """
+    if iter(recordings) is recordings:
+        raise IdentificationError("recordings may have to be read twice: a sequence is needed")
+    if gram is None:
+        factors = [Factor.of(model, samples) for samples in recordings]
+        if not factors:
+            raise IdentificationError("there are no recordings to estimate from")
+        gram = total(factors)
+    alone = isinstance(recordings, Sequence) and not recordings
+    if alone or gram.solve(np.ones(model.n_joints)).condition <= QR_CONDITION:
+        return gram
+    triangles = (QRFactor.of(model, samples) for samples in recordings)
+    return sum(triangles, QRFactor.zero(model))
