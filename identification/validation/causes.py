@@ -45,6 +45,11 @@ Kind = Literal[
 # Standard errors over the blocks, and the share of the error, that make a mended fault better.
 SIGMAS: Final = 3.0
 LEAST_GAIN: Final = 0.1
+# A wrong sign or order is a gross fault: mended, the joints that it is of are predicted with at
+# most half the error, or all joints with this share of it. Where a small wrist is predicted badly,
+# a nonsensical order may well predict it a little better.
+_GROSS_OWN: Final = 0.5
+_GROSS: Final = 0.7
 # What is as good as that with fewer coefficients is taken in its place.
 _ALIKE: Final = 1.05
 _MOST_CAUSES: Final = 4
@@ -165,18 +170,25 @@ def find_causes(
 
 
 class _Trial(NamedTuple):
-    """A fault mended, the upper end of its ratio, and how many coefficients it has."""
+    """A fault mended, the upper end of its ratio, that of its own joints, and its coefficients."""
 
     cause: Cause
     highest: float
+    own: float
     coefficients: int
+
+    @property
+    def better(self) -> bool:
+        """Whether the fault mended predicts better, beyond chance."""
+        ratio = self.cause.ratio
+        if self.cause.fault.discrete and not (self.own < _GROSS_OWN or ratio < _GROSS):
+            return False
+        return ratio < 1.0 - LEAST_GAIN and self.highest < 1.0
 
 
 def _best(trials: Sequence[_Trial]) -> _Trial | None:
     """The trial of least error among those that are better beyond chance, simple ones first."""
-    better = [
-        trial for trial in trials if trial.cause.ratio < 1.0 - LEAST_GAIN and trial.highest < 1.0
-    ]
+    better = [trial for trial in trials if trial.better]
     if not better:
         return None
     least = min(trial.cause.ratio for trial in better)
@@ -231,8 +243,10 @@ class _State:
                 own = _columns_of(tables, model, self.values, fault)
             score = _score(seen, p, np.concatenate([own, before], axis=3), measured)
             ratio, highest = score.against(usual)
+            of_its_own, _ = score.against(usual, fault.joints)
             size, std = _size(fault, score, tables, own)
-            trials.append(_Trial(Cause(fault, ratio, size, std), highest, own.shape[3]))
+            cause = Cause(fault, ratio, size, std)
+            trials.append(_Trial(cause, highest, of_its_own, own.shape[3]))
         return trials
 
     def _tables_of(self, fault: Fault) -> _Tables:
@@ -394,9 +408,14 @@ class _Score(NamedTuple):
     values: Array
     added: Array
 
-    def against(self, other: _Score) -> tuple[float, float]:
-        """Error over another's: geometric mean over joints, and its upper end by the blocks."""
+    def against(self, other: _Score, joints: Sequence[int] = ()) -> tuple[float, float]:
+        """Error over another's: geometric mean over joints, and its upper end by the blocks.
+
+        Of the given joints, by default of all of them.
+        """
         tested = (self.squares > 0.0) & (other.squares > 0.0)
+        if joints:
+            tested &= np.isin(np.arange(tested.shape[1]), joints)
         known = tested.any(axis=0)
         if not known.any():
             return 1.0, np.inf
