@@ -36,8 +36,8 @@ MOST_READ: Final = 32
 _REPETITIONS: Final = 1
 # Where the delay is stated it is looked for all the same, to be reported: in so many samples.
 _DELAY_SAMPLES: Final = 8000
-RIPPLE: Final = (1, 2)
-"""Periods per motor turn of a torque ripple: a rotor out of centre, a wave generator."""
+RIPPLE: Final = ((1,), (2,), (1, 2))
+"""Periods per motor turn of a torque ripple: a rotor out of centre, a wave generator, both."""
 
 
 class Decided(NamedTuple):
@@ -203,8 +203,8 @@ def _chosen(
         friction |= {"presliding": law.presliding}
     if "friction" in questions:
         friction |= {"third": law.third or "none", "stribeck": law.stribeck or 0.0}
-    if "ripple" in questions and best.rippled:
-        friction |= {"ripple": [*RIPPLE]}
+    if "ripple" in questions and best.ripple:
+        friction |= {"ripple": [*best.ripple]}
     return replace(
         settings,
         preprocessing=best.preprocessing,
@@ -214,11 +214,12 @@ def _chosen(
     )
 
 
-def _ripples(cell: Cell) -> Sequence[TorqueRipple]:
+def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
     """Torque ripple that the cell's gears may have; none where it has some, or no gear is known."""
     if cell.file.drive_train is None or cell.file.robot.friction.ripple:
-        return ()
-    return ripples(cell.joint_names, cell.drive_train.motor_from_joint, RIPPLE)
+        return []
+    motors = cell.drive_train.motor_from_joint
+    return [ripples(cell.joint_names, motors, orders) for orders in RIPPLE]
 
 
 def _read_to_choose(sources: Sources) -> Sequence[Source]:

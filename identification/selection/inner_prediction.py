@@ -92,9 +92,10 @@ class Settings:
         return (self.model.friction.laws, self.model.elements.elements), self.preprocessing
 
     @property
-    def rippled(self) -> bool:
-        """Whether a torque ripple is among what is estimated."""
-        return any(isinstance(one, TorqueRipple) for one in self.model.elements.elements)
+    def ripple(self) -> tuple[int, ...]:
+        """Orders of the torque ripple that is estimated, periods per motor turn."""
+        elements = self.model.elements.elements
+        return next((one.orders for one in elements if isinstance(one, TorqueRipple)), ())
 
     def describe(self) -> tuple[str, ...]:
         """The settings in words, part by part."""
@@ -103,7 +104,7 @@ class Settings:
             f"{how.rigid_bandwidth:g} Hz",
             "measured velocity" if how.velocity == "measured" else "velocity from positions",
             *self.model.friction.laws[0].words(),
-            "torque ripple" if self.rippled else "no torque ripple",
+            _ripple_in_words(self.ripple),
             {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
                 how.left_out or "", "by the friction law"
             ),
@@ -217,7 +218,7 @@ def choose_settings(
     start: Settings,
     questions: Collection[Question],
     low_passes: LowPasses,
-    ripples: Sequence[TorqueRipple] = (),
+    ripples: Sequence[Sequence[TorqueRipple]] = (),
 ) -> tuple[Settings, tuple[Choice, ...]]:
     """Choose settings one question after the other, each with what was chosen before it.
 
@@ -226,7 +227,7 @@ def choose_settings(
         start: what is not asked for stays as it is here.
         questions: what is chosen.
         low_passes: looked for where "low-pass" is among them.
-        ripples: added to the model where "ripple" is among them and they help.
+        ripples: of which one is added to the model where "ripple" is among them and it helps.
 
     Returns:
         The settings, and how they were chosen; those of `start` where what is fitted is too short
@@ -272,8 +273,8 @@ def choose_settings(
         found = trial.decide("friction at speed", _friction_terms(now), TERM_WORTHWHILE)
         now, choices = found.settings, [*choices, found.choice]
     if "ripple" in questions:
-        with_them = replace(now, model=now.model.with_elements(ripples))
-        found = trial.decide("torque ripple", [now, with_them])
+        rippled = [replace(now, model=now.model.with_elements(one)) for one in ripples]
+        found = trial.decide("torque ripple", [now, *rippled])
         now, choices = found.settings, [*choices, found.choice]
     if "estimator" in questions:
         trial.renew_centres()
@@ -453,6 +454,12 @@ def _shrinkages(prior_weights: Sequence[float]) -> list[Shrinkage]:
 
 def _with(settings: Settings, **changes: Any) -> Settings:
     return replace(settings, preprocessing=replace(settings.preprocessing, **changes))
+
+
+def _ripple_in_words(orders: Sequence[int]) -> str:
+    if not orders:
+        return "no torque ripple"
+    return f"torque ripple, {' and '.join(map(str, orders))} per motor turn"
 
 
 def _differences(candidates: Sequence[Settings]) -> tuple[str, ...]:
