@@ -28,7 +28,7 @@ class Sequence:
         self.last = number
         self.cycle = 0
         self.broken = False
-        # Beyond half of all numbers, ahead could not be told from behind.
+        # Beyond half of all numbers, ahead could not be distinguished from behind.
         self._window = max(1, min(int(window), LAST_NUMBER // 2))
 
     def distance(self, number: int) -> int:

@@ -32,8 +32,8 @@ How = Literal["stopped", "flown", "reduced"]
 # Shares of the fly asked for that are compared, and those tried one by one if none of them will do.
 FIRST_SHARES: Final = (1.0, 0.9999, 0.999, 0.99, 0.97)
 LAST_SHARES: Final = (0.9, 0.5, 0.25, 0.125, 0.0625)
-# A corner that takes less of its ramps than this cannot be told from a stop: its path passes at
-# some 1e-12 of the distance of a full one.
+# A corner that takes less of its ramps than this cannot be distinguished from a stop: its path
+# passes at some 1e-12 of the distance of a full one.
 LEAST_SHARE: Final = 1e-4
 # A join is preferred to that at the share asked for if it saves this much more [s].
 BETTER: Final = 1e-9

@@ -136,7 +136,7 @@ def of_estimate(
 
 def _unjudged(why: str) -> tuple[Criterion, Criterion, Criterion]:
     def missing(name: str, bound: float) -> Criterion:
-        sentence = f"{name}: cannot be told, for nothing can be identified ({why})"
+        sentence = f"{name}: cannot be determined, for nothing can be identified ({why})"
         return Criterion(name=name, value=None, bound=bound, passed=False, sentence=sentence)
 
     return (

@@ -42,7 +42,7 @@ _MOTIONS = ("via_points", "sines")
 RESULT_FORMAT: Final = "designed excitation"
 """What the file that a design leaves calls itself; the settings are a table in it."""
 SHORTEST_RAMP: Final = 0.05
-"""s; sines that grow faster are a blow to any arm, and their contacts cannot be told."""
+"""s; sines that grow faster are a blow to any arm, and their contacts cannot be determined."""
 
 
 class SettingsError(InputError):

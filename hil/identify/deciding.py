@@ -46,7 +46,7 @@ class Decided(NamedTuple):
     Attributes:
         settings: to be applied.
         delays: of the torque behind the position, as the longest of the recordings has them; None
-            where that cannot be told.
+            where that cannot be determined.
         notes: about them, in sentences.
     """
 

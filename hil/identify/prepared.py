@@ -33,7 +33,7 @@ class Prepared:
         held_out: what is predicted, likewise; `training` where nothing was held out.
         settings: of `fitted`.
         delays: of the torque behind the position, as the longest of the fitted recordings has
-            them; None where that cannot be told.
+            them; None where that cannot be determined.
         masked: rows of `fitted` that do not count, per joint (n,), by the first reason against
             them, in words.
         rows: time samples of `fitted`.

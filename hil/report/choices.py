@@ -59,5 +59,5 @@ def _question(choice: ChoiceResult) -> Question:
 
 
 def _percent(error: float | None) -> str:
-    # Two decimals throughout: candidates are told apart by little.
+    # Two decimals throughout: candidates are distinguished by little.
     return numbers.MISSING if error is None else numbers.fixed(100.0 * error, 2)

@@ -47,7 +47,7 @@ class WarmUpResult(Frozen):
     friction: list[list[float | None]]
     """Of each motion and joint, N·m or N; null for a joint that hardly moves."""
     change: list[float | None]
-    """Largest change per motion of any joint, as a share; null before it can be told."""
+    """Largest change per motion of any joint, as a share; null before it can be determined."""
 
 
 class ConductResult(Frozen):

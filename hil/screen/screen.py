@@ -80,7 +80,7 @@ class Pace:
         self._last = None
 
     def left(self, status: RunStatus) -> float | None:
-        """Waiting time to the end of the run [s]; None where it cannot be told yet."""
+        """Waiting time to the end of the run [s]; None where it cannot be determined yet."""
         changes = status.motions_left + (status.motion is None)
         between = changes * (_BETWEEN + self._between) / (1.0 + self._gaps)
         if not self._virtual:

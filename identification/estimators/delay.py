@@ -64,7 +64,8 @@ _BIN: Final = 0.01  # s
 _PROFILE_STEP: Final = 0.01  # s
 _ITERATIONS: Final = 12
 _CONVERGED, _OF_STD = 1e-6, 0.02  # step: s, or this small beside what noise does
-# Two valleys whose residual variances differ by less are told apart by what the model gets wrong.
+# Two valleys whose residual variances differ by less are distinguished by what the model gets
+# wrong.
 _MODEL_ERROR: Final = 0.05
 # Of the smoothing's bandwidth, on either side of a velocity reversal.
 _REVERSAL_PERIODS: Final = 0.5

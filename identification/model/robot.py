@@ -459,7 +459,7 @@ def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Arr
             name = chain.joint_names[joint]
             raise ModelError(
                 f"joint {name!r} slides along gravity and has a rotor inertia: the offset of its "
-                "friction and the weight it carries cannot be told apart; leave out the offset "
+                "friction and the weight it carries cannot be distinguished; leave out the offset "
                 "(asymmetric friction has one) or the rotor inertias",
                 joint=name,
             )

@@ -237,8 +237,8 @@ class Recording:
         With a commanded position: a stretch of identical readings during which the command
         moves by more than `STUCK_MOVEMENT`. A joint commanded to stand still may do so. Without
         one: a reading that never changes in a recording in which another joint moves; whether
-        that joint was held or its reading is dead cannot be told, so a joint that was held has
-        to be declared.
+        that joint was held or its reading is dead cannot be determined, so a joint that was held
+        has to be declared.
         """
         moves = np.ptp(self.position, axis=0) > STUCK_MOVEMENT
         for j, name in enumerate(self.joint_names):

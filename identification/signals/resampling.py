@@ -27,7 +27,7 @@ def without_repeats(recording: Recording) -> Recording:
     """Return the recording with one sample per time stamp: the mean of those that share it.
 
     Raises:
-        RecordingError: the clock falls back; which sample is right cannot be told.
+        RecordingError: the clock falls back; which sample is right cannot be determined.
     """
     steps = np.diff(recording.time)
     if np.any(steps < 0.0):

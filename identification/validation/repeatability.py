@@ -90,8 +90,8 @@ class _Moments:
         rows = np.count_nonzero(shared, axis=0)
         if self.repetitions < 2 or not rows.any():
             raise IdentificationError(
-                "what repeats cannot be told from noise: it takes two repetitions in which joints"
-                f" move at the same times, here are {self.repetitions} with"
+                "what repeats cannot be distinguished from noise: it takes two repetitions in which"
+                f" joints move at the same times, here are {self.repetitions} with"
                 f" {rows.tolist()} common rows per joint"
             )
         freedom = np.where(shared, self.count - 1.0, 0.0).sum(axis=0)

@@ -47,7 +47,7 @@ class Thresholds:
             tested.
         noticeable: systematic error that is worth a word: what right models with ripple, drifting
             friction, elasticity and delay reach. Torque constants of wrist axes that are wrong by
-            30 % show as 1 to 3 %, of which the smaller half cannot be told from those.
+            30 % show as 1 to 3 %, of which the smaller half cannot be distinguished from those.
         gravity: squared error on unseen motion with gravity pulling the way that fits best, over
             that as declared, and
         gravity_angle: degrees between the two, to call gravity wrong. NS 16: 0.06 at most with

@@ -31,7 +31,7 @@ def judge_course(
         pieces: of a journal.
         settled: s of a piece after which nothing is to be added to a process any more.
         faults: told of what is wrong.
-        doubts: told of what the machine explains, or what cannot be told.
+        doubts: told of what the machine explains, or what cannot be determined.
     """
     if not any(piece.campaigns for piece in pieces):
         faults.append("no campaign was run")

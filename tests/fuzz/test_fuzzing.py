@@ -1,4 +1,4 @@
-"""The harness itself: laws that are broken are found, told apart, kept and counted once."""
+"""The harness itself: laws that are broken are found, distinguished, kept and counted once."""
 
 from __future__ import annotations
 

@@ -154,7 +154,7 @@ def test_archives_of_different_robots_are_not_mixed(campaign: Campaign, tmp_path
 def test_without_repetitions_the_result_says_what_was_not_looked_for(campaign: Campaign) -> None:
     one = [campaign.folder.completed("excitation")[0], *campaign.folder.completed("validation")]
     found = identify_archives(one, Silent())
-    assert any("cannot be told from noise" in doubt for doubt in found.verdict.doubts)
+    assert any("cannot be distinguished from noise" in doubt for doubt in found.verdict.doubts)
 
 
 def test_a_stretch_at_rest_is_no_test_of_a_model(campaign: Campaign) -> None:

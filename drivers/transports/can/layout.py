@@ -133,7 +133,7 @@ def _floats(name: str, first_byte: int, axes: range, unit: str) -> list[Signal]:
 
 
 def _slow(start: int) -> list[Signal]:
-    """The values that share one place, told apart by the multiplexer."""
+    """The values that share one place, distinguished by the multiplexer."""
     units = {"D2": "rev/cycle", "extra1": "A", "extra2": "kg m2", "extra3": ""}
     signals = [
         Signal(

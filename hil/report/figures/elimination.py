@@ -17,7 +17,7 @@ from hil.results import EliminationStepResult, EssentialResult
 
 _WIDTH, _HEIGHT = 370.0, 250.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 12.0, 22.0, 42.0
-# The last few parameters leave errors of 100 %, beside which nothing else could be told apart.
+# The last few parameters leave errors of 100 %, beside which nothing else could be distinguished.
 _HIGHEST_ERROR = 4.0  # times the lowest
 
 

@@ -105,7 +105,7 @@ def touch_between(
 
 
 def _untold(scene: Scene, stretch: _Stretch) -> Touch:
-    """Return what counts as a touch: so close to the margin that it cannot be told, or too long."""
+    """Return what counts as a touch: too close to the margin to be determined, or too long."""
     return Touch(stretch.pair, stretch.start, float(np.nextafter(scene.margin, -1.0)))
 
 

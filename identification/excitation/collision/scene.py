@@ -127,7 +127,7 @@ class Scene:
         return Path(q, at, bodies, travel(self._bodies, bodies, turning(self._chain, q)))
 
     def distance(self, pair: int, path: Path, sample: int) -> float:
-        """Return the signed distance of a pair at a sample [m], -inf if it cannot be told."""
+        """Return the signed distance of a pair at a sample [m], -inf if it cannot be determined."""
         poses = []
         for index in (self.separation.first[pair], self.separation.second[pair]):
             body = self._bodies[index]

@@ -69,7 +69,7 @@ def systematic(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> I
             "systematic error",
             "doubtful",
             "without repetitions of one motion an error of the drive train (a coupling or torque"
-            " constant) cannot be told from noise, and was not looked for",
+            " constant) cannot be distinguished from noise, and was not looked for",
             "record the same motion several times",
         )
         return

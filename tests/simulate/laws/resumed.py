@@ -114,7 +114,7 @@ def _played(
     moves = np.flatnonzero((np.diff(q, axis=0) != 0.0).any(axis=1))
     if not moves.size:
         return "nothing moves in it"
-    # The first steps of a motion may be smaller than what can be told from rest.
+    # The first steps of a motion may be smaller than what can be distinguished from rest.
     for first in range(max(0, int(moves[0]) - 5), int(moves[0]) + 1):
         part = q[first : first + len(planned)]
         off = np.abs(part - planned[: len(part)]).max()
