@@ -45,11 +45,6 @@ Kind = Literal[
 # Standard errors over the blocks, and the share of the error, that make a mended fault better.
 SIGMAS: Final = 3.0
 LEAST_GAIN: Final = 0.1
-# A wrong sign or order is a gross fault: mended, the joints that it is of are predicted with at
-# most half the error, or all joints with this share of it. Where a small wrist is predicted badly,
-# a nonsensical order may well predict it a little better.
-_GROSS_OWN: Final = 0.5
-_GROSS: Final = 0.7
 # What is as good as that with fewer coefficients is taken in its place.
 _ALIKE: Final = 1.05
 _MOST_CAUSES: Final = 4
@@ -170,20 +165,31 @@ def find_causes(
 
 
 class _Trial(NamedTuple):
-    """A fault mended, the upper end of its ratio, that of its own joints, and its coefficients."""
+    """A fault mended, the upper end of its ratio, and how many coefficients it has."""
 
     cause: Cause
     highest: float
-    own: float
     coefficients: int
 
     @property
     def better(self) -> bool:
         """Whether the fault mended predicts better, beyond chance."""
-        ratio = self.cause.ratio
-        if self.cause.fault.discrete and not (self.own < _GROSS_OWN or ratio < _GROSS):
-            return False
-        return ratio < 1.0 - LEAST_GAIN and self.highest < 1.0
+        return self.cause.ratio < 1.0 - LEAST_GAIN and self.highest < 1.0
+
+    def rivalled_by(self, other: _Trial) -> bool:
+        """Whether another order, or an order in place of a sign, explains nearly as much.
+
+        Then neither is sure: of a wrist that is predicted badly many nonsensical orders predict a
+        little more. Signs of two joints may well be the same arm mirrored.
+        """
+        mine, its = self.cause, other.cause
+        return (
+            mine.fault.discrete
+            and its.fault.discrete
+            and not (mine.fault.kind.endswith("sign") and its.fault.kind.endswith("sign"))
+            and mine.fault.joints != its.fault.joints
+            and (1.0 - LEAST_GAIN) * its.ratio < mine.ratio
+        )
 
 
 def _best(trials: Sequence[_Trial]) -> _Trial | None:
@@ -193,7 +199,8 @@ def _best(trials: Sequence[_Trial]) -> _Trial | None:
         return None
     least = min(trial.cause.ratio for trial in better)
     alike = [trial for trial in better if trial.cause.ratio <= _ALIKE * least]
-    return min(alike, key=lambda trial: (trial.coefficients, trial.cause.ratio))
+    best = min(alike, key=lambda trial: (trial.coefficients, trial.cause.ratio))
+    return None if any(best.rivalled_by(trial) for trial in better) else best
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,10 +250,8 @@ class _State:
                 own = _columns_of(tables, model, self.values, fault)
             score = _score(seen, p, np.concatenate([own, before], axis=3), measured)
             ratio, highest = score.against(usual)
-            of_its_own, _ = score.against(usual, fault.joints)
             size, std = _size(fault, score, tables, own)
-            cause = Cause(fault, ratio, size, std)
-            trials.append(_Trial(cause, highest, of_its_own, own.shape[3]))
+            trials.append(_Trial(Cause(fault, ratio, size, std), highest, own.shape[3]))
         return trials
 
     def _tables_of(self, fault: Fault) -> _Tables:
@@ -408,14 +413,9 @@ class _Score(NamedTuple):
     values: Array
     added: Array
 
-    def against(self, other: _Score, joints: Sequence[int] = ()) -> tuple[float, float]:
-        """Error over another's: geometric mean over joints, and its upper end by the blocks.
-
-        Of the given joints, by default of all of them.
-        """
+    def against(self, other: _Score) -> tuple[float, float]:
+        """Error over another's: geometric mean over joints, and its upper end by the blocks."""
         tested = (self.squares > 0.0) & (other.squares > 0.0)
-        if joints:
-            tested &= np.isin(np.arange(tested.shape[1]), joints)
         known = tested.any(axis=0)
         if not known.any():
             return 1.0, np.inf
