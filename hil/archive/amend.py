@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import IO, BinaryIO
 
+from hil.archive.header import ArchiveOutcome
 from hil.archive.repair import ArchiveCopy
 from hil.archive.rewrite import write_anew
 from hil.archive.survey import survey
@@ -35,7 +36,8 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
     found = survey(path)
     if found.faults or found.metadata is None or found.outcome is None:
         raise ArchiveError(path, "is not whole", remedy="repair it with `hil archive repair`")
-    amended = replace(found, outcome={**found.outcome, "outcome": outcome, "reason": reason})
+    record = {**found.outcome.record, "outcome": outcome, "reason": reason}
+    amended = replace(found, outcome=ArchiveOutcome.of(record))
 
     def fill(stream: BinaryIO, output: IO[bytes]) -> None:
         ArchiveCopy(stream, output).write(amended)

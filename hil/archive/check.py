@@ -17,16 +17,24 @@ import zstandard
 from numpy.typing import NDArray
 
 from drivers.packet_records import LONGEST_PACKET
-from hil.archive import container, definitions, description, index, schema
+from hil.archive import container, definitions, index, schema
 from hil.archive.amend import REJECTED
 from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
 from hil.archive.chunk import ChunkParser, Messages
 from hil.archive.container import ChannelRecord, Damage, Record
-from hil.archive.description import Description, DescriptionError
+from hil.archive.header import (
+    CHUNKS,
+    FORMAT_VERSION,
+    KINDS,
+    METADATA,
+    ArchiveHeader,
+    ArchiveName,
+    ArchiveOutcome,
+    HeaderError,
+    is_known,
+)
 from hil.archive.intact import Survey
 from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
-from hil.archive.names import KINDS, ArchiveName
-from hil.archive.order import checksums
 from hil.archive.survey import survey
 from hil.errors import NotAnArchiveError
 from hil.reading import opened
@@ -64,12 +72,12 @@ class _Checker:
     """Goes through the chunks that stand."""
 
     def __init__(self, found: Survey) -> None:
-        assert found.metadata is not None
+        header = found.header
+        assert header is not None
         self._found = found
-        self._imported = found.metadata["kind"] == "imported"
-        description = Description.of(found.metadata)
-        self._joints = description.joint_names
-        self._period_ns = None if description.period is None else description.period * 1e9
+        self._imported = header.kind == "imported"
+        self._joints = header.joint_names
+        self._period_ns = None if header.period is None else header.period * 1e9
         self._parser = ChunkParser()
         self._known = self._parser.known
         self._layouts: dict[str, MessageLayout | None] = {}
@@ -215,10 +223,10 @@ class _Checker:
     def _outcome(self) -> Iterator[Fault]:
         """Check what the outcome says of the cycles."""
         outcome = self._found.outcome
-        if self._imported or outcome is None or "repaired" in outcome or self._found.losses:
+        if self._imported or outcome is None or outcome.repaired or self._found.losses:
             return
-        stated = outcome.get("lost_packets")
-        if stated is not None and stated != str(self._gaps):
+        stated = outcome.lost_packets
+        if stated is not None and stated != self._gaps:
             yield "outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}"
 
 
@@ -334,7 +342,7 @@ def check_archive(path: str | PathLike[str]) -> Check:
     for fault in found.faults:
         faults.setdefault(fault.aspect, []).append(fault.text)
     if found.metadata is None:
-        if not any(repr(schema.METADATA) in text for text in faults.get("metadata", ())):
+        if not any(repr(METADATA) in text for text in faults.get("metadata", ())):
             raise _another_kind(found)
         described = ["without the record hil the rest cannot be checked"]
     else:
@@ -350,16 +358,16 @@ def check_archive(path: str | PathLike[str]) -> Check:
         version=(found.metadata or {}).get("format_version", "unknown"),
         faults={aspect: _shortened(faults[aspect]) for aspect in ASPECTS if faults.get(aspect)},
         samples=found.samples,
-        repaired=(found.outcome or {}).get("repaired") == "yes",
+        repaired=found.outcome is not None and found.outcome.repaired,
     )
 
 
 def _another_kind(found: Survey) -> NotAnArchiveError:
     if found.size == 0:
         return NotAnArchiveError(found.path, "is empty")
-    if found.header is None:
+    if found.written_by is None:
         return NotAnArchiveError(found.path, "is not an MCAP file")
-    profile, library = found.header
+    profile, library = found.written_by
     return NotAnArchiveError(
         found.path,
         f"is an MCAP file of profile {profile!r} written by {library!r}, but not an archive of hil",
@@ -373,34 +381,31 @@ def _shortened(texts: list[str]) -> tuple[str, ...]:
     return tuple([*unique[:_MOST], f"and {more} more of the kind"] if more > 0 else unique)
 
 
-def _description_faults(path: Path, metadata: Mapping[str, str]) -> list[str]:
+def _description_faults(path: Path, entries: Mapping[str, str]) -> list[str]:
     """What is wrong with the ``hil`` record."""
+    if not is_known(entries):
+        return [f"format_version is {entries.get('format_version')!r}, known is '{FORMAT_VERSION}'"]
     faults = []
-    version = metadata.get("format_version")
-    if version != str(schema.FORMAT_VERSION):
-        return [f"format_version is {version!r}, known is '{schema.FORMAT_VERSION}'"]
-    kind = metadata.get("kind")
+    kind = entries.get("kind", "")
     if kind not in KINDS:
         faults.append(f"kind is {kind!r}, not one of {', '.join(KINDS)}")
-    for read in (description.joint_names, description.attachment_names, description.period):
-        try:
-            read(metadata)
-        except DescriptionError as error:
-            faults.append(str(error))
-    if "period" not in metadata and kind != "imported":
+    try:
+        ArchiveHeader.of(entries)
+    except HeaderError as error:
+        faults += [f"{name} {problem}" for name, problem in error.problems.items()]
+    if "period" not in entries and kind != "imported":
         faults.append("period is missing")
     name = ArchiveName.parse(path)
     for key, value in (name.metadata() if name else {}).items():
-        if metadata.get(key) != value:
-            faults.append(f"{key} is {metadata.get(key)!r}, but the file name says {value!r}")
+        if entries.get(key) != value:
+            faults.append(f"{key} is {entries.get(key)!r}, but the file name says {value!r}")
     return faults
 
 
-def _outcome_faults(outcome: Mapping[str, str]) -> list[str]:
+def _outcome_faults(outcome: ArchiveOutcome) -> list[str]:
     """What is wrong with the ``hil.outcome`` record, but for its counts."""
-    word = outcome.get("outcome")
-    if word not in OUTCOMES:
-        return [f"outcome is {word!r}, not one of {', '.join(OUTCOMES)}"]
-    if checksums(outcome.get(schema.CHUNKS, "")) is None:
-        return [f"{schema.CHUNKS} is no list of checksums"]
+    if outcome.outcome not in OUTCOMES:
+        return [f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"]
+    if CHUNKS in outcome.record and outcome.chunks is None:
+        return [f"{CHUNKS} is no list of checksums"]
     return []

@@ -11,21 +11,23 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from hil.archive.mcap_writer import McapWriter
-from hil.archive.messages import LogMessage, encode_log
-from hil.archive.order import listed
-from hil.archive.schema import (
+from hil.archive.header import (
     CHUNKS,
     DESCRIPTION,
-    EVENT_CHANNEL,
     FORMAT_VERSION,
-    LIBRARY,
     METADATA,
     OUTCOME,
+    checksum,
+    listed,
+)
+from hil.archive.mcap_writer import McapWriter
+from hil.archive.messages import LogMessage, encode_log
+from hil.archive.schema import (
+    EVENT_CHANNEL,
+    LIBRARY,
     PROFILE,
     Batch,
     Channel,
-    checksum,
 )
 from hil.errors import ArchiveWriteError
 

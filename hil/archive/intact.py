@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from hil.archive import foreign_json, schema
+from hil.archive import schema
 from hil.archive.container import Record
+from hil.archive.header import ArchiveHeader, ArchiveOutcome
 
 NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
 """Channels that have one message of each sample."""
@@ -53,9 +54,10 @@ class Survey:
     Attributes:
         path: the file.
         size: its length.
-        header: profile and library, None where the record is damaged.
+        written_by: profile and library, None where the record is damaged.
         metadata: entries of the ``hil`` record, None where it is missing or damaged.
-        outcome: entries of ``hil.outcome``, likewise.
+        header: the same, parsed; None where they cannot be used.
+        outcome: the ``hil.outcome`` record, None where it is missing or damaged.
         attachments: names of those that stand.
         pieces: records that stand, but for ``hil`` and ``hil.outcome``, in the order of the file.
         definitions: schemas and channels that only the summary still has.
@@ -67,9 +69,10 @@ class Survey:
 
     path: Path
     size: int
-    header: tuple[str, str] | None = None
+    written_by: tuple[str, str] | None = None
     metadata: dict[str, str] | None = None
-    outcome: dict[str, str] | None = None
+    header: ArchiveHeader | None = None
+    outcome: ArchiveOutcome | None = None
     attachments: list[str] = field(default_factory=list)
     pieces: list[Piece] = field(default_factory=list)
     definitions: tuple[Record, ...] = ()
@@ -88,7 +91,7 @@ class Survey:
     @property
     def mixed(self) -> bool:
         """Whether begin and end are of two recordings, and the samples of nobody knows which."""
-        return not schema.belong_together(self.metadata, self.outcome)
+        return self.outcome is not None and not self.outcome.belongs_to(self.header)
 
     @property
     def samples(self) -> int:
@@ -99,8 +102,3 @@ class Survey:
     def events(self) -> int:
         """Events that stand."""
         return self.counts.get(schema.EVENTS, 0)
-
-
-def announced_attachments(metadata: dict[str, str]) -> list[str]:
-    """Names of the attachments that must be there."""
-    return list(foreign_json.names(metadata.get("attachments", "[]")) or ())

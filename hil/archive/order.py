@@ -11,7 +11,7 @@ Reader and survey ask the same questions here, in the order of the file.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import BinaryIO, Self
 
@@ -20,10 +20,15 @@ from numpy.typing import NDArray
 
 from hil.archive import container, index, schema
 from hil.archive.container import Damage, Record
-from hil.archive.description import DescriptionError, period
-from hil.whole_number import whole_number
+from hil.archive.header import (
+    METADATA,
+    OUTCOME,
+    ArchiveHeader,
+    ArchiveOutcome,
+    HeaderError,
+    checksum,
+)
 
-_DIGITS = 8  # of a checksum
 _BUT_METADATA = frozenset(range(256)) - {container.METADATA}
 
 
@@ -37,22 +42,6 @@ class Contested(Damage):
     def __init__(self, offset: int, reason: str, since: int) -> None:
         super().__init__(offset, reason)
         self.since = since
-
-
-def listed(checksums: Iterable[int]) -> str:
-    """The checksums of chunks as the outcome lists them."""
-    return "".join(f"{crc:08x}" for crc in checksums)
-
-
-def checksums(text: str) -> NDArray[np.uint32] | None:
-    """The checksums that such a list holds, shape (k,); None where it is none."""
-    try:
-        data = bytes.fromhex(text)
-    except ValueError:
-        return None
-    if len(text) != 2 * len(data) or len(text) % _DIGITS:
-        return None
-    return np.frombuffer(data, ">u4").astype(np.uint32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,20 +62,25 @@ class Written:
     def read(cls, stream: BinaryIO, size: int) -> Self:
         """Find it; the stream is left anywhere."""
         found = _records_of_ours(_indexed(stream, size))
-        if found.keys() != {schema.METADATA, schema.OUTCOME}:
+        if found.keys() != {METADATA, OUTCOME}:
             found = _records_of_ours(_walked(stream, size))
-        written = cls.of(found.get(schema.METADATA), found.get(schema.OUTCOME))
+        if found.keys() != {METADATA, OUTCOME}:
+            return cls()
+        try:
+            header = ArchiveHeader.of(found[METADATA])
+        except HeaderError:
+            return cls()
+        written = cls.of(header, ArchiveOutcome.of(found[OUTCOME]))
         # Another program that copies a file may cut its chunks anew, and then names itself.
         return written if _is_ours(stream, size) else replace(written, chunks=None)
 
     @classmethod
-    def of(cls, metadata: Mapping[str, str] | None, outcome: Mapping[str, str] | None) -> Self:
-        """What the outcome says, given both records as they stand."""
-        if metadata is None or outcome is None:
-            return cls()
-        if not schema.belong_together(metadata, outcome):
+    def of(cls, header: ArchiveHeader, outcome: ArchiveOutcome) -> Self:
+        """What the outcome says of the recording with this header."""
+        if not outcome.belongs_to(header):
             return cls(strange=True)
-        return cls(checksums(outcome.get(schema.CHUNKS, "-")), _ends(metadata, outcome))
+        chunks = None if outcome.chunks is None else np.array(outcome.chunks, np.uint32)
+        return cls(chunks, _ends(header, outcome))
 
 
 class Order:
@@ -180,14 +174,10 @@ class Order:
         raise Contested(size, reason, self._newest)
 
 
-def _ends(metadata: Mapping[str, str], outcome: Mapping[str, str]) -> tuple[int, int] | None:
+def _ends(header: ArchiveHeader, outcome: ArchiveOutcome) -> tuple[int, int] | None:
     """Stamps of the first and the last cycle; None of what was repaired or has no cycles."""
-    try:
-        step = period(metadata)
-    except DescriptionError:
-        return None
-    first, last = (whole_number(outcome.get(key)) for key in ("first_cycle", "last_cycle"))
-    if step is None or "repaired" in outcome or first is None or last is None:
+    step, first, last = header.period, outcome.first_cycle, outcome.last_cycle
+    if step is None or outcome.repaired or first is None or last is None:
         return None
     if first > last:  # earlier versions took two sessions
         return None
@@ -213,7 +203,7 @@ def _records_of_ours(records: Iterable[Record]) -> dict[str, dict[str, str]]:
         for record in records:
             name, entries = container.metadata(record)
             claimed = entries.pop("checksum", None)
-            if name in (schema.METADATA, schema.OUTCOME) and claimed == schema.checksum(entries):
+            if name in (METADATA, OUTCOME) and claimed == checksum(entries):
                 found.setdefault(name, entries)
     except Damage:
         pass  # what comes behind it cannot be found this way

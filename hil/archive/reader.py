@@ -20,15 +20,24 @@ from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
 from hil.archive.chunk import Bytes, ChunkParser, Messages
 from hil.archive.columns import Columns
 from hil.archive.container import Damage, Record
-from hil.archive.description import Description, DescriptionError
 from hil.archive.events import ArchivedEvent
+from hil.archive.header import (
+    FORMAT_VERSION,
+    METADATA,
+    OUTCOME,
+    ArchiveHeader,
+    ArchiveOutcome,
+    HeaderError,
+    checksum,
+    is_known,
+)
 from hil.archive.index import Summary
 from hil.archive.intact import NUMBERS
 from hil.archive.messages import check_joints, decode_log, joint_state_of
 from hil.archive.order import Contested, Order, Written
-from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, LATER_FIELDS, METADATA
+from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
-from hil.reading import opened
+from hil.reading import json_of, opened
 
 _NANOSECONDS = 1_000_000_000
 _ALWAYS = 1 << 63  # ns, beyond every stamp
@@ -88,7 +97,6 @@ class Selection:
         return self.topics is None or schema.EVENTS in self.topics
 
 
-_NEEDED = ("kind", "joint_names", "attachments")
 _MOST_EXPECTED = 1 << 20  # samples that room is made for on the word of one chunk
 _MARGIN = 1.3  # room for chunks that are smaller than the one the count is guessed from
 _BATCH = 1 << 20  # bytes of chunks decoded at once: few calls per chunk, and all in the cache
@@ -114,8 +122,9 @@ class Content:
 
     def __init__(self, selection: Selection, order: Order, *, gapless: bool = True) -> None:
         self.metadata: dict[str, str] | None = None
-        self.description: Description | None = None
-        self.outcome: dict[str, str] | None = None
+        self.header: ArchiveHeader | None = None
+        self.unusable: HeaderError | None = None
+        self.outcome: ArchiveOutcome | None = None
         self.attachments: dict[str, bytes] = {}
         self.events: list[ArchivedEvent] = []
         self.parser = ChunkParser()
@@ -172,33 +181,31 @@ class Content:
 
     def _take_metadata(self, record: Record) -> None:
         name, entries = container.metadata(record)
-        if name not in (schema.METADATA, schema.OUTCOME):
+        if name not in (METADATA, OUTCOME):
             return
         claimed = entries.pop("checksum", None)
-        if claimed != schema.checksum(entries):
+        if claimed != checksum(entries):
             raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
-        if name == schema.OUTCOME:
-            if not schema.belong_together(self.metadata, entries):
+        if name == OUTCOME:
+            outcome = ArchiveOutcome.of(entries)
+            if not outcome.belongs_to(self.header):
                 reason = f"(metadata {name!r}) is that of another recording"
                 raise Damage(record.offset, reason)
-            self.outcome = {key: entries[key] for key in entries if key not in schema.SEALS}
+            self.outcome = outcome
             return
         if self.metadata is not None:
             raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
-        if entries.get("format_version") != str(schema.FORMAT_VERSION):
-            self.metadata = entries
-            raise Damage(record.offset, "is of another version")
-        absent = [key for key in _NEEDED if key not in entries]
-        if absent:
-            raise Damage(record.offset, f"(metadata {name!r}) has no entry {absent[0]!r}")
         self.metadata = entries
+        if not is_known(entries):
+            raise Damage(record.offset, "is of another version")
         try:
-            self.description = Description.of(entries)
-        except DescriptionError as error:
+            self.header = ArchiveHeader.of(entries)
+        except HeaderError as error:
+            self.unusable = error
             raise Damage(record.offset, f"(metadata {name!r}) cannot be used: {error}") from error
 
     def _take_chunk(self, record: Record) -> None:
-        if self.description is None:
+        if self.header is None:
             return  # some other MCAP file, which will be refused as such
         data = container.chunk_data(record, decompressor=self._decompressor)
         self._order.check_chunk(container.chunk(record).crc, record.offset)
@@ -279,8 +286,8 @@ class Content:
         return topic in schema.PER_CYCLE and schema.CYCLE in self.parser.known.topics
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout:
-        assert self.description is not None
-        joints = self.description.joint_names
+        assert self.header is not None
+        joints = self.header.joint_names
         if topic in (schema.MEASURED, schema.COMMANDED):
             names, layout = joint_state_of(messages.first())
             check_joints(names, layout, joints)
@@ -307,13 +314,13 @@ class Content:
 
     def _check_counts(self, size: int) -> None:
         """Compare what was read with what the writer says it wrote."""
-        if self.description is None:
+        if self.header is None:
             return
-        absent = sorted(set(self.description.attachments) - set(self.attachments))
+        absent = sorted(set(self.header.attachments) - set(self.attachments))
         if absent:
             raise Damage(size, f"(attachment {absent[0]!r}) is missing")
         if self.outcome is None:
-            raise Damage(size, f"(metadata {schema.OUTCOME!r}) is missing")
+            raise Damage(size, f"(metadata {OUTCOME!r}) is missing")
         if not self._gapless:
             return
         counts = {"samples": max([channel.read for channel in self._channels.values()], default=0)}
@@ -324,8 +331,9 @@ class Content:
         elif schema.PACKETS in (self._selection.topics or ()):
             counts["packets"] = counts.pop("samples")
         for key, count in counts.items():
-            if self.outcome.get(key) != str(count):
-                raise Damage(size, f"is missing: {self.outcome.get(key)} {key} were written")
+            stated = getattr(self.outcome, key)
+            if stated != count:
+                raise Damage(size, f"is missing: {stated} {key} were written")
         self._order.check_end(size)
 
 
@@ -436,10 +444,9 @@ class Archive:
 
     Attributes:
         path: the file.
-        metadata: entries of the ``hil`` record.
-        outcome: entries of the ``hil.outcome`` record, None when it is missing.
+        header: what it says of itself.
+        outcome: how the recording ended, None when that is missing.
         attachments: content by file name.
-        joint_names: joints in the order of the columns.
         columns: contiguous read-only arrays (m,) or (m, n) by name: the fields of the cycle
             message, or ``position``, ``velocity``, ``torque`` and ``motor_current`` of an imported
             recording as far as it has them; and ``stamp`` (m,), nanoseconds.
@@ -448,10 +455,9 @@ class Archive:
     """
 
     path: Path
-    metadata: Mapping[str, str]
-    outcome: Mapping[str, str] | None
+    header: ArchiveHeader
+    outcome: ArchiveOutcome | None
     attachments: Mapping[str, bytes]
-    joint_names: tuple[str, ...]
     columns: Mapping[str, NDArray[Any]]
     events: tuple[ArchivedEvent, ...]
     damage: ArchiveDamage | None
@@ -469,13 +475,17 @@ class Archive:
     @property
     def kind(self) -> str:
         """Why the arm moved, one of `hil.archive.KINDS`."""
-        return self.metadata["kind"]
+        return self.header.kind
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints in the order of the columns."""
+        return self.header.joint_names
 
     @property
     def period(self) -> float | None:
         """Cycle time [s]; None for an imported recording without a fixed one."""
-        text = self.metadata.get("period")
-        return None if text is None else float(text)
+        return self.header.period
 
     @property
     def n_samples(self) -> int:
@@ -517,6 +527,25 @@ class Archive:
                 field=name,
                 remedy="import the recording again with a URDF or a cell file in UTF-8",
             ) from error
+
+    def table(self, name: str) -> dict[str, Any]:
+        """An attachment that is a JSON object; empty where it is not there.
+
+        Raises:
+            ArchiveError: it is no JSON object.
+        """
+        try:
+            found = json_of(self.attachments.get(name, b"{}"))
+        except ValueError:
+            found = None
+        if not isinstance(found, dict):
+            raise ArchiveError(
+                self.path,
+                "is no JSON object",
+                field=name,
+                remedy="leave the archive out, or take the attachment from another of its campaign",
+            )
+        return found
 
     def cycles(self) -> Rows:
         """The cycle records as the session wrote them, structure of `drivers.cycle_dtype`.
@@ -581,17 +610,16 @@ def open_archive(
         raise ArchiveError(
             path, "does not fit into memory", remedy="read a part of its time, or fewer columns"
         ) from error
-    metadata = _checked_metadata(path, size, content, damage)
+    header = _checked_header(path, size, content, damage)
     if damage is None:
         _check_topics(path, content, selection)
     columns = content.columns()
     stamp = columns["stamp"] if fields is None or fields else None
     return Archive(
         path=path,
-        metadata=metadata,
+        header=header,
         outcome=content.outcome,
         attachments=content.attachments,
-        joint_names=_described(path, metadata).joint_names,
         columns=columns,
         events=tuple(content.events),
         damage=None if damage is None else _damage(damage, size, content, stamp),
@@ -654,19 +682,23 @@ def _check_topics(path: Path, content: Content, selection: Selection) -> None:
             )
 
 
-def _checked_metadata(
+def _checked_header(
     path: Path, size: int, content: Content, damage: Damage | None
-) -> Mapping[str, str]:
-    """The ``hil`` record, whose version we know."""
+) -> ArchiveHeader:
+    """The header, whose version we know."""
+    if content.header is not None:
+        return content.header
+    if content.unusable is not None:
+        field, problem = next(iter(content.unusable.problems.items()))
+        remedy = f"what wrote this archive does not keep the profile: its record {METADATA!r} "
+        raise ArchiveError(path, problem, field=field, remedy=f"{remedy}must be mended there")
     if content.metadata is not None:
         version = content.metadata.get("format_version")
-        if version != str(FORMAT_VERSION):
-            raise ArchiveVersionError(
-                path,
-                f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
-                remedy="install a newer hil",
-            )
-        return content.metadata
+        raise ArchiveVersionError(
+            path,
+            f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
+            remedy="install a newer hil",
+        )
     remedy = "record it again"
     if size == 0:
         problem = "is empty: the recording ended before anything was written"
@@ -679,19 +711,6 @@ def _checked_metadata(
     else:
         problem = f"is torn before its first data: the record at byte {damage.offset} {damage}"
     raise NotAnArchiveError(path, problem, remedy=remedy)
-
-
-def _described(path: Path, metadata: Mapping[str, str]) -> Description:
-    try:
-        return Description.of(metadata)
-    except DescriptionError as error:
-        raise ArchiveError(
-            path,
-            error.problem,
-            field=error.field,
-            remedy=f"what wrote this archive does not keep the profile: its record {METADATA!r} "
-            "must be mended there",
-        ) from error
 
 
 def _damage(

@@ -18,17 +18,15 @@ from typing import IO, BinaryIO
 
 import zstandard
 
-from hil.archive import container, foreign_json, index, schema
+from hil.archive import container, header, index, schema
 from hil.archive.container import Record
-from hil.archive.description import Description, DescriptionError
+from hil.archive.header import ArchiveOutcome
 from hil.archive.index import IndexBuilder, MessageHead
-from hil.archive.intact import Piece, Survey, announced_attachments
-from hil.archive.order import listed
+from hil.archive.intact import Piece, Survey
 from hil.archive.reader import open_archive
 from hil.archive.rewrite import write_anew
 from hil.archive.survey import HEADER, survey
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
-from hil.whole_number import whole_number
 
 _SEQUENCE_AT = container.RECORD.size + 2  # in a message record
 
@@ -83,7 +81,7 @@ def repair(
     """
     path = Path(path)
     found = survey(path)
-    if not _is_described(found):
+    if found.header is None or found.metadata is None or not header.is_known(found.metadata):
         open_archive(path, fields=())  # says why it is none
         raise NotAnArchiveError(path, "is not an archive")
     if found.mixed:
@@ -102,21 +100,10 @@ def repair(
     )
 
 
-def _is_described(found: Survey) -> bool:
-    """Whether the file says what is in it, in words that we know."""
-    if found.metadata is None:
-        return False
-    try:
-        Description.of(found.metadata)
-    except DescriptionError:
-        return False
-    return found.metadata.get("format_version") == str(schema.FORMAT_VERSION)
-
-
 def _samples_lost(found: Survey) -> int | None:
     if not found.losses:
         return 0
-    stated = None if found.outcome is None else whole_number(found.outcome.get("samples"))
+    stated = None if found.outcome is None else found.outcome.samples
     return None if stated is None else max(0, stated - found.samples)
 
 
@@ -148,7 +135,7 @@ class ArchiveCopy:
         """Write the file."""
         assert found.metadata is not None
         self._put(container.MAGIC + HEADER)
-        self._metadata(schema.METADATA, _description(found))
+        self._metadata(header.METADATA, _description(found))
         announced = False
         for piece in found.pieces:
             if piece.opcode == container.CHUNK and not announced:
@@ -156,7 +143,7 @@ class ArchiveCopy:
                 for record in found.definitions:
                     self._announce(record)
             self._piece(piece)
-        self._metadata(schema.OUTCOME, _outcome(found, self._checksums))
+        self._metadata(header.OUTCOME, _outcome(found, self._checksums))
         self._put(self._index.tail(self._offset))
 
     def _put(self, data: bytes) -> None:
@@ -164,7 +151,7 @@ class ArchiveCopy:
         self._offset += len(data)
 
     def _metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        data = index.metadata(name, {**entries, "checksum": schema.checksum(entries)})
+        data = index.metadata(name, {**entries, "checksum": header.checksum(entries)})
         self._index.add_metadata(self._offset, len(data), name)
         self._put(data)
 
@@ -216,8 +203,8 @@ def _renumbered(data: bytes, piece: Piece) -> bytes:
 
 def _description(found: Survey) -> dict[str, str]:
     """The ``hil`` record: as it was, without the attachments that are lost."""
-    assert found.metadata is not None
-    announced = announced_attachments(found.metadata)
+    assert found.metadata is not None and found.header is not None
+    announced = [*found.header.attachments]
     kept = [name for name in announced if name in found.attachments]
     if kept == announced:
         return found.metadata
@@ -226,21 +213,24 @@ def _description(found: Survey) -> dict[str, str]:
 
 def _outcome(found: Survey, chunks: Sequence[int]) -> dict[str, str]:
     """The ``hil.outcome`` record of a file of these chunks: as it was where nothing is lost."""
+    lists = {header.CHUNKS: header.listed(chunks)}
     if not found.losses and found.outcome is not None:
-        lists = {schema.CHUNKS: listed(chunks)} if schema.CHUNKS in found.outcome else {}
-        return {**found.outcome, **lists}  # other than before if another program cut the chunks
-    before = found.outcome or {"outcome": "unknown", "reason": "the outcome is lost"}
-    lost, lost_before = _samples_lost(found), whole_number(before.get("repaired.samples_lost", "0"))
-    known = lost is not None and lost_before is not None
-    earlier = foreign_json.names(before.get("repaired.losses", "[]")) or ()
+        record = found.outcome.record  # other chunks than before if another program cut them
+        return {**record, **(lists if header.CHUNKS in record else {})}
+    unknown = {"outcome": "unknown", "reason": "the outcome is lost"}
+    outcome = found.outcome or ArchiveOutcome.of(unknown)
+    before, lost = outcome.record, _samples_lost(found)
+    known = lost is not None and outcome.samples_lost is not None
     return {
         **before,
-        schema.DESCRIPTION: schema.checksum(_description(found)),
-        schema.CHUNKS: listed(chunks),
+        header.DESCRIPTION: header.checksum(_description(found)),
+        **lists,
         "samples": str(found.samples),
         "events": str(found.events),
         **({"packets": str(found.counts.get(schema.PACKETS, 0))} if "packets" in before else {}),
         "repaired": "yes",
-        "repaired.samples_lost": str((lost or 0) + (lost_before or 0)) if known else "unknown",
-        "repaired.losses": json.dumps([*earlier, *found.losses]),
+        "repaired.samples_lost": str((lost or 0) + (outcome.samples_lost or 0))
+        if known
+        else "unknown",
+        "repaired.losses": json.dumps([*outcome.losses, *found.losses]),
     }

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import json
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -21,19 +19,8 @@ from hil.archive.messages import joint_state_layout
 
 Array = NDArray[np.float64]
 
-FORMAT_VERSION = 1
 PROFILE = "ros2"
 LIBRARY = "hil"  # without version: the same recording gives the same bytes
-METADATA = "hil"
-OUTCOME = "hil.outcome"
-DESCRIPTION = "description"
-"""Entry of the outcome: checksum of the ``hil`` record it belongs to. Older files have none."""
-CHUNKS = "chunks"
-"""Entry of the outcome: the checksums of all chunks in order. Older files have none."""
-SEALS = (DESCRIPTION, CHUNKS)
-"""Entries of the outcome that serve to verify the file, and say nothing of the recording."""
-CONTROLLERS_OWN = "controller"
-"""Metadata entry ``motion`` of an archive whose motion was made by the controller's own program."""
 
 CYCLE = "/hil/cycle"
 MEASURED = "/joint_states"
@@ -208,19 +195,6 @@ def check_fields(topic: str, layout: MessageLayout, n_joints: int) -> None:
             raise LayoutError(f"they have no {name}")
         if name in found and found[name][0] != kind:
             raise LayoutError(f"their {name} is not that of {n_joints} joints")
-
-
-def checksum(entries: Mapping[str, str]) -> str:
-    """CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
-    text = json.dumps(dict(entries), sort_keys=True, separators=(",", ":"))
-    return f"{zlib.crc32(text.encode()):08x}"
-
-
-def belong_together(metadata: Mapping[str, str] | None, outcome: Mapping[str, str] | None) -> bool:
-    """Whether an outcome is that of the recording which the ``hil`` record describes, if known."""
-    if metadata is None or outcome is None:
-        return True
-    return outcome.get(DESCRIPTION) in (None, checksum(metadata))
 
 
 def _stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:

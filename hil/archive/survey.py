@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -21,8 +22,16 @@ from numpy.typing import NDArray
 
 from hil.archive import container, index, schema
 from hil.archive.container import Damage, Record
+from hil.archive.header import (
+    METADATA,
+    OUTCOME,
+    ArchiveHeader,
+    ArchiveOutcome,
+    HeaderError,
+    checksum,
+)
 from hil.archive.index import IndexBuilder, MessageHead, Summary
-from hil.archive.intact import NUMBERS, Fault, Piece, Survey, announced_attachments
+from hil.archive.intact import NUMBERS, Fault, Piece, Survey
 from hil.archive.known_channels import KnownChannels
 from hil.archive.order import Contested, Order, Written
 from hil.errors import ArchiveError
@@ -179,7 +188,7 @@ class _Surveyor:
         try:
             if record.opcode == container.HEADER:
                 fields = container.Fields(record.body, record.offset)
-                self.survey.header = fields.text(), fields.text()
+                self.survey.written_by = fields.text(), fields.text()
             elif record.opcode == container.METADATA:
                 self._metadata(record)
             elif record.opcode == container.ATTACHMENT:
@@ -218,18 +227,20 @@ class _Surveyor:
     def _metadata(self, record: Record) -> None:
         name, entries = container.metadata(record)
         self._index.add_metadata(record.offset, record.end - record.offset, name)
-        if name not in (schema.METADATA, schema.OUTCOME):
+        if name not in (METADATA, OUTCOME):
             self._keep(record)
             return
-        if entries.pop("checksum", None) != schema.checksum(entries):
+        if entries.pop("checksum", None) != checksum(entries):
             raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
-        known = self.survey.metadata if name == schema.METADATA else self.survey.outcome
-        if known is not None:
+        survey = self.survey
+        if (survey.metadata if name == METADATA else survey.outcome) is not None:
             raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
-        if name == schema.METADATA:
-            self.survey.metadata = entries
-        else:
-            self.survey.outcome = entries
+        if name == OUTCOME:
+            survey.outcome = ArchiveOutcome.of(entries)
+            return
+        survey.metadata = entries
+        with suppress(HeaderError):
+            survey.header = ArchiveHeader.of(entries)
 
     def _attachment(self, record: Record) -> None:
         name, _ = container.attachment(record)
@@ -371,9 +382,9 @@ class _Surveyor:
         for topic in self._known.topics:
             found = self._known.schema(topic)
             survey.types[topic] = found.name if found else ""
-        if survey.header != (schema.PROFILE, schema.LIBRARY):
+        if survey.written_by != (schema.PROFILE, schema.LIBRARY):
             self._fault("container", "the header is not that of the profile", loss=False)
-        for name in announced_attachments(survey.metadata):
+        for name in survey.header.attachments if survey.header else ():
             if name not in survey.attachments:
                 self._fault("attachments", f"attachment {name!r} is missing", loss=True)
         self._check_outcome()
@@ -388,17 +399,18 @@ class _Surveyor:
             self._fault("outcome", "the outcome is that of another recording", loss=True)
         topic = self._known.topic
         cycles = [at for channel, at in self._next.items() if topic(channel) == schema.CYCLE]
-        if str(max(cycles, default=0)) == outcome.get("samples"):
+        if max(cycles, default=0) == outcome.samples:
             self._order.check_end(self.survey.size)
         counts = {"samples": self.survey.samples, "events": self.survey.events}
-        if "packets" in outcome:
+        stated = {"samples": outcome.samples, "events": outcome.events}
+        if outcome.packets is not None:
             counts["packets"] = self.survey.counts.get(schema.PACKETS, 0)
-        stated = {key: outcome.get(key) for key in counts}
+            stated["packets"] = outcome.packets
         if self._order.listed is not None:
             counts["chunks"] = sum(p.opcode == container.CHUNK for p in self.survey.pieces)
-            stated["chunks"] = str(self._order.listed)
+            stated["chunks"] = self._order.listed
         for key, count in counts.items():
-            if stated[key] != str(count):
+            if stated[key] != count:
                 text = f"{stated[key]} {key} were written, {count} are there"
                 self._fault("outcome", text, loss=True)
 

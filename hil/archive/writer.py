@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hil.archive.cdr import Rows
 from hil.archive.events import ArchivedEvent, Level
 from hil.archive.file_writer import ArchiveFile
-from hil.archive.names import KINDS, ArchiveName
+from hil.archive.header import KINDS, ArchiveName
 from hil.archive.schema import CycleEncoder, PacketEncoder
 from hil.errors import ArchiveWriteError
 

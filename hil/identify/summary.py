@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import foreign_json
+from hil.archive import ArchiveHeader
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.results import (
@@ -127,13 +125,13 @@ def summarise(
         for source, samples in zip(sources.training, training, strict=True)
     ]
     gram = information(_executed(cell.model, training, rows))
-    simulated = sources.metadata.get("simulated") == "yes"
-    truth = planted_in(cell, sources.metadata) if simulated else None
+    simulated = sources.header.only_simulated
+    truth = planted_in(cell, sources.header) if simulated else None
     return Results(
         name=name,
         cell=cell.name,
         simulated=simulated,
-        effects=json.loads(sources.metadata.get("effects", "[]")),
+        effects=[*sources.header.effects],
         joint_names=list(model.joint_names),
         period=_period(training[0]),
         software=software(),
@@ -176,22 +174,17 @@ def summarise(
     )
 
 
-def planted_in(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
+def planted_in(cell: Cell, header: ArchiveHeader) -> Array | None:
     """What was planted in the simulated arm (p,): as the archive says, or else its cell.
 
     None where neither says it, and where the archive does not say it of each parameter.
     """
-    if "planted" in metadata:
-        told, names = foreign_json.loads(metadata["planted"]), cell.model.parameter_names
-        if not isinstance(told, dict) or not all(_is_number(told.get(name)) for name in names):
-            return None
-        return np.array([told[name] for name in names], dtype=np.float64)
-    return planted_values(cell) if cell.file.simulation else None
-
-
-def _is_number(value: object) -> bool:
-    most = sys.float_info.max
-    return isinstance(value, int | float) and type(value) is not bool and -most <= value <= most
+    planted, names = header.planted, cell.model.parameter_names
+    if planted is None:
+        return planted_values(cell) if cell.file.simulation else None
+    if not planted.keys() >= {*names}:
+        return None
+    return np.array([planted[name] for name in names])
 
 
 def _period(samples: Samples) -> float:

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 import lz4.frame
 import zstandard
 
-from hil.archive import container, schema
+from hil.archive import container, header
+from hil.archive.header import listed
 from hil.archive.index import IndexBuilder
-from hil.archive.order import listed
 from tests.fuzz.mutate_bytes import mutate_bytes
 from tests.fuzz.mutate_text import mutate_text
 
@@ -107,7 +107,7 @@ def put_together(records: list[Record], *, index: bool) -> bytes:
     described, checksums = _described(records), list[int]()
     for one in records:
         at = len(file)
-        body = _sealed(one, {schema.DESCRIPTION: described, schema.CHUNKS: listed(checksums)})
+        body = _sealed(one, {header.DESCRIPTION: described, header.CHUNKS: listed(checksums)})
         if one.opcode == CHUNK and len(body) >= _CHUNK.size:
             checksums.append(_CHUNK.unpack_from(body)[3])
         file += _HEAD.pack(one.opcode, len(body)) + body
@@ -139,9 +139,9 @@ def _described(records: list[Record]) -> str:
     for one in records:
         with contextlib.suppress(Exception):  # damaged beyond reading: nothing to repeat
             name, entries = _entries(one.body) if one.opcode == METADATA else ("", {})
-            if name == schema.METADATA:
+            if name == header.METADATA:
                 entries.pop("checksum", None)
-                return schema.checksum(entries)
+                return header.checksum(entries)
     return ""
 
 
@@ -160,7 +160,7 @@ def _sealed(one: Record, seals: dict[str, str]) -> bytes:
             name, entries = _entries(one.body)
             if entries.pop("checksum", None) is not None:
                 entries |= {key: seals[key] for key in seals if key in entries}
-                return _metadata(name, {**entries, "checksum": schema.checksum(entries)})
+                return _metadata(name, {**entries, "checksum": header.checksum(entries)})
     return one.body
 
 

@@ -18,7 +18,7 @@ import pytest
 from drivers import CyclicPacket, Guard, Session
 from drivers.transports.can import answers, ends
 from drivers.transports.can.ends import ControllerEnd, PcEnd
-from hil.archive import foreign_json, open_archive
+from hil.archive import open_archive, reader
 from hil.errors import ArchiveError
 from tests.fuzz import __main__ as command
 from tests.fuzz import findings, journal, keeping, lives, targets
@@ -107,7 +107,7 @@ class TestBrokenLawsAreFound:
     def test_a_table_of_a_stranger_that_is_taken_for_json(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(foreign_json, "loads", json.loads)
+        monkeypatch.setattr(reader, "json_of", json.loads)
         assert any(cause.startswith("JSONDecode") for cause in self.broken("archive", 60))
 
 

@@ -22,6 +22,7 @@ from hil.archive import (
     Samples,
     container,
     definitions,
+    header,
     open_archive,
     schema,
     write_samples,
@@ -149,7 +150,7 @@ class TestRoundTrip:
         assert archive.period == PERIOD
         assert archive.attachments == ATTACHMENTS
         expected = {"kind": "excitation", "index": "7", "attempt": "2", "campaign": "c1"}
-        assert expected.items() <= archive.metadata.items()
+        assert expected.items() <= archive.header.entries.items()
 
     def test_the_outcome_counts_what_was_written(self, tmp_path):
         rows = records(120)
@@ -157,7 +158,7 @@ class TestRoundTrip:
         with writer(tmp_path / NAME) as archive:
             archive.write(rows, torques(rows))
             archive.close("stopped", reason="Ctrl-C", details={"operator": "me"})
-        assert open_archive(tmp_path / NAME).outcome == {
+        assert open_archive(tmp_path / NAME).outcome.entries == {
             "outcome": "stopped",
             "reason": "Ctrl-C",
             "operator": "me",
@@ -366,16 +367,16 @@ class TestBadInput:
             raise RuntimeError("cable pulled")
         outcome = open_archive(tmp_path / NAME).outcome
         assert outcome is not None
-        assert outcome["outcome"] == "interrupted"
-        assert outcome["reason"] == "RuntimeError: cable pulled"
-        assert outcome["samples"] == "30"
+        assert outcome.outcome == "interrupted"
+        assert outcome.reason == "RuntimeError: cable pulled"
+        assert outcome.samples == 30
 
     def test_an_outcome_nobody_told_is_unknown(self, tmp_path):
         with writer(tmp_path / NAME):
             pass
         outcome = open_archive(tmp_path / NAME).outcome
         assert outcome is not None
-        assert outcome["outcome"] == "unknown"
+        assert outcome.outcome == "unknown"
 
     def test_a_file_that_is_not_there_is_named(self, tmp_path):
         with pytest.raises(ArchiveError, match=r"gone\.mcap: cannot be read: No such file"):
@@ -432,5 +433,5 @@ def test_the_documentation_shows_the_messages_as_they_are() -> None:
         assert definition.partition("=" * 80)[0].strip() in text
     for topic in (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.EVENTS):
         assert f"`{topic}`" in text
-    assert f"version {schema.FORMAT_VERSION}" in text.splitlines()[0]
+    assert f"version {header.FORMAT_VERSION}" in text.splitlines()[0]
     assert all(f"`{kind}`" in text for kind in KINDS)

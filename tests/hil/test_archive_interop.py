@@ -141,7 +141,7 @@ def test_mcap_finds_index_statistics_metadata_and_attachments(path: Path, ours: 
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         attachments = {record.name: record.data for record in reader.iter_attachments()}
     assert attachments == ours.attachments
-    assert ours.metadata.items() <= metadata["hil"].items()
+    assert ours.header.entries.items() <= metadata["hil"].items()
     assert metadata["hil.outcome"]["outcome"] == "completed"
 
 

@@ -199,7 +199,7 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
             link.run(player, spec, Stop())
         told = open_archive(path).outcome
         assert told is not None
-        assert told["outcome"] == "void"
+        assert told.outcome == "void"
 
 
 @pytest.mark.slow  # waits for a real second of silence; test_heartbeat shows the rule by itself
