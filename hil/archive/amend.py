@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from hil.archive.header import ArchiveOutcome
-from hil.archive.repair import ArchiveCopy
+from hil.archive.repair import copy_of
 from hil.archive.rewrite import write_anew
 from hil.archive.survey import survey
 from hil.errors import ArchiveError
@@ -36,10 +34,9 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
     found = survey(path)
     if found.faults or found.metadata is None or found.outcome is None:
         raise ArchiveError(path, "is not whole", remedy="repair it with `hil archive repair`")
-    record = {**found.outcome.record, "outcome": outcome, "reason": reason}
-    amended = replace(found, outcome=ArchiveOutcome.of(record))
+    amended = {"outcome": outcome, "reason": reason}
 
     def fill(stream: BinaryIO, output: IO[bytes]) -> None:
-        ArchiveCopy(stream, output).write(amended)
+        copy_of(found, stream, output, outcome=amended)
 
     write_anew(path, path, fill)

@@ -10,18 +10,18 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
-import zstandard
+from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from drivers.packet_records import LONGEST_PACKET
-from hil.archive import container, definitions, index, schema
+from hil.archive import container, definitions, schema
 from hil.archive.amend import REJECTED
 from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
-from hil.archive.chunk import ChunkParser, Messages
-from hil.archive.container import ChannelRecord, Damage, Record
+from hil.archive.chunk import KnownChannels, Messages
+from hil.archive.container import Record
 from hil.archive.header import (
     CHUNKS,
     FORMAT_VERSION,
@@ -33,11 +33,9 @@ from hil.archive.header import (
     HeaderError,
     is_known,
 )
-from hil.archive.intact import Survey
 from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
-from hil.archive.survey import survey
+from hil.archive.survey import Survey, Visit, survey
 from hil.errors import NotAnArchiveError
-from hil.reading import opened
 
 Fault = tuple[str, str]
 
@@ -57,69 +55,65 @@ _CYCLE_FIELDS = (
 _ADDED_LATER = 1  # fields at the end of the cycle that the first archives do not have
 
 
-def message_faults(found: Survey) -> Iterator[Fault]:
-    """What is wrong with schemas, channels and messages of what stands of an archive.
-
-    Yields:
-        Aspect of the profile, and what is wrong.
-    """
-    checker = _Checker(found)
-    with opened(found.path) as stream:
-        yield from checker.run(stream)
-
-
 class _Checker:
-    """Goes through the chunks that stand."""
+    """Checks chunks that stand, one after the other; then the rest.
 
-    def __init__(self, found: Survey) -> None:
-        header = found.header
-        assert header is not None
-        self._found = found
-        self._imported = header.kind == "imported"
-        self._joints = header.joint_names
-        self._period_ns = None if header.period is None else header.period * 1e9
-        self._parser = ChunkParser()
-        self._known = self._parser.known
+    Attributes:
+        faults: aspect of the profile, and what is wrong.
+    """
+
+    def __init__(self) -> None:
+        self.faults: list[Fault] = []
+        self._joints: tuple[str, ...] = ()
+        self._period_ns: float | None = None
+        self._known = KnownChannels()
         self._layouts: dict[str, MessageLayout | None] = {}
         self._last_cycle: int | None = None
         self._gaps = 0
-        self._decompressor = zstandard.ZstdDecompressor()
 
-    def run(self, stream: BinaryIO) -> Iterator[Fault]:
-        """All faults."""
-        for record in self._found.definitions:
-            self._known.take(record.opcode, record.body, record.offset)
-        for piece in self._found.pieces:
-            record = container.record_at(stream, piece.offset, piece.length)
-            if piece.opcode == container.CHUNK:
-                try:
-                    yield from self._chunk(record)
-                except Damage as damage:
-                    yield "chunks", f"the record at byte {damage.offset} {damage}"
-            elif piece.opcode in (container.SCHEMA, container.CHANNEL):
-                self._known.take(record.opcode, record.body, record.offset)
+    def visit(self, found: Survey, record: Record, messages: Mapping[str, Messages]) -> None:
+        """Check the next chunk."""
+        if found.header is not None:
+            self._joints, period = found.header.joint_names, found.header.period
+            self._period_ns = None if period is None else period * 1e9
+            self._known = found.parser.known
+            self.faults += self._chunk(record, messages)
+
+    def finish(self, found: Survey) -> None:
+        """Check channels and outcome."""
+        header, outcome = found.header, found.outcome
+        if header is None or not found.pieces:
+            return
+        imported = header.kind == "imported"
         if self._known.channels:
-            yield from self._channels()
-        yield from self._outcome()
+            self.faults += self._channels(imported=imported)
+        if imported or outcome is None or outcome.repaired or found.losses:
+            return
+        if outcome.lost_packets not in (None, self._gaps):
+            text = f"lost_packets is {outcome.lost_packets}, the cycles lack {self._gaps}"
+            self.faults.append(("outcome", text))
 
-    def _channels(self) -> Iterator[Fault]:
+    def _channels(self, *, imported: bool) -> Iterator[Fault]:
         """Check topics, types and encodings."""
         channels = {channel.topic: channel for channel in self._known.channels.values()}
         needed = {schema.MEASURED, schema.EVENTS}
-        if not self._imported:
+        if not imported:
             needed |= {schema.CYCLE, schema.COMMANDED}
         for topic in sorted(needed - channels.keys()):
             yield "channels", f"there is no {topic}"
         for topic in sorted(channels):
             yield from self._channel(channels[topic])
 
-    def _channel(self, channel: ChannelRecord) -> Iterator[Fault]:
+    def _channel(self, channel: Channel) -> Iterator[Fault]:
         expected = _expected(channel.topic, len(self._joints))
         if expected is None:
             return  # a later version may add channels
         name, definition = expected
-        if channel.encoding != "cdr":
-            yield "channels", f"{channel.topic} is encoded as {channel.encoding!r}, not 'cdr'"
+        if channel.message_encoding != "cdr":
+            yield (
+                "channels",
+                f"{channel.topic} is encoded as {channel.message_encoding!r}, not 'cdr'",
+            )
         found = self._known.schemas.get(channel.schema_id)
         if found is None:
             yield "schemas", f"{channel.topic} has none"
@@ -128,17 +122,16 @@ class _Checker:
             yield "channels", f"{channel.topic} is of type {found.name}, not {name}"
         if found.encoding != "ros2msg":
             yield "schemas", f"that of {channel.topic} is {found.encoding!r}, not 'ros2msg'"
-        if not _extends(found.definition, definition, fixed=channel.topic != schema.CYCLE):
+        if not _extends(_text(found), definition, fixed=channel.topic != schema.CYCLE):
             yield "schemas", f"that of {channel.topic} is not the text of the profile"
 
-    def _chunk(self, record: Record) -> Iterator[Fault]:
+    def _chunk(self, record: Record, found: Mapping[str, Messages]) -> Iterator[Fault]:
         place = f"the chunk at byte {record.offset}"
-        head = container.chunk(record)
-        if head.compression != "zstd":
-            yield "chunks", f"{place} is compressed with {head.compression or 'nothing'}, not zstd"
-        data = container.chunk_data(record, decompressor=self._decompressor)
-        yield from self._log_times(data, record.offset, place)
-        found = self._parser.messages(data, record.offset)
+        compression = container.chunk(record).compression
+        if compression != "zstd":
+            yield "chunks", f"{place} is compressed with {compression or 'nothing'}, not zstd"
+        if not all(_logged_in_time(messages) for messages in found.values()):
+            yield "times", f"{place} has messages logged at another time than their stamp"
         rows: dict[str, Rows] = {}
         for topic, messages in found.items():
             if topic == schema.EVENTS:
@@ -168,7 +161,7 @@ class _Checker:
                 record = self._known.schema(topic)
                 if record is None:
                     return None
-                layout = fixed_layout(record.definition)
+                layout = fixed_layout(_text(record))
                 schema.check_fields(topic, layout, len(self._joints))
                 return layout
             names, layout = joint_state_of(messages.first())
@@ -186,19 +179,6 @@ class _Checker:
         )
         known = names == self._joints and set(lengths.values()) <= {0, len(self._joints)}
         return layout if known and expected.template == layout.template else None
-
-    def _log_times(self, data: bytes, offset: int, place: str) -> Iterator[Fault]:
-        """Check log and publish times against the stamps in the messages."""
-        stamps = []
-        for item in index.messages(data, offset):
-            if isinstance(item, Record):
-                continue
-            seconds = int.from_bytes(data[item.data + 4 : item.data + 8], "little", signed=True)
-            rest = int.from_bytes(data[item.data + 8 : item.data + 12], "little")
-            if not item.log_time == item.publish_time == seconds * 10**9 + rest:
-                yield "times", f"{place} has messages logged at another time than their stamp"
-                return
-            stamps.append(item.log_time)
 
     def _cycles(self, rows: Mapping[str, Rows], place: str) -> Iterator[Fault]:
         """Check the cycles of a chunk, and the channels that repeat them."""
@@ -220,14 +200,17 @@ class _Checker:
             if topic in rows and not _repeats(rows[topic], cycles, columns):
                 yield "joint_states", f"{place} has messages of {topic} unlike its cycles"
 
-    def _outcome(self) -> Iterator[Fault]:
-        """Check what the outcome says of the cycles."""
-        outcome = self._found.outcome
-        if self._imported or outcome is None or outcome.repaired or self._found.losses:
-            return
-        stated = outcome.lost_packets
-        if stated is not None and stated != self._gaps:
-            yield "outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}"
+
+def _logged_in_time(messages: Messages) -> bool:
+    """Whether log and publish times are the stamps in the messages."""
+    stamps, logged = messages.stamps, messages.of_heads("log_time")
+    if stamps is None or not np.array_equal(logged, messages.of_heads("publish_time")):
+        return False
+    return np.array_equal(logged, stamps)
+
+
+def _text(record: Schema) -> str:
+    return record.data.decode(errors="replace")
 
 
 def _expected(topic: str, n_joints: int) -> tuple[str, str] | None:
@@ -337,7 +320,14 @@ def check_archive(path: str | PathLike[str]) -> Check:
         ArchiveError: it cannot be read.
     """
     path = Path(path)
-    found = survey(path)
+    checkers: list[_Checker] = []
+
+    def begin() -> Visit:
+        checkers.append(_Checker())
+        return checkers[-1].visit
+
+    found = survey(path, begin)
+    checkers[-1].finish(found)
     faults: dict[str, list[str]] = {}
     for fault in found.faults:
         faults.setdefault(fault.aspect, []).append(fault.text)
@@ -351,7 +341,7 @@ def check_archive(path: str | PathLike[str]) -> Check:
     if found.outcome is not None:
         faults.setdefault("outcome", []).extend(_outcome_faults(found.outcome))
     if not described and found.pieces:
-        for aspect, text in message_faults(found):
+        for aspect, text in checkers[-1].faults:
             faults.setdefault(aspect, []).append(text)
     return Check(
         path=path,

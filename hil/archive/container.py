@@ -1,8 +1,10 @@
 """The MCAP container as far as an archive needs it: records in file order, each verified.
 
+The `mcap` library reads and writes single records; files are walked here, because what is torn or
+forged must surface as `Damage` with its place, and a chunk stay compressed until it is wanted.
 Only the data section is believed. It is self-delimiting and its chunks and attachments carry
 checksums, so a file cut off anywhere can be read up to its last whole chunk; the index at the end
-is for other programs. Whatever is wrong with the bytes surfaces as `Damage`, with the place.
+is for other programs.
 
 Layout: https://mcap.dev/spec
 """
@@ -12,11 +14,25 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Collection, Iterator
-from typing import BinaryIO, NamedTuple
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any, BinaryIO, NamedTuple, Self, TypeVar
 
 import lz4.frame
 import zstandard
 from isal.isal_zlib import crc32  # ten times as fast as that of zlib
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    ChunkIndex,
+    Footer,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    SummaryOffset,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 LARGEST_CHUNK = 1 << 24  # bytes; ours have a tenth of a megabyte
@@ -44,6 +60,8 @@ FOOTER_SIZE = RECORD.size + 20
 _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
 _NO_CRC = 0
+_MOST_LISTED = 1 << 16  # bytes
+_Parsed = TypeVar("_Parsed", bound=McapRecord)
 FARTHEST = 1 << 62  # bytes, less than the end of any file
 
 
@@ -74,6 +92,16 @@ class Record(NamedTuple):
         """Where the next record begins."""
         return self.offset + RECORD.size + self.length
 
+    @property
+    def size(self) -> int:
+        """Bytes with its head."""
+        return RECORD.size + self.length
+
+    @property
+    def data(self) -> bytes:
+        """Its bytes as they stand in the file."""
+        return RECORD.pack(self.opcode, self.length) + self.body
+
 
 class Chunk(NamedTuple):
     """The head of a chunk record, and its compressed records."""
@@ -86,70 +114,68 @@ class Chunk(NamedTuple):
     data: memoryview
 
 
-class SchemaRecord(NamedTuple):
-    """A schema: how the messages of a channel are to be read."""
+class _Body(ReadDataStream):
+    """The fields of a record; running out is the end of the file, not a shorter field."""
 
-    id: int
-    name: str
-    encoding: str
-    definition: str
+    def __init__(self, body: bytes) -> None:
+        super().__init__(BytesIO(body))
+        self._size = len(body)
 
-
-class ChannelRecord(NamedTuple):
-    """A channel: a topic and the schema of its messages."""
-
-    id: int
-    schema_id: int
-    topic: str
-    encoding: str
+    def read(self, length: int) -> bytes:
+        if length > self._size - self.count:
+            raise EndOfFile
+        return super().read(length)
 
 
-class Fields:
-    """Reads the fields of a record body one after the other; running out is damage.
+def parsed(kind: type[_Parsed], body: bytes, offset: int) -> _Parsed:
+    """Read the body of a record that stands at `offset`.
 
-    Args:
-        body: the record without its head.
-        offset: where the record stands in the file, for the error.
+    Raises:
+        Damage: it is not one of this kind.
     """
+    try:
+        found: _Parsed = kind.read(_Body(body))  # type: ignore[attr-defined]
+    except EndOfFile:
+        raise Damage(offset, "is shorter than its fields") from None
+    except UnicodeDecodeError:
+        raise Damage(offset, "holds text that is not UTF-8") from None
+    return found
 
-    def __init__(self, body: bytes, offset: int) -> None:
-        self._body = body
-        self._offset = offset
-        self.at = 0
 
-    def number(self, code: str) -> int:
-        """Read a number; `code` is that of `struct`."""
-        size = struct.calcsize("<" + code)
-        value: int
-        (value,) = struct.unpack("<" + code, self._take(size))
-        return value
+def encoded(record: McapRecord) -> bytes:
+    """The bytes of a record, with its head."""
+    builder: Any = RecordBuilder()  # its methods are not annotated
+    record.write(builder)
+    return bytes(builder.end())
 
-    def text(self) -> str:
-        """Read a string."""
-        try:
-            return self._take(self.number("I")).decode()
-        except UnicodeDecodeError:
-            raise Damage(self._offset, "holds text that is not UTF-8") from None
 
-    def data(self, code: str) -> bytes:
-        """Read bytes whose count precedes them."""
-        return self._take(self.number(code))
+def bounds(data: bytes, at: int, offset: int) -> tuple[int, int]:
+    """Opcode and end of the record at `at`, in a chunk or summary that stands at `offset`.
 
-    def mapping(self) -> dict[str, str]:
-        """Read strings by name."""
-        end = self.number("I") + self.at
-        entries = {}
-        while self.at < end:
-            key = self.text()
-            entries[key] = self.text()
-        return entries
+    Raises:
+        Damage: it is cut off.
+    """
+    if len(data) - at < RECORD.size:
+        raise Damage(offset, "(chunk) ends within a record")
+    opcode, length = RECORD.unpack_from(data, at)
+    end = at + RECORD.size + length
+    if end > len(data):
+        raise Damage(offset, "(chunk) ends within a record")
+    return opcode, end
 
-    def _take(self, size: int) -> bytes:
-        part = self._body[self.at : self.at + size]
-        if len(part) != size:
-            raise Damage(self._offset, "is shorter than its fields")
-        self.at += size
-        return part
+
+def split(data: bytes, offset: int) -> Iterator[Record]:
+    """The records of a chunk or summary one by one, each with its place in it.
+
+    Raises:
+        Damage: the last one is cut off.
+    """
+    at = 0
+    while at < len(data):
+        opcode, end = bounds(data, at, offset)
+        body = data[at + RECORD.size : end]
+        yield Record(at, opcode, body, len(body))
+        at = end
 
 
 def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
@@ -237,39 +263,17 @@ def _check_end(tail: bytes, offset: int) -> None:
 
 def metadata(record: Record) -> tuple[str, dict[str, str]]:
     """Name and entries of a metadata record."""
-    fields = Fields(record.body, record.offset)
-    return fields.text(), fields.mapping()
+    found = parsed(Metadata, record.body, record.offset)
+    return found.name, found.metadata
 
 
-def attachment(record: Record) -> tuple[str, bytes]:
-    """Name and content of an attachment, its checksum verified."""
-    fields = Fields(record.body, record.offset)
-    fields.number("Q")
-    fields.number("Q")
-    name = fields.text()
-    fields.text()
-    data = fields.data("Q")
-    covered = record.body[: fields.at]
-    crc = fields.number("I")
-    if crc != crc32(covered):
-        raise Damage(record.offset, f"(attachment {name!r}) fails its checksum")
-    return name, data
-
-
-def schema(body: bytes, offset: int) -> SchemaRecord:
-    """Read a schema record that stands in a chunk at `offset`."""
-    fields = Fields(body, offset)
-    identity, name, encoding = fields.number("H"), fields.text(), fields.text()
-    definition = fields.data("I").decode(errors="replace")
-    if not identity:
-        raise Damage(offset, "(schema) has the number 0, which says that there is none")
-    return SchemaRecord(identity, name, encoding, definition)
-
-
-def channel(body: bytes, offset: int) -> ChannelRecord:
-    """Read a channel record that stands in a chunk at `offset`."""
-    fields = Fields(body, offset)
-    return ChannelRecord(fields.number("H"), fields.number("H"), fields.text(), fields.text())
+def attachment(record: Record) -> Attachment:
+    """An attachment, its checksum verified."""
+    found = parsed(Attachment, record.body, record.offset)
+    (crc,) = struct.unpack("<I", record.body[-4:])
+    if crc != crc32(record.body[:-4]):
+        raise Damage(record.offset, f"(attachment {found.name!r}) fails its checksum")
+    return found
 
 
 def chunk(record: Record) -> Chunk:
@@ -318,3 +322,128 @@ def _decompressed(chunk: Chunk, offset: int, decompressor: zstandard.ZstdDecompr
     if chunk.compression == "":
         return bytes(chunk.data)
     raise Damage(offset, f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4")
+
+
+def metadata_places(stream: BinaryIO, size: int) -> list[tuple[int, int]]:
+    """Offset and length of the metadata records as the end of a file lists them.
+
+    A few hundred bytes are read and nothing is verified: what stands there must verify itself.
+    """
+    footer = _footer(stream, size)
+    if footer is None:
+        return []
+    end = size - FOOTER_SIZE - len(MAGIC)
+    found: list[tuple[int, int]] = []
+    try:
+        start = footer.summary_offset_start
+        for item in _listed(stream, start, end - start):
+            group = parsed(SummaryOffset, item.body, start)
+            if group.group_opcode == METADATA_INDEX:
+                for one in _listed(stream, group.group_start, group.group_length):
+                    place = parsed(MetadataIndex, one.body, group.group_start)
+                    found.append((place.offset, place.length))
+    except Damage:
+        return []
+    return found
+
+
+def _listed(stream: BinaryIO, at: int, length: int) -> list[Record]:
+    """Short records that follow one another."""
+    if not 0 < length <= _MOST_LISTED or at > FARTHEST:
+        return []
+    stream.seek(at)
+    return [*split(stream.read(length), at)]
+
+
+def _footer(stream: BinaryIO, size: int) -> Footer | None:
+    """The record that ends a file; None where it does not."""
+    if size < FOOTER_SIZE + len(MAGIC):
+        return None
+    stream.seek(size - FOOTER_SIZE - len(MAGIC))
+    data = stream.read(FOOTER_SIZE + len(MAGIC))
+    if not data.endswith(MAGIC) or RECORD.unpack_from(data) != (FOOTER, FOOTER_SIZE - RECORD.size):
+        return None
+    return parsed(Footer, data[RECORD.size :], size)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The summary of a file as far as reading needs it.
+
+    Attributes:
+        definitions: schema and channel records.
+        chunks: in the order of the file.
+        others: offset and length of attachments and metadata.
+        statistics: the record's body, empty where there is none.
+    """
+
+    definitions: tuple[Record, ...]
+    chunks: tuple[ChunkIndex, ...]
+    others: tuple[tuple[int, int], ...]
+    statistics: bytes = b""
+
+    @classmethod
+    def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Self | None:
+        """Read it; None where there is none, or where it is not whole or lists nonsense.
+
+        Args:
+            stream: the file.
+            size: its length.
+            start: where the data section ends, of a file in which records have moved: then what
+                the summary lists may be elsewhere.
+        """
+        footer = _footer(stream, size)
+        if footer is None:
+            return None
+        moved, start = start is not None, footer.summary_start if start is None else start
+        end = size - FOOTER_SIZE - len(MAGIC)
+        if not len(MAGIC) <= start <= end <= start + LARGEST_RECORD or not footer.summary_crc:
+            return None
+        stream.seek(start)
+        data = stream.read(end + FOOTER_SIZE - 4 - start)
+        if crc32(data) != footer.summary_crc:
+            return None
+        try:
+            found = cls.parsed(data[: end - start])
+        except Damage:
+            return None
+        return found if moved or found._is_within(start) else None
+
+    @classmethod
+    def parsed(cls, data: bytes) -> Self:
+        """Read its records.
+
+        Raises:
+            Damage: they are not whole.
+        """
+        definitions, chunks, others, statistics = [], [], [], b""
+        for item in split(data, 0):
+            if item.opcode in (SCHEMA, CHANNEL):
+                definitions.append(item)
+            elif item.opcode == CHUNK_INDEX:
+                chunks.append(parsed(ChunkIndex, item.body, 0))
+            elif item.opcode == ATTACHMENT_INDEX:
+                attachment = parsed(AttachmentIndex, item.body, 0)
+                others.append((attachment.offset, attachment.length))
+            elif item.opcode == METADATA_INDEX:
+                metadata = parsed(MetadataIndex, item.body, 0)
+                others.append((metadata.offset, metadata.length))
+            elif item.opcode == STATISTICS:
+                statistics = item.body
+        chunks.sort(key=lambda entry: entry.chunk_start_offset)
+        return cls(tuple(definitions), tuple(chunks), tuple(sorted(others)), statistics)
+
+    @property
+    def places(self) -> list[tuple[int, int]]:
+        """Offset and length of all records that it lists."""
+        chunks = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in self.chunks]
+        return sorted([*chunks, *self.others])
+
+    def _is_within(self, end: int) -> bool:
+        """Whether what it lists lies before `end`, and nothing twice."""
+        at = len(MAGIC)
+        for offset, length in self.places:
+            if offset < at:
+                return False
+            at = offset + length
+        return at <= end

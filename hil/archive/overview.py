@@ -8,7 +8,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from hil.archive import container
 from hil.archive.header import WORDS, ArchiveHeader, ArchiveOutcome, motion_name
 from hil.archive.reader import Archive, open_archive
 from hil.archive.survey import survey
@@ -87,9 +86,9 @@ def overview(path: str | PathLike[str]) -> Overview:
         joint_names=archive.joint_names,
         size=found.size,
         per_minute=found.size / duration * 60.0 if duration else None,
-        chunks=sum(piece.opcode == container.CHUNK for piece in found.pieces),
+        chunks=found.chunks,
         channels=tuple(
-            (topic, found.types.get(topic, ""), count)
+            (topic, found.schema_name(topic), count)
             for topic, count in sorted(found.counts.items())
         ),
         attachments={name: len(data) for name, data in archive.attachments.items()},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -11,15 +12,13 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
 from hil.archive import container, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
-from hil.archive.chunk import Bytes, ChunkParser, Messages
-from hil.archive.columns import Columns
-from hil.archive.container import Damage, Record
+from hil.archive.chunk import Bytes, Messages, stamps
+from hil.archive.container import Damage, Record, Summary
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
     FORMAT_VERSION,
@@ -27,14 +26,10 @@ from hil.archive.header import (
     OUTCOME,
     ArchiveHeader,
     ArchiveOutcome,
-    HeaderError,
-    checksum,
     is_known,
 )
-from hil.archive.index import Summary
-from hil.archive.intact import NUMBERS
 from hil.archive.messages import check_joints, decode_log, joint_state_of
-from hil.archive.order import Contested, Order, Written
+from hil.archive.scan import NUMBERS, Contested, Order, Scan, Written
 from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import json_of, opened
@@ -99,44 +94,123 @@ class Selection:
 
 _MOST_EXPECTED = 1 << 20  # samples that room is made for on the word of one chunk
 _MARGIN = 1.3  # room for chunks that are smaller than the one the count is guessed from
+_FIRST_CAPACITY = 4096
 _BATCH = 1 << 20  # bytes of chunks decoded at once: few calls per chunk, and all in the cache
 _COLUMN_OF = {"effort": "torque"}  # where a message has another word for it than we
+_STAMP_FIELDS = ("sec", "nanosec")
 
 
-class _Waiting(NamedTuple):
-    """A chunk that passed its checksum and is decoded with others."""
+class _Block(NamedTuple):
+    """Fields of one type that lie side by side in a message: copied together, as bytes."""
 
-    offset: int
-    data: bytes
+    names: list[str]
+    start: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    raw: np.dtype[np.void]
+
+    @property
+    def end(self) -> int:
+        return self.start + len(self.names) * self.raw.itemsize
 
 
-class Content:
-    """What has been read from a file so far.
+class _Columns:
+    """Contiguous arrays, one per field of a message, appended to chunk by chunk.
+
+    Args:
+        layout: the messages; their time stamp becomes the column ``stamp`` in nanoseconds.
+        selection: fields and times wanted.
+    """
+
+    def __init__(self, layout: MessageLayout, selection: Selection) -> None:
+        self._layout = layout
+        self._times = selection.times if selection.bounded else None
+        self._blocks = _blocks(layout, selection.fields)
+        self._stamps = np.empty(0, np.int64)
+        self._arrays = [np.empty((len(block.names), 0), block.raw) for block in self._blocks]
+        self._count = 0
+
+    def verified(self, messages: Messages, offset: int) -> Bytes:
+        """The messages as bytes (k, size), which must be like those before."""
+        data = messages.matrix(self._layout.size)
+        if data is None or not self._layout.is_kept_by(data):
+            raise Damage(offset, "(chunk) has messages that differ from those before")
+        return data
+
+    def append(self, messages: Bytes, expected: int) -> None:
+        """Append messages, shape (k, size); `expected` is a guess at the final count."""
+        stamp = stamps(messages)
+        if self._times is not None:
+            wanted = (stamp >= self._times[0]) & (stamp < self._times[1])
+            messages, stamp = messages[wanted], stamp[wanted]
+        now = slice(self._count, self._count + len(messages))
+        if now.stop > len(self._stamps):
+            self._grow(max(_FIRST_CAPACITY, now.stop, 2 * self._count, expected))
+        self._stamps[now] = stamp
+        for block, array in zip(self._blocks, self._arrays, strict=True):
+            array[:, now] = messages[:, block.start : block.end].view(block.raw).T
+        self._count = now.stop
+
+    def finished(self) -> dict[str, NDArray[Any]]:
+        """The columns by our names, contiguous and read-only."""
+        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
+        for block, array in zip(self._blocks, self._arrays, strict=True):
+            fields = array.view(block.dtype).reshape(*array.shape, *block.shape)
+            for name, values in zip(block.names, fields, strict=True):
+                columns[_COLUMN_OF.get(name, name)] = values[: self._count]
+        for column in columns.values():
+            column.flags.writeable = False
+        return columns
+
+    def _grow(self, capacity: int) -> None:
+        kept = slice(0, self._count)
+        grown = np.empty(capacity, np.int64)
+        grown[kept] = self._stamps[kept]
+        self._stamps = grown
+        for index, array in enumerate(self._arrays):
+            self._arrays[index] = np.empty((len(array), capacity), array.dtype)
+            self._arrays[index][:, kept] = array[:, kept]
+
+
+def _blocks(layout: MessageLayout, fields: Collection[str] | None) -> list[_Block]:
+    """Gather the wanted fields into blocks of neighbours."""
+    blocks: list[_Block] = []
+    places: Mapping[str, Any] = layout.dtype.fields or {}
+    for name, (dtype, start, *_) in places.items():
+        unwanted = fields is not None and _COLUMN_OF.get(name, name) not in fields
+        if name in _STAMP_FIELDS or unwanted:
+            continue
+        base, shape = dtype.subdtype or (dtype, ())
+        last = blocks[-1] if blocks else None
+        if last and (last.end, last.dtype, last.shape) == (start, base, shape):
+            last.names.append(name)
+        else:
+            raw = np.dtype((np.void, base.itemsize * math.prod(shape)))
+            blocks.append(_Block([name], start, base, shape, raw))
+    return blocks
+
+
+class _Content(Scan):
+    """What is selected of a file, up to its first damage.
 
     Args:
         selection: what is wanted of it.
         order: the chunks that must come.
         gapless: whether all chunks are read, so that the messages of a channel must count on from
             chunk to chunk; otherwise their numbers need only grow.
+
+    Attributes:
+        events: what happened, in the order of writing.
     """
 
     def __init__(self, selection: Selection, order: Order, *, gapless: bool = True) -> None:
-        self.metadata: dict[str, str] | None = None
-        self.header: ArchiveHeader | None = None
-        self.unusable: HeaderError | None = None
-        self.outcome: ArchiveOutcome | None = None
-        self.attachments: dict[str, bytes] = {}
+        super().__init__(order, topics=())
         self.events: list[ArchivedEvent] = []
-        self.parser = ChunkParser()
         self._selection = selection
-        self._order = order
         self._gapless = gapless
         self._size = 0
-        self._decompressor = zstandard.ZstdDecompressor()
-        self._channels: dict[str, _Channel] = {}
-        self._wanted: tuple[str, ...] = ()
-        self._n_events = 0
-        self._waiting: list[_Waiting] = []
+        self._columns: dict[str, _Columns] = {}
+        self._waiting: list[tuple[int, bytes]] = []  # chunks that are decoded with others
         self._waiting_size = 0
 
     def collect(self, records: Iterable[Record], size: int) -> Damage | None:
@@ -150,13 +224,13 @@ class Content:
         damage = None
         try:
             for record in records:
-                self._take(record)
+                self.take(record)
         except Damage as found:
             damage = found
         try:
             self._take_waiting()
             if damage is None:
-                self._check_counts(size)
+                self._check_end(size)
         except Damage as found:  # in an earlier record
             damage = found
         return damage
@@ -164,56 +238,29 @@ class Content:
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns read, all of the same length."""
         joined: dict[str, NDArray[Any]] = {"stamp": np.zeros(0, np.int64)}
-        for channel in self._channels.values():
-            joined |= channel.finished()
+        for columns in self._columns.values():
+            joined |= columns.finished()
         return joined
 
-    def _take(self, record: Record) -> None:
-        if record.opcode == container.CHUNK:
-            self._take_chunk(record)
-        elif record.opcode == container.ATTACHMENT:
-            name, data = container.attachment(record)
-            self.attachments[name] = data
-        elif record.opcode == container.METADATA:
-            self._take_metadata(record)
-        elif record.opcode in (container.SCHEMA, container.CHANNEL):
-            self.parser.known.take(record.opcode, record.body, record.offset)
-
-    def _take_metadata(self, record: Record) -> None:
-        name, entries = container.metadata(record)
-        if name not in (METADATA, OUTCOME):
-            return
-        claimed = entries.pop("checksum", None)
-        if claimed != checksum(entries):
-            raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
-        if name == OUTCOME:
-            outcome = ArchiveOutcome.of(entries)
-            if not outcome.belongs_to(self.header):
-                reason = f"(metadata {name!r}) is that of another recording"
-                raise Damage(record.offset, reason)
-            self.outcome = outcome
-            return
-        if self.metadata is not None:
-            raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
-        self.metadata = entries
-        if not is_known(entries):
+    def take_metadata(self, record: Record, name: str, entries: dict[str, str]) -> None:
+        """Take header or outcome, which must be of what can be read here."""
+        super().take_metadata(record, name, entries)
+        if self.metadata is not None and not is_known(self.metadata):
             raise Damage(record.offset, "is of another version")
-        try:
-            self.header = ArchiveHeader.of(entries)
-        except HeaderError as error:
-            self.unusable = error
-            raise Damage(record.offset, f"(metadata {name!r}) cannot be used: {error}") from error
+        if self.unusable is not None:
+            raise Damage(record.offset, f"(metadata {name!r}) cannot be used: {self.unusable}")
+        if self.outcome is not None and not self.outcome.belongs_to(self.header):
+            self.outcome = None
+            raise Damage(record.offset, f"(metadata {name!r}) is that of another recording")
 
-    def _take_chunk(self, record: Record) -> None:
-        if self.header is None:
-            return  # some other MCAP file, which will be refused as such
-        data = container.chunk_data(record, decompressor=self._decompressor)
-        self._order.check_chunk(container.chunk(record).crc, record.offset)
+    def take_chunk(self, record: Record) -> None:
+        """Take a chunk, or leave it to be decoded with others."""
+        data = self.opened(record)
         if not self.parser.repeats(data):
             self._take_waiting()
-            self._decode(self.parser.messages(data, record.offset), record.offset, len(record.body))
+            self._decode(self.parser.messages(data, record.offset), record.offset, record.length)
             return
-        self._waiting.append(_Waiting(record.offset, data))
+        self._waiting.append((record.offset, data))
         self._waiting_size += len(data)
         if self._waiting_size >= _BATCH:
             self._take_waiting()
@@ -224,66 +271,51 @@ class Content:
         if not waiting:
             return
         try:
-            found = self.parser.repeated([chunk.data for chunk in waiting])
+            found = self.parser.repeated([data for _, data in waiting])
             if found is not None:
-                self._decode(found, waiting[0].offset, 0)
+                self._decode(found, waiting[0][0], 0)
                 return
         except Damage:
             pass  # in one of them
-        for chunk in waiting:
-            self._decode(self.parser.messages(chunk.data, chunk.offset), chunk.offset, 0)
+        for offset, data in waiting:
+            self._decode(self.parser.messages(data, offset), offset, 0)
 
-    def _decode(self, found: dict[str, Messages], offset: int, compressed: int) -> None:
+    def _decode(self, numbered: dict[int, Messages], offset: int, compressed: int) -> None:
         """Decode messages, if they are what must follow now; else nothing of them counts."""
+        found = self.parser.by_topic(numbered, offset)
         recorded = self.parser.known.topics
         wanted = tuple(topic for topic in self._selection.numbers(recorded) if topic in recorded)
         counts = {len(found[topic]) if topic in found else 0 for topic in wanted}
         if len(counts) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
-        if any(counts):
-            self._wanted = self._wanted or wanted
-            elsewhere = wanted != self._wanted
-        else:
-            elsewhere = self._selection.topics is None and not found.keys().isdisjoint(NUMBERS)
-        if elsewhere:
+        elsewhere = self._selection.topics is None and not found.keys().isdisjoint(NUMBERS)
+        if elsewhere and not any(counts):
             raise Damage(offset, "(chunk) has samples in other channels than those before")
+        self._topics = (*wanted, EVENTS) if self._selection.events else wanted
         decoded = []
         for topic in wanted:
             if topic in found:
-                channel = self._channel(topic, found[topic], offset)
-                decoded.append((channel, channel.verified(found[topic], offset)))
-        if len(decoded) > 1:
-            times = [channel.stamps(messages) for channel, messages in decoded]
-            if not all(np.array_equal(one, times[0]) for one in times):
-                raise Damage(offset, "(chunk) has channels of different times")
-        logs = found.get(schema.EVENTS) if self._selection.events else None
-        events = self._decoded_events(logs, offset)
-        for channel, messages in decoded:
+                columns = self._columns.get(topic) or self._begun(topic, found[topic], offset)
+                decoded.append((topic, columns, columns.verified(found[topic], offset)))
+        events = self._decoded_events(found.get(EVENTS), offset)
+        self.continued(found, offset)
+        for topic, columns, messages in decoded:
+            self._columns[topic] = columns
             share = self._size / compressed if compressed else 0.0
-            expected = min(_MOST_EXPECTED, int(_MARGIN * len(messages) * share))
-            channel.append(messages, expected)
-        self._n_events += len(events)
-        start, stop = self._selection.times
-        self.events += [event for stamp, event in events if start <= stamp < stop]
+            columns.append(messages, min(_MOST_EXPECTED, int(_MARGIN * len(messages) * share)))
+        self.events += events
 
-    def _channel(self, topic: str, messages: Messages, offset: int) -> _Channel:
-        """The decoder of a topic, made from its schema or from its first message."""
-        if topic not in self._channels:
-            try:
-                layout = self._layout(topic, messages)
-            except LayoutError as error:
-                raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-            self._channels[topic] = _Channel(
-                layout,
-                self._selection,
-                gapless=self._gapless,
-                order=self._order if self._grows(topic) else None,
-            )
-        return self._channels[topic]
+    def missing(self, gaps: Mapping[str, int], offset: int) -> None:
+        """Messages may be missing where chunks were left out."""
+        if self._gapless:
+            super().missing(gaps, offset)
 
-    def _grows(self, topic: str) -> bool:
-        """Whether the messages of a topic are of cycles, one each."""
-        return topic in schema.PER_CYCLE and schema.CYCLE in self.parser.known.topics
+    def _begun(self, topic: str, messages: Messages, offset: int) -> _Columns:
+        """The columns of a topic, from its schema or from its first message."""
+        try:
+            return _Columns(self._layout(topic, messages), self._selection)
+        except LayoutError as error:
+            raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout:
         assert self.header is not None
@@ -295,24 +327,22 @@ class Content:
         known = self.parser.known.schema(topic)
         if known is None:
             raise LayoutError("their schema is missing")
-        layout = fixed_layout(known.definition)
+        layout = fixed_layout(known.data.decode(errors="replace"))
         schema.check_fields(topic, layout, len(joints))
         return layout
 
-    def _decoded_events(
-        self, messages: Messages | None, offset: int
-    ) -> list[tuple[int, ArchivedEvent]]:
-        """The events with their stamps [ns]."""
-        if messages is None:
+    def _decoded_events(self, messages: Messages | None, offset: int) -> list[ArchivedEvent]:
+        """The events of the time that is wanted."""
+        if messages is None or not self._selection.events:
             return []
-        _check_sequence(messages, self._n_events if self._gapless else None, offset)
         try:
             logs = [decode_log(message) for message in messages.all()]
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has an event that cannot be read: {error}") from error
-        return [(log.stamp, ArchivedEvent.from_log(log)) for log in logs]
+        start, stop = self._selection.times
+        return [ArchivedEvent.from_log(log) for log in logs if start <= log.stamp < stop]
 
-    def _check_counts(self, size: int) -> None:
+    def _check_end(self, size: int) -> None:
         """Compare what was read with what the writer says it wrote."""
         if self.header is None:
             return
@@ -323,82 +353,17 @@ class Content:
             raise Damage(size, f"(metadata {OUTCOME!r}) is missing")
         if not self._gapless:
             return
-        counts = {"samples": max([channel.read for channel in self._channels.values()], default=0)}
+        counts = {}
+        if numbers := self._selection.numbers(self.parser.known.topics):
+            samples = "packets" if schema.PACKETS in numbers else "samples"
+            counts[samples] = max(self.counts.get(topic, 0) for topic in numbers)
         if self._selection.events:
-            counts["events"] = self._n_events
-        if not self._selection.numbers(self.parser.known.topics):
-            del counts["samples"]
-        elif schema.PACKETS in (self._selection.topics or ()):
-            counts["packets"] = counts.pop("samples")
+            counts["events"] = self.counts.get(EVENTS, 0)
         for key, count in counts.items():
             stated = getattr(self.outcome, key)
             if stated != count:
                 raise Damage(size, f"is missing: {stated} {key} were written")
         self._order.check_end(size)
-
-
-class _Channel:
-    """Decodes the messages of one topic into columns.
-
-    Attributes:
-        read: messages read so far, whether their time is wanted or not.
-    """
-
-    def __init__(
-        self, layout: MessageLayout, selection: Selection, *, gapless: bool, order: Order | None
-    ) -> None:
-        self.read = 0
-        self._order = order
-        self._layout = layout
-        self._times = selection.times if selection.bounded else None
-        self._gapless = gapless
-        self._next = 0
-        self._columns = Columns(layout, _wanted(layout, selection.fields))
-
-    def verified(self, messages: Messages, offset: int) -> Bytes:
-        """The messages as bytes (k, size): the next of this topic, and like those before."""
-        expected = self.read if self._gapless else None
-        _check_sequence(messages, expected, offset)
-        data = messages.matrix(self._layout.size)
-        if data is None or not self._layout.is_kept_by(data):
-            raise Damage(offset, "(chunk) has messages that differ from those before")
-        if self._order is not None and len(data):
-            begins = self._gapless and not self.read
-            self._order.check_cycles(self._columns.stamps(data), offset, begins=begins)
-        return data
-
-    def stamps(self, data: Bytes) -> NDArray[np.int64]:
-        """Time stamps of messages, shape (k,) [ns]."""
-        return self._columns.stamps(data)
-
-    def append(self, data: Bytes, expected: int) -> None:
-        """Append verified messages; `expected` is a guess at the final count."""
-        if self._order is not None and len(data):
-            self._order.take(int(self._columns.stamps(data[-1:])[0]))
-        self.read += len(data)
-        if self._times is not None:
-            stamp = self._columns.stamps(data)
-            data = data[(stamp >= self._times[0]) & (stamp < self._times[1])]
-        self._columns.append(data, expected)
-
-    def finished(self) -> dict[str, NDArray[Any]]:
-        """The columns by our names."""
-        columns = self._columns.finished()
-        return {_COLUMN_OF.get(name, name): column for name, column in columns.items()}
-
-
-def _wanted(layout: MessageLayout, fields: Collection[str] | None) -> list[str]:
-    names = layout.dtype.names or ()
-    return [name for name in names if fields is None or _COLUMN_OF.get(name, name) in fields]
-
-
-def _check_sequence(messages: Messages, expected: int | None, offset: int) -> None:
-    """Check that messages are numbered one by one, from `expected` on where it is known."""
-    sequence = messages.sequence
-    first = int(sequence[0]) if expected is None else expected
-    wanted = np.arange(first, first + len(sequence), dtype=np.int64) & 0xFFFFFFFF
-    if not np.array_equal(sequence, wanted):
-        raise Damage(offset, "(chunk) does not continue the one before it: a chunk is missing")
 
 
 _UNREAD = frozenset((container.MESSAGE_INDEX,))
@@ -632,10 +597,10 @@ def _from_the_beginning(
     selection: Selection,
     written: Written,
     until: Contested | None = None,
-) -> tuple[Content, Damage | None]:
+) -> tuple[_Content, Damage | None]:
     """What is selected of the whole chunks before the first damage, and that."""
     stream.seek(0)
-    content = Content(selection, Order(written, until=until))
+    content = _Content(selection, Order(written, until=until))
     damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
     if until is None and isinstance(damage, Contested):  # some of what was read may be strange
         return _from_the_beginning(stream, size, selection, written, damage)
@@ -644,12 +609,12 @@ def _from_the_beginning(
 
 def _by_index(
     stream: BinaryIO, size: int, selection: Selection, written: Written
-) -> Content | None:
+) -> _Content | None:
     """What is selected, found through the summary; None where that or what it names is damaged."""
     summary = Summary.read(stream, size)
     if summary is None:
         return None
-    content = Content(selection, Order(written, gapless=False), gapless=False)
+    content = _Content(selection, Order(written, gapless=False), gapless=False)
     try:
         for record in summary.definitions:
             content.parser.known.take(record.opcode, record.body, record.offset)
@@ -663,16 +628,18 @@ def _by_index(
         topics.update(NUMBERS)  # a chunk that has others than those wanted is to be seen, too
     wanted = {channel.id for channel in known.channels.values() if channel.topic in topics}
     start, stop = selection.times
-    chunks = [chunk for chunk in summary.chunks if chunk.channels & wanted]
-    taken = [chunk for chunk in chunks if chunk.start_time < stop and chunk.end_time >= start]
+    chunks = [chunk for chunk in summary.chunks if chunk.message_index_offsets.keys() & wanted]
+    within = [
+        one for one in chunks if one.message_start_time < stop and one.message_end_time >= start
+    ]
     # Where nothing falls into the range, one chunk still tells what columns there are.
-    places = [(chunk.offset, chunk.length) for chunk in taken or chunks[:1]]
+    places = [(one.chunk_start_offset, one.chunk_length) for one in within or chunks[:1]]
     records = (container.record_at(stream, *place) for place in sorted([*summary.others, *places]))
     damage = content.collect(records, sum(length for _, length in places))
     return content if damage is None and content.metadata is not None else None
 
 
-def _check_topics(path: Path, content: Content, selection: Selection) -> None:
+def _check_topics(path: Path, content: _Content, selection: Selection) -> None:
     """Check that the archive has the channels wanted."""
     recorded = sorted(content.parser.known.topics)
     for topic in selection.topics or ():
@@ -683,7 +650,7 @@ def _check_topics(path: Path, content: Content, selection: Selection) -> None:
 
 
 def _checked_header(
-    path: Path, size: int, content: Content, damage: Damage | None
+    path: Path, size: int, content: _Content, damage: Damage | None
 ) -> ArchiveHeader:
     """The header, whose version we know."""
     if content.header is not None:
@@ -714,7 +681,7 @@ def _checked_header(
 
 
 def _damage(
-    damage: Damage, size: int, content: Content, stamp: NDArray[np.int64] | None
+    damage: Damage, size: int, content: _Content, stamp: NDArray[np.int64] | None
 ) -> ArchiveDamage:
     return ArchiveDamage(
         offset=damage.offset,

@@ -9,26 +9,27 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import IO, BinaryIO
 
+import numpy as np
 import zstandard
+from mcap.records import Chunk
 
-from hil.archive import container, header, index, schema
+from hil.archive import container, header, schema
+from hil.archive.chunk import HEAD, ChunkParser, Messages
 from hil.archive.container import Record
 from hil.archive.header import ArchiveOutcome
-from hil.archive.index import IndexBuilder, MessageHead
-from hil.archive.intact import Piece, Survey
+from hil.archive.mcap_writer import Entries, McapWriter, chunk_of, entries_of, span
 from hil.archive.reader import open_archive
 from hil.archive.rewrite import write_anew
-from hil.archive.survey import HEADER, survey
+from hil.archive.survey import Piece, Survey, survey
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 
-_SEQUENCE_AT = container.RECORD.size + 2  # in a message record
+_SEQUENCE_AT = HEAD.fields["sequence"][1] if HEAD.fields else 0  # in a message record
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def repair(
     """
     path = Path(path)
     found = survey(path)
-    if found.header is None or found.metadata is None or not header.is_known(found.metadata):
+    if found.header is None:
         open_archive(path, fields=())  # says why it is none
         raise NotAnArchiveError(path, "is not an archive")
     if found.mixed:
@@ -112,93 +113,67 @@ def _write(found: Survey, target: Path) -> None:
 
     def fill(stream: BinaryIO, output: IO[bytes]) -> None:
         if found.faults:
-            ArchiveCopy(stream, output).write(found)
+            copy_of(found, stream, output)
         else:
             shutil.copyfileobj(stream, output)
 
     write_anew(found.path, target, fill)
 
 
-class ArchiveCopy:
-    """Copies what stands of a survey into a new file, with the outcome of the survey."""
+def copy_of(
+    found: Survey, stream: BinaryIO, output: IO[bytes], *, outcome: Mapping[str, str] | None = None
+) -> None:
+    """Write what stands of an archive as a new one.
 
-    def __init__(self, stream: BinaryIO, output: IO[bytes]) -> None:
-        self._stream = stream
-        self._output = output
-        self._offset = 0
-        self._index = IndexBuilder()
-        self._checksums: list[int] = []
-        self._decompressor = zstandard.ZstdDecompressor()
-        self._compressor = zstandard.ZstdCompressor()
-
-    def write(self, found: Survey) -> None:
-        """Write the file."""
-        assert found.metadata is not None
-        self._put(container.MAGIC + HEADER)
-        self._metadata(header.METADATA, _description(found))
-        announced = False
-        for piece in found.pieces:
-            if piece.opcode == container.CHUNK and not announced:
-                announced = True
-                for record in found.definitions:
-                    self._announce(record)
-            self._piece(piece)
-        self._metadata(header.OUTCOME, _outcome(found, self._checksums))
-        self._put(self._index.tail(self._offset))
-
-    def _put(self, data: bytes) -> None:
-        self._output.write(data)
-        self._offset += len(data)
-
-    def _metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        data = index.metadata(name, {**entries, "checksum": header.checksum(entries)})
-        self._index.add_metadata(self._offset, len(data), name)
-        self._put(data)
-
-    def _announce(self, record: Record) -> None:
-        self._index.announce(record.opcode, record.body)
-        self._put(index.record(record.opcode, record.body))
-
-    def _piece(self, piece: Piece) -> None:
-        record = container.record_at(self._stream, piece.offset, piece.length)
-        if piece.opcode == container.CHUNK:
-            self._chunk(record, piece)
-        elif piece.opcode in (container.SCHEMA, container.CHANNEL):
-            self._announce(record)
-        else:
-            if piece.opcode == container.ATTACHMENT:
-                self._index.add_attachment(self._offset, record)
-            else:
-                name, _ = container.metadata(record)
-                self._index.add_metadata(self._offset, piece.length, name)
-            self._put(index.record(record.opcode, record.body))
-
-    def _chunk(self, record: Record, piece: Piece) -> None:
-        head = container.chunk(record)
-        data = container.chunk_data(record, decompressor=self._decompressor)
-        copy = index.record(record.opcode, record.body)
-        assert piece.times is not None
-        if piece.shift is not None:
-            data = _renumbered(data, piece)
-            copy = index.chunk(data, self._compressor.compress(data), "zstd", piece.times)
-        elif piece.times != (head.start_time, head.end_time):
-            copy = index.chunk(data, bytes(head.data), head.compression, piece.times)
-        taken = Record(self._offset, record.opcode, copy[container.RECORD.size :], 0)
-        indexes = self._index.add_chunk(self._offset, len(copy), container.chunk(taken), data)
-        self._checksums.append(container.chunk(taken).crc)
-        self._put(copy)
-        self._put(indexes)
+    Args:
+        found: what stands of it.
+        stream: the archive.
+        output: the new one.
+        outcome: entries of its outcome that are to be others than before.
+    """
+    writer, parser = McapWriter(output.write), ChunkParser()
+    described = _description(found)
+    writer.start(schema.PROFILE, schema.LIBRARY)
+    writer.add_metadata(header.METADATA, {**described, "checksum": header.checksum(described)})
+    recovered = found.definitions
+    for piece in found.pieces:
+        record = container.record_at(stream, piece.offset, piece.length)
+        if piece.opcode != container.CHUNK:
+            writer.add_record(record)
+            continue
+        for definition in recovered:
+            parser.known.take(definition.opcode, definition.body, definition.offset)
+            writer.add_record(definition)
+        recovered = ()
+        chunk, entries = _chunk(record, piece, parser)
+        for known in parser.known.definitions:
+            writer.add_definition(known)
+        writer.add_chunk(chunk, entries)
+    stated = {**_outcome(found, writer.checksums), **(outcome or {})}
+    writer.add_metadata(header.OUTCOME, {**stated, "checksum": header.checksum(stated)})
+    writer.finish()
 
 
-def _renumbered(data: bytes, piece: Piece) -> bytes:
-    """The records of a chunk with its messages counting on from those that stand before it."""
-    assert piece.shift is not None
-    changed = bytearray(data)
-    for item in index.messages(data, piece.offset):
-        if isinstance(item, MessageHead):
-            sequence = item.sequence - piece.shift[item.channel]
-            struct.pack_into("<I", changed, item.start + _SEQUENCE_AT, sequence)
-    return bytes(changed)
+def _chunk(record: Record, piece: Piece, parser: ChunkParser) -> tuple[Chunk, Entries]:
+    """A chunk as it stands, or with its messages counting on from those that stand before it."""
+    head = container.chunk(record)
+    data = container.chunk_data(record, decompressor=zstandard.ZstdDecompressor())
+    found = parser.messages(data, record.offset)
+    entries = entries_of(found)
+    if piece.shift is not None:
+        return chunk_of(_renumbered(data, found, piece.shift), entries), entries
+    first, last = span(entries)
+    return Chunk(head.compression, bytes(head.data), last, first, head.crc, head.size), entries
+
+
+def _renumbered(data: bytes, found: Mapping[int, Messages], shift: Mapping[int, int]) -> bytes:
+    """The records of a chunk, with the numbers of its messages lower by so much, by channel."""
+    changed = np.frombuffer(bytearray(data), np.uint8)
+    for channel, messages in found.items():
+        numbers = messages.of_heads("sequence") - np.uint32(shift[channel])
+        places = messages.places[:, None] + _SEQUENCE_AT + np.arange(numbers.itemsize)
+        changed[places] = numbers.astype("<u4")[:, None].view(np.uint8)
+    return changed.tobytes()
 
 
 def _description(found: Survey) -> dict[str, str]:

@@ -14,10 +14,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from drivers.record import cycle_dtype
-from hil.archive import ArchiveWriter, container, header, index, open_archive, schema
+from hil.archive import ArchiveWriter, container, header, open_archive, schema
 from hil.archive.amend import amend_outcome
 from hil.archive.check import check_archive
 from hil.archive.repair import repair
+from tests.hil import mcap_bytes
 
 NAME = "validation_003_a1.mcap"
 
@@ -72,7 +73,7 @@ def earlier(data: bytes, path: Path) -> bytes:
         del entries[key]
     path.parent.mkdir(parents=True, exist_ok=True)
     entries["checksum"] = header.checksum(entries)
-    path.write_bytes(data[:at] + index.metadata(name, entries))
+    path.write_bytes(data[:at] + mcap_bytes.metadata(name, entries))
     done = repair(path, in_place=True)  # makes the index anew
     assert done.losses == ()
     assert header.CHUNKS.encode() + b"\x28" not in path.read_bytes()
