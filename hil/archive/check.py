@@ -16,10 +16,9 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from drivers.packet_records import LONGEST_PACKET
-from hil.archive import container, definitions, schema
+from hil.archive import container, schema
 from hil.archive.amend import REJECTED
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
+from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
 from hil.archive.chunk import KnownChannels, Messages
 from hil.archive.container import Record
 from hil.archive.header import (
@@ -33,7 +32,6 @@ from hil.archive.header import (
     HeaderError,
     is_known,
 )
-from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
 from hil.archive.survey import Survey, Visit, survey
 from hil.errors import NotAnArchiveError
 
@@ -105,24 +103,20 @@ class _Checker:
             yield from self._channel(channels[topic])
 
     def _channel(self, channel: Channel) -> Iterator[Fault]:
-        expected = _expected(channel.topic, len(self._joints))
+        expected = schema.profile(len(self._joints)).get(channel.topic)
         if expected is None:
             return  # a later version may add channels
-        name, definition = expected
-        if channel.message_encoding != "cdr":
-            yield (
-                "channels",
-                f"{channel.topic} is encoded as {channel.message_encoding!r}, not 'cdr'",
-            )
+        if (encoding := channel.message_encoding) != "cdr":
+            yield "channels", f"{channel.topic} is encoded as {encoding!r}, not 'cdr'"
         found = self._known.schemas.get(channel.schema_id)
         if found is None:
             yield "schemas", f"{channel.topic} has none"
             return
-        if found.name != name:
-            yield "channels", f"{channel.topic} is of type {found.name}, not {name}"
+        if found.name != expected.schema:
+            yield "channels", f"{channel.topic} is of type {found.name}, not {expected.schema}"
         if found.encoding != "ros2msg":
             yield "schemas", f"that of {channel.topic} is {found.encoding!r}, not 'ros2msg'"
-        if not _extends(_text(found), definition, fixed=channel.topic != schema.CYCLE):
+        if not _extends(_text(found), expected.definition, fixed=channel.topic != schema.CYCLE):
             yield "schemas", f"that of {channel.topic} is not the text of the profile"
 
     def _chunk(self, record: Record, found: Mapping[str, Messages]) -> Iterator[Fault]:
@@ -157,28 +151,11 @@ class _Checker:
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout | None:
         try:
-            if topic not in _STATES:
-                record = self._known.schema(topic)
-                if record is None:
-                    return None
-                layout = fixed_layout(_text(record))
-                schema.check_fields(topic, layout, len(self._joints))
-                return layout
-            names, layout = joint_state_of(messages.first())
+            return schema.message_layout(
+                topic, self._joints, self._known.schema(topic), messages.first()
+            )
         except LayoutError:
             return None
-        lengths = {
-            word: layout.dtype[word].shape[0] if word in (layout.dtype.names or ()) else 0
-            for word in ("position", "velocity", "effort")
-        }
-        expected = joint_state_layout(
-            self._joints,
-            position=lengths["position"],
-            velocity=lengths["velocity"],
-            effort=lengths["effort"],
-        )
-        known = names == self._joints and set(lengths.values()) <= {0, len(self._joints)}
-        return layout if known and expected.template == layout.template else None
 
     def _cycles(self, rows: Mapping[str, Rows], place: str) -> Iterator[Fault]:
         """Check the cycles of a chunk, and the channels that repeat them."""
@@ -211,21 +188,6 @@ def _logged_in_time(messages: Messages) -> bool:
 
 def _text(record: Schema) -> str:
     return record.data.decode(errors="replace")
-
-
-def _expected(topic: str, n_joints: int) -> tuple[str, str] | None:
-    """Type and text that a topic of the profile must have."""
-    return {
-        schema.CYCLE: (definitions.cycle_name(n_joints), definitions.cycle(n_joints)),
-        schema.MEASURED: (definitions.JOINT_STATE, definitions.joint_state()),
-        schema.COMMANDED: (definitions.JOINT_STATE, definitions.joint_state()),
-        schema.MOTOR_CURRENT: (
-            definitions.motor_current_name(n_joints),
-            definitions.motor_current(n_joints),
-        ),
-        schema.EVENTS: (definitions.LOG, definitions.log()),
-        schema.PACKETS: (definitions.PACKET, definitions.packet(LONGEST_PACKET)),
-    }.get(topic)
 
 
 def _extends(text: str, profile: str, *, fixed: bool) -> bool:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple, Self, TypeVar
 
@@ -31,7 +31,6 @@ from mcap.records import (
     McapRecord,
     Metadata,
     MetadataIndex,
-    SummaryOffset,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -60,7 +59,6 @@ FOOTER_SIZE = RECORD.size + 20
 _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
 _NO_CRC = 0
-_MOST_LISTED = 1 << 16  # bytes
 _Parsed = TypeVar("_Parsed", bound=McapRecord)
 FARTHEST = 1 << 62  # bytes, less than the end of any file
 
@@ -292,9 +290,11 @@ def chunk(record: Record) -> Chunk:
     return Chunk(start_time, end_time, size, crc, compression, data)
 
 
-def chunk_data(record: Record, *, decompressor: zstandard.ZstdDecompressor) -> bytes:
-    """Decompress the records of a chunk and verify their checksum."""
-    head = chunk(record)
+def chunk_data(
+    record: Record, *, decompressor: zstandard.ZstdDecompressor, head: Chunk | None = None
+) -> bytes:
+    """Decompress the records of a chunk, whose head may be known, and verify their checksum."""
+    head = head or chunk(record)
     if head.size > min(LARGEST_CHUNK, MOST_INFLATION * len(head.data)):
         raise Damage(record.offset, f"(chunk) claims {head.size} bytes of content")
     data = _decompressed(head, record.offset, decompressor)
@@ -324,37 +324,6 @@ def _decompressed(chunk: Chunk, offset: int, decompressor: zstandard.ZstdDecompr
     raise Damage(offset, f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4")
 
 
-def metadata_places(stream: BinaryIO, size: int) -> list[tuple[int, int]]:
-    """Offset and length of the metadata records as the end of a file lists them.
-
-    A few hundred bytes are read and nothing is verified: what stands there must verify itself.
-    """
-    footer = _footer(stream, size)
-    if footer is None:
-        return []
-    end = size - FOOTER_SIZE - len(MAGIC)
-    found: list[tuple[int, int]] = []
-    try:
-        start = footer.summary_offset_start
-        for item in _listed(stream, start, end - start):
-            group = parsed(SummaryOffset, item.body, start)
-            if group.group_opcode == METADATA_INDEX:
-                for one in _listed(stream, group.group_start, group.group_length):
-                    place = parsed(MetadataIndex, one.body, group.group_start)
-                    found.append((place.offset, place.length))
-    except Damage:
-        return []
-    return found
-
-
-def _listed(stream: BinaryIO, at: int, length: int) -> list[Record]:
-    """Short records that follow one another."""
-    if not 0 < length <= _MOST_LISTED or at > FARTHEST:
-        return []
-    stream.seek(at)
-    return [*split(stream.read(length), at)]
-
-
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
     """The record that ends a file; None where it does not."""
     if size < FOOTER_SIZE + len(MAGIC):
@@ -366,25 +335,21 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
     return parsed(Footer, data[RECORD.size :], size)
 
 
-@dataclass(frozen=True)
 class Summary:
-    """The summary of a file as far as reading needs it.
+    """The summary of a file, its records parsed when they are asked for.
 
-    Attributes:
-        definitions: schema and channel records.
-        chunks: in the order of the file.
-        others: offset and length of attachments and metadata.
-        statistics: the record's body, empty where there is none.
+    Args:
+        data: its records.
+        end: where the data section ends; None where what the summary lists may have moved.
     """
 
-    definitions: tuple[Record, ...]
-    chunks: tuple[ChunkIndex, ...]
-    others: tuple[tuple[int, int], ...]
-    statistics: bytes = b""
+    def __init__(self, data: bytes, end: int | None = None) -> None:
+        self._records = [*split(data, 0)]
+        self._end = end
 
     @classmethod
     def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Self | None:
-        """Read it; None where there is none, or where it is not whole or lists nonsense.
+        """Read it; None where there is none, or where it is not whole.
 
         Args:
             stream: the file.
@@ -395,55 +360,70 @@ class Summary:
         footer = _footer(stream, size)
         if footer is None:
             return None
-        moved, start = start is not None, footer.summary_start if start is None else start
-        end = size - FOOTER_SIZE - len(MAGIC)
-        if not len(MAGIC) <= start <= end <= start + LARGEST_RECORD or not footer.summary_crc:
+        end = None if start is not None else footer.summary_start
+        start = footer.summary_start if start is None else start
+        last = size - FOOTER_SIZE - len(MAGIC)
+        if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD or not footer.summary_crc:
             return None
         stream.seek(start)
-        data = stream.read(end + FOOTER_SIZE - 4 - start)
+        data = stream.read(last + FOOTER_SIZE - 4 - start)
         if crc32(data) != footer.summary_crc:
             return None
         try:
-            found = cls.parsed(data[: end - start])
+            return cls(data[: last - start], end)
         except Damage:
             return None
-        return found if moved or found._is_within(start) else None
 
-    @classmethod
-    def parsed(cls, data: bytes) -> Self:
-        """Read its records.
+    def __eq__(self, other: object) -> bool:
+        """Whether both say the same of schemas, channels, chunks and the rest."""
+        if not isinstance(other, Summary):
+            return NotImplemented
+        kinds = (SCHEMA, CHANNEL, STATISTICS, CHUNK_INDEX, ATTACHMENT_INDEX, METADATA_INDEX)
+        return all(self._bodies(kind) == other._bodies(kind) for kind in kinds)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def _bodies(self, opcode: int) -> list[bytes]:
+        return [record.body for record in self._records if record.opcode == opcode]
+
+    @property
+    def definitions(self) -> list[Record]:
+        """Schema and channel records."""
+        return [record for record in self._records if record.opcode in (SCHEMA, CHANNEL)]
+
+    @property
+    def metadata(self) -> list[tuple[int, int]]:
+        """Offset and length of the metadata records."""
+        found = [parsed(MetadataIndex, body, 0) for body in self._bodies(METADATA_INDEX)]
+        return [(one.offset, one.length) for one in found]
+
+    @property
+    def others(self) -> list[tuple[int, int]]:
+        """Offset and length of metadata and attachments."""
+        found = [parsed(AttachmentIndex, body, 0) for body in self._bodies(ATTACHMENT_INDEX)]
+        return sorted([*self.metadata, *((one.offset, one.length) for one in found)])
+
+    @cached_property
+    def chunks(self) -> list[ChunkIndex]:
+        """In the order of the file.
 
         Raises:
-            Damage: they are not whole.
+            Damage: what is listed overlaps, or lies beyond the data section.
         """
-        definitions, chunks, others, statistics = [], [], [], b""
-        for item in split(data, 0):
-            if item.opcode in (SCHEMA, CHANNEL):
-                definitions.append(item)
-            elif item.opcode == CHUNK_INDEX:
-                chunks.append(parsed(ChunkIndex, item.body, 0))
-            elif item.opcode == ATTACHMENT_INDEX:
-                attachment = parsed(AttachmentIndex, item.body, 0)
-                others.append((attachment.offset, attachment.length))
-            elif item.opcode == METADATA_INDEX:
-                metadata = parsed(MetadataIndex, item.body, 0)
-                others.append((metadata.offset, metadata.length))
-            elif item.opcode == STATISTICS:
-                statistics = item.body
+        chunks = [parsed(ChunkIndex, body, 0) for body in self._bodies(CHUNK_INDEX)]
         chunks.sort(key=lambda entry: entry.chunk_start_offset)
-        return cls(tuple(definitions), tuple(chunks), tuple(sorted(others)), statistics)
+        at = len(MAGIC)
+        places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in chunks]
+        for offset, length in sorted([*places, *self.others]):
+            if offset < at:
+                raise Damage(0, "(index) lists records that overlap")
+            at = offset + length
+        if self._end is not None and at > self._end:
+            raise Damage(0, "(index) lists records beyond the data")
+        return chunks
 
     @property
     def places(self) -> list[tuple[int, int]]:
-        """Offset and length of all records that it lists."""
+        """Offset and length of all records that it lists; raises as `chunks` does."""
         chunks = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in self.chunks]
         return sorted([*chunks, *self.others])
-
-    def _is_within(self, end: int) -> bool:
-        """Whether what it lists lies before `end`, and nothing twice."""
-        at = len(MAGIC)
-        for offset, length in self.places:
-            if offset < at:
-                return False
-            at = offset + length
-        return at <= end

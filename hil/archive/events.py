@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.archive.messages import LogMessage
+from hil.archive.cdr import LogMessage
 from hil.reading import json_of
 
 

@@ -11,6 +11,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
+from hil.archive.cdr import LogMessage, encode_log
 from hil.archive.header import (
     CHUNKS,
     DESCRIPTION,
@@ -21,7 +22,6 @@ from hil.archive.header import (
     listed,
 )
 from hil.archive.mcap_writer import McapWriter
-from hil.archive.messages import LogMessage, encode_log
 from hil.archive.schema import (
     EVENT_CHANNEL,
     LIBRARY,

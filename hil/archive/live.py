@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.exchange import ExchangeEvent
+from hil.archive.cdr import encode_log
 from hil.archive.commands import Serve
 from hil.archive.events import ArchivedEvent
 from hil.archive.live_view import LiveView, LiveViewError
-from hil.archive.messages import encode_log
 from hil.archive.schema import EVENT_CHANNEL, Channel, CycleEncoder
 from hil.archive.wording import describe, level_of
 from hil.version import install_command

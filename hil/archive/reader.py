@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
 from hil.archive import container, schema
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
+from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
 from hil.archive.chunk import Bytes, Messages, stamps
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.events import ArchivedEvent
@@ -28,7 +28,6 @@ from hil.archive.header import (
     ArchiveOutcome,
     is_known,
 )
-from hil.archive.messages import check_joints, decode_log, joint_state_of
 from hil.archive.scan import NUMBERS, Contested, Order, Scan, Written
 from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
@@ -312,24 +311,14 @@ class _Content(Scan):
 
     def _begun(self, topic: str, messages: Messages, offset: int) -> _Columns:
         """The columns of a topic, from its schema or from its first message."""
+        assert self.header is not None
         try:
-            return _Columns(self._layout(topic, messages), self._selection)
+            layout = schema.message_layout(
+                topic, self.header.joint_names, self.parser.known.schema(topic), messages.first()
+            )
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-
-    def _layout(self, topic: str, messages: Messages) -> MessageLayout:
-        assert self.header is not None
-        joints = self.header.joint_names
-        if topic in (schema.MEASURED, schema.COMMANDED):
-            names, layout = joint_state_of(messages.first())
-            check_joints(names, layout, joints)
-            return layout
-        known = self.parser.known.schema(topic)
-        if known is None:
-            raise LayoutError("their schema is missing")
-        layout = fixed_layout(known.data.decode(errors="replace"))
-        schema.check_fields(topic, layout, len(joints))
-        return layout
+        return _Columns(layout, self._selection)
 
     def _decoded_events(self, messages: Messages | None, offset: int) -> list[ArchivedEvent]:
         """The events of the time that is wanted."""
@@ -563,9 +552,10 @@ def open_archive(
     try:
         with opened(path) as stream:
             size = os.fstat(stream.fileno()).st_size
-            written = Written.read(stream, size)
-            content = _by_index(stream, size, selection, written) if selection.partial else None
-            damage = None
+            summary, damage, content = Summary.read(stream, size), None, None
+            written = Written.read(stream, size, summary)
+            if selection.partial and summary is not None:
+                content = _by_index(stream, selection, written, summary)
             if content is None:
                 content, damage = _from_the_beginning(stream, size, selection, written)
     except OSError as error:
@@ -608,16 +598,14 @@ def _from_the_beginning(
 
 
 def _by_index(
-    stream: BinaryIO, size: int, selection: Selection, written: Written
+    stream: BinaryIO, selection: Selection, written: Written, summary: Summary
 ) -> _Content | None:
     """What is selected, found through the summary; None where that or what it names is damaged."""
-    summary = Summary.read(stream, size)
-    if summary is None:
-        return None
     content = _Content(selection, Order(written, gapless=False), gapless=False)
     try:
         for record in summary.definitions:
             content.parser.known.take(record.opcode, record.body, record.offset)
+        listed, others = summary.chunks, summary.others
     except Damage:
         return None
     known = content.parser.known
@@ -628,13 +616,13 @@ def _by_index(
         topics.update(NUMBERS)  # a chunk that has others than those wanted is to be seen, too
     wanted = {channel.id for channel in known.channels.values() if channel.topic in topics}
     start, stop = selection.times
-    chunks = [chunk for chunk in summary.chunks if chunk.message_index_offsets.keys() & wanted]
+    chunks = [chunk for chunk in listed if chunk.message_index_offsets.keys() & wanted]
     within = [
         one for one in chunks if one.message_start_time < stop and one.message_end_time >= start
     ]
     # Where nothing falls into the range, one chunk still tells what columns there are.
     places = [(one.chunk_start_offset, one.chunk_length) for one in within or chunks[:1]]
-    records = (container.record_at(stream, *place) for place in sorted([*summary.others, *places]))
+    records = (container.record_at(stream, *place) for place in sorted([*others, *places]))
     damage = content.collect(records, sum(length for _, length in places))
     return content if damage is None and content.metadata is not None else None
 

@@ -144,7 +144,7 @@ def copy_of(
         for definition in recovered:
             parser.known.take(definition.opcode, definition.body, definition.offset)
             writer.add_record(definition)
-        recovered = ()
+        recovered = []
         chunk, entries = _chunk(record, piece, parser)
         for known in parser.known.definitions:
             writer.add_definition(known)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from hil.archive import container, schema
 from hil.archive.chunk import ChunkParser, Messages
-from hil.archive.container import Damage, Record
+from hil.archive.container import Damage, Record, Summary
 from hil.archive.header import (
     METADATA,
     OUTCOME,
@@ -68,9 +68,9 @@ class Written:
     strange: bool = False
 
     @classmethod
-    def read(cls, stream: BinaryIO, size: int) -> Self:
-        """Find it; the stream is left anywhere."""
-        found = _records_of_ours(_indexed(stream, size))
+    def read(cls, stream: BinaryIO, size: int, summary: Summary | None) -> Self:
+        """Find it, where the summary says or from head to head; the stream is left anywhere."""
+        found = _records_of_ours(_indexed(stream, summary)) if summary else {}
         if found.keys() != {METADATA, OUTCOME}:
             found = _records_of_ours(_walked(stream, size))
         if found.keys() != {METADATA, OUTCOME}:
@@ -261,8 +261,9 @@ class Scan:
         Raises:
             Damage: it is none of them, or damaged.
         """
-        data = container.chunk_data(record, decompressor=self._decompressor)
-        self._order.check_chunk(container.chunk(record).crc, record.offset)
+        head = container.chunk(record)
+        data = container.chunk_data(record, decompressor=self._decompressor, head=head)
+        self._order.check_chunk(head.crc, record.offset)
         return data
 
     def continued(self, found: Mapping[str, Messages], offset: int) -> dict[str, int]:
@@ -375,9 +376,9 @@ def _records_of_ours(records: Iterable[Record]) -> dict[str, dict[str, str]]:
     return found
 
 
-def _indexed(stream: BinaryIO, size: int) -> Iterator[Record]:
-    """Metadata records where the end of the file says that they are."""
-    for place in container.metadata_places(stream, size):
+def _indexed(stream: BinaryIO, summary: Summary) -> Iterator[Record]:
+    """Metadata records where the summary says that they are."""
+    for place in summary.metadata:
         record = container.record_at(stream, *place)
         if record.opcode == container.METADATA:
             yield record

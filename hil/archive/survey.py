@@ -54,14 +54,12 @@ class Piece(NamedTuple):
         length: with its head.
         opcode: kind of record.
         shift: of a chunk behind a loss, how much too high its messages count, by channel.
-        retimed: of a chunk, whether it states other times than those of its messages.
     """
 
     offset: int
     length: int
     opcode: int
     shift: Mapping[int, int] | None = None
-    retimed: bool = False
 
 
 Visit = Callable[["Survey", Record, Mapping[str, Messages]], None]
@@ -74,6 +72,7 @@ class Survey(Scan):
         path: the file.
         stream: the same, open.
         order: the chunks that must come.
+        summary: of the file, None where it is not whole.
         visit: told each chunk that stands.
 
     Attributes:
@@ -86,18 +85,23 @@ class Survey(Scan):
     """
 
     def __init__(
-        self, path: Path, stream: BinaryIO, order: Order, visit: Visit | None = None
+        self,
+        path: Path,
+        stream: BinaryIO,
+        order: Order,
+        summary: Summary | None,
+        visit: Visit | None = None,
     ) -> None:
         super().__init__(order)
         self.path = path
         self.size = os.fstat(stream.fileno()).st_size
         self.written_by: tuple[str, str] | None = None
         self.pieces: list[Piece] = []
-        self.definitions: tuple[Record, ...] = ()
+        self.definitions: list[Record] = []
         self.faults: list[Fault] = []
         self._stream = stream
         self._visit = visit
-        self._summary = Summary.read(stream, self.size)
+        self._summary = summary
         self._seen: set[int] = set()
         self._lost_since = False
         self._ended = False
@@ -158,7 +162,11 @@ class Survey(Scan):
 
     def _unreached(self) -> Iterator[Record]:
         """Records that the summary knows and the walk did not reach."""
-        for place in self._summary.places if self._summary else ():
+        try:
+            places = self._summary.places if self._summary else []
+        except Damage:
+            self._summary, places = None, []
+        for place in places:
             if place[0] not in self._seen:
                 try:
                     yield container.record_at(self._stream, *place)
@@ -244,15 +252,13 @@ class Survey(Scan):
             self.parser.known, self.definitions = known, definitions  # what it says goes with it
             raise
         head, entries = container.chunk(record), entries_of(numbered)
-        retimed = (head.start_time, head.end_time) != span(entries)
-        if retimed:
+        if (head.start_time, head.end_time) != span(entries):
             self._fault("index", Damage(record.offset, "(chunk) states other times"), loss=False)
         sizes = len(head.data), head.size
         place = record.offset, record.size
         self._indexes = self._index.add_chunk(*place, head.compression, sizes, entries)
         moved = {number: shifts[self.parser.known.channels[number].topic] for number in numbered}
         self._keep(record, moved if any(moved.values()) else None)
-        self.pieces[-1] = self.pieces[-1]._replace(retimed=retimed)
         self._lost_since = False
         if self._visit is not None:
             self._visit(self, record, found)
@@ -262,7 +268,7 @@ class Survey(Scan):
         if numbered.keys() <= self.parser.known.channels.keys():
             return
         summary = self._summary or self._moved_summary()
-        self.definitions = summary.definitions if summary else ()
+        self.definitions = summary.definitions if summary else []
         for item in self.definitions:
             self.parser.known.take(item.opcode, item.body, offset)
 
@@ -326,7 +332,7 @@ class Survey(Scan):
             )
         elif not self.counts:
             return  # channels without messages stand in the summary alone
-        elif self._summary != Summary.parsed(self._index.summary(0)[0]):
+        elif self._summary != Summary(self._index.summary(0)[0]):
             self._fault("index", "the index at the end does not fit the file", loss=False)
 
 
@@ -344,12 +350,14 @@ def survey(path: str | PathLike[str], visit: Callable[[], Visit] | None = None) 
     path = Path(path)
     try:
         with opened(path) as stream:
-            written = Written.read(stream, os.fstat(stream.fileno()).st_size)
+            size = os.fstat(stream.fileno()).st_size
+            summary = Summary.read(stream, size)
+            written = Written.read(stream, size, summary)
             if written.strange:
                 written = Written()  # told as a fault of the outcome
             order = Order(written, gapless=False)
             while True:
-                found = Survey(path, stream, order, visit() if visit else None)
+                found = Survey(path, stream, order, summary, visit() if visit else None)
                 try:
                     found.run()
                 except Contested as contested:

@@ -21,14 +21,12 @@ from hil.archive import (
     Level,
     Samples,
     container,
-    definitions,
     header,
     open_archive,
     schema,
     write_samples,
 )
 from hil.archive.cdr import fixed_layout
-from hil.archive.definitions import cycle as cycle_definition
 from hil.errors import ArchiveError, ArchiveVersionError, ArchiveWriteError, NotAnArchiveError
 
 JOINTS = ("joint_1", "joint_2", "joint_3")
@@ -119,7 +117,7 @@ class TestRoundTrip:
         assert np.array_equal(archive.columns["torque"], torques(rows))
 
     def test_the_cycle_message_has_a_place_for_every_field_of_a_record(self):
-        message = fixed_layout(cycle_definition(4)).dtype
+        message = fixed_layout(schema.profile(4)[schema.CYCLE].definition).dtype
         recorded = cycle_dtype(4)
         for name in recorded.names or ():
             assert message[name] == recorded[name], name
@@ -415,8 +413,8 @@ def test_an_archive_from_before_ages_were_known_is_still_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = records(300)
-    whole = definitions._CYCLE
-    monkeypatch.setattr(definitions, "_CYCLE", whole[: whole.index("uint16[8] age")])
+    whole = schema._CYCLE
+    monkeypatch.setattr(schema, "_CYCLE", whole[: whole.index("uint16[8] age")])
     path = write(tmp_path / NAME, rows)
     monkeypatch.undo()
     archive = open_archive(path)
@@ -429,7 +427,8 @@ def test_an_archive_from_before_ages_were_known_is_still_read(
 def test_the_documentation_shows_the_messages_as_they_are() -> None:
     page = Path(__file__).parents[2] / "docs" / "archive-format.md"
     text = page.read_text(encoding="utf-8")
-    for definition in (definitions.cycle(6), definitions.motor_current(6)):
+    profile = schema.profile(6)
+    for definition in (profile[topic].definition for topic in (schema.CYCLE, schema.MOTOR_CURRENT)):
         assert definition.partition("=" * 80)[0].strip() in text
     for topic in (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.EVENTS):
         assert f"`{topic}`" in text
