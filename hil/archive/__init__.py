@@ -10,10 +10,9 @@ from hil.archive.header import (
     ArchiveOutcome,
     Findings,
 )
-from hil.archive.imported import Samples, write_samples
 from hil.archive.reader import Archive, ArchiveDamage, open_archive
 from hil.archive.recorder import ArchiveSpec, Recorder
-from hil.archive.writer import ArchiveWriter
+from hil.archive.writer import ArchiveWriter, Samples, write_samples
 
 __all__ = [
     "CONTROLLERS_OWN",

@@ -17,7 +17,6 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from hil.archive import container, schema
-from hil.archive.amend import REJECTED
 from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
 from hil.archive.chunk import KnownChannels, Messages
 from hil.archive.container import Record
@@ -26,6 +25,7 @@ from hil.archive.header import (
     FORMAT_VERSION,
     KINDS,
     METADATA,
+    REJECTED,
     ArchiveHeader,
     ArchiveName,
     ArchiveOutcome,

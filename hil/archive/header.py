@@ -57,6 +57,8 @@ SEALS = (DESCRIPTION, CHUNKS)
 """Entries of the outcome that serve to verify the file, and say nothing of the recording."""
 CONTROLLERS_OWN = "controller"
 """Entry ``motion`` of an archive whose motion was made by the controller's own program."""
+REJECTED = "rejected"
+"""Outcome of a motion that ended well and failed its quality check."""
 MOST_JOINTS: Final = 256
 
 _DIGITS = 8  # of a checksum

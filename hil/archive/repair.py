@@ -6,13 +6,16 @@ says what is lost. Nothing is invented: what cannot be verified is left out.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+import stat
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import IO, BinaryIO
 
 import numpy as np
@@ -25,9 +28,64 @@ from hil.archive.container import Record
 from hil.archive.header import ArchiveOutcome
 from hil.archive.mcap_writer import Entries, McapWriter, chunk_of, entries_of, span
 from hil.archive.reader import open_archive
-from hil.archive.rewrite import write_anew
 from hil.archive.survey import Piece, Survey, survey
+from hil.archive.writer import sync_folder
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
+
+_NAMED = 40  # characters that the temporary file takes over of the name
+
+
+def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, IO[bytes]], None]) -> None:
+    """Make an archive of another one; `target` is at any moment what it was, or whole.
+
+    File and folder are on the disk when this returns, and the file has the mode of its source.
+
+    Args:
+        source: the archive to make it of.
+        target: the file to write or to replace, which may be the source.
+        fill: writes the content, given the source and the new file.
+
+    Raises:
+        ArchiveWriteError: the disk refuses.
+        ArchiveError: what was written cannot be read back; it is thrown away.
+    """
+    try:
+        with source.open("rb") as stream, _beside(target) as output:
+            os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
+            fill(stream, output)
+            output.flush()
+            os.fsync(output.fileno())
+            back = open_archive(output.name, fields=())
+            if not back.complete:
+                raise ArchiveError(
+                    source,
+                    f"cannot be written anew: {back.damage}",
+                    remedy="it is as it was, and what opens of it can be read: restore it from a "
+                    "copy, or record again",
+                )
+            Path(output.name).replace(target)
+        sync_folder(target.parent)
+    except OSError as error:
+        raise ArchiveWriteError(
+            target,
+            f"cannot be written: {error.strerror}",
+            remedy="what was there is as it was: make room or make its folder writable, "
+            "and do it again",
+        ) from error
+
+
+@contextlib.contextmanager
+def _beside(target: Path) -> Iterator[IO[bytes]]:
+    """A new file in the folder of another, of a name that nobody else has or can foresee."""
+    with NamedTemporaryFile(
+        dir=target.parent, prefix=f".{target.name[:_NAMED]}.", suffix=".part", delete=False
+    ) as output:
+        try:
+            yield output
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                Path(output.name).unlink()
+
 
 _SEQUENCE_AT = HEAD.fields["sequence"][1] if HEAD.fields else 0  # in a message record
 
@@ -209,3 +267,30 @@ def _outcome(found: Survey, chunks: Sequence[int]) -> dict[str, str]:
         else "unknown",
         "repaired.losses": json.dumps([*outcome.losses, *found.losses]),
     }
+
+
+def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
+    """Replace outcome and reason of a whole archive; all else stays as it was written.
+
+    The file is written anew beside its name, read back, and then takes its name: whatever
+    interrupts it leaves the old or the new file.
+
+    Args:
+        path: the archive.
+        outcome: how the interval is judged now, such as ``rejected``.
+        reason: why, in a sentence.
+
+    Raises:
+        ArchiveError: it is no whole archive.
+        ArchiveWriteError: the disk refuses; the archive is as it was.
+    """
+    path = Path(path)
+    found = survey(path)
+    if found.faults or found.metadata is None or found.outcome is None:
+        raise ArchiveError(path, "is not whole", remedy="repair it with `hil archive repair`")
+    amended = {"outcome": outcome, "reason": reason}
+
+    def fill(stream: BinaryIO, output: IO[bytes]) -> None:
+        copy_of(found, stream, output, outcome=amended)
+
+    write_anew(path, path, fill)

@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import Final
 
 from hil.archive import ArchiveName, open_archive
-from hil.archive.amend import REJECTED, amend_outcome
+from hil.archive.header import REJECTED
+from hil.archive.repair import amend_outcome
 from hil.cell import Cell
 from hil.errors import ArchiveError
 

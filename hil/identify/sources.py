@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
-from hil.archive.amend import REJECTED
+from hil.archive.header import REJECTED
 from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell

@@ -396,7 +396,7 @@ class TestBadInput:
             open_archive(tmp_path / "a.mcap")
 
     def test_an_archive_of_a_newer_profile_is_refused_by_version(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("hil.archive.file_writer.FORMAT_VERSION", 9)
+        monkeypatch.setattr("hil.archive.writer.FORMAT_VERSION", 9)
         write(tmp_path / NAME, records(5))
         with pytest.raises(ArchiveVersionError, match="version 9; this software reads version 1"):
             open_archive(tmp_path / NAME)

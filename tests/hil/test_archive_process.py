@@ -32,9 +32,16 @@ from drivers.exchange import (
 )
 from drivers.exchange import control as control_memory
 from hil.archive import Archive, ArchiveSpec, open_archive
-from hil.archive.commands import Answer, Channel, Close, Closed, Open, Opened
 from hil.archive.process import ArchiveProcess
-from hil.archive.supervised import ArchiveProcessHandle
+from hil.archive.supervised import (
+    Answer,
+    ArchiveProcessHandle,
+    Channel,
+    Close,
+    Closed,
+    Open,
+    Opened,
+)
 
 PERIOD = 0.001
 NAME = "excitation_000_a1.mcap"

@@ -15,7 +15,7 @@ from drivers.motion_source import MotionSource
 from drivers.states import State
 from drivers.transports import TransportSpec, UdpSpec
 from hil.archive import ArchiveSpec, open_archive
-from hil.archive.live_view import LiveView, LiveViewError
+from hil.archive.live import LiveView, LiveViewError
 from hil.campaign import Stop
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.live_link import LiveLink

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from drivers.transports import SimulatedTransport
 from hil.archive import open_archive
-from hil.archive.amend import amend_outcome
 from hil.archive.check import check_archive
+from hil.archive.repair import amend_outcome
 from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError
 from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import (

@@ -15,9 +15,8 @@ from mcap.writer import CompressionType, Writer
 
 from drivers.record import cycle_dtype
 from hil.archive import ArchiveWriter, container, header, open_archive, schema
-from hil.archive.amend import amend_outcome
 from hil.archive.check import check_archive
-from hil.archive.repair import repair
+from hil.archive.repair import amend_outcome, repair
 from tests.hil import mcap_bytes
 
 NAME = "validation_003_a1.mcap"

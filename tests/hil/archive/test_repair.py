@@ -15,7 +15,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from hil.archive import Samples, container, open_archive, rewrite, write_samples
+from hil.archive import Samples, container, open_archive, write_samples
+from hil.archive import repair as repairing
 from hil.archive.check import check_archive
 from hil.archive.repair import Repair, repair
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
@@ -263,7 +264,7 @@ class TestRefused:
     ):
         broken.write_bytes(written.data[:-100])
         torn = open_archive(broken)
-        monkeypatch.setattr(rewrite, "open_archive", lambda *_, **__: torn)
+        monkeypatch.setattr(repairing, "open_archive", lambda *_, **__: torn)
         with pytest.raises(ArchiveError, match=r"cannot be written anew.*restore it from a copy"):
             repair(broken)
         assert [path.name for path in broken.parent.iterdir()] == [broken.name]
@@ -308,11 +309,11 @@ def test_repairs_of_one_archive_at_once_do_not_meet(broken: Path, written, monke
     second: list[Repair] = []
 
     def meanwhile(path: object, **options: Any) -> Any:
-        monkeypatch.setattr(rewrite, "open_archive", open_archive)
+        monkeypatch.setattr(repairing, "open_archive", open_archive)
         second.append(repair(broken, in_place=True))
         return open_archive(path, **options)
 
-    monkeypatch.setattr(rewrite, "open_archive", meanwhile)
+    monkeypatch.setattr(repairing, "open_archive", meanwhile)
     first = repair(broken, in_place=True)
     assert broken.read_bytes() == written.data
     assert first.samples == second[0].samples == 43

@@ -25,12 +25,11 @@ from hil.archive import container, header, open_archive, schema
 from hil.archive.cdr import LayoutError, fixed_layout
 from hil.archive.check import check_archive
 from hil.archive.container import Record
-from hil.archive.file_writer import ArchiveFile
 from hil.archive.header import ArchiveHeader, HeaderError, listed
 from hil.archive.overview import overview
 from hil.archive.repair import repair
 from hil.archive.schema import SampleEncoder
-from hil.archive.writer import checked_metadata
+from hil.archive.writer import ArchiveFile, checked_metadata
 from hil.cli import app
 from hil.errors import ArchiveError
 from hil.identify.sources import cell_of, gather_sources
