@@ -12,6 +12,7 @@ import struct
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,7 +82,7 @@ class Messages:
         ]
         return np.concatenate(places)
 
-    @property
+    @cached_property
     def stamps(self) -> NDArray[np.int64] | None:
         """Time stamps of all, shape (k,) [ns]; None where a message is too short for one."""
         if any(part.shape[1] < _STAMP_AT.stop for part in self.parts):

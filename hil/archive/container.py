@@ -36,7 +36,6 @@ from mcap.records import (
 MAGIC = b"\x89MCAP0\r\n"
 LARGEST_CHUNK = 1 << 24  # bytes; ours have a tenth of a megabyte
 LARGEST_RECORD = 1 << 28  # bytes; neither attachments nor summaries come near
-MOST_INFLATION = 1000  # times what is compressed; an arm at rest reaches a tenth
 
 HEADER = 0x01
 FOOTER = 0x02
@@ -295,7 +294,7 @@ def chunk_data(
 ) -> bytes:
     """Decompress the records of a chunk, whose head may be known, and verify their checksum."""
     head = head or chunk(record)
-    if head.size > min(LARGEST_CHUNK, MOST_INFLATION * len(head.data)):
+    if head.size > LARGEST_CHUNK:
         raise Damage(record.offset, f"(chunk) claims {head.size} bytes of content")
     data = _decompressed(head, record.offset, decompressor)
     if len(data) != head.size:

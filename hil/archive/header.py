@@ -381,3 +381,8 @@ def checksum(entries: Mapping[str, str]) -> str:
     """CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
     text = json.dumps(dict(entries), sort_keys=True, separators=(",", ":"))
     return f"{zlib.crc32(text.encode()):08x}"
+
+
+def sealed(entries: Mapping[str, str]) -> dict[str, str]:
+    """The entries of a metadata record with their checksum."""
+    return {**entries, "checksum": checksum(entries)}

@@ -180,7 +180,7 @@ class LivePublisher:
             torque = portion.drive_train.joint_torque(records["target_current"])
             batch = self._encoder.encode(records, torque)
             times = [self._clock.at(int(stamp)) for stamp in batch.stamp]
-            for channel, rows in zip(self._channels, batch.messages, strict=True):
+            for channel, rows in zip(self._channels, batch.messages.values(), strict=True):
                 size = rows.dtype.itemsize
                 data = rows.tobytes()
                 for index, log_time in enumerate(times):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drivers.record import cycle_dtype
 from hil.archive import container, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
-from hil.archive.chunk import Bytes, Messages, stamps
+from hil.archive.chunk import Bytes, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
@@ -91,9 +91,6 @@ class Selection:
         return self.topics is None or schema.EVENTS in self.topics
 
 
-_MOST_EXPECTED = 1 << 20  # samples that room is made for on the word of one chunk
-_MARGIN = 1.3  # room for chunks that are smaller than the one the count is guessed from
-_FIRST_CAPACITY = 4096
 _BATCH = 1 << 20  # bytes of chunks decoded at once: few calls per chunk, and all in the cache
 _COLUMN_OF = {"effort": "torque"}  # where a message has another word for it than we
 _STAMP_FIELDS = ("sec", "nanosec")
@@ -125,9 +122,8 @@ class _Columns:
         self._layout = layout
         self._times = selection.times if selection.bounded else None
         self._blocks = _blocks(layout, selection.fields)
-        self._stamps = np.empty(0, np.int64)
-        self._arrays = [np.empty((len(block.names), 0), block.raw) for block in self._blocks]
-        self._count = 0
+        self._stamps: list[NDArray[np.int64]] = []
+        self._parts: list[list[NDArray[np.void]]] = [[] for _ in self._blocks]
 
     def verified(self, messages: Messages, offset: int) -> Bytes:
         """The messages as bytes (k, size), which must be like those before."""
@@ -136,39 +132,28 @@ class _Columns:
             raise Damage(offset, "(chunk) has messages that differ from those before")
         return data
 
-    def append(self, messages: Bytes, expected: int) -> None:
-        """Append messages, shape (k, size); `expected` is a guess at the final count."""
-        stamp = stamps(messages)
+    def append(self, messages: Bytes, stamp: NDArray[np.int64]) -> None:
+        """Append messages, shape (k, size), and their stamps (k,) [ns]."""
         if self._times is not None:
             wanted = (stamp >= self._times[0]) & (stamp < self._times[1])
             messages, stamp = messages[wanted], stamp[wanted]
-        now = slice(self._count, self._count + len(messages))
-        if now.stop > len(self._stamps):
-            self._grow(max(_FIRST_CAPACITY, now.stop, 2 * self._count, expected))
-        self._stamps[now] = stamp
-        for block, array in zip(self._blocks, self._arrays, strict=True):
-            array[:, now] = messages[:, block.start : block.end].view(block.raw).T
-        self._count = now.stop
+        self._stamps.append(stamp)
+        for block, parts in zip(self._blocks, self._parts, strict=True):
+            fields = messages[:, block.start : block.end].view(block.raw)
+            parts.append(np.ascontiguousarray(fields.T))
 
     def finished(self) -> dict[str, NDArray[Any]]:
         """The columns by our names, contiguous and read-only."""
-        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
-        for block, array in zip(self._blocks, self._arrays, strict=True):
-            fields = array.view(block.dtype).reshape(*array.shape, *block.shape)
+        columns: dict[str, NDArray[Any]] = {"stamp": np.concatenate(self._stamps)}
+        for block, parts in zip(self._blocks, self._parts, strict=True):
+            joined = np.concatenate(parts, axis=1)
+            parts.clear()
+            fields = joined.view(block.dtype).reshape(*joined.shape, *block.shape)
             for name, values in zip(block.names, fields, strict=True):
-                columns[_COLUMN_OF.get(name, name)] = values[: self._count]
+                columns[_COLUMN_OF.get(name, name)] = values
         for column in columns.values():
             column.flags.writeable = False
         return columns
-
-    def _grow(self, capacity: int) -> None:
-        kept = slice(0, self._count)
-        grown = np.empty(capacity, np.int64)
-        grown[kept] = self._stamps[kept]
-        self._stamps = grown
-        for index, array in enumerate(self._arrays):
-            self._arrays[index] = np.empty((len(array), capacity), array.dtype)
-            self._arrays[index][:, kept] = array[:, kept]
 
 
 def _blocks(layout: MessageLayout, fields: Collection[str] | None) -> list[_Block]:
@@ -207,7 +192,6 @@ class _Content(Scan):
         self.events: list[ArchivedEvent] = []
         self._selection = selection
         self._gapless = gapless
-        self._size = 0
         self._columns: dict[str, _Columns] = {}
         self._waiting: list[tuple[int, bytes]] = []  # chunks that are decoded with others
         self._waiting_size = 0
@@ -217,9 +201,8 @@ class _Content(Scan):
 
         Args:
             records: of the data section, in the order of the file.
-            size: length of the file, or of the part of it that is read.
+            size: length of the file.
         """
-        self._size = size
         damage = None
         try:
             for record in records:
@@ -257,7 +240,7 @@ class _Content(Scan):
         data = self.opened(record)
         if not self.parser.repeats(data):
             self._take_waiting()
-            self._decode(self.parser.messages(data, record.offset), record.offset, record.length)
+            self._decode(self.parser.messages(data, record.offset), record.offset)
             return
         self._waiting.append((record.offset, data))
         self._waiting_size += len(data)
@@ -272,14 +255,14 @@ class _Content(Scan):
         try:
             found = self.parser.repeated([data for _, data in waiting])
             if found is not None:
-                self._decode(found, waiting[0][0], 0)
+                self._decode(found, waiting[0][0])
                 return
         except Damage:
             pass  # in one of them
         for offset, data in waiting:
-            self._decode(self.parser.messages(data, offset), offset, 0)
+            self._decode(self.parser.messages(data, offset), offset)
 
-    def _decode(self, numbered: dict[int, Messages], offset: int, compressed: int) -> None:
+    def _decode(self, numbered: dict[int, Messages], offset: int) -> None:
         """Decode messages, if they are what must follow now; else nothing of them counts."""
         found = self.parser.by_topic(numbered, offset)
         recorded = self.parser.known.topics
@@ -299,9 +282,10 @@ class _Content(Scan):
         events = self._decoded_events(found.get(EVENTS), offset)
         self.continued(found, offset)
         for topic, columns, messages in decoded:
+            stamp = found[topic].stamps
             self._columns[topic] = columns
-            share = self._size / compressed if compressed else 0.0
-            columns.append(messages, min(_MOST_EXPECTED, int(_MARGIN * len(messages) * share)))
+            assert stamp is not None  # the layout has one
+            columns.append(messages, stamp)
         self.events += events
 
     def missing(self, gaps: Mapping[str, int], offset: int) -> None:
@@ -623,7 +607,7 @@ def _by_index(
     # Where nothing falls into the range, one chunk still tells what columns there are.
     places = [(one.chunk_start_offset, one.chunk_length) for one in within or chunks[:1]]
     records = (container.record_at(stream, *place) for place in sorted([*others, *places]))
-    damage = content.collect(records, sum(length for _, length in places))
+    damage = content.collect(records, 0)
     return content if damage is None and content.metadata is not None else None
 
 

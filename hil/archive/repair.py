@@ -192,7 +192,7 @@ def copy_of(
     writer, parser = McapWriter(output.write), ChunkParser()
     described = _description(found)
     writer.start(schema.PROFILE, schema.LIBRARY)
-    writer.add_metadata(header.METADATA, {**described, "checksum": header.checksum(described)})
+    writer.add_metadata(header.METADATA, header.sealed(described))
     recovered = found.definitions
     for piece in found.pieces:
         record = container.record_at(stream, piece.offset, piece.length)
@@ -208,7 +208,7 @@ def copy_of(
             writer.add_definition(known)
         writer.add_chunk(chunk, entries)
     stated = {**_outcome(found, writer.checksums), **(outcome or {})}
-    writer.add_metadata(header.OUTCOME, {**stated, "checksum": header.checksum(stated)})
+    writer.add_metadata(header.OUTCOME, header.sealed(stated))
     writer.finish()
 
 

@@ -172,11 +172,11 @@ class Batch(NamedTuple):
 
     Attributes:
         stamp: shape (k,), nanoseconds.
-        messages: per channel its k messages.
+        messages: by topic, k of each.
     """
 
     stamp: NDArray[np.int64]
-    messages: tuple[Rows, ...]
+    messages: Mapping[str, Rows]
 
 
 class CycleEncoder:
@@ -185,7 +185,7 @@ class CycleEncoder:
     `/hil/cycle` holds everything; the two JointState channels repeat what viewers plot.
 
     Attributes:
-        channels: the channels, in the order of the messages of a batch.
+        channels: the channels.
     """
 
     def __init__(self, joint_names: Sequence[str], period: float) -> None:
@@ -215,7 +215,7 @@ class CycleEncoder:
         measured["effort"] = torque
         commanded["position"] = records["commanded_position"]
         commanded["velocity"] = records["commanded_velocity"]
-        return Batch(stamp, (cycle, measured, commanded))
+        return Batch(stamp, {CYCLE: cycle, MEASURED: measured, COMMANDED: commanded})
 
 
 class PacketEncoder:
@@ -237,7 +237,7 @@ class PacketEncoder:
         rows = _stamped(self._layout, stamp)
         for name in packets.dtype.names or ():
             rows[name] = packets[name]
-        return Batch(stamp, (rows,))
+        return Batch(stamp, {PACKETS: rows})
 
 
 class SampleEncoder:
@@ -246,7 +246,7 @@ class SampleEncoder:
     Quantities that the recording does not have are left out of the messages, not invented.
 
     Attributes:
-        channels: the channels, in the order of the messages of a batch.
+        channels: the channels.
     """
 
     def __init__(
@@ -274,10 +274,10 @@ class SampleEncoder:
             if values is not None:
                 state[name] = values
         if self._current is None or motor_current is None:
-            return Batch(stamp, (state,))
+            return Batch(stamp, {MEASURED: state})
         current = _stamped(self._current, stamp)
         current["motor_current"] = motor_current
-        return Batch(stamp, (state, current))
+        return Batch(stamp, {MEASURED: state, MOTOR_CURRENT: current})
 
 
 def message_layout(

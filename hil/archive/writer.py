@@ -6,8 +6,8 @@ import json
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from os import PathLike
@@ -30,11 +30,15 @@ from hil.archive.header import (
     ArchiveName,
     checksum,
     listed,
+    sealed,
 )
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.schema import (
+    CYCLE,
     EVENT_CHANNEL,
+    EVENTS,
     LIBRARY,
+    PACKETS,
     PROFILE,
     Batch,
     Channel,
@@ -54,29 +58,6 @@ _MEDIA_TYPES = {
 }
 
 
-class _Sink:
-    """Collects what is to be written; each flush is one write to the file."""
-
-    def __init__(self, descriptor: int, *, durable: bool) -> None:
-        self._descriptor = descriptor
-        self._durable = durable
-        self._parts: list[bytes] = []
-        self.slowest = 0.0
-
-    def write(self, data: bytes) -> None:
-        self._parts.append(data)
-
-    def flush(self) -> None:
-        data = memoryview(b"".join(self._parts))
-        self._parts.clear()
-        begin = time.monotonic()
-        while data:
-            data = data[os.write(self._descriptor, data) :]
-        if self._durable:
-            os.fdatasync(self._descriptor)
-        self.slowest = max(self.slowest, time.monotonic() - begin)
-
-
 class ArchiveFile:
     """An MCAP file of the archive profile, open for writing.
 
@@ -85,11 +66,15 @@ class ArchiveFile:
 
     Args:
         path: where to write.
-        channels: the channels whose messages come in batches, one of each at every instant.
-        packets: a channel for raw packets, which come as they come.
+        channels: all channels.
         metadata: entries of the ``hil`` metadata record.
         attachments: file name to content.
         durable: wait at each flush until the disk has the data.
+
+    Attributes:
+        counts: messages written so far, by topic.
+        slowest_flush: longest time that the disk took for what was handed to it at once [s].
+        closed: whether the file is closed, by `finish` or by a failure of the disk.
 
     Raises:
         ArchiveWriteError: the file exists or cannot be created.
@@ -103,117 +88,74 @@ class ArchiveFile:
         metadata: Mapping[str, str],
         attachments: Mapping[str, bytes],
         durable: bool,
-        packets: Channel | None = None,
     ) -> None:
-        self.path = path
+        self.counts = {channel.topic: 0 for channel in channels}
+        self.slowest_flush = 0.0
+        self.closed = False
+        self._path = path
+        self._durable = durable
         self._descriptor = _create(path)
-        self._closed = False
-        self._written = 0
-        self._events = 0
-        self._packets = 0
-        self._description = ""
-        self._sink = _Sink(self._descriptor, durable=durable)
-        self._writer = McapWriter(self._sink.write)
+        self._parts: list[bytes] = []  # to be written at once
+        self._writer = McapWriter(self._parts.append)
+        names = json.dumps(sorted(attachments))
+        described = {**metadata, "format_version": str(FORMAT_VERSION), "attachments": names}
+        self._description = checksum(described)
         with self._guarded():
-            self._start(metadata, attachments)
+            self._writer.start(PROFILE, LIBRARY)
+            self._writer.add_metadata(METADATA, sealed(described))
+            for name, data in sorted(attachments.items()):
+                media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
+                self._writer.add_attachment(name, media_type, data)
+            self._write()
             if durable:  # only now: the file is empty for as short a time as possible
                 sync_folder(path.parent)
-            self._channels = [self._register(channel) for channel in channels]
-            self._event_channel = self._register(EVENT_CHANNEL)
-            self._packet_channel = None if packets is None else self._register(packets)
-
-    @property
-    def samples(self) -> int:
-        """Number of instants written so far."""
-        return self._written
-
-    @property
-    def events(self) -> int:
-        """Number of events written so far."""
-        return self._events
-
-    @property
-    def packets(self) -> int:
-        """Number of raw packets written so far."""
-        return self._packets
-
-    @property
-    def slowest_flush(self) -> float:
-        """Longest time that the disk took for what was handed to it at once [s]."""
-        return self._sink.slowest
-
-    @property
-    def closed(self) -> bool:
-        """Whether the file is closed, by `finish` or by a failure of the disk."""
-        return self._closed
+        self._numbers = {channel.topic: self._register(channel) for channel in channels}
 
     def add(self, batch: Batch) -> None:
-        """Add a batch of messages to the chunk in progress."""
-        self._add(self._channels, self._written, batch)
-        self._written += len(batch.stamp)
-
-    def add_packets(self, batch: Batch) -> None:
-        """Add raw packets to the chunk in progress.
-
-        Raises:
-            ValueError: the file was opened without a channel for them.
-        """
-        if self._packet_channel is None:
-            raise ValueError("this file has no channel for raw packets")
-        self._add([self._packet_channel], self._packets, batch)
-        self._packets += len(batch.stamp)
+        """Add messages of channels that count alike to the chunk in progress."""
+        topics = [*batch.messages]
+        numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _MOST_NUMBERS
+        channels = [self._numbers[topic] for topic in topics]
+        with self._guarded():
+            self._writer.add_rows(channels, batch.stamp, numbers, [*batch.messages.values()])
+        for topic in topics:
+            self.counts[topic] += len(batch.stamp)
 
     def add_event(self, message: LogMessage) -> None:
         """Add an event to the chunk in progress."""
+        number = self.counts[EVENTS] % _MOST_NUMBERS
         with self._guarded():
-            self._writer.add_message(
-                self._event_channel,
-                message.stamp,
-                self._events % _MOST_NUMBERS,
-                encode_log(message),
-            )
-        self._events += 1
+            data = encode_log(message)
+            self._writer.add_message(self._numbers[EVENTS], message.stamp, number, data)
+        self.counts[EVENTS] += 1
 
     def flush(self) -> None:
         """End the chunk in progress and hand everything to the operating system, or the disk."""
         with self._guarded():
             self._writer.flush()
-            self._sink.flush()
+            self._write()
 
     def finish(self, outcome: Mapping[str, str]) -> None:
         """Write the outcome, index and footer, and close the file."""
-        if self._closed:
+        if self.closed:
             return
         with self._guarded():
             self._writer.flush()
-            chunks = listed(self._writer.checksums)
-            seals = {DESCRIPTION: self._description, CHUNKS: chunks}
-            self._add_metadata(OUTCOME, {**outcome, **seals})
+            seals = {DESCRIPTION: self._description, CHUNKS: listed(self._writer.checksums)}
+            self._writer.add_metadata(OUTCOME, sealed({**outcome, **seals}))
             self._writer.finish()
-            self._sink.flush()
+            self._write()
             self._close()  # some file systems tell only now that they did not take everything
 
-    def _add(self, channels: Sequence[int], first: int, batch: Batch) -> None:
-        numbers = (first + np.arange(len(batch.stamp))) % _MOST_NUMBERS
-        with self._guarded():
-            self._writer.add_rows(channels, batch.stamp, numbers, batch.messages)
-
-    def _start(self, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> None:
-        self._writer.start(PROFILE, LIBRARY)
-        own = {
-            "format_version": str(FORMAT_VERSION),
-            "attachments": json.dumps(sorted(attachments)),
-        }
-        described = {**metadata, **own}
-        self._description = checksum(described)
-        self._add_metadata(METADATA, described)
-        for name, data in sorted(attachments.items()):
-            media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
-            self._writer.add_attachment(name, media_type, data)
-        self._sink.flush()
-
-    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        self._writer.add_metadata(name, {**entries, "checksum": checksum(entries)})
+    def _write(self) -> None:
+        data = memoryview(b"".join(self._parts))
+        self._parts.clear()
+        begin = time.monotonic()
+        while data:
+            data = data[os.write(self._descriptor, data) :]
+        if self._durable:
+            os.fdatasync(self._descriptor)
+        self.slowest_flush = max(self.slowest_flush, time.monotonic() - begin)
 
     def _register(self, channel: Channel) -> int:
         definition = channel.definition.encode()
@@ -221,36 +163,27 @@ class ArchiveFile:
             channel.topic, "cdr", schema=channel.schema, encoding="ros2msg", definition=definition
         )
 
-    def _guarded(self) -> _DiskGuard:
-        if self._closed:
-            raise ArchiveWriteError(self.path, "the archive is closed")
-        return _DiskGuard(self)
-
-    def _close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            os.close(self._descriptor)
-
-
-class _DiskGuard:
-    """Turns a failure of the disk into our error, and closes the file for good."""
-
-    def __init__(self, file: ArchiveFile) -> None:
-        self._file = file
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, OSError):
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Turn a failure of the disk into our error, and close the file for good."""
+        if self.closed:
+            raise ArchiveWriteError(self._path, "the archive is closed")
+        try:
+            yield
+        except OSError as error:
             with suppress(OSError):
-                self._file._close()
+                self._close()
             raise ArchiveWriteError(
-                self._file.path,
+                self._path,
                 f"cannot be written further: {error.strerror}",
                 remedy="what was flushed before can be read; make room or mend the disk, "
                 "and record again",
             ) from error
+
+    def _close(self) -> None:
+        if not self.closed:
+            self.closed = True
+            os.close(self._descriptor)
 
 
 def _create(path: Path) -> int:
@@ -334,15 +267,17 @@ class ArchiveWriter:
         self._last: int | None = None
         self._newest = 0
         self._lost = 0
+        own = {"joint_names": list(joint_names), "period": period}
         self._file = ArchiveFile(
             self._path,
-            channels=self._encoder.channels,
-            metadata=checked_metadata(
-                self._path, metadata, {"joint_names": list(joint_names), "period": period}
-            ),
+            channels=[
+                *self._encoder.channels,
+                EVENT_CHANNEL,
+                *([PacketEncoder.channel] if packets else []),
+            ],
+            metadata=checked_metadata(self._path, metadata, own),
             attachments=attachments or {},
             durable=durable,
-            packets=self._packet_encoder.channel if self._packet_encoder else None,
         )
 
     @property
@@ -471,12 +406,12 @@ class ArchiveWriter:
         self._emit(everything=True)
         self._emit_packets(None if self._first is None else self._newest)
         cycles = {
-            "samples": self._file.samples,
-            "events": self._file.events,
+            "samples": self._file.counts[CYCLE],
+            "events": self._file.counts[EVENTS],
             "lost_packets": self._lost,
         }
         if self._packet_encoder is not None:
-            cycles["packets"] = self._file.packets
+            cycles["packets"] = self._file.counts[PACKETS]
         if self._first is not None and self._last is not None:
             cycles |= {"first_cycle": self._first, "last_cycle": self._last}
         counted = {key: str(value) for key, value in cycles.items()}
@@ -525,7 +460,7 @@ class ArchiveWriter:
         count = len(packets)
         if last is not None:
             count = int(np.searchsorted(packets["cycle"], last, side="right"))
-        self._file.add_packets(self._packet_encoder.encode(packets[:count]))
+        self._file.add(self._packet_encoder.encode(packets[:count]))
         self._pending_packets = [packets[count:]] if count < len(packets) else []
 
     def _emit(self, *, everything: bool) -> None:
@@ -641,7 +576,7 @@ def write_samples(
         own["period"] = period
     file = ArchiveFile(
         path,
-        channels=encoder.channels,
+        channels=[*encoder.channels, EVENT_CHANNEL],
         metadata=checked_metadata(path, {**metadata, "kind": "imported"}, own),
         attachments=attachments or {},
         durable=durable,

@@ -28,7 +28,7 @@ from hil.archive.container import Record
 from hil.archive.header import ArchiveHeader, HeaderError, listed
 from hil.archive.overview import overview
 from hil.archive.repair import repair
-from hil.archive.schema import SampleEncoder
+from hil.archive.schema import EVENT_CHANNEL, SampleEncoder
 from hil.archive.writer import ArchiveFile, checked_metadata
 from hil.cli import app
 from hil.errors import ArchiveError
@@ -338,7 +338,11 @@ def imported(tmp_path) -> Imported:
     encoder = SampleEncoder(["a", "b"], velocity=False, torque=False, motor_current=True)
     entries = checked_metadata(path, {"kind": "imported"}, {"joint_names": ["a", "b"]})
     file = ArchiveFile(
-        path, channels=encoder.channels, metadata=entries, attachments={}, durable=False
+        path,
+        channels=[*encoder.channels, EVENT_CHANNEL],
+        metadata=entries,
+        attachments={},
+        durable=False,
     )
     for start in range(0, 60, 20):
         stamps = np.arange(start, start + 20, dtype=np.int64) * 10**9
