@@ -20,7 +20,7 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from hil.archive import container
-from hil.archive.container import Damage
+from hil.archive.container import Damage, Record
 
 Bytes = NDArray[np.uint8]
 
@@ -137,25 +137,28 @@ class KnownChannels:
         identity = next(one.schema_id for one in self.channels.values() if one.topic == topic)
         return self.schemas.get(identity)
 
-    def take(self, opcode: int, body: bytes, offset: int) -> None:
-        """Take a schema or channel record that begins at `offset`; others are passed over.
+    def take(self, record: Record) -> None:
+        """Take a schema or channel; other records are passed over.
 
         Raises:
             Damage: the record is torn, or says something else than one before.
         """
-        if opcode == container.SCHEMA:
-            schema = container.parsed(Schema, body, offset)
-            if not schema.id:
-                raise Damage(offset, "(schema) has the number 0, which says that there is none")
-            if self.schemas.setdefault(schema.id, schema) != schema:
-                raise Damage(offset, f"announces schema {schema.id} a second time, as another")
-        elif opcode == container.CHANNEL:
-            channel = container.parsed(Channel, body, offset)
+        if record.opcode not in (container.SCHEMA, container.CHANNEL):
+            return
+        item, again = container.item(record), ""
+        if isinstance(item, Schema):
+            if not item.id:
+                raise Damage(record.offset, "(schema) has the number 0, which stands for none")
+            if self.schemas.setdefault(item.id, item) != item:
+                again = f"schema {item.id}"
+        elif isinstance(item, Channel):
             known = self.channels.values()
-            same = [one for one in known if one.id == channel.id or one.topic == channel.topic]
-            if same not in ([], [channel]):
-                raise Damage(offset, f"announces channel {channel.id} a second time, as another")
-            self.channels[channel.id] = channel
+            same = [one for one in known if one.id == item.id or one.topic == item.topic]
+            if same not in ([], [item]):
+                again = f"channel {item.id}"
+            self.channels.setdefault(item.id, item)
+        if again:
+            raise Damage(record.offset, f"announces {again} a second time, as another")
 
 
 class _Place(NamedTuple):
@@ -224,7 +227,8 @@ class ChunkParser:
                 messages = found.setdefault(channel, Messages())
                 messages.append(row[:, : HEAD.itemsize], row[:, HEAD.itemsize :], at, 0)
             else:
-                self.known.take(opcode, chunk[at + container.RECORD.size : end], offset)
+                body = chunk[at + container.RECORD.size : end]
+                self.known.take(Record(offset, opcode, body, len(body)))
             at = end
         return found
 

@@ -26,11 +26,14 @@ from mcap.exceptions import EndOfFile
 from mcap.records import (
     Attachment,
     AttachmentIndex,
+    Channel,
+    Chunk,
     ChunkIndex,
     Footer,
     McapRecord,
     Metadata,
     MetadataIndex,
+    Schema,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -55,9 +58,9 @@ DATA_END = 0x0F
 
 RECORD = struct.Struct("<BQ")  # opcode, length of the body
 FOOTER_SIZE = RECORD.size + 20
-_CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
-_LENGTH = struct.Struct("<Q")
+_CHUNK_FIELDS = struct.calcsize("<QQQIIQ")  # of a chunk, but for compression and data
 _NO_CRC = 0
+_KINDS: dict[int, type[McapRecord]] = {SCHEMA: Schema, CHANNEL: Channel, METADATA: Metadata}
 _Parsed = TypeVar("_Parsed", bound=McapRecord)
 FARTHEST = 1 << 62  # bytes, less than the end of any file
 
@@ -98,17 +101,6 @@ class Record(NamedTuple):
     def data(self) -> bytes:
         """Its bytes as they stand in the file."""
         return RECORD.pack(self.opcode, self.length) + self.body
-
-
-class Chunk(NamedTuple):
-    """The head of a chunk record, and its compressed records."""
-
-    start_time: int
-    end_time: int
-    size: int
-    crc: int
-    compression: str
-    data: memoryview
 
 
 class _Body(ReadDataStream):
@@ -258,10 +250,17 @@ def _check_end(tail: bytes, offset: int) -> None:
         raise Damage(offset, "(index and footer) fails its checksum")
 
 
-def metadata(record: Record) -> tuple[str, dict[str, str]]:
-    """Name and entries of a metadata record."""
-    found = parsed(Metadata, record.body, record.offset)
-    return found.name, found.metadata
+def item(record: Record) -> McapRecord:
+    """A schema, channel, metadata record or attachment.
+
+    Raises:
+        Damage: it is none of these, or damaged.
+    """
+    if record.opcode == ATTACHMENT:
+        return attachment(record)
+    if record.opcode not in _KINDS:
+        raise Damage(record.offset, "is of another kind")
+    return parsed(_KINDS[record.opcode], record.body, record.offset)
 
 
 def attachment(record: Record) -> Attachment:
@@ -273,53 +272,52 @@ def attachment(record: Record) -> Attachment:
     return found
 
 
+def metadata(record: Record) -> tuple[str, dict[str, str]]:
+    """Name and entries of a metadata record."""
+    found = parsed(Metadata, record.body, record.offset)
+    return found.name, found.metadata
+
+
 def chunk(record: Record) -> Chunk:
     """Read a chunk record, without decompressing it."""
-    body = memoryview(record.body)
-    try:
-        start_time, end_time, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
-        name_end = _CHUNK_HEAD.size + name_length
-        compression = bytes(body[_CHUNK_HEAD.size : name_end]).decode()
-        (length,) = _LENGTH.unpack_from(body, name_end)
-    except (struct.error, UnicodeDecodeError):
-        raise Damage(record.offset, "(chunk) has a head that cannot be read") from None
-    data = body[name_end + _LENGTH.size :]
-    if len(data) != length:
+    found = parsed(Chunk, record.body, record.offset)
+    if record.length != _CHUNK_FIELDS + len(found.compression.encode()) + len(found.data):
         raise Damage(record.offset, "(chunk) has another length than its fields")
-    return Chunk(start_time, end_time, size, crc, compression, data)
+    return found
 
 
 def chunk_data(
     record: Record, *, decompressor: zstandard.ZstdDecompressor, head: Chunk | None = None
 ) -> bytes:
-    """Decompress the records of a chunk, whose head may be known, and verify their checksum."""
+    """Decompress the records of a chunk, which may be parsed already; verify their checksum."""
     head = head or chunk(record)
-    if head.size > LARGEST_CHUNK:
-        raise Damage(record.offset, f"(chunk) claims {head.size} bytes of content")
+    size = head.uncompressed_size
+    if size > LARGEST_CHUNK:
+        raise Damage(record.offset, f"(chunk) claims {size} bytes of content")
     data = _decompressed(head, record.offset, decompressor)
-    if len(data) != head.size:
+    if len(data) != size:
         raise Damage(record.offset, "(chunk) has another length than it claims")
-    if crc32(data) != head.crc:
-        missing = head.crc == _NO_CRC
+    if crc32(data) != head.uncompressed_crc:
+        missing = head.uncompressed_crc == _NO_CRC
         raise Damage(record.offset, f"(chunk) {'has no' if missing else 'fails its'} checksum")
     return data
 
 
 def _decompressed(chunk: Chunk, offset: int, decompressor: zstandard.ZstdDecompressor) -> bytes:
     """Decompress to at most one byte more than announced: a corrupt frame fills no memory."""
+    size = chunk.uncompressed_size
     try:
         if chunk.compression == "zstd":
-            claimed = zstandard.frame_content_size(chunk.data)
-            if claimed not in (-1, chunk.size):
+            if zstandard.frame_content_size(chunk.data) not in (-1, size):
                 raise Damage(offset, "(chunk) has another length than it claims")
-            return decompressor.decompress(chunk.data, max_output_size=max(1, chunk.size))
+            return decompressor.decompress(chunk.data, max_output_size=max(1, size))
         if chunk.compression == "lz4":
             frame = lz4.frame.LZ4FrameDecompressor()
-            return bytes(frame.decompress(chunk.data, max_length=chunk.size + 1))
+            return bytes(frame.decompress(chunk.data, max_length=size + 1))
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise Damage(offset, "(chunk) cannot be decompressed") from error
     if chunk.compression == "":
-        return bytes(chunk.data)
+        return chunk.data
     raise Damage(offset, f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4")
 
 

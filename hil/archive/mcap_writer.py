@@ -74,122 +74,6 @@ def span(entries: Entries) -> tuple[int, int]:
     return int(min(part.min() for part in stamps)), int(max(part.max() for part in stamps))
 
 
-class Index:
-    """What follows from the other records of a file: message indexes and summary.
-
-    It holds nothing of its own, so a file that lost it gets it back to the byte.
-    """
-
-    def __init__(self) -> None:
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._chunks: list[ChunkIndex] = []
-        self._attachments: list[AttachmentIndex] = []
-        self._metadata: list[MetadataIndex] = []
-        self._counts: dict[int, int] = {}
-        self._times: tuple[int, int] | None = None
-
-    def add_definition(self, record: Schema | Channel) -> None:
-        """Take a schema or a channel."""
-        if isinstance(record, Schema):
-            self._schemas.setdefault(record.id, record)
-        else:
-            self._channels.setdefault(record.id, record)
-
-    def add_attachment(self, offset: int, length: int, item: Attachment) -> None:
-        """Take an attachment whose record of so many bytes begins at `offset`."""
-        times = item.log_time, item.create_time
-        place = offset, length, *times, len(item.data)
-        self._attachments.append(AttachmentIndex(*place, item.name, item.media_type))
-
-    def add_metadata(self, offset: int, length: int, name: str) -> None:
-        """Take a metadata record of so many bytes that begins at `offset`."""
-        self._metadata.append(MetadataIndex(offset, length, name))
-
-    def add_chunk(
-        self, offset: int, length: int, compression: str, sizes: tuple[int, int], entries: Entries
-    ) -> list[bytes]:
-        """Take a chunk record of so many bytes that begins at `offset`.
-
-        Args:
-            offset: where it begins.
-            length: of the whole record.
-            compression: as it states.
-            sizes: of its records, compressed and not.
-            entries: of its messages.
-
-        Returns:
-            The message indexes that must follow it.
-        """
-        indexes: list[bytes] = []
-        offsets: dict[int, int] = {}
-        at = offset + length
-        for channel, parts in entries.items():
-            data = b"".join(part.tobytes() for part in parts)
-            count = len(data) // _ENTRY.itemsize
-            self._counts[channel] = self._counts.get(channel, 0) + count
-            body = _MESSAGE_INDEX.size - container.RECORD.size + len(data)
-            head = _MESSAGE_INDEX.pack(container.MESSAGE_INDEX, body, channel, len(data))
-            indexes.append(head + data)
-            offsets[channel] = at
-            at += len(indexes[-1])
-        first, last = span(entries)
-        before = self._times or (first, last)
-        self._times = min(before[0], first), max(before[1], last)
-        self._chunks.append(
-            ChunkIndex(
-                chunk_length=length,
-                chunk_start_offset=offset,
-                compression=compression,
-                compressed_size=sizes[0],
-                message_end_time=last,
-                message_index_length=at - offset - length,
-                message_index_offsets=offsets,
-                message_start_time=first,
-                uncompressed_size=sizes[1],
-            )
-        )
-        return indexes
-
-    def summary(self, start: int) -> tuple[bytes, int]:
-        """The groups of the summary that begins at `start`, and where their offsets begin."""
-        first, last = self._times or (0, 0)
-        statistics = Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
-            channel_message_counts=self._counts,
-            chunk_count=len(self._chunks),
-            message_count=sum(self._counts.values()),
-            message_end_time=last,
-            message_start_time=first,
-            metadata_count=len(self._metadata),
-            schema_count=len(self._schemas),
-        )
-        groups: list[tuple[int, Sequence[McapRecord]]] = [
-            (container.SCHEMA, [*self._schemas.values()]),
-            (container.CHANNEL, [*self._channels.values()]),
-            (container.STATISTICS, [statistics]),
-            (container.CHUNK_INDEX, self._chunks),
-            (container.ATTACHMENT_INDEX, self._attachments),
-            (container.METADATA_INDEX, self._metadata),
-        ]
-        summary, offsets = b"", b""
-        for opcode, records in groups:
-            data = b"".join(map(encoded, records))
-            offsets += encoded(SummaryOffset(opcode, start + len(summary), len(data)))
-            summary += data
-        return summary + offsets, start + len(summary)
-
-    def tail(self, offset: int) -> bytes:
-        """What ends the file: DataEnd, which stands at `offset`, summary, footer and magic."""
-        end = encoded(DataEnd(0))
-        start = offset + len(end)
-        summary, offsets_start = self.summary(start)
-        # The checksum of the index covers the footer up to the checksum itself.
-        covered = summary + encoded(Footer(start, offsets_start, 0))[: -struct.calcsize("<I")]
-        return end + covered + struct.pack("<I", crc32(covered)) + MAGIC
-
-
 class McapWriter:
     """Writes one MCAP file to `write`, which is told whole records.
 
@@ -197,24 +81,31 @@ class McapWriter:
     registered for it goes into the next. Compressed by Zstandard, with checksums of chunks,
     attachments and index.
 
+    Message indexes and summary follow from the other records: a file that lost them gets them back
+    to the byte.
+
     Args:
         write: takes the next bytes of the file.
+
+    Attributes:
+        position: where the next record begins.
+        checksums: of the chunks written so far, CRC-32 of their records.
     """
 
     def __init__(self, write: Callable[[bytes], object]) -> None:
+        self.position = 0
+        self.checksums: list[int] = []
         self._write = write
-        self._position = 0
-        self._index = Index()
-        self._checksums: list[int] = []
-        self._n_channels = 0
         self._parts: list[bytes] = []  # of the chunk in progress
         self._size = 0
         self._entries: dict[int, list[NDArray[np.void]]] = {}
-
-    @property
-    def checksums(self) -> tuple[int, ...]:
-        """Those of the chunks written so far, CRC-32 of their records."""
-        return tuple(self._checksums)
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._chunks: list[ChunkIndex] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._counts: dict[int, int] = {}
+        self._times: list[int] = []
 
     def start(self, profile: str, library: str) -> None:
         """Begin the file."""
@@ -223,30 +114,41 @@ class McapWriter:
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Add a metadata record, in front of the chunk in progress."""
-        data = encoded(Metadata(name, dict(entries)))
-        self._index.add_metadata(self._position, len(data), name)
-        self._put(data)
+        item = Metadata(name, dict(entries))
+        self._add(item, encoded(item))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Add an attachment without times, in front of the chunk in progress."""
         item = Attachment(0, 0, name, media_type, data)
-        record = encoded(item)
-        self._index.add_attachment(self._position, len(record), item)
-        self._put(record)
+        self._add(item, encoded(item))
+
+    def copy(self, record: Record) -> None:
+        """Add a record of another file: attachment, metadata, schema or channel.
+
+        Raises:
+            Damage: it is none of these.
+        """
+        self._add(container.item(record), record.data)
 
     def register(
         self, topic: str, message_encoding: str, schema: str, encoding: str, definition: bytes
     ) -> int:
         """Announce a channel and the schema of its messages; returns the channel's id."""
-        self._n_channels += 1
-        number = self._n_channels
-        for record in (
+        number = len(self._channels) + 1
+        for item in (
             Schema(number, definition, encoding, schema),
             Channel(number, topic, message_encoding, {}, number),
         ):
-            self._index.add_definition(record)
-            self._append(encoded(record))
+            self.note(item)
+            self._append(encoded(item))
         return number
+
+    def note(self, item: Schema | Channel) -> None:
+        """List a schema or channel in the summary; it stands in a chunk."""
+        if isinstance(item, Schema):
+            self._schemas.setdefault(item.id, item)
+        else:
+            self._channels.setdefault(item.id, item)
 
     def add_message(self, channel: int, stamp: int, sequence: int, data: bytes) -> None:
         """Add one message at `stamp` [ns] to the chunk in progress."""
@@ -297,41 +199,90 @@ class McapWriter:
         self.add_chunk(chunk_of(data, entries), entries)
 
     def add_chunk(self, chunk: Chunk, entries: Entries) -> None:
-        """Add a whole chunk, in front of the one in progress.
+        """Add a whole chunk and its message indexes, in front of the chunk in progress.
 
         Args:
             chunk: its record.
             entries: of its messages.
         """
-        record = encoded(chunk)
-        sizes = len(chunk.data), chunk.uncompressed_size
-        place = self._position, len(record)
-        indexes = self._index.add_chunk(*place, chunk.compression, sizes, entries)
-        self._checksums.append(chunk.uncompressed_crc)
+        start, record = self.position, encoded(chunk)
         self._put(record)
-        for data in indexes:
-            self._put(data)
-
-    def add_record(self, record: Record) -> None:
-        """Add a record that stands in another file: attachment, metadata, schema or channel."""
-        place = self._position, record.size
-        if record.opcode == container.ATTACHMENT:
-            self._index.add_attachment(*place, container.attachment(record))
-        elif record.opcode == container.METADATA:
-            self._index.add_metadata(*place, container.metadata(record)[0])
-        else:
-            kind: type[Schema | Channel] = Schema if record.opcode == container.SCHEMA else Channel
-            self._index.add_definition(container.parsed(kind, record.body, record.offset))
-        self._put(record.data)
-
-    def add_definition(self, record: Schema | Channel) -> None:
-        """Note a schema or channel that stands in a chunk added whole."""
-        self._index.add_definition(record)
+        end = self.position
+        offsets: dict[int, int] = {}
+        for channel, parts in entries.items():
+            offsets[channel] = self.position
+            data = b"".join(part.tobytes() for part in parts)
+            self._counts[channel] = self._counts.get(channel, 0) + len(data) // _ENTRY.itemsize
+            length = _MESSAGE_INDEX.size - container.RECORD.size + len(data)
+            head = _MESSAGE_INDEX.pack(container.MESSAGE_INDEX, length, channel, len(data))
+            self._put(head + data)
+        first, last = span(entries)
+        self._times = [min([first, *self._times]), max([last, *self._times])]
+        self.checksums.append(chunk.uncompressed_crc)
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(record),
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=last,
+                message_index_length=self.position - end,
+                message_index_offsets=offsets,
+                message_start_time=first,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        )
 
     def finish(self) -> None:
         """Write what is left, the index and the footer."""
         self.flush()
-        self._put(self._index.tail(self._position))
+        self._put(encoded(DataEnd(0)))
+        start = self.position
+        summary, offsets_start = self.summary()
+        # The checksum of the index covers the footer up to the checksum itself.
+        covered = summary + encoded(Footer(start, offsets_start, 0))[: -struct.calcsize("<I")]
+        self._put(covered + struct.pack("<I", crc32(covered)) + MAGIC)
+
+    def summary(self) -> tuple[bytes, int]:
+        """The summary, were it to begin here, and where its last group begins."""
+        first, last = self._times or (0, 0)
+        statistics = Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=last,
+            message_start_time=first,
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+        groups: list[tuple[int, Sequence[McapRecord]]] = [
+            (container.SCHEMA, [*self._schemas.values()]),
+            (container.CHANNEL, [*self._channels.values()]),
+            (container.STATISTICS, [statistics]),
+            (container.CHUNK_INDEX, self._chunks),
+            (container.ATTACHMENT_INDEX, self._attachments),
+            (container.METADATA_INDEX, self._metadata),
+        ]
+        summary, offsets = b"", b""
+        for opcode, records in groups:
+            data = b"".join(map(encoded, records))
+            offsets += encoded(SummaryOffset(opcode, self.position + len(summary), len(data)))
+            summary += data
+        return summary + offsets, self.position + len(summary)
+
+    def _add(self, item: McapRecord, data: bytes) -> None:
+        place = self.position, len(data)
+        if isinstance(item, Metadata):
+            self._metadata.append(MetadataIndex(*place, item.name))
+        elif isinstance(item, Attachment):
+            times, size = (item.log_time, item.create_time), len(item.data)
+            index = AttachmentIndex(*place, *times, size, item.name, item.media_type)
+            self._attachments.append(index)
+        elif isinstance(item, Schema | Channel):
+            self.note(item)
+        self._put(data)
 
     def _append(self, records: bytes) -> None:
         self._parts.append(records)
@@ -339,7 +290,7 @@ class McapWriter:
 
     def _put(self, data: bytes) -> None:
         self._write(data)
-        self._position += len(data)
+        self.position += len(data)
 
 
 def chunk_of(data: bytes, entries: Entries) -> Chunk:

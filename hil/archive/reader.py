@@ -237,7 +237,7 @@ class _Content(Scan):
 
     def take_chunk(self, record: Record) -> None:
         """Take a chunk, or leave it to be decoded with others."""
-        data = self.opened(record)
+        _, data = self.opened(record)
         if not self.parser.repeats(data):
             self._take_waiting()
             self._decode(self.parser.messages(data, record.offset), record.offset)
@@ -588,7 +588,7 @@ def _by_index(
     content = _Content(selection, Order(written, gapless=False), gapless=False)
     try:
         for record in summary.definitions:
-            content.parser.known.take(record.opcode, record.body, record.offset)
+            content.parser.known.take(record)
         listed, others = summary.chunks, summary.others
     except Damage:
         return None

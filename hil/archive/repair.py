@@ -12,7 +12,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -197,15 +197,15 @@ def copy_of(
     for piece in found.pieces:
         record = container.record_at(stream, piece.offset, piece.length)
         if piece.opcode != container.CHUNK:
-            writer.add_record(record)
+            writer.copy(record)
             continue
         for definition in recovered:
-            parser.known.take(definition.opcode, definition.body, definition.offset)
-            writer.add_record(definition)
+            parser.known.take(definition)
+            writer.copy(definition)
         recovered = []
         chunk, entries = _chunk(record, piece, parser)
         for known in parser.known.definitions:
-            writer.add_definition(known)
+            writer.note(known)
         writer.add_chunk(chunk, entries)
     stated = {**_outcome(found, writer.checksums), **(outcome or {})}
     writer.add_metadata(header.OUTCOME, header.sealed(stated))
@@ -215,13 +215,13 @@ def copy_of(
 def _chunk(record: Record, piece: Piece, parser: ChunkParser) -> tuple[Chunk, Entries]:
     """A chunk as it stands, or with its messages counting on from those that stand before it."""
     head = container.chunk(record)
-    data = container.chunk_data(record, decompressor=zstandard.ZstdDecompressor())
+    data = container.chunk_data(record, decompressor=zstandard.ZstdDecompressor(), head=head)
     found = parser.messages(data, record.offset)
     entries = entries_of(found)
     if piece.shift is not None:
         return chunk_of(_renumbered(data, found, piece.shift), entries), entries
     first, last = span(entries)
-    return Chunk(head.compression, bytes(head.data), last, first, head.crc, head.size), entries
+    return replace(head, message_start_time=first, message_end_time=last), entries
 
 
 def _renumbered(data: bytes, found: Mapping[int, Messages], shift: Mapping[int, int]) -> bytes:

@@ -18,7 +18,7 @@ from typing import BinaryIO, Self
 
 import numpy as np
 import zstandard
-from mcap.records import Attachment, Header
+from mcap.records import Chunk, Header
 from numpy.typing import NDArray
 
 from hil.archive import container, schema
@@ -224,18 +224,19 @@ class Scan:
             if self.metadata is not None:  # else some other MCAP file
                 self.take_chunk(record)
         elif record.opcode == container.ATTACHMENT:
-            self.take_attachment(record, container.attachment(record))
+            self.take_attachment(record)
         elif record.opcode == container.METADATA:
             self.take_metadata(record, *container.metadata(record))
         elif record.opcode in (container.SCHEMA, container.CHANNEL):
-            self.parser.known.take(record.opcode, record.body, record.offset)
+            self.parser.known.take(record)
 
     def take_chunk(self, record: Record) -> None:
         """Take a chunk."""
         raise NotImplementedError
 
-    def take_attachment(self, record: Record, attachment: Attachment) -> None:  # noqa: ARG002
-        """Take an attachment, which is that of the record."""
+    def take_attachment(self, record: Record) -> None:
+        """Take an attachment."""
+        attachment = container.attachment(record)
         self.attachments[attachment.name] = attachment.data
 
     def take_metadata(self, record: Record, name: str, entries: dict[str, str]) -> None:
@@ -255,16 +256,16 @@ class Scan:
         except HeaderError as error:
             self.unusable = error
 
-    def opened(self, record: Record) -> bytes:
-        """The records of a chunk that is one of those written, and whose turn it is.
+    def opened(self, record: Record) -> tuple[Chunk, bytes]:
+        """A chunk that is one of those written, and whose turn it is; and its records.
 
         Raises:
             Damage: it is none of them, or damaged.
         """
         head = container.chunk(record)
         data = container.chunk_data(record, decompressor=self._decompressor, head=head)
-        self._order.check_chunk(head.crc, record.offset)
-        return data
+        self._order.check_chunk(head.uncompressed_crc, record.offset)
+        return head, data
 
     def continued(self, found: Mapping[str, Messages], offset: int) -> dict[str, int]:
         """Take messages by topic, which must be the next of their channels.

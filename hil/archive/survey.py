@@ -12,13 +12,13 @@ from os import PathLike
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from mcap.records import Attachment, Header
+from mcap.records import Header
 
 from hil.archive import container, schema
 from hil.archive.chunk import KnownChannels, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.header import METADATA, OUTCOME
-from hil.archive.mcap_writer import Index, entries_of, span
+from hil.archive.mcap_writer import McapWriter, entries_of, span
 from hil.archive.scan import NUMBERS, Contested, Order, Scan, Written
 from hil.errors import ArchiveError
 from hil.reading import opened
@@ -105,7 +105,8 @@ class Survey(Scan):
         self._seen: set[int] = set()
         self._lost_since = False
         self._ended = False
-        self._index = Index()
+        self._expected: list[bytes] = []  # what would be written instead of the present record
+        self._anew = McapWriter(self._expected.append)
         self._indexes: list[bytes] = []  # message indexes that must come now
         self._ends = False  # whether the data section has its end
 
@@ -184,6 +185,8 @@ class Survey(Scan):
 
     def _examine(self, record: Record) -> None:
         self._seen.add(record.offset)
+        self._expected.clear()
+        self._anew.position = record.offset
         self._check_indexes(record)
         try:
             if record.opcode == container.HEADER:
@@ -222,17 +225,18 @@ class Survey(Scan):
 
     def take_metadata(self, record: Record, name: str, entries: dict[str, str]) -> None:
         """Take header or outcome; another one is kept as it is."""
-        self._index.add_metadata(record.offset, record.size, name)
+        self._anew.copy(record)
         super().take_metadata(record, name, entries)
         if name not in (METADATA, OUTCOME):
             self._keep(record)
 
-    def take_attachment(self, record: Record, attachment: Attachment) -> None:
+    def take_attachment(self, record: Record) -> None:
         """Take an attachment, of each name one."""
-        if attachment.name in self.attachments:
-            raise Damage(record.offset, f"(attachment {attachment.name!r}) is there a second time")
-        super().take_attachment(record, attachment)
-        self._index.add_attachment(record.offset, record.size, attachment)
+        name = container.attachment(record).name
+        if name in self.attachments:
+            raise Damage(record.offset, f"(attachment {name!r}) is there a second time")
+        super().take_attachment(record)
+        self._anew.copy(record)
         self._keep(record)
 
     def take_chunk(self, record: Record) -> None:
@@ -241,36 +245,35 @@ class Survey(Scan):
             raise Damage(record.offset, "(chunk) comes after a gap that nothing would show")
         if self._order.closed:
             return  # that nothing behind is believed was said
-        data, known = self.opened(record), KnownChannels(self.parser.known)
-        definitions = self.definitions
+        head, data = self.opened(record)
+        known, definitions = KnownChannels(self.parser.known), self.definitions
         try:
             numbered = self.parser.messages(data, record.offset)
-            self._recover_channels(numbered, record.offset)
+            self._recover_channels(numbered)
             found = self.parser.by_topic(numbered, record.offset)
             shifts = self.continued(found, record.offset)
         except Damage:
             self.parser.known, self.definitions = known, definitions  # what it says goes with it
             raise
-        head, entries = container.chunk(record), entries_of(numbered)
-        if (head.start_time, head.end_time) != span(entries):
+        entries = entries_of(numbered)
+        if (head.message_start_time, head.message_end_time) != span(entries):
             self._fault("index", Damage(record.offset, "(chunk) states other times"), loss=False)
-        sizes = len(head.data), head.size
-        place = record.offset, record.size
-        self._indexes = self._index.add_chunk(*place, head.compression, sizes, entries)
+        self._anew.add_chunk(head, entries)
+        self._indexes = self._expected[1:]  # behind the chunk itself
         moved = {number: shifts[self.parser.known.channels[number].topic] for number in numbered}
         self._keep(record, moved if any(moved.values()) else None)
         self._lost_since = False
         if self._visit is not None:
             self._visit(self, record, found)
 
-    def _recover_channels(self, numbered: Mapping[int, Messages], offset: int) -> None:
+    def _recover_channels(self, numbered: Mapping[int, Messages]) -> None:
         """Take channels that no record before announces from the summary."""
         if numbered.keys() <= self.parser.known.channels.keys():
             return
         summary = self._summary or self._moved_summary()
         self.definitions = summary.definitions if summary else []
         for item in self.definitions:
-            self.parser.known.take(item.opcode, item.body, offset)
+            self.parser.known.take(item)
 
     def _moved_summary(self) -> Summary | None:
         """The summary where a chunk of another length has come before it."""
@@ -325,14 +328,14 @@ class Survey(Scan):
 
     def _check_summary(self) -> None:
         for definition in self.parser.known.definitions:
-            self._index.add_definition(definition)
+            self._anew.note(definition)
         if self._summary is None or not self._ends:
             self._fault(
                 "index", "the index at the end is missing or fails its checksum", loss=False
             )
         elif not self.counts:
             return  # channels without messages stand in the summary alone
-        elif self._summary != Summary(self._index.summary(0)[0]):
+        elif self._summary != Summary(self._anew.summary()[0]):
             self._fault("index", "the index at the end does not fit the file", loss=False)
 
 

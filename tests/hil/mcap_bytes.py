@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import zstandard
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Chunk, Metadata
 
 from hil.archive import container
 from hil.archive.chunk import ChunkParser
-from hil.archive.container import Record, encoded, parsed
-from hil.archive.mcap_writer import Index, entries_of
+from hil.archive.container import Record, encoded
+from hil.archive.mcap_writer import McapWriter, entries_of
 
 
 class Head(NamedTuple):
@@ -58,42 +58,46 @@ def heads(chunk: bytes) -> Iterator[Head]:
             yield Head(channel, sequence, log_time, item.offset, start + head.size)
 
 
+COPIED = (container.METADATA, container.ATTACHMENT, container.SCHEMA, container.CHANNEL)
+
+
 class Indexed:
     """A file that grows record by record, and gets an index that fits."""
 
     def __init__(self) -> None:
-        self.data, self._index, self._parser = bytearray(container.MAGIC), Index(), ChunkParser()
-        self.checksums: list[int] = []
+        self.data, self._parser = bytearray(container.MAGIC), ChunkParser()
+        self._writer = McapWriter(self.data.extend)
+        self._writer.position = len(self.data)
+
+    @property
+    def checksums(self) -> list[int]:
+        """Those of the chunks so far."""
+        return self._writer.checksums
 
     def put(self, data: bytes) -> None:
         """Append a record, given with its head."""
         opcode, length = container.RECORD.unpack_from(data)
-        at = len(self.data)
-        item = Record(at, opcode, data[container.RECORD.size :], length)
-        self.data += data
-        if opcode == container.METADATA:
-            self._index.add_metadata(at, len(data), container.metadata(item)[0])
-        elif opcode == container.ATTACHMENT:
-            self._index.add_attachment(at, len(data), container.attachment(item))
-        elif opcode in (container.SCHEMA, container.CHANNEL):
-            kind: type[Schema | Channel] = Schema if opcode == container.SCHEMA else Channel
-            self._index.add_definition(parsed(kind, item.body, at))
+        item = Record(len(self.data), opcode, data[container.RECORD.size :], length)
+        if opcode in (
+            container.METADATA,
+            container.ATTACHMENT,
+            container.SCHEMA,
+            container.CHANNEL,
+        ):
+            self._writer.copy(item)
         elif opcode == container.CHUNK:
-            self._chunk(item)
-
-    def _chunk(self, item: Record) -> None:
-        head = container.chunk(item)
-        self.checksums.append(head.crc)
-        content = container.chunk_data(item, decompressor=zstandard.ZstdDecompressor())
-        parser = ChunkParser()
-        found = parser.messages(content, item.offset)
-        for definition in parser.known.definitions:
-            self._index.add_definition(definition)
-        sizes = len(head.data), head.size
-        place = item.offset, item.size
-        for data in self._index.add_chunk(*place, head.compression, sizes, entries_of(found)):
+            head = container.chunk(item)
+            content = container.chunk_data(item, decompressor=zstandard.ZstdDecompressor())
+            parser = ChunkParser()
+            found = parser.messages(content, item.offset)
+            for definition in parser.known.definitions:
+                self._writer.note(definition)
+            self._writer.add_chunk(head, entries_of(found))
+        else:
             self.data += data
+            self._writer.position = len(self.data)
 
     def ended(self) -> bytes:
         """The file, whole."""
-        return bytes(self.data + self._index.tail(len(self.data)))
+        self._writer.finish()
+        return bytes(self.data)

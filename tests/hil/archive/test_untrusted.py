@@ -70,7 +70,7 @@ class Stranger(mcap_bytes.Indexed):
     def chunk(self, record: Record, change: Callable[[bytes], bytes]) -> None:
         plain = change(container.chunk_data(record, decompressor=zstandard.ZstdDecompressor()))
         head = container.chunk(record)
-        self.put(mcap_bytes.chunk(plain, (head.start_time, head.end_time)))
+        self.put(mcap_bytes.chunk(plain, (head.message_start_time, head.message_end_time)))
 
     def attachment(self, record: Record, given: Mapping[str, bytes]) -> None:
         found = container.attachment(record)
