@@ -10,11 +10,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Schema
-from numpy.typing import NDArray
 
 from hil.archive import container, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
@@ -66,7 +64,6 @@ class _Checker:
         self._period_ns: float | None = None
         self._known = KnownChannels()
         self._layouts: dict[str, MessageLayout | None] = {}
-        self._last_cycle: int | None = None
         self._gaps = 0
 
     def visit(self, found: Survey, record: Record, messages: Mapping[str, Messages]) -> None:
@@ -137,7 +134,7 @@ class _Checker:
             else:
                 rows[topic] = laid_out
         if schema.CYCLE in rows and set(_CYCLE_FIELDS) <= set(rows[schema.CYCLE].dtype.names or ()):
-            yield from self._cycles(rows, place)
+            yield from self._cycles(found, rows, place)
 
     def _rows(self, topic: str, messages: Messages) -> Rows | None:
         """The messages as a structured array; None where one has another layout."""
@@ -157,10 +154,12 @@ class _Checker:
         except LayoutError:
             return None
 
-    def _cycles(self, rows: Mapping[str, Rows], place: str) -> Iterator[Fault]:
+    def _cycles(
+        self, found: Mapping[str, Messages], rows: Mapping[str, Rows], place: str
+    ) -> Iterator[Fault]:
         """Check the cycles of a chunk, and the channels that repeat them."""
         cycles = rows[schema.CYCLE]
-        number, stamp = cycles["cycle"], _stamps(cycles)
+        number, stamp = cycles["cycle"], found[schema.CYCLE].stamps
         if self._period_ns is not None:
             if not np.array_equal(stamp, np.rint(number * self._period_ns)):
                 yield "times", f"{place} has cycles whose stamp is not cycle times period"
@@ -168,13 +167,12 @@ class _Checker:
                 _CHUNK_NS, self._period_ns
             ):
                 yield "chunks", f"{place} spans more than 100 ms"
-        behind = () if self._last_cycle is None else (number[0] <= self._last_cycle,)
-        if any(behind) or (number[1:] <= number[:-1]).any():
-            yield "times", f"{place} has cycles that do not grow"
-        self._last_cycle = int(number[-1])
         self._gaps += int(cycles["gap"].sum())
         for topic, columns in _STATES.items():
-            if topic in rows and not _repeats(rows[topic], cycles, columns):
+            if topic not in rows:
+                continue
+            same = np.array_equal(found[topic].stamps, stamp)
+            if not (same and _repeats(rows[topic], cycles, columns)):
                 yield "joint_states", f"{place} has messages of {topic} unlike its cycles"
 
 
@@ -214,20 +212,9 @@ def _events(messages: Messages, place: str) -> Iterator[Fault]:
 
 
 def _repeats(state: Rows, cycles: Rows, columns: Mapping[str, str]) -> bool:
-    names = state.dtype.names or ()
-    if set(names) != {"sec", "nanosec", *columns} or len(state) != len(cycles):
+    if {*(state.dtype.names or ())} != {"sec", "nanosec", *columns}:
         return False
-    pairs = [(state[word], cycles[column]) for word, column in columns.items()]
-    pairs.append((_stamps(state), _stamps(cycles)))
-    return all(_bits(a) == _bits(b) for a, b in pairs)
-
-
-def _bits(values: NDArray[Any]) -> bytes:
-    return values.tobytes()
-
-
-def _stamps(rows: Rows) -> NDArray[np.int64]:
-    return np.asarray(rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"])
+    return all(state[word].tobytes() == cycles[name].tobytes() for word, name in columns.items())
 
 
 ASPECTS = {

@@ -91,6 +91,8 @@ class Selection:
         return self.topics is None or schema.EVENTS in self.topics
 
 
+_FIRST_ROOM = 4096  # samples
+_MOST_ROOM = 1 << 20  # samples that room is made for on the word of the outcome
 _BATCH = 1 << 20  # bytes of chunks decoded at once: few calls per chunk, and all in the cache
 _COLUMN_OF = {"effort": "torque"}  # where a message has another word for it than we
 _STAMP_FIELDS = ("sec", "nanosec")
@@ -116,14 +118,18 @@ class _Columns:
     Args:
         layout: the messages; their time stamp becomes the column ``stamp`` in nanoseconds.
         selection: fields and times wanted.
+        room: for so many at first, where all times are wanted.
     """
 
-    def __init__(self, layout: MessageLayout, selection: Selection) -> None:
+    def __init__(self, layout: MessageLayout, selection: Selection, room: int) -> None:
         self._layout = layout
         self._times = selection.times if selection.bounded else None
         self._blocks = _blocks(layout, selection.fields)
-        self._stamps: list[NDArray[np.int64]] = []
-        self._parts: list[list[NDArray[np.void]]] = [[] for _ in self._blocks]
+        self._stamps = np.empty(0, np.int64)
+        self._arrays = [np.empty((len(block.names), 0), block.raw) for block in self._blocks]
+        self._count = 0
+        if self._times is None:
+            self._grow(room)
 
     def verified(self, messages: Messages, offset: int) -> Bytes:
         """The messages as bytes (k, size), which must be like those before."""
@@ -137,23 +143,32 @@ class _Columns:
         if self._times is not None:
             wanted = (stamp >= self._times[0]) & (stamp < self._times[1])
             messages, stamp = messages[wanted], stamp[wanted]
-        self._stamps.append(stamp)
-        for block, parts in zip(self._blocks, self._parts, strict=True):
-            fields = messages[:, block.start : block.end].view(block.raw)
-            parts.append(np.ascontiguousarray(fields.T))
+        now = slice(self._count, self._count + len(messages))
+        if now.stop > len(self._stamps):
+            self._grow(max(_FIRST_ROOM, 2 * now.stop))
+        self._stamps[now] = stamp
+        for block, array in zip(self._blocks, self._arrays, strict=True):
+            array[:, now] = messages[:, block.start : block.end].view(block.raw).T
+        self._count = now.stop
 
     def finished(self) -> dict[str, NDArray[Any]]:
         """The columns by our names, contiguous and read-only."""
-        columns: dict[str, NDArray[Any]] = {"stamp": np.concatenate(self._stamps)}
-        for block, parts in zip(self._blocks, self._parts, strict=True):
-            joined = np.concatenate(parts, axis=1)
-            parts.clear()
-            fields = joined.view(block.dtype).reshape(*joined.shape, *block.shape)
+        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
+        for block, array in zip(self._blocks, self._arrays, strict=True):
+            fields = array.view(block.dtype).reshape(*array.shape, *block.shape)
             for name, values in zip(block.names, fields, strict=True):
-                columns[_COLUMN_OF.get(name, name)] = values
+                columns[_COLUMN_OF.get(name, name)] = values[: self._count]
         for column in columns.values():
             column.flags.writeable = False
         return columns
+
+    def _grow(self, room: int) -> None:
+        kept = slice(self._count)
+        stamps, self._stamps = self._stamps, np.empty(room, np.int64)
+        self._stamps[kept] = stamps[kept]
+        for index, array in enumerate(self._arrays):
+            self._arrays[index] = np.empty((len(array), room), array.dtype)
+            self._arrays[index][:, kept] = array[:, kept]
 
 
 def _blocks(layout: MessageLayout, fields: Collection[str] | None) -> list[_Block]:
@@ -302,7 +317,7 @@ class _Content(Scan):
             )
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-        return _Columns(layout, self._selection)
+        return _Columns(layout, self._selection, min(self._order.samples, _MOST_ROOM))
 
     def _decoded_events(self, messages: Messages | None, offset: int) -> list[ArchivedEvent]:
         """The events of the time that is wanted."""

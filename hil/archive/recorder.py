@@ -7,7 +7,7 @@ process of a real one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Self
 
@@ -153,15 +153,7 @@ class ArchiveSpec:
         Raises:
             ArchiveWriteError: it exists, the disk refuses, or the metadata cannot stand.
         """
-        return ArchiveWriter(
-            self.path,
-            joint_names=self.joint_names,
-            period=self.period,
-            metadata=self.metadata,
-            attachments=self.attachments,
-            durable=self.durable,
-            packets=self.packets,
-        )
+        return ArchiveWriter(**{one.name: getattr(self, one.name) for one in fields(self)})
 
 
 class Recorder:

@@ -60,11 +60,13 @@ class Written:
     Attributes:
         chunks: their checksums in order, shape (k,).
         ends: stamps of the first and the last cycle [ns].
+        samples: how many.
         strange: whether that end is of another recording than the beginning.
     """
 
     chunks: NDArray[np.uint32] | None = None
     ends: tuple[int, int] | None = None
+    samples: int = 0
     strange: bool = False
 
     @classmethod
@@ -89,7 +91,7 @@ class Written:
         if not outcome.belongs_to(header):
             return cls(strange=True)
         chunks = None if outcome.chunks is None else np.array(outcome.chunks, np.uint32)
-        return cls(chunks, _ends(header, outcome))
+        return cls(chunks, _ends(header, outcome), outcome.samples or 0)
 
 
 class Order:
@@ -111,6 +113,11 @@ class Order:
         self._newest = -1
         self.closed = False
         """Whether no further chunk can be believed."""
+
+    @property
+    def samples(self) -> int:
+        """How many were written, 0 where nothing says so."""
+        return self._written.samples
 
     @property
     def listed(self) -> int | None:

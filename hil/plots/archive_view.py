@@ -211,7 +211,10 @@ class _Scales:
             limits["velocity"] = _both(np.degrees(bounds.velocity))
             if cell.torque_limit is not None:
                 limits["torque"] = _both(cell.torque_limit)
-        table = archive.table("drive_train.json")
+        try:
+            table = archive.table("drive_train.json")
+        except ArchiveError:
+            table = {}  # limits that cannot be read are not drawn
         for name, key in (("current", "current_limit"), ("following", "following_error")):
             if (limit := _limit_in(table, key, n)) is not None:
                 limits[name] = _both(limit)
