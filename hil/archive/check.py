@@ -179,9 +179,8 @@ class _Checker:
 def _logged_in_time(messages: Messages) -> bool:
     """Whether log and publish times are the stamps in the messages."""
     stamps, logged = messages.stamps, messages.of_heads("log_time")
-    if stamps is None or not np.array_equal(logged, messages.of_heads("publish_time")):
-        return False
-    return np.array_equal(logged, stamps)
+    published = messages.of_heads("publish_time")
+    return np.array_equal(logged, published) and np.array_equal(logged, stamps)
 
 
 def _text(record: Schema) -> str:

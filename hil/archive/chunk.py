@@ -83,10 +83,10 @@ class Messages:
         return np.concatenate(places)
 
     @cached_property
-    def stamps(self) -> NDArray[np.int64] | None:
-        """Time stamps of all, shape (k,) [ns]; None where a message is too short for one."""
+    def stamps(self) -> NDArray[np.int64]:
+        """Time stamps of all, shape (k,) [ns]; none where a message is too short for one."""
         if any(part.shape[1] < _STAMP_AT.stop for part in self.parts):
-            return None
+            return np.zeros(0, np.int64)
         found = [stamps(part) for part in self.parts]
         return found[0] if len(found) == 1 else np.concatenate(found)
 

@@ -6,7 +6,7 @@ import errno
 import math
 import os
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
@@ -28,7 +28,7 @@ from hil.archive.header import (
     ArchiveOutcome,
     is_known,
 )
-from hil.archive.scan import NUMBERS, Contested, Order, Scan, Written
+from hil.archive.scan import NUMBERS, Contested, Order, Scan
 from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import json_of, opened
@@ -195,18 +195,15 @@ class _Content(Scan):
     Args:
         selection: what is wanted of it.
         order: the chunks that must come.
-        gapless: whether all chunks are read, so that the messages of a channel must count on from
-            chunk to chunk; otherwise their numbers need only grow.
 
     Attributes:
         events: what happened, in the order of writing.
     """
 
-    def __init__(self, selection: Selection, order: Order, *, gapless: bool = True) -> None:
+    def __init__(self, selection: Selection, order: Order) -> None:
         super().__init__(order, topics=())
         self.events: list[ArchivedEvent] = []
         self._selection = selection
-        self._gapless = gapless
         self._columns: dict[str, _Columns] = {}
         self._waiting: list[tuple[int, bytes]] = []  # chunks that are decoded with others
         self._waiting_size = 0
@@ -299,13 +296,12 @@ class _Content(Scan):
         for topic, columns, messages in decoded:
             stamp = found[topic].stamps
             self._columns[topic] = columns
-            assert stamp is not None  # the layout has one
             columns.append(messages, stamp)
         self.events += events
 
     def missing(self, gaps: Mapping[str, int], offset: int) -> None:
         """Messages may be missing where chunks were left out."""
-        if self._gapless:
+        if self._order.gapless:
             super().missing(gaps, offset)
 
     def _begun(self, topic: str, messages: Messages, offset: int) -> _Columns:
@@ -339,7 +335,7 @@ class _Content(Scan):
             raise Damage(size, f"(attachment {absent[0]!r}) is missing")
         if self.outcome is None:
             raise Damage(size, f"(metadata {OUTCOME!r}) is missing")
-        if not self._gapless:
+        if not self._order.gapless:
             return
         counts = {}
         if numbers := self._selection.numbers(self.parser.known.topics):
@@ -552,11 +548,11 @@ def open_archive(
         with opened(path) as stream:
             size = os.fstat(stream.fileno()).st_size
             summary, damage, content = Summary.read(stream, size), None, None
-            written = Written.read(stream, size, summary)
+            order = Order.read(stream, size, summary)
             if selection.partial and summary is not None:
-                content = _by_index(stream, selection, written, summary)
+                content = _by_index(stream, selection, order, summary)
             if content is None:
-                content, damage = _from_the_beginning(stream, size, selection, written)
+                content, damage = _from_the_beginning(stream, size, selection, order)
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "")
         raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
@@ -584,23 +580,22 @@ def _from_the_beginning(
     stream: BinaryIO,
     size: int,
     selection: Selection,
-    written: Written,
-    until: Contested | None = None,
+    order: Order,
 ) -> tuple[_Content, Damage | None]:
     """What is selected of the whole chunks before the first damage, and that."""
     stream.seek(0)
-    content = _Content(selection, Order(written, until=until))
+    content = _Content(selection, order)
     damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
-    if until is None and isinstance(damage, Contested):  # some of what was read may be strange
-        return _from_the_beginning(stream, size, selection, written, damage)
+    if order.until is None and isinstance(damage, Contested):  # what was read may be strange
+        return _from_the_beginning(stream, size, selection, replace(order, until=damage))
     return content, damage
 
 
 def _by_index(
-    stream: BinaryIO, selection: Selection, written: Written, summary: Summary
+    stream: BinaryIO, selection: Selection, order: Order, summary: Summary
 ) -> _Content | None:
     """What is selected, found through the summary; None where that or what it names is damaged."""
-    content = _Content(selection, Order(written, gapless=False), gapless=False)
+    content = _Content(selection, replace(order, gapless=False))
     try:
         for record in summary.definitions:
             content.parser.known.take(record)

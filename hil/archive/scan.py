@@ -13,7 +13,7 @@ Where two chunks claim the same cycles, nobody knows which is strange, and neith
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import BinaryIO, Self
 
 import numpy as np
@@ -53,21 +53,29 @@ class Contested(Damage):
         self.since = since
 
 
-@dataclass(frozen=True, eq=False)
-class Written:
-    """What the end of a file says of its chunks, as far as it is there.
+@dataclass(eq=False)
+class Order:
+    """The chunks that a file must have, as its end says, and how far they have come.
 
     Attributes:
-        chunks: their checksums in order, shape (k,).
+        chunks: their checksums in order, shape (k,); None where nothing says so.
         ends: stamps of the first and the last cycle [ns].
-        samples: how many.
+        samples: how many were written, 0 where nothing says so.
         strange: whether that end is of another recording than the beginning.
+        gapless: whether every chunk comes; otherwise some are left out.
+        until: what an earlier go ended with.
+        closed: whether no further chunk can be believed.
     """
 
     chunks: NDArray[np.uint32] | None = None
     ends: tuple[int, int] | None = None
     samples: int = 0
     strange: bool = False
+    gapless: bool = True
+    until: Contested | None = None
+    closed: bool = field(default=False, init=False)
+    _at: int = field(default=0, init=False)
+    _newest: int = field(default=-1, init=False)
 
     @classmethod
     def read(cls, stream: BinaryIO, size: int, summary: Summary | None) -> Self:
@@ -78,52 +86,16 @@ class Written:
         if found.keys() != {METADATA, OUTCOME}:
             return cls()
         try:
-            header = ArchiveHeader.of(found[METADATA])
+            header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
         except HeaderError:
             return cls()
-        written = cls.of(header, ArchiveOutcome.of(found[OUTCOME]))
-        # Another program that copies a file may cut its chunks anew, and then names itself.
-        return written if _is_ours(stream, size) else replace(written, chunks=None)
-
-    @classmethod
-    def of(cls, header: ArchiveHeader, outcome: ArchiveOutcome) -> Self:
-        """What the outcome says of the recording with this header."""
         if not outcome.belongs_to(header):
             return cls(strange=True)
-        chunks = None if outcome.chunks is None else np.array(outcome.chunks, np.uint32)
+        chunks = None
+        # Another program that copies a file may cut its chunks anew, and then names itself.
+        if outcome.chunks is not None and _is_ours(stream, size):
+            chunks = np.array(outcome.chunks, np.uint32)
         return cls(chunks, _ends(header, outcome), outcome.samples or 0)
-
-
-class Order:
-    """Goes with the chunks of a file from its beginning to its end.
-
-    Args:
-        written: what the end of the file says.
-        gapless: whether every chunk comes; otherwise some are left out.
-        until: what an earlier go ended with.
-    """
-
-    def __init__(
-        self, written: Written, *, gapless: bool = True, until: Contested | None = None
-    ) -> None:
-        self._written = written
-        self._gapless = gapless
-        self._until = until
-        self._at = 0
-        self._newest = -1
-        self.closed = False
-        """Whether no further chunk can be believed."""
-
-    @property
-    def samples(self) -> int:
-        """How many were written, 0 where nothing says so."""
-        return self._written.samples
-
-    @property
-    def listed(self) -> int | None:
-        """How many chunks were written, None where nothing says so."""
-        chunks = self._written.chunks
-        return None if chunks is None else len(chunks)
 
     def check_chunk(self, crc: int, offset: int) -> None:
         """Check that the chunk with this checksum, its own, is the next.
@@ -131,10 +103,10 @@ class Order:
         Raises:
             Damage: it is not.
         """
-        if self._written.strange:
+        if self.strange:
             reason = "(chunk) may be of either of two: the outcome is that of another recording"
             raise Damage(offset, reason)
-        chunks = self._written.chunks
+        chunks = self.chunks
         if chunks is None:
             return
         if self._at < len(chunks) and chunks[self._at] == crc:
@@ -144,7 +116,7 @@ class Order:
         if not len(places) or places[-1] < self._at:
             why = "stands behind one that followed it" if len(places) else "is of another recording"
             raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
-        if self._gapless:
+        if self.gapless:
             raise Damage(offset, "(chunk) does not continue the one before")
         self._at = int(places[-1]) + 1
 
@@ -160,12 +132,12 @@ class Order:
             Contested: a chunk before claims the same time.
             Damage: this chunk is wrong by itself.
         """
-        if self._until is not None and stamps.max() >= self._until.since:
+        if self.until is not None and stamps.max() >= self.until.since:
             self.closed = True
-            raise Damage(offset, self._until.reason)
+            raise Damage(offset, self.until.reason)
         if (np.diff(stamps) <= 0).any():
             raise Damage(offset, "(chunk) has cycles that do not grow")
-        first, last = self._written.ends or (int(stamps[0]), int(stamps[-1]))
+        first, last = self.ends or (int(stamps[0]), int(stamps[-1]))
         if stamps[0] < first or stamps[-1] > last or (begins and stamps[0] != first):
             reason = "(chunk) has cycles of another recording: the outcome names others"
             raise Damage(offset, reason)
@@ -183,8 +155,8 @@ class Order:
         Raises:
             Contested: it is another.
         """
-        ends = self._written.ends
-        if ends is None or self._newest in (-1, ends[1]) or self._until is not None:
+        ends = self.ends
+        if ends is None or self._newest in (-1, ends[1]) or self.until is not None:
             return
         reason = "(chunk) does not end with the last cycle that the outcome names"
         raise Contested(size, reason, self._newest)
@@ -335,8 +307,8 @@ class Scan:
         timed = [schema.CYCLE] if schema.CYCLE in samples else samples
         if not timed:
             return None
-        stamps = [one for topic in timed if (one := found[topic].stamps) is not None]
-        if len(stamps) < len(timed):
+        stamps = [found[topic].stamps for topic in timed]
+        if not all(map(len, stamps)):
             raise Damage(offset, "(chunk) has messages without a stamp")
         first = stamps[0]
         if not all(np.array_equal(one, first) for one in stamps):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -19,7 +20,7 @@ from hil.archive.chunk import KnownChannels, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.header import METADATA, OUTCOME
 from hil.archive.mcap_writer import McapWriter, entries_of, span
-from hil.archive.scan import NUMBERS, Contested, Order, Scan, Written
+from hil.archive.scan import NUMBERS, Contested, Order, Scan
 from hil.errors import ArchiveError
 from hil.reading import opened
 
@@ -319,8 +320,8 @@ class Survey(Scan):
         }
         if outcome.packets is not None:
             counts["packets"] = outcome.packets, self.counts.get(schema.PACKETS, 0)
-        if self._order.listed is not None:
-            counts["chunks"] = self._order.listed, self.chunks
+        if self._order.chunks is not None:
+            counts["chunks"] = len(self._order.chunks), self.chunks
         for key, (stated, count) in counts.items():
             if stated != count:
                 text = f"{stated} {key} were written, {count} are there"
@@ -355,16 +356,15 @@ def survey(path: str | PathLike[str], visit: Callable[[], Visit] | None = None) 
         with opened(path) as stream:
             size = os.fstat(stream.fileno()).st_size
             summary = Summary.read(stream, size)
-            written = Written.read(stream, size, summary)
-            if written.strange:
-                written = Written()  # told as a fault of the outcome
-            order = Order(written, gapless=False)
+            order = replace(Order.read(stream, size, summary), gapless=False)
+            if order.strange:
+                order = Order(gapless=False)  # a fault of the outcome will say so
             while True:
                 found = Survey(path, stream, order, summary, visit() if visit else None)
                 try:
                     found.run()
                 except Contested as contested:
-                    order = Order(written, gapless=False, until=contested)
+                    order = replace(order, until=contested)
                 else:
                     return found
     except OSError as error:
