@@ -61,6 +61,7 @@ FOOTER_SIZE = RECORD.size + 20
 _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
 _NO_CRC = 0
+_BUT_END = frozenset(range(256)) - {DATA_END}
 _KINDS: dict[int, type[McapRecord]] = {SCHEMA: Schema, CHANNEL: Channel, METADATA: Metadata}
 _Parsed = TypeVar("_Parsed", bound=McapRecord)
 FARTHEST = 1 << 62  # bytes, less than the end of any file
@@ -81,7 +82,7 @@ class Damage(Exception):  # noqa: N818 - handed on as a finding, too
 
 
 class Record(NamedTuple):
-    """One record of the data section; a body that was not asked for is empty."""
+    """One record of the data section."""
 
     offset: int
     opcode: int
@@ -194,7 +195,7 @@ def records(
     Args:
         stream: the file, at its beginning.
         size: its length.
-        skip: opcodes of records whose bodies are passed over.
+        skip: opcodes of records that are passed over.
         check_end: whether to check summary and footer.
 
     Raises:
@@ -217,7 +218,6 @@ def records(
             raise Damage(offset, f"claims {length} bytes of content")
         if opcode in skip:
             seek(length, os.SEEK_CUR)
-            yield Record(offset, opcode, b"", length)
         else:
             yield Record(offset, opcode, read(length), length)
         offset += RECORD.size + length
@@ -231,12 +231,9 @@ def data_end(stream: BinaryIO, size: int) -> int | None:
     """Where the summary must begin, found from head to head; None where the way is broken."""
     stream.seek(0)
     try:
-        for record in records(stream, size, skip=range(256), check_end=False):
-            if record.opcode == DATA_END:
-                return record.end
+        return next(records(stream, size, skip=_BUT_END, check_end=False)).end
     except Damage:
         return None
-    return None
 
 
 def _check_end(tail: bytes, offset: int) -> None:

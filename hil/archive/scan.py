@@ -367,6 +367,4 @@ def _indexed(stream: BinaryIO, summary: Summary) -> Iterator[Record]:
 def _walked(stream: BinaryIO, size: int) -> Iterator[Record]:
     """Metadata records, found from head to head."""
     stream.seek(0)
-    for record in container.records(stream, size, skip=_BUT_METADATA, check_end=False):
-        if record.opcode == container.METADATA:
-            yield record
+    yield from container.records(stream, size, skip=_BUT_METADATA, check_end=False)
