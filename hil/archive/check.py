@@ -84,8 +84,9 @@ class _Checker:
             self.faults += self._channels(imported=imported)
         if imported or outcome is None or outcome.repaired or found.losses:
             return
-        if outcome.lost_packets not in (None, self._gaps):
-            text = f"lost_packets is {outcome.lost_packets}, the cycles lack {self._gaps}"
+        if "lost_packets" in outcome.record and outcome.lost_packets != self._gaps:
+            stated = outcome.record["lost_packets"]
+            text = f"lost_packets is {stated}, the cycles lack {self._gaps}"
             self.faults.append(("outcome", text))
 
     def _channels(self, *, imported: bool) -> Iterator[Fault]:

@@ -318,7 +318,7 @@ class Survey(Scan):
             "samples": (outcome.samples, self.samples),
             "events": (outcome.events, self.events),
         }
-        if outcome.packets is not None:
+        if "packets" in outcome.record:
             counts["packets"] = outcome.packets, self.counts.get(schema.PACKETS, 0)
         if self._order.chunks is not None:
             counts["chunks"] = len(self._order.chunks), self.chunks

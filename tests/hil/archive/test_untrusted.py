@@ -191,6 +191,12 @@ def test_what_is_written_for_a_number_stops_no_reader(number, written, tmp_path)
     assert "validation" in overview(path).title
 
 
+@pytest.mark.parametrize("count", ["samples", "events", "lost_packets"])
+def test_a_count_that_is_no_number_is_a_fault(count, written, tmp_path):
+    path = stranger(written, tmp_path / NAME, outcome={count: "many"})
+    assert "outcome" in check_archive(path).faults
+
+
 @pytest.mark.parametrize("name", ["cell.toml", "robot.urdf"])
 def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
     path = stranger(written, tmp_path / NAME, attachments={name: b"\xff\xfe"})
