@@ -252,11 +252,11 @@ class ChunkParser:
         if not count:
             return None
         rows = np.frombuffer(chunk, np.uint8, count * size, at).reshape(-1, size)
-        kept = np.ones(count, np.bool_)
+        matching = np.ones(count, np.bool_)
         for place in self._pattern:
             for where, word in place.words:
-                kept &= rows[:, where].view(_WORD)[:, 0] == word
-        return rows if kept.all() else rows[: int(kept.argmin())]
+                matching &= rows[:, where].view(_WORD)[:, 0] == word
+        return rows if matching.all() else rows[: int(matching.argmin())]
 
     def _add(self, rows: Bytes, at: int, found: dict[int, Messages]) -> None:
         for place in self._pattern:

@@ -361,7 +361,7 @@ def is_known(entries: Mapping[str, str]) -> bool:
     return entries.get("format_version") == str(FORMAT_VERSION)
 
 
-def listed(chunks: Iterable[int]) -> str:
+def chunk_list(chunks: Iterable[int]) -> str:
     """The checksums of chunks as the outcome lists them."""
     return "".join(f"{crc:08x}" for crc in chunks)
 

@@ -163,12 +163,12 @@ class _Columns:
         return columns
 
     def _grow(self, room: int) -> None:
-        kept = slice(self._count)
+        filled = slice(self._count)
         stamps, self._stamps = self._stamps, np.empty(room, np.int64)
-        self._stamps[kept] = stamps[kept]
+        self._stamps[filled] = stamps[filled]
         for index, array in enumerate(self._arrays):
             self._arrays[index] = np.empty((len(array), room), array.dtype)
-            self._arrays[index][:, kept] = array[:, kept]
+            self._arrays[index][:, filled] = array[:, filled]
 
 
 def _blocks(layout: MessageLayout, fields: Collection[str] | None) -> list[_Block]:
@@ -599,7 +599,7 @@ def _by_index(
     try:
         for record in summary.definitions:
             content.parser.known.take(record)
-        listed, others = summary.chunks, summary.others
+        indexed, others = summary.chunks, summary.others
     except Damage:
         return None
     known = content.parser.known
@@ -610,7 +610,7 @@ def _by_index(
         topics.update(NUMBERS)  # a chunk that has others than those wanted is to be seen, too
     wanted = {channel.id for channel in known.channels.values() if channel.topic in topics}
     start, stop = selection.times
-    chunks = [chunk for chunk in listed if chunk.message_index_offsets.keys() & wanted]
+    chunks = [chunk for chunk in indexed if chunk.message_index_offsets.keys() & wanted]
     within = [
         one for one in chunks if one.message_start_time < stop and one.message_end_time >= start
     ]

@@ -129,7 +129,7 @@ def repair(
     is named, and left alone otherwise.
 
     Args:
-        path: the archive, which is kept unless `in_place`.
+        path: the archive, which stays as it is unless `in_place`.
         output: the file to write, which must not exist; `repaired_name` by default.
         in_place: replace the archive by the repaired one instead.
 
@@ -237,16 +237,16 @@ def _renumbered(data: bytes, found: Mapping[int, Messages], shift: Mapping[int, 
 def _description(found: Survey) -> dict[str, str]:
     """The ``hil`` record: as it was, without the attachments that are lost."""
     assert found.metadata is not None and found.header is not None
-    announced = [*found.header.attachments]
-    kept = [name for name in announced if name in found.attachments]
-    if kept == announced:
+    names = [*found.header.attachments]
+    found_names = [name for name in names if name in found.attachments]
+    if found_names == names:
         return found.metadata
-    return {**found.metadata, "attachments": json.dumps(kept)}
+    return {**found.metadata, "attachments": json.dumps(found_names)}
 
 
 def _outcome(found: Survey, chunks: Sequence[int]) -> dict[str, str]:
     """The ``hil.outcome`` record of a file of these chunks: as it was where nothing is lost."""
-    lists = {header.CHUNKS: header.listed(chunks)}
+    lists = {header.CHUNKS: header.chunk_list(chunks)}
     if not found.losses and found.outcome is not None:
         record = found.outcome.record  # other chunks than before if another program cut them
         return {**record, **(lists if header.CHUNKS in record else {})}

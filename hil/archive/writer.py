@@ -29,7 +29,7 @@ from hil.archive.header import (
     OUTCOME,
     ArchiveName,
     checksum,
-    listed,
+    chunk_list,
     sealed,
 )
 from hil.archive.mcap_writer import McapWriter
@@ -141,7 +141,7 @@ class ArchiveFile:
             return
         with self._guarded():
             self._writer.flush()
-            seals = {DESCRIPTION: self._description, CHUNKS: listed(self._writer.checksums)}
+            seals = {DESCRIPTION: self._description, CHUNKS: chunk_list(self._writer.checksums)}
             self._writer.add_metadata(OUTCOME, sealed({**outcome, **seals}))
             self._writer.finish()
             self._write()

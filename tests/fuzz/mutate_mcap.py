@@ -17,7 +17,7 @@ import lz4.frame
 import zstandard
 
 from hil.archive import header
-from hil.archive.header import listed
+from hil.archive.header import chunk_list
 from tests.fuzz.mutate_bytes import mutate_bytes
 from tests.fuzz.mutate_text import mutate_text
 from tests.hil.mcap_bytes import Indexed
@@ -106,7 +106,9 @@ def put_together(records: list[Record], *, index: bool) -> bytes:
     file = built.data
     described = _described(records)
     for one in records:
-        body = _sealed(one, {header.DESCRIPTION: described, header.CHUNKS: listed(built.checksums)})
+        body = _sealed(
+            one, {header.DESCRIPTION: described, header.CHUNKS: chunk_list(built.checksums)}
+        )
         if index:
             built.put(_HEAD.pack(one.opcode, len(body)) + body)
             continue

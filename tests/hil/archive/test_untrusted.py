@@ -25,7 +25,7 @@ from hil.archive import container, header, open_archive, schema
 from hil.archive.cdr import LayoutError, fixed_layout
 from hil.archive.check import check_archive
 from hil.archive.container import Record
-from hil.archive.header import ArchiveHeader, HeaderError, listed
+from hil.archive.header import ArchiveHeader, HeaderError, chunk_list
 from hil.archive.overview import overview
 from hil.archive.repair import repair
 from hil.archive.schema import EVENT_CHANNEL, SampleEncoder
@@ -59,7 +59,7 @@ class Stranger(mcap_bytes.Indexed):
         name, entries = container.metadata(record)
         del entries["checksum"]
         if header.CHUNKS in entries:
-            entries[header.CHUNKS] = listed(self.checksums)
+            entries[header.CHUNKS] = chunk_list(self.checksums)
         entries |= given[name]
         if name == "hil":
             self._described = header.checksum(entries)
