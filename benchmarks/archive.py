@@ -47,9 +47,9 @@ from numpy.typing import NDArray
 
 from benchmarks.archive_files import CYCLES, JOINTS, SECONDS, repetitions
 from benchmarks.batch import archives_to_estimate
-from hil.archive import container, definitions, open_archive
+from hil.archive import container, open_archive
 from hil.archive.cdr import fixed_layout
-from hil.archive.schema import CYCLE
+from hil.archive.schema import CYCLE, profile
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -65,7 +65,7 @@ COLUMNS = (
     "gap",
 )
 _CODES = {"<f8": "d", "<i8": "q", "<i4": "i"}  # of struct, by the types of the columns
-_LAYOUT = fixed_layout(definitions.cycle(JOINTS)).dtype
+_LAYOUT = fixed_layout(profile(JOINTS)[CYCLE].definition).dtype
 
 
 def ours(path: Path) -> Columns:

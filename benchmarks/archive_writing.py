@@ -27,8 +27,7 @@ from drivers.exchange import ControlBlock, EventWriter, SharedCycleRing, SharedP
 from drivers.exchange import control as control_memory
 from drivers.packets import AXIS_DTYPE, HEADER_LENGTH, Mode, next_number
 from hil.archive import ArchiveSpec, open_archive
-from hil.archive.commands import Close, Closed, Open, Opened
-from hil.archive.supervised import ArchiveProcessHandle
+from hil.archive.supervised import ArchiveProcessHandle, Close, Closed, Open, Opened
 
 Array = NDArray[np.float64]
 

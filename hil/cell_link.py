@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hil.archive.live_view import LiveView, LiveViewError
+from hil.archive.live import LiveView, LiveViewError
 from hil.campaign.live_link import LiveLink
 from hil.campaign.motion_link import MotionLink
 from hil.cell import Cell

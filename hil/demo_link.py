@@ -16,7 +16,7 @@ from typing import IO
 
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
-from hil.archive.live_view import LiveView
+from hil.archive.live import LiveView
 from hil.campaign.live_link import LiveLink
 from hil.cell import Cell
 from hil.cell.schema import CanTable

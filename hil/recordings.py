@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import AnswersLost
-from hil.archive import CONTROLLERS_OWN, Archive, foreign_json, open_archive
+from hil.archive import Archive, open_archive
 from hil.errors import ArchiveError
 from identification.signals.recording import Recording
-from planner.plain import DAMAGED, numbers
 
 Array = NDArray[np.float64]
 
@@ -81,11 +80,9 @@ def recording_of(archive: Archive) -> Recording:
     recording has a fixed rate), not in times of arrival.
 
     Raises:
-        ArchiveError: the archive holds no sample, or its metadata hold what they must not.
+        ArchiveError: the archive holds no sample.
     """
     columns = archive.columns
-    _names(archive, "effects")
-    _check_motors(archive)
     if not archive.n_samples or "position" not in columns:
         raise ArchiveError(
             archive.path,
@@ -102,14 +99,14 @@ def recording_of(archive: Archive) -> Recording:
         motor_current=current,
         commanded_position=_commanded(archive),
         gap_before=_gaps(archive),
-        held_joints=_names(archive, "held_joints"),
+        held_joints=archive.header.held_joints,
         provenance=_provenance(archive),
     )
 
 
 def _commanded(archive: Archive) -> Array | None:
     """What the arm was told: by the PC, or by the controller's own program."""
-    own = archive.metadata.get("motion") == CONTROLLERS_OWN
+    own = archive.header.controllers_own
     return archive.columns.get("target_position" if own else "commanded_position")
 
 
@@ -153,40 +150,14 @@ def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
     return gaps
 
 
-def _names(archive: Archive, field: str) -> tuple[str, ...]:
-    """An entry of the metadata that lists names; none where there is no such entry."""
-    found = foreign_json.names(archive.metadata.get(field, "[]"))
-    if found is None:
-        raise _unfit(archive, field, "is no JSON list of names")
-    return found
-
-
-def _check_motors(archive: Archive) -> None:
-    """Check the motors' angles per joint angle, where the metadata state them."""
-    field = "motor_from_joint"
-    stated, n = foreign_json.loads(archive.metadata.get(field, "null")), len(archive.joint_names)
-    if field not in archive.metadata:
-        return
-    try:
-        matrix = numbers(stated, 2)
-    except DAMAGED:
-        matrix = np.zeros(0)
-    if matrix.shape != (n, n) or not np.isfinite(matrix).all():
-        raise _unfit(archive, field, f"is no JSON matrix of {n} by {n} numbers")
-
-
-def _unfit(archive: Archive, field: str, problem: str) -> ArchiveError:
-    return ArchiveError(archive.path, problem, field=field, remedy="import it again")
-
-
 def _known(torque: Array | None) -> Array | None:
     """None where the recording has no torque at all."""
     return None if torque is None or np.isnan(torque).all() else torque
 
 
 def _provenance(archive: Archive) -> dict[str, str]:
-    provenance = {"archive": archive.path.name, **archive.metadata}
-    for key, value in (archive.outcome or {}).items():
+    provenance = {"archive": archive.path.name, **archive.header.entries}
+    for key, value in (archive.outcome.entries if archive.outcome else {}).items():
         provenance[key if key == "outcome" else f"outcome.{key}"] = value
     if archive.missing is not None:
         provenance["missing"] = archive.missing

@@ -10,26 +10,28 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO
 
 import numpy as np
-import zstandard
-from numpy.typing import NDArray
+from mcap.records import Channel, Schema
 
-from drivers.packet_records import LONGEST_PACKET
-from hil.archive import container, definitions, description, index, schema
-from hil.archive.amend import REJECTED
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
-from hil.archive.chunk import ChunkParser, Messages
-from hil.archive.container import ChannelRecord, Damage, Record
-from hil.archive.description import Description, DescriptionError
-from hil.archive.intact import Survey
-from hil.archive.messages import decode_log, joint_state_layout, joint_state_of
-from hil.archive.names import KINDS, ArchiveName
-from hil.archive.order import checksums
-from hil.archive.survey import survey
+from hil.archive import container, schema
+from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
+from hil.archive.chunk import KnownChannels, Messages
+from hil.archive.container import Record
+from hil.archive.header import (
+    CHUNKS,
+    FORMAT_VERSION,
+    KINDS,
+    METADATA,
+    REJECTED,
+    ArchiveHeader,
+    ArchiveName,
+    ArchiveOutcome,
+    HeaderError,
+    is_known,
+)
+from hil.archive.survey import Survey, Visit, survey
 from hil.errors import NotAnArchiveError
-from hil.reading import opened
 
 Fault = tuple[str, str]
 
@@ -49,88 +51,79 @@ _CYCLE_FIELDS = (
 _ADDED_LATER = 1  # fields at the end of the cycle that the first archives do not have
 
 
-def message_faults(found: Survey) -> Iterator[Fault]:
-    """What is wrong with schemas, channels and messages of what stands of an archive.
-
-    Yields:
-        Aspect of the profile, and what is wrong.
-    """
-    checker = _Checker(found)
-    with opened(found.path) as stream:
-        yield from checker.run(stream)
-
-
 class _Checker:
-    """Goes through the chunks that stand."""
+    """Checks chunks that stand, one after the other; then the rest.
 
-    def __init__(self, found: Survey) -> None:
-        assert found.metadata is not None
-        self._found = found
-        self._imported = found.metadata["kind"] == "imported"
-        description = Description.of(found.metadata)
-        self._joints = description.joint_names
-        self._period_ns = None if description.period is None else description.period * 1e9
-        self._parser = ChunkParser()
-        self._known = self._parser.known
+    Attributes:
+        faults: aspect of the profile, and what is wrong.
+    """
+
+    def __init__(self) -> None:
+        self.faults: list[Fault] = []
+        self._joints: tuple[str, ...] = ()
+        self._period_ns: float | None = None
+        self._known = KnownChannels()
         self._layouts: dict[str, MessageLayout | None] = {}
-        self._last_cycle: int | None = None
         self._gaps = 0
-        self._decompressor = zstandard.ZstdDecompressor()
 
-    def run(self, stream: BinaryIO) -> Iterator[Fault]:
-        """All faults."""
-        for record in self._found.definitions:
-            self._known.take(record.opcode, record.body, record.offset)
-        for piece in self._found.pieces:
-            record = container.record_at(stream, piece.offset, piece.length)
-            if piece.opcode == container.CHUNK:
-                try:
-                    yield from self._chunk(record)
-                except Damage as damage:
-                    yield "chunks", f"the record at byte {damage.offset} {damage}"
-            elif piece.opcode in (container.SCHEMA, container.CHANNEL):
-                self._known.take(record.opcode, record.body, record.offset)
+    def visit(self, found: Survey, record: Record, messages: Mapping[str, Messages]) -> None:
+        """Check the next chunk."""
+        if found.header is not None:
+            self._joints, period = found.header.joint_names, found.header.period
+            self._period_ns = None if period is None else period * 1e9
+            self._known = found.parser.known
+            self.faults += self._chunk(record, messages)
+
+    def finish(self, found: Survey) -> None:
+        """Check channels and outcome."""
+        header, outcome = found.header, found.outcome
+        if header is None or not found.pieces:
+            return
+        imported = header.kind == "imported"
         if self._known.channels:
-            yield from self._channels()
-        yield from self._outcome()
+            self.faults += self._channels(imported=imported)
+        if imported or outcome is None or outcome.repaired or found.losses:
+            return
+        if "lost_packets" in outcome.record and outcome.lost_packets != self._gaps:
+            stated = outcome.record["lost_packets"]
+            text = f"lost_packets is {stated}, the cycles lack {self._gaps}"
+            self.faults.append(("outcome", text))
 
-    def _channels(self) -> Iterator[Fault]:
+    def _channels(self, *, imported: bool) -> Iterator[Fault]:
         """Check topics, types and encodings."""
         channels = {channel.topic: channel for channel in self._known.channels.values()}
         needed = {schema.MEASURED, schema.EVENTS}
-        if not self._imported:
+        if not imported:
             needed |= {schema.CYCLE, schema.COMMANDED}
         for topic in sorted(needed - channels.keys()):
             yield "channels", f"there is no {topic}"
         for topic in sorted(channels):
             yield from self._channel(channels[topic])
 
-    def _channel(self, channel: ChannelRecord) -> Iterator[Fault]:
-        expected = _expected(channel.topic, len(self._joints))
+    def _channel(self, channel: Channel) -> Iterator[Fault]:
+        expected = schema.profile(len(self._joints)).get(channel.topic)
         if expected is None:
             return  # a later version may add channels
-        name, definition = expected
-        if channel.encoding != "cdr":
-            yield "channels", f"{channel.topic} is encoded as {channel.encoding!r}, not 'cdr'"
+        if (encoding := channel.message_encoding) != "cdr":
+            yield "channels", f"{channel.topic} is encoded as {encoding!r}, not 'cdr'"
         found = self._known.schemas.get(channel.schema_id)
         if found is None:
             yield "schemas", f"{channel.topic} has none"
             return
-        if found.name != name:
-            yield "channels", f"{channel.topic} is of type {found.name}, not {name}"
+        if found.name != expected.schema:
+            yield "channels", f"{channel.topic} is of type {found.name}, not {expected.schema}"
         if found.encoding != "ros2msg":
             yield "schemas", f"that of {channel.topic} is {found.encoding!r}, not 'ros2msg'"
-        if not _extends(found.definition, definition, fixed=channel.topic != schema.CYCLE):
+        if not _extends(_text(found), expected.definition, fixed=channel.topic != schema.CYCLE):
             yield "schemas", f"that of {channel.topic} is not the text of the profile"
 
-    def _chunk(self, record: Record) -> Iterator[Fault]:
+    def _chunk(self, record: Record, found: Mapping[str, Messages]) -> Iterator[Fault]:
         place = f"the chunk at byte {record.offset}"
-        head = container.chunk(record)
-        if head.compression != "zstd":
-            yield "chunks", f"{place} is compressed with {head.compression or 'nothing'}, not zstd"
-        data = container.chunk_data(record, decompressor=self._decompressor)
-        yield from self._log_times(data, record.offset, place)
-        found = self._parser.messages(data, record.offset)
+        compression = container.chunk(record).compression
+        if compression != "zstd":
+            yield "chunks", f"{place} is compressed with {compression or 'nothing'}, not zstd"
+        if not all(_logged_in_time(messages) for messages in found.values()):
+            yield "times", f"{place} has messages logged at another time than their stamp"
         rows: dict[str, Rows] = {}
         for topic, messages in found.items():
             if topic == schema.EVENTS:
@@ -142,7 +135,7 @@ class _Checker:
             else:
                 rows[topic] = laid_out
         if schema.CYCLE in rows and set(_CYCLE_FIELDS) <= set(rows[schema.CYCLE].dtype.names or ()):
-            yield from self._cycles(rows, place)
+            yield from self._cycles(found, rows, place)
 
     def _rows(self, topic: str, messages: Messages) -> Rows | None:
         """The messages as a structured array; None where one has another layout."""
@@ -156,46 +149,18 @@ class _Checker:
 
     def _layout(self, topic: str, messages: Messages) -> MessageLayout | None:
         try:
-            if topic not in _STATES:
-                record = self._known.schema(topic)
-                if record is None:
-                    return None
-                layout = fixed_layout(record.definition)
-                schema.check_fields(topic, layout, len(self._joints))
-                return layout
-            names, layout = joint_state_of(messages.first())
+            return schema.message_layout(
+                topic, self._joints, self._known.schema(topic), messages.first()
+            )
         except LayoutError:
             return None
-        lengths = {
-            word: layout.dtype[word].shape[0] if word in (layout.dtype.names or ()) else 0
-            for word in ("position", "velocity", "effort")
-        }
-        expected = joint_state_layout(
-            self._joints,
-            position=lengths["position"],
-            velocity=lengths["velocity"],
-            effort=lengths["effort"],
-        )
-        known = names == self._joints and set(lengths.values()) <= {0, len(self._joints)}
-        return layout if known and expected.template == layout.template else None
 
-    def _log_times(self, data: bytes, offset: int, place: str) -> Iterator[Fault]:
-        """Check log and publish times against the stamps in the messages."""
-        stamps = []
-        for item in index.messages(data, offset):
-            if isinstance(item, Record):
-                continue
-            seconds = int.from_bytes(data[item.data + 4 : item.data + 8], "little", signed=True)
-            rest = int.from_bytes(data[item.data + 8 : item.data + 12], "little")
-            if not item.log_time == item.publish_time == seconds * 10**9 + rest:
-                yield "times", f"{place} has messages logged at another time than their stamp"
-                return
-            stamps.append(item.log_time)
-
-    def _cycles(self, rows: Mapping[str, Rows], place: str) -> Iterator[Fault]:
+    def _cycles(
+        self, found: Mapping[str, Messages], rows: Mapping[str, Rows], place: str
+    ) -> Iterator[Fault]:
         """Check the cycles of a chunk, and the channels that repeat them."""
         cycles = rows[schema.CYCLE]
-        number, stamp = cycles["cycle"], _stamps(cycles)
+        number, stamp = cycles["cycle"], found[schema.CYCLE].stamps
         if self._period_ns is not None:
             if not np.array_equal(stamp, np.rint(number * self._period_ns)):
                 yield "times", f"{place} has cycles whose stamp is not cycle times period"
@@ -203,38 +168,24 @@ class _Checker:
                 _CHUNK_NS, self._period_ns
             ):
                 yield "chunks", f"{place} spans more than 100 ms"
-        behind = () if self._last_cycle is None else (number[0] <= self._last_cycle,)
-        if any(behind) or (number[1:] <= number[:-1]).any():
-            yield "times", f"{place} has cycles that do not grow"
-        self._last_cycle = int(number[-1])
         self._gaps += int(cycles["gap"].sum())
         for topic, columns in _STATES.items():
-            if topic in rows and not _repeats(rows[topic], cycles, columns):
+            if topic not in rows:
+                continue
+            same = np.array_equal(found[topic].stamps, stamp)
+            if not (same and _repeats(rows[topic], cycles, columns)):
                 yield "joint_states", f"{place} has messages of {topic} unlike its cycles"
 
-    def _outcome(self) -> Iterator[Fault]:
-        """Check what the outcome says of the cycles."""
-        outcome = self._found.outcome
-        if self._imported or outcome is None or "repaired" in outcome or self._found.losses:
-            return
-        stated = outcome.get("lost_packets")
-        if stated is not None and stated != str(self._gaps):
-            yield "outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}"
+
+def _logged_in_time(messages: Messages) -> bool:
+    """Whether log and publish times are the stamps in the messages."""
+    stamps, logged = messages.stamps, messages.of_heads("log_time")
+    published = messages.of_heads("publish_time")
+    return np.array_equal(logged, published) and np.array_equal(logged, stamps)
 
 
-def _expected(topic: str, n_joints: int) -> tuple[str, str] | None:
-    """Type and text that a topic of the profile must have."""
-    return {
-        schema.CYCLE: (definitions.cycle_name(n_joints), definitions.cycle(n_joints)),
-        schema.MEASURED: (definitions.JOINT_STATE, definitions.joint_state()),
-        schema.COMMANDED: (definitions.JOINT_STATE, definitions.joint_state()),
-        schema.MOTOR_CURRENT: (
-            definitions.motor_current_name(n_joints),
-            definitions.motor_current(n_joints),
-        ),
-        schema.EVENTS: (definitions.LOG, definitions.log()),
-        schema.PACKETS: (definitions.PACKET, definitions.packet(LONGEST_PACKET)),
-    }.get(topic)
+def _text(record: Schema) -> str:
+    return record.data.decode(errors="replace")
 
 
 def _extends(text: str, profile: str, *, fixed: bool) -> bool:
@@ -261,20 +212,9 @@ def _events(messages: Messages, place: str) -> Iterator[Fault]:
 
 
 def _repeats(state: Rows, cycles: Rows, columns: Mapping[str, str]) -> bool:
-    names = state.dtype.names or ()
-    if set(names) != {"sec", "nanosec", *columns} or len(state) != len(cycles):
+    if {*(state.dtype.names or ())} != {"sec", "nanosec", *columns}:
         return False
-    pairs = [(state[word], cycles[column]) for word, column in columns.items()]
-    pairs.append((_stamps(state), _stamps(cycles)))
-    return all(_bits(a) == _bits(b) for a, b in pairs)
-
-
-def _bits(values: NDArray[Any]) -> bytes:
-    return values.tobytes()
-
-
-def _stamps(rows: Rows) -> NDArray[np.int64]:
-    return np.asarray(rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"])
+    return all(state[word].tobytes() == cycles[name].tobytes() for word, name in columns.items())
 
 
 ASPECTS = {
@@ -329,12 +269,19 @@ def check_archive(path: str | PathLike[str]) -> Check:
         ArchiveError: it cannot be read.
     """
     path = Path(path)
-    found = survey(path)
+    checkers: list[_Checker] = []
+
+    def begin() -> Visit:
+        checkers.append(_Checker())
+        return checkers[-1].visit
+
+    found = survey(path, begin)
+    checkers[-1].finish(found)
     faults: dict[str, list[str]] = {}
     for fault in found.faults:
         faults.setdefault(fault.aspect, []).append(fault.text)
     if found.metadata is None:
-        if not any(repr(schema.METADATA) in text for text in faults.get("metadata", ())):
+        if not any(repr(METADATA) in text for text in faults.get("metadata", ())):
             raise _another_kind(found)
         described = ["without the record hil the rest cannot be checked"]
     else:
@@ -343,23 +290,23 @@ def check_archive(path: str | PathLike[str]) -> Check:
     if found.outcome is not None:
         faults.setdefault("outcome", []).extend(_outcome_faults(found.outcome))
     if not described and found.pieces:
-        for aspect, text in message_faults(found):
+        for aspect, text in checkers[-1].faults:
             faults.setdefault(aspect, []).append(text)
     return Check(
         path=path,
         version=(found.metadata or {}).get("format_version", "unknown"),
         faults={aspect: _shortened(faults[aspect]) for aspect in ASPECTS if faults.get(aspect)},
         samples=found.samples,
-        repaired=(found.outcome or {}).get("repaired") == "yes",
+        repaired=found.outcome is not None and found.outcome.repaired,
     )
 
 
 def _another_kind(found: Survey) -> NotAnArchiveError:
     if found.size == 0:
         return NotAnArchiveError(found.path, "is empty")
-    if found.header is None:
+    if found.written_by is None:
         return NotAnArchiveError(found.path, "is not an MCAP file")
-    profile, library = found.header
+    profile, library = found.written_by
     return NotAnArchiveError(
         found.path,
         f"is an MCAP file of profile {profile!r} written by {library!r}, but not an archive of hil",
@@ -373,34 +320,31 @@ def _shortened(texts: list[str]) -> tuple[str, ...]:
     return tuple([*unique[:_MOST], f"and {more} more of the kind"] if more > 0 else unique)
 
 
-def _description_faults(path: Path, metadata: Mapping[str, str]) -> list[str]:
+def _description_faults(path: Path, entries: Mapping[str, str]) -> list[str]:
     """What is wrong with the ``hil`` record."""
+    if not is_known(entries):
+        return [f"format_version is {entries.get('format_version')!r}, known is '{FORMAT_VERSION}'"]
     faults = []
-    version = metadata.get("format_version")
-    if version != str(schema.FORMAT_VERSION):
-        return [f"format_version is {version!r}, known is '{schema.FORMAT_VERSION}'"]
-    kind = metadata.get("kind")
+    kind = entries.get("kind", "")
     if kind not in KINDS:
         faults.append(f"kind is {kind!r}, not one of {', '.join(KINDS)}")
-    for read in (description.joint_names, description.attachment_names, description.period):
-        try:
-            read(metadata)
-        except DescriptionError as error:
-            faults.append(str(error))
-    if "period" not in metadata and kind != "imported":
+    try:
+        ArchiveHeader.of(entries)
+    except HeaderError as error:
+        faults += [f"{name} {problem}" for name, problem in error.problems.items()]
+    if "period" not in entries and kind != "imported":
         faults.append("period is missing")
     name = ArchiveName.parse(path)
     for key, value in (name.metadata() if name else {}).items():
-        if metadata.get(key) != value:
-            faults.append(f"{key} is {metadata.get(key)!r}, but the file name says {value!r}")
+        if entries.get(key) != value:
+            faults.append(f"{key} is {entries.get(key)!r}, but the file name says {value!r}")
     return faults
 
 
-def _outcome_faults(outcome: Mapping[str, str]) -> list[str]:
+def _outcome_faults(outcome: ArchiveOutcome) -> list[str]:
     """What is wrong with the ``hil.outcome`` record, but for its counts."""
-    word = outcome.get("outcome")
-    if word not in OUTCOMES:
-        return [f"outcome is {word!r}, not one of {', '.join(OUTCOMES)}"]
-    if checksums(outcome.get(schema.CHUNKS, "")) is None:
-        return [f"{schema.CHUNKS} is no list of checksums"]
+    if outcome.outcome not in OUTCOMES:
+        return [f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"]
+    if CHUNKS in outcome.record and outcome.chunks is None:
+        return [f"{CHUNKS} is no list of checksums"]
     return []

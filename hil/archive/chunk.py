@@ -11,26 +11,44 @@ from __future__ import annotations
 import struct
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from hil.archive import container
-from hil.archive.container import Damage
-from hil.archive.known_channels import KnownChannels
+from hil.archive.container import Damage, Record
 
 Bytes = NDArray[np.uint8]
 
-_RECORD = container.RECORD
-_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""What precedes the data of a message."""
 _FIXED = struct.Struct("<BQH")  # the part of it that repeats with the pattern
-_SEQUENCE = np.dtype("<u4")
-_IN_BODY = _HEAD.size - _RECORD.size  # the part of it that the record's length counts
 _WORD = np.dtype("<u8")
 _WORDS_AT = (0, _FIXED.size - _WORD.itemsize)  # two words that overlap cover the fixed part
+_STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
+_STAMP_AT = slice(4, 4 + _STAMP.itemsize)  # in the data of a message, behind its encapsulation
 _LONGEST_PATTERN = 16  # messages
+
+
+def stamps(data: Bytes) -> NDArray[np.int64]:
+    """Time stamps in the data of messages (k, size), shape (k,) [ns]."""
+    stamp = data[:, _STAMP_AT].view(_STAMP)[:, 0]
+    found = np.multiply(stamp["sec"], 10**9, dtype=np.int64)
+    found += stamp["nanosec"]
+    return np.asarray(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,20 +56,39 @@ class Messages:
     """The messages of one channel in one chunk, or in several that follow each other.
 
     Attributes:
-        parts: their data in order, each an array (k, size) of messages of one size.
-        sequence: their numbers as written, shape (k,) for each part.
+        heads: what precedes their data, in order, each an array (k, 31) of bytes.
+        parts: their data, each an array (k, size) of messages of one size.
+        starts: where in the chunk the first of each part begins, and how far the next is.
     """
 
-    parts: list[Bytes]
-    sequences: list[NDArray[np.uint32]]
+    heads: list[Bytes] = field(default_factory=list)
+    parts: list[Bytes] = field(default_factory=list)
+    starts: list[tuple[int, int]] = field(default_factory=list)
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
 
+    def of_heads(self, name: str) -> NDArray[Any]:
+        """A field of `HEAD`, of all messages."""
+        found = [head.view(HEAD)[:, 0][name] for head in self.heads]
+        return found[0] if len(found) == 1 else np.concatenate(found)
+
     @property
-    def sequence(self) -> NDArray[np.uint32]:
-        """The numbers of all messages."""
-        return self.sequences[0] if len(self.sequences) == 1 else np.concatenate(self.sequences)
+    def places(self) -> NDArray[np.int64]:
+        """Where in the chunk each begins, shape (k,)."""
+        places = [
+            start + step * np.arange(len(part))
+            for (start, step), part in zip(self.starts, self.parts, strict=True)
+        ]
+        return np.concatenate(places)
+
+    @cached_property
+    def stamps(self) -> NDArray[np.int64]:
+        """Time stamps of all, shape (k,) [ns]; none where a message is too short for one."""
+        if any(part.shape[1] < _STAMP_AT.stop for part in self.parts):
+            return np.zeros(0, np.int64)
+        found = [stamps(part) for part in self.parts]
+        return found[0] if len(found) == 1 else np.concatenate(found)
 
     def all(self) -> list[bytes]:
         """The data of each message."""
@@ -67,13 +104,69 @@ class Messages:
             return None
         return self.parts[0] if len(self.parts) == 1 else np.concatenate(self.parts)
 
+    def append(self, head: Bytes, data: Bytes, start: int, step: int) -> None:
+        """Append messages, the first of which begins at `start`, the next `step` behind it."""
+        self.heads.append(head)
+        self.parts.append(data)
+        self.starts.append((start, step))
+
+
+class KnownChannels:
+    """Schemas and channels by their numbers; what is known once stays what it is.
+
+    Were a number or a topic to change its meaning in mid-file, samples of one channel would be
+    taken for those of another.
+    """
+
+    def __init__(self, known: KnownChannels | None = None) -> None:
+        self.schemas: dict[int, Schema] = dict(known.schemas) if known else {}
+        self.channels: dict[int, Channel] = dict(known.channels) if known else {}
+
+    @property
+    def topics(self) -> set[str]:
+        """The topics of all channels."""
+        return {channel.topic for channel in self.channels.values()}
+
+    @property
+    def definitions(self) -> list[Schema | Channel]:
+        """All of them."""
+        return [*self.schemas.values(), *self.channels.values()]
+
+    def schema(self, topic: str) -> Schema | None:
+        """The schema of a topic's messages, if it is known."""
+        identity = next(one.schema_id for one in self.channels.values() if one.topic == topic)
+        return self.schemas.get(identity)
+
+    def take(self, record: Record) -> None:
+        """Take a schema or channel; other records are passed over.
+
+        Raises:
+            Damage: the record is torn, or says something else than one before.
+        """
+        if record.opcode not in (container.SCHEMA, container.CHANNEL):
+            return
+        item, again = container.item(record), ""
+        if isinstance(item, Schema):
+            if not item.id:
+                raise Damage(record.offset, "(schema) has the number 0, which stands for none")
+            if self.schemas.setdefault(item.id, item) != item:
+                again = f"schema {item.id}"
+        elif isinstance(item, Channel):
+            known = self.channels.values()
+            same = [one for one in known if one.id == item.id or one.topic == item.topic]
+            if same not in ([], [item]):
+                again = f"channel {item.id}"
+            self.channels.setdefault(item.id, item)
+        if again:
+            raise Damage(record.offset, f"announces {again} a second time, as another")
+
 
 class _Place(NamedTuple):
     """Where in the pattern a message stands, and the head it must have as two words."""
 
     channel: int
     words: tuple[tuple[slice, int], ...]
-    sequence: slice
+    head: slice
     data: slice
 
 
@@ -88,8 +181,8 @@ class ChunkParser:
         """Whether a chunk may be nothing but the known pattern, to judge by its length."""
         return bool(self._pattern) and len(chunk) % self._pattern[-1].data.stop == 0
 
-    def repeated(self, chunks: Sequence[bytes]) -> dict[str, Messages] | None:
-        """The messages of chunks by topic if they repeat the known pattern and nothing else.
+    def repeated(self, chunks: Sequence[bytes]) -> dict[int, Messages] | None:
+        """The messages of chunks by channel if they repeat the known pattern and nothing else.
 
         The chunks must each be of a length that `repeats`.
         """
@@ -98,18 +191,18 @@ class ChunkParser:
         if rows is None or rows.size != len(data):
             return None
         found: dict[int, Messages] = {}
-        self._add(rows, found)
-        return self._by_topic(found, 0)
+        self._add(rows, 0, found)
+        return found
 
-    def messages(self, chunk: bytes, offset: int) -> dict[str, Messages]:
-        """The messages of a chunk by topic.
+    def messages(self, chunk: bytes, offset: int) -> dict[int, Messages]:
+        """The messages of a chunk by channel.
 
         Args:
             chunk: decompressed records.
             offset: where the chunk's record begins in the file, for the error.
 
         Raises:
-            Damage: the chunk does not hold whole records, or announcements that fit its messages.
+            Damage: the chunk does not hold whole records, or definitions that fit one another.
         """
         found: dict[int, Messages] = {}
         recent: deque[bytes] = deque(maxlen=_LONGEST_PATTERN)
@@ -117,29 +210,38 @@ class ChunkParser:
         while at < len(chunk):
             rows = self._run(chunk, at)
             if rows is not None and len(rows):
-                self._add(rows, found)
+                self._add(rows, at, found)
                 at += rows.size
                 continue
-            opcode, end = _bounds(chunk, at, offset)
+            opcode, end = container.bounds(chunk, at, offset)
             if opcode == container.MESSAGE:
+                if end - at < HEAD.itemsize:
+                    raise Damage(offset, "(chunk) ends within a record")
                 head = chunk[at : at + _FIXED.size]
                 if head in recent and self._learn(list(recent)[recent.index(head) :]):
                     recent.clear()
                     continue
                 recent.append(head)
-                _, _, channel, sequence, _, _ = _HEAD.unpack_from(chunk, at)
-                data = np.frombuffer(chunk, np.uint8, end - at - _HEAD.size, at + _HEAD.size)
-                _append(found, channel, data[None], np.array([sequence], np.uint32))
+                row = np.frombuffer(chunk, np.uint8, end - at, at)[None]
+                _, _, channel = _FIXED.unpack(head)
+                messages = found.setdefault(channel, Messages())
+                messages.append(row[:, : HEAD.itemsize], row[:, HEAD.itemsize :], at, 0)
             else:
-                self.known.take(opcode, chunk[at + _RECORD.size : end], offset)
+                body = chunk[at + container.RECORD.size : end]
+                self.known.take(Record(offset, opcode, body, len(body)))
             at = end
-        return self._by_topic(found, offset)
+        return found
 
-    def _by_topic(self, found: dict[int, Messages], offset: int) -> dict[str, Messages]:
+    def by_topic(self, found: dict[int, Messages], offset: int) -> dict[str, Messages]:
+        """The same by topic.
+
+        Raises:
+            Damage: a channel is not known.
+        """
         unknown = found.keys() - self.known.channels.keys()
         if unknown:
             raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
-        return {self.known.topic(channel): messages for channel, messages in found.items()}
+        return {self.known.channels[number].topic: messages for number, messages in found.items()}
 
     def _run(self, chunk: bytes, at: int) -> Bytes | None:
         """As many repetitions of the pattern as follow from `at` on, shape (k, size)."""
@@ -150,16 +252,17 @@ class ChunkParser:
         if not count:
             return None
         rows = np.frombuffer(chunk, np.uint8, count * size, at).reshape(-1, size)
-        kept = np.ones(count, np.bool_)
+        matching = np.ones(count, np.bool_)
         for place in self._pattern:
             for where, word in place.words:
-                kept &= rows[:, where].view(_WORD)[:, 0] == word
-        return rows if kept.all() else rows[: int(kept.argmin())]
+                matching &= rows[:, where].view(_WORD)[:, 0] == word
+        return rows if matching.all() else rows[: int(matching.argmin())]
 
-    def _add(self, rows: Bytes, found: dict[int, Messages]) -> None:
+    def _add(self, rows: Bytes, at: int, found: dict[int, Messages]) -> None:
         for place in self._pattern:
-            sequence = rows[:, place.sequence].view(_SEQUENCE)[:, 0]
-            _append(found, place.channel, rows[:, place.data], sequence)
+            messages = found.setdefault(place.channel, Messages())
+            start = at + place.head.start
+            messages.append(rows[:, place.head], rows[:, place.data], start, rows.shape[1])
 
     def _learn(self, heads: list[bytes]) -> bool:
         """Take one round of heads for the pattern, if no channel comes twice in it."""
@@ -169,36 +272,15 @@ class ChunkParser:
             words = tuple(
                 (
                     slice(start + at, start + at + _WORD.itemsize),
-                    int.from_bytes(head[at : at + 8], "little"),
+                    int.from_bytes(head[at : at + _WORD.itemsize], "little"),
                 )
                 for at in _WORDS_AT
             )
-            number = start + _FIXED.size
-            end = start + _RECORD.size + length
-            sequence = slice(number, number + _SEQUENCE.itemsize)
-            places.append(_Place(channel, words, sequence, slice(start + _HEAD.size, end)))
+            data, end = start + HEAD.itemsize, start + container.RECORD.size + length
+            places.append(_Place(channel, words, slice(start, data), slice(data, end)))
             start = end
         changed = len({place.channel for place in places}) == len(places)
         changed &= places != self._pattern
         if changed:
             self._pattern = places
         return changed
-
-
-def _bounds(chunk: bytes, at: int, offset: int) -> tuple[int, int]:
-    """Opcode and end of the record at `at`."""
-    if len(chunk) - at < _RECORD.size:
-        raise Damage(offset, "(chunk) ends within a record")
-    opcode, length = _RECORD.unpack_from(chunk, at)
-    end = at + _RECORD.size + length
-    if end > len(chunk) or (opcode == container.MESSAGE and length < _IN_BODY):
-        raise Damage(offset, "(chunk) ends within a record")
-    return opcode, end
-
-
-def _append(
-    found: dict[int, Messages], channel: int, data: Bytes, sequence: NDArray[np.uint32]
-) -> None:
-    messages = found.setdefault(channel, Messages([], []))
-    messages.parts.append(data)
-    messages.sequences.append(sequence)

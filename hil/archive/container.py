@@ -1,8 +1,10 @@
 """The MCAP container as far as an archive needs it: records in file order, each verified.
 
-Only the data section is believed. It is self-delimiting and its chunks and attachments carry
-checksums, so a file cut off anywhere can be read up to its last whole chunk; the index at the end
-is for other programs. Whatever is wrong with the bytes surfaces as `Damage`, with the place.
+The `mcap` library reads and writes single records. Files are walked here: the library's walk alone
+takes twice as long as all our reading, message indexes and all, and what is torn or forged must
+surface as `Damage` with its place. Only the data section is believed. It is self-delimiting and its
+chunks and attachments carry checksums, so a file cut off anywhere can be read up to its last whole
+chunk; the index at the end is for other programs.
 
 Layout: https://mcap.dev/spec
 """
@@ -12,16 +14,32 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Collection, Iterator
-from typing import BinaryIO, NamedTuple
+from functools import cached_property
+from io import BytesIO
+from typing import Any, BinaryIO, NamedTuple, Self, TypeVar
 
 import lz4.frame
 import zstandard
 from isal.isal_zlib import crc32  # ten times as fast as that of zlib
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Footer,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 LARGEST_CHUNK = 1 << 24  # bytes; ours have a tenth of a megabyte
-LARGEST_RECORD = 1 << 28  # bytes; neither attachments nor summaries come near
 MOST_INFLATION = 1000  # times what is compressed; an arm at rest reaches a tenth
+LARGEST_RECORD = 1 << 28  # bytes; neither attachments nor summaries come near
 
 HEADER = 0x01
 FOOTER = 0x02
@@ -44,6 +62,9 @@ FOOTER_SIZE = RECORD.size + 20
 _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
 _NO_CRC = 0
+_BUT_END = frozenset(range(256)) - {DATA_END}
+_KINDS: dict[int, type[McapRecord]] = {SCHEMA: Schema, CHANNEL: Channel, METADATA: Metadata}
+_Parsed = TypeVar("_Parsed", bound=McapRecord)
 FARTHEST = 1 << 62  # bytes, less than the end of any file
 
 
@@ -62,7 +83,7 @@ class Damage(Exception):  # noqa: N818 - handed on as a finding, too
 
 
 class Record(NamedTuple):
-    """One record of the data section; a body that was not asked for is empty."""
+    """One record of the data section."""
 
     offset: int
     opcode: int
@@ -74,82 +95,79 @@ class Record(NamedTuple):
         """Where the next record begins."""
         return self.offset + RECORD.size + self.length
 
+    @property
+    def size(self) -> int:
+        """Bytes with its head."""
+        return RECORD.size + self.length
 
-class Chunk(NamedTuple):
-    """The head of a chunk record, and its compressed records."""
-
-    start_time: int
-    end_time: int
-    size: int
-    crc: int
-    compression: str
-    data: memoryview
-
-
-class SchemaRecord(NamedTuple):
-    """A schema: how the messages of a channel are to be read."""
-
-    id: int
-    name: str
-    encoding: str
-    definition: str
+    @property
+    def data(self) -> bytes:
+        """Its bytes as they stand in the file."""
+        return RECORD.pack(self.opcode, self.length) + self.body
 
 
-class ChannelRecord(NamedTuple):
-    """A channel: a topic and the schema of its messages."""
+class _Body(ReadDataStream):
+    """The fields of a record; running out is the end of the file, not a shorter field."""
 
-    id: int
-    schema_id: int
-    topic: str
-    encoding: str
+    def __init__(self, body: bytes) -> None:
+        super().__init__(BytesIO(body))
+        self._size = len(body)
+
+    def read(self, length: int) -> bytes:
+        if length > self._size - self.count:
+            raise EndOfFile
+        return super().read(length)
 
 
-class Fields:
-    """Reads the fields of a record body one after the other; running out is damage.
+def parsed(kind: type[_Parsed], body: bytes, offset: int) -> _Parsed:
+    """Read the body of a record that stands at `offset`.
 
-    Args:
-        body: the record without its head.
-        offset: where the record stands in the file, for the error.
+    Raises:
+        Damage: it is not one of this kind.
     """
+    try:
+        found: _Parsed = kind.read(_Body(body))  # type: ignore[attr-defined]
+    except EndOfFile:
+        raise Damage(offset, "is shorter than its fields") from None
+    except UnicodeDecodeError:
+        raise Damage(offset, "holds text that is not UTF-8") from None
+    return found
 
-    def __init__(self, body: bytes, offset: int) -> None:
-        self._body = body
-        self._offset = offset
-        self.at = 0
 
-    def number(self, code: str) -> int:
-        """Read a number; `code` is that of `struct`."""
-        size = struct.calcsize("<" + code)
-        value: int
-        (value,) = struct.unpack("<" + code, self._take(size))
-        return value
+def encoded(record: McapRecord) -> bytes:
+    """The bytes of a record, with its head."""
+    builder: Any = RecordBuilder()  # its methods are not annotated
+    record.write(builder)
+    return bytes(builder.end())
 
-    def text(self) -> str:
-        """Read a string."""
-        try:
-            return self._take(self.number("I")).decode()
-        except UnicodeDecodeError:
-            raise Damage(self._offset, "holds text that is not UTF-8") from None
 
-    def data(self, code: str) -> bytes:
-        """Read bytes whose count precedes them."""
-        return self._take(self.number(code))
+def bounds(data: bytes, at: int, offset: int) -> tuple[int, int]:
+    """Opcode and end of the record at `at`, in a chunk or summary that stands at `offset`.
 
-    def mapping(self) -> dict[str, str]:
-        """Read strings by name."""
-        end = self.number("I") + self.at
-        entries = {}
-        while self.at < end:
-            key = self.text()
-            entries[key] = self.text()
-        return entries
+    Raises:
+        Damage: it is cut off.
+    """
+    if len(data) - at < RECORD.size:
+        raise Damage(offset, "(chunk) ends within a record")
+    opcode, length = RECORD.unpack_from(data, at)
+    end = at + RECORD.size + length
+    if end > len(data):
+        raise Damage(offset, "(chunk) ends within a record")
+    return opcode, end
 
-    def _take(self, size: int) -> bytes:
-        part = self._body[self.at : self.at + size]
-        if len(part) != size:
-            raise Damage(self._offset, "is shorter than its fields")
-        self.at += size
-        return part
+
+def split(data: bytes, offset: int) -> Iterator[Record]:
+    """The records of a chunk or summary one by one, each with its place in it.
+
+    Raises:
+        Damage: the last one is cut off.
+    """
+    at = 0
+    while at < len(data):
+        opcode, end = bounds(data, at, offset)
+        body = data[at + RECORD.size : end]
+        yield Record(at, opcode, body, len(body))
+        at = end
 
 
 def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
@@ -178,7 +196,7 @@ def records(
     Args:
         stream: the file, at its beginning.
         size: its length.
-        skip: opcodes of records whose bodies are passed over.
+        skip: opcodes of records that are passed over.
         check_end: whether to check summary and footer.
 
     Raises:
@@ -201,7 +219,6 @@ def records(
             raise Damage(offset, f"claims {length} bytes of content")
         if opcode in skip:
             seek(length, os.SEEK_CUR)
-            yield Record(offset, opcode, b"", length)
         else:
             yield Record(offset, opcode, read(length), length)
         offset += RECORD.size + length
@@ -215,12 +232,9 @@ def data_end(stream: BinaryIO, size: int) -> int | None:
     """Where the summary must begin, found from head to head; None where the way is broken."""
     stream.seek(0)
     try:
-        for record in records(stream, size, skip=range(256), check_end=False):
-            if record.opcode == DATA_END:
-                return record.end
+        return next(records(stream, size, skip=_BUT_END, check_end=False)).end
     except Damage:
         return None
-    return None
 
 
 def _check_end(tail: bytes, offset: int) -> None:
@@ -235,86 +249,185 @@ def _check_end(tail: bytes, offset: int) -> None:
         raise Damage(offset, "(index and footer) fails its checksum")
 
 
+def item(record: Record) -> McapRecord:
+    """A schema, channel, metadata record or attachment.
+
+    Raises:
+        Damage: it is none of these, or damaged.
+    """
+    if record.opcode == ATTACHMENT:
+        return attachment(record)
+    if record.opcode not in _KINDS:
+        raise Damage(record.offset, "is of another kind")
+    return parsed(_KINDS[record.opcode], record.body, record.offset)
+
+
+def attachment(record: Record) -> Attachment:
+    """An attachment, its checksum verified."""
+    found = parsed(Attachment, record.body, record.offset)
+    (crc,) = struct.unpack("<I", record.body[-4:])
+    if crc != crc32(record.body[:-4]):
+        raise Damage(record.offset, f"(attachment {found.name!r}) fails its checksum")
+    return found
+
+
 def metadata(record: Record) -> tuple[str, dict[str, str]]:
     """Name and entries of a metadata record."""
-    fields = Fields(record.body, record.offset)
-    return fields.text(), fields.mapping()
-
-
-def attachment(record: Record) -> tuple[str, bytes]:
-    """Name and content of an attachment, its checksum verified."""
-    fields = Fields(record.body, record.offset)
-    fields.number("Q")
-    fields.number("Q")
-    name = fields.text()
-    fields.text()
-    data = fields.data("Q")
-    covered = record.body[: fields.at]
-    crc = fields.number("I")
-    if crc != crc32(covered):
-        raise Damage(record.offset, f"(attachment {name!r}) fails its checksum")
-    return name, data
-
-
-def schema(body: bytes, offset: int) -> SchemaRecord:
-    """Read a schema record that stands in a chunk at `offset`."""
-    fields = Fields(body, offset)
-    identity, name, encoding = fields.number("H"), fields.text(), fields.text()
-    definition = fields.data("I").decode(errors="replace")
-    if not identity:
-        raise Damage(offset, "(schema) has the number 0, which says that there is none")
-    return SchemaRecord(identity, name, encoding, definition)
-
-
-def channel(body: bytes, offset: int) -> ChannelRecord:
-    """Read a channel record that stands in a chunk at `offset`."""
-    fields = Fields(body, offset)
-    return ChannelRecord(fields.number("H"), fields.number("H"), fields.text(), fields.text())
+    found = parsed(Metadata, record.body, record.offset)
+    return found.name, found.metadata
 
 
 def chunk(record: Record) -> Chunk:
-    """Read a chunk record, without decompressing it."""
-    body = memoryview(record.body)
+    """Read a chunk record, without decompressing it; three times as fast as the library does."""
+    body = record.body
     try:
-        start_time, end_time, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
+        start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
         name_end = _CHUNK_HEAD.size + name_length
-        compression = bytes(body[_CHUNK_HEAD.size : name_end]).decode()
+        compression = body[_CHUNK_HEAD.size : name_end].decode()
         (length,) = _LENGTH.unpack_from(body, name_end)
     except (struct.error, UnicodeDecodeError):
         raise Damage(record.offset, "(chunk) has a head that cannot be read") from None
     data = body[name_end + _LENGTH.size :]
     if len(data) != length:
         raise Damage(record.offset, "(chunk) has another length than its fields")
-    return Chunk(start_time, end_time, size, crc, compression, data)
+    return Chunk(compression, data, end, start, crc, size)
 
 
-def chunk_data(record: Record, *, decompressor: zstandard.ZstdDecompressor) -> bytes:
-    """Decompress the records of a chunk and verify their checksum."""
-    head = chunk(record)
-    if head.size > min(LARGEST_CHUNK, MOST_INFLATION * len(head.data)):
-        raise Damage(record.offset, f"(chunk) claims {head.size} bytes of content")
+def chunk_data(
+    record: Record, *, decompressor: zstandard.ZstdDecompressor, head: Chunk | None = None
+) -> bytes:
+    """Decompress the records of a chunk, which may be parsed already; verify their checksum."""
+    head = head or chunk(record)
+    size = head.uncompressed_size
+    if size > min(LARGEST_CHUNK, MOST_INFLATION * len(head.data)):
+        raise Damage(record.offset, f"(chunk) claims {size} bytes of content")
     data = _decompressed(head, record.offset, decompressor)
-    if len(data) != head.size:
+    if len(data) != size:
         raise Damage(record.offset, "(chunk) has another length than it claims")
-    if crc32(data) != head.crc:
-        missing = head.crc == _NO_CRC
+    if crc32(data) != head.uncompressed_crc:
+        missing = head.uncompressed_crc == _NO_CRC
         raise Damage(record.offset, f"(chunk) {'has no' if missing else 'fails its'} checksum")
     return data
 
 
 def _decompressed(chunk: Chunk, offset: int, decompressor: zstandard.ZstdDecompressor) -> bytes:
     """Decompress to at most one byte more than announced: a corrupt frame fills no memory."""
+    size = chunk.uncompressed_size
     try:
         if chunk.compression == "zstd":
-            claimed = zstandard.frame_content_size(chunk.data)
-            if claimed not in (-1, chunk.size):
+            if zstandard.frame_content_size(chunk.data) not in (-1, size):
                 raise Damage(offset, "(chunk) has another length than it claims")
-            return decompressor.decompress(chunk.data, max_output_size=max(1, chunk.size))
+            return decompressor.decompress(chunk.data, max_output_size=max(1, size))
         if chunk.compression == "lz4":
             frame = lz4.frame.LZ4FrameDecompressor()
-            return bytes(frame.decompress(chunk.data, max_length=chunk.size + 1))
+            return bytes(frame.decompress(chunk.data, max_length=size + 1))
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise Damage(offset, "(chunk) cannot be decompressed") from error
     if chunk.compression == "":
-        return bytes(chunk.data)
+        return chunk.data
     raise Damage(offset, f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4")
+
+
+def _footer(stream: BinaryIO, size: int) -> Footer | None:
+    """The record that ends a file; None where it does not."""
+    if size < FOOTER_SIZE + len(MAGIC):
+        return None
+    stream.seek(size - FOOTER_SIZE - len(MAGIC))
+    data = stream.read(FOOTER_SIZE + len(MAGIC))
+    if not data.endswith(MAGIC) or RECORD.unpack_from(data) != (FOOTER, FOOTER_SIZE - RECORD.size):
+        return None
+    return parsed(Footer, data[RECORD.size :], size)
+
+
+class Summary:
+    """The summary of a file, its records parsed when they are asked for.
+
+    Args:
+        data: its records.
+        end: where the data section ends; None where what the summary lists may have moved.
+    """
+
+    def __init__(self, data: bytes, end: int | None = None) -> None:
+        self._records = [*split(data, 0)]
+        self._end = end
+
+    @classmethod
+    def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Self | None:
+        """Read it; None where there is none, or where it is not whole.
+
+        Args:
+            stream: the file.
+            size: its length.
+            start: where the data section ends, of a file in which records have moved: then what
+                the summary lists may be elsewhere.
+        """
+        footer = _footer(stream, size)
+        if footer is None:
+            return None
+        end = None if start is not None else footer.summary_start
+        start = footer.summary_start if start is None else start
+        last = size - FOOTER_SIZE - len(MAGIC)
+        if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD or not footer.summary_crc:
+            return None
+        stream.seek(start)
+        data = stream.read(last + FOOTER_SIZE - 4 - start)
+        if crc32(data) != footer.summary_crc:
+            return None
+        try:
+            return cls(data[: last - start], end)
+        except Damage:
+            return None
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both say the same of schemas, channels, chunks and the rest."""
+        if not isinstance(other, Summary):
+            return NotImplemented
+        kinds = (SCHEMA, CHANNEL, STATISTICS, CHUNK_INDEX, ATTACHMENT_INDEX, METADATA_INDEX)
+        return all(self._bodies(kind) == other._bodies(kind) for kind in kinds)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def _bodies(self, opcode: int) -> list[bytes]:
+        return [record.body for record in self._records if record.opcode == opcode]
+
+    @property
+    def definitions(self) -> list[Record]:
+        """Schema and channel records."""
+        return [record for record in self._records if record.opcode in (SCHEMA, CHANNEL)]
+
+    @property
+    def metadata(self) -> list[tuple[int, int]]:
+        """Offset and length of the metadata records."""
+        found = [parsed(MetadataIndex, body, 0) for body in self._bodies(METADATA_INDEX)]
+        return [(one.offset, one.length) for one in found]
+
+    @property
+    def others(self) -> list[tuple[int, int]]:
+        """Offset and length of metadata and attachments."""
+        found = [parsed(AttachmentIndex, body, 0) for body in self._bodies(ATTACHMENT_INDEX)]
+        return sorted([*self.metadata, *((one.offset, one.length) for one in found)])
+
+    @cached_property
+    def chunks(self) -> list[ChunkIndex]:
+        """In the order of the file.
+
+        Raises:
+            Damage: what is listed overlaps, or lies beyond the data section.
+        """
+        chunks = [parsed(ChunkIndex, body, 0) for body in self._bodies(CHUNK_INDEX)]
+        chunks.sort(key=lambda entry: entry.chunk_start_offset)
+        at = len(MAGIC)
+        places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in chunks]
+        for offset, length in sorted([*places, *self.others]):
+            if offset < at:
+                raise Damage(0, "(index) lists records that overlap")
+            at = offset + length
+        if self._end is not None and at > self._end:
+            raise Damage(0, "(index) lists records beyond the data")
+        return chunks
+
+    @property
+    def places(self) -> list[tuple[int, int]]:
+        """Offset and length of all records that it lists; raises as `chunks` does."""
+        chunks = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in self.chunks]
+        return sorted([*chunks, *self.others])

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
-from hil.archive import foreign_json
-from hil.archive.messages import LogMessage
+from hil.archive.cdr import LogMessage
+from hil.reading import json_of
 
 
 class Level(IntEnum):
@@ -56,7 +57,8 @@ class ArchivedEvent:
         text, _, second = message.text.partition("\n")
         data: Any = None
         if second:
-            data = foreign_json.loads(second)
+            with suppress(ValueError):
+                data = json_of(second)
         if not isinstance(data, dict):
             text, data = message.text, {}
         level = max((known for known in Level if known <= message.level), default=Level.DEBUG)

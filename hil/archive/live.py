@@ -19,17 +19,71 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.exchange import ExchangeEvent
-from hil.archive.commands import Serve
+from hil.archive.cdr import encode_log
 from hil.archive.events import ArchivedEvent
-from hil.archive.live_view import LiveView, LiveViewError
-from hil.archive.messages import encode_log
+from hil.archive.recorder import describe, level_of
 from hil.archive.schema import EVENT_CHANNEL, Channel, CycleEncoder
-from hil.archive.wording import describe, level_of
 from hil.version import install_command
 
 if TYPE_CHECKING:
     import foxglove
     from foxglove.websocket import WebSocketServer
+
+
+import re
+from typing import Self
+
+from hil.errors import InputError
+from hil.whole_number import LAST_PORT
+
+LOOPBACK: Final = "127.0.0.1"
+PORT: Final = 8765
+"""That of the Foxglove WebSocket protocol."""
+RATE: Final = 50.0
+"""Messages of a channel per second: more than a screen shows."""
+_ADDRESS: Final = re.compile(r"((?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]+):)?(?P<port>\d{1,5})")
+
+
+class LiveViewError(InputError):
+    """The live view cannot be served as asked for."""
+
+
+@dataclass(frozen=True)
+class LiveView:
+    """A live view that was asked for; pickles.
+
+    Attributes:
+        host: address it is bound to; anybody who reaches that address may look.
+        port: TCP.
+        rate: cycles published per second, at most.
+    """
+
+    host: str = LOOPBACK
+    port: int = PORT
+    rate: float = RATE
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read HOST:PORT, or PORT alone for this computer only.
+
+        Raises:
+            LiveViewError: it is neither.
+        """
+        match = _ADDRESS.fullmatch(text.strip())
+        if match is None or int(match["port"]) > LAST_PORT:
+            remedy = f"e.g. {LOOPBACK}:{PORT}"
+            raise LiveViewError(None, f"--live {text} is no HOST:PORT", remedy=remedy)
+        return cls((match["host"] or LOOPBACK).strip("[]"), int(match["port"]))
+
+    @property
+    def invitation(self) -> str:
+        """One line that says where to look."""
+        return f"live view: open ws://{self} in Foxglove"
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{host}:{self.port}"
+
 
 Records = NDArray[np.void]
 
@@ -41,6 +95,25 @@ SLEEP: Final = 0.2
 """s between two looks whether to end."""
 ASTRAY: Final = 1.0
 """s by which the controller's time may leave this computer's before they are put together anew."""
+
+
+@dataclass(frozen=True, eq=False)
+class Serve:
+    """Let viewers look from now on, whether or not an archive is open.
+
+    Attributes:
+        job: for the answer, `Serving` or `Failed`.
+        view: where.
+        joint_names: of the link's joints.
+        period: of the controller, s.
+        drive_train: in force until an archive says otherwise.
+    """
+
+    job: int
+    view: LiveView
+    joint_names: tuple[str, ...]
+    period: float
+    drive_train: DriveTrain
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +180,7 @@ class LivePublisher:
             torque = portion.drive_train.joint_torque(records["target_current"])
             batch = self._encoder.encode(records, torque)
             times = [self._clock.at(int(stamp)) for stamp in batch.stamp]
-            for channel, rows in zip(self._channels, batch.messages, strict=True):
+            for channel, rows in zip(self._channels, batch.messages.values(), strict=True):
                 size = rows.dtype.itemsize
                 data = rows.tobytes()
                 for index, log_time in enumerate(times):

@@ -3,7 +3,7 @@
 Record for record what `mcap.writer.Writer` makes of the same messages, but for the level of
 compression. That one takes messages singly, at some microseconds each, which is most of the time of
 an archive of three messages a millisecond; here a batch of messages of constant size is one
-structured array.
+structured array. The library makes all other records.
 
 Layout: https://mcap.dev/spec
 """
@@ -11,15 +11,12 @@ Layout: https://mcap.dev/spec
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 import zstandard
-from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
+from isal.isal_zlib import crc32
 from mcap.records import (
     Attachment,
     AttachmentIndex,
@@ -29,6 +26,7 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
+    McapRecord,
     Metadata,
     MetadataIndex,
     Schema,
@@ -37,58 +35,43 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
+from hil.archive import container
 from hil.archive.cdr import Rows
-from hil.archive.container import MAGIC, MESSAGE
+from hil.archive.chunk import HEAD, Messages
+from hil.archive.container import MAGIC, MESSAGE, Record, encoded
 
-_INDEX_DTYPE = np.dtype([("stamp", "<u8"), ("offset", "<u8")])
-_HEAD_FIELDS = (
-    ("opcode", "u1"),
-    ("length", "<u8"),
-    ("channel", "<u2"),
-    ("sequence", "<u4"),
-    ("stamp", "<u8"),
-    ("published", "<u8"),
-)
+_ENTRY = np.dtype([("stamp", "<u8"), ("offset", "<u8")])
 _HEAD = struct.Struct("<BQHIQQ")
-_BEFORE_LENGTH_COUNTS = struct.calcsize("<BQ")
-_INDEX_HEAD = struct.Struct("<BQHI")
+_MESSAGE_INDEX = struct.Struct("<BQHI")
 _COMPRESSION = "zstd"
 _LEVEL = -1
 """Of Zstandard. Against the usual 3 it costs 4 % in size, and saves a third of the time both of
 writing and of reading (`python -m benchmarks.archive --sizes`)."""
 
+Entries = Mapping[int, Sequence[NDArray[np.void]]]
+"""Stamps and offsets of the messages of a chunk by channel, in the order of the first ones."""
 
-class _OpenChunk:
-    """Records of the chunk in progress, and where its messages lie.
 
-    Attributes:
-        size: bytes so far.
-        first, last: earliest and latest stamp [ns].
-        messages: messages so far.
-        index: per channel, in the order of their first messages, packed entries of its index.
-    """
+def entries_of(found: Mapping[int, Messages]) -> Entries:
+    """The entries of messages that were read."""
+    return {
+        number: [_entries(messages.of_heads("log_time"), messages.places)]
+        for number, messages in found.items()
+    }
 
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-        self.size = 0
-        self.first = self.last = 0
-        self.messages = 0
-        self.index: dict[int, list[bytes]] = {}
 
-    def append(self, records: bytes) -> None:
-        self._parts.append(records)
-        self.size += len(records)
+def _entries(stamp: NDArray[np.int64], offset: NDArray[np.int64]) -> NDArray[np.void]:
+    entries = np.empty(len(stamp), _ENTRY)
+    entries["stamp"], entries["offset"] = stamp, offset
+    return entries
 
-    def note(self, channel: int, stamp: NDArray[np.int64], offset: NDArray[np.int64]) -> None:
-        """Note messages of a channel at these stamps [ns] and offsets in the chunk."""
-        entries = np.empty(len(stamp), _INDEX_DTYPE)
-        entries["stamp"], entries["offset"] = stamp, offset
-        self.index.setdefault(channel, []).append(entries.tobytes())
-        self.first, self.last = _spanned(self.messages, self.first, self.last, stamp)
-        self.messages += len(stamp)
 
-    def data(self) -> bytes:
-        return b"".join(self._parts)
+def span(entries: Entries) -> tuple[int, int]:
+    """First and last stamp [ns], zeros of a chunk without messages."""
+    stamps = [part["stamp"] for parts in entries.values() for part in parts if len(part)]
+    if not stamps:
+        return 0, 0
+    return int(min(part.min() for part in stamps)), int(max(part.max() for part in stamps))
 
 
 class McapWriter:
@@ -98,61 +81,81 @@ class McapWriter:
     registered for it goes into the next. Compressed by Zstandard, with checksums of chunks,
     attachments and index.
 
+    Message indexes and summary follow from the other records: a file that lost them gets them back
+    to the byte.
+
     Args:
         write: takes the next bytes of the file.
+
+    Attributes:
+        position: where the next record begins.
+        checksums: of the chunks written so far, CRC-32 of their records.
     """
 
     def __init__(self, write: Callable[[bytes], object]) -> None:
+        self.position = 0
+        self.checksums: list[int] = []
         self._write = write
-        self._position = 0
-        self._chunk = _OpenChunk()
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
+        self._parts: list[bytes] = []  # of the chunk in progress
+        self._size = 0
+        self._entries: dict[int, list[NDArray[np.void]]] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
         self._chunks: list[ChunkIndex] = []
-        self._checksums: list[int] = []
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
-        self._first = self._last = 0
-
-    @property
-    def checksums(self) -> tuple[int, ...]:
-        """Those of the chunks written so far, CRC-32 of their records."""
-        return tuple(self._checksums)
+        self._times: list[int] = []
 
     def start(self, profile: str, library: str) -> None:
         """Begin the file."""
         self._put(MAGIC)
-        self._put(_bytes_of(Header(profile, library)))
+        self._put(encoded(Header(profile, library)))
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Add a metadata record, in front of the chunk in progress."""
-        offset = self._position
-        length = self._put(_bytes_of(Metadata(name, dict(entries))))
-        self._metadata.append(MetadataIndex(offset, length, name))
+        item = Metadata(name, dict(entries))
+        self._add(item, encoded(item))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Add an attachment without times, in front of the chunk in progress."""
-        offset = self._position
-        length = self._put(_bytes_of(Attachment(0, 0, name, media_type, data)))
-        self._attachments.append(AttachmentIndex(offset, length, 0, 0, len(data), name, media_type))
+        item = Attachment(0, 0, name, media_type, data)
+        self._add(item, encoded(item))
+
+    def copy(self, record: Record) -> None:
+        """Add a record of another file: attachment, metadata, schema or channel.
+
+        Raises:
+            Damage: it is none of these.
+        """
+        self._add(container.item(record), record.data)
 
     def register(
         self, topic: str, message_encoding: str, schema: str, encoding: str, definition: bytes
     ) -> int:
         """Announce a channel and the schema of its messages; returns the channel's id."""
         number = len(self._channels) + 1
-        self._schemas.append(Schema(number, definition, encoding, schema))
-        self._channels.append(Channel(number, topic, message_encoding, {}, number))
-        self._chunk.append(_bytes_of(self._schemas[-1]))
-        self._chunk.append(_bytes_of(self._channels[-1]))
+        for item in (
+            Schema(number, definition, encoding, schema),
+            Channel(number, topic, message_encoding, {}, number),
+        ):
+            self.note(item)
+            self._append(encoded(item))
         return number
+
+    def note(self, item: Schema | Channel) -> None:
+        """List a schema or channel in the summary; it stands in a chunk."""
+        if isinstance(item, Schema):
+            self._schemas.setdefault(item.id, item)
+        else:
+            self._channels.setdefault(item.id, item)
 
     def add_message(self, channel: int, stamp: int, sequence: int, data: bytes) -> None:
         """Add one message at `stamp` [ns] to the chunk in progress."""
-        length = _HEAD.size - _BEFORE_LENGTH_COUNTS + len(data)
-        self._note(channel, np.array([stamp]), np.array([self._chunk.size]))
-        self._chunk.append(_HEAD.pack(MESSAGE, length, channel, sequence, stamp, stamp) + data)
+        length = HEAD.itemsize - container.RECORD.size + len(data)
+        entries = _entries(np.array([stamp]), np.array([self._size]))
+        self._entries.setdefault(channel, []).append(entries)
+        self._append(_HEAD.pack(MESSAGE, length, channel, sequence, stamp, stamp) + data)
 
     def add_rows(
         self,
@@ -171,111 +174,131 @@ class McapWriter:
         """
         if not len(stamp):
             return
-        sizes = tuple(rows.itemsize for rows in messages)
-        records = np.empty(len(stamp), _records_dtype(sizes))
-        offset = self._chunk.size + records.itemsize * np.arange(len(stamp))
+        records = np.empty(len(stamp), _records_dtype(tuple(rows.itemsize for rows in messages)))
+        fields = records.dtype.fields
+        assert fields is not None
+        offset = self._size + records.itemsize * np.arange(len(stamp))
         for place, (channel, rows) in enumerate(zip(channels, messages, strict=True)):
             record = records[str(place)]
             record["opcode"] = MESSAGE
-            record["length"] = _HEAD.size - _BEFORE_LENGTH_COUNTS + rows.itemsize
+            record["length"] = HEAD.itemsize - container.RECORD.size + rows.itemsize
             record["channel"] = channel
             record["sequence"] = sequence
-            record["stamp"] = record["published"] = stamp
+            record["log_time"] = record["publish_time"] = stamp
             record["data"] = rows.view(record["data"].dtype)
-            fields = records.dtype.fields
-            assert fields is not None
-            self._note(channel, stamp, offset + fields[str(place)][1])
-        self._chunk.append(records.tobytes())
+            begin = offset + fields[str(place)][1]
+            self._entries.setdefault(channel, []).append(_entries(stamp, begin))
+        self._append(records.tobytes())
 
     def flush(self) -> None:
         """End the chunk in progress, if it has messages."""
-        chunk = self._chunk
-        if not chunk.messages:
+        if not self._entries:
             return
-        self._chunk = _OpenChunk()
-        data = chunk.data()
-        packed = zstandard.compress(data, _LEVEL)
-        crc = zlib.crc32(data)
-        self._checksums.append(crc)
-        record = Chunk(_COMPRESSION, packed, chunk.last, chunk.first, crc, len(data))
-        start = self._position
-        length = self._put(_bytes_of(record))
-        index_start = self._position
-        offsets = {}
-        for channel, entries in chunk.index.items():
-            offsets[channel] = self._position
-            self._put(_message_index(channel, b"".join(entries)))
+        data, entries = b"".join(self._parts), self._entries
+        self._parts, self._size, self._entries = [], 0, {}
+        self.add_chunk(chunk_of(data, entries), entries)
+
+    def add_chunk(self, chunk: Chunk, entries: Entries) -> None:
+        """Add a whole chunk and its message indexes, in front of the chunk in progress.
+
+        Args:
+            chunk: its record.
+            entries: of its messages.
+        """
+        start, record = self.position, encoded(chunk)
+        self._put(record)
+        end = self.position
+        offsets: dict[int, int] = {}
+        for channel, parts in entries.items():
+            offsets[channel] = self.position
+            data = b"".join(part.tobytes() for part in parts)
+            self._counts[channel] = self._counts.get(channel, 0) + len(data) // _ENTRY.itemsize
+            length = _MESSAGE_INDEX.size - container.RECORD.size + len(data)
+            head = _MESSAGE_INDEX.pack(container.MESSAGE_INDEX, length, channel, len(data))
+            self._put(head + data)
+        first, last = span(entries)
+        self._times = [min([first, *self._times]), max([last, *self._times])]
+        self.checksums.append(chunk.uncompressed_crc)
         self._chunks.append(
             ChunkIndex(
-                chunk_length=length,
+                chunk_length=len(record),
                 chunk_start_offset=start,
-                compression=_COMPRESSION,
-                compressed_size=len(packed),
-                message_end_time=chunk.last,
-                message_index_length=self._position - index_start,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=last,
+                message_index_length=self.position - end,
                 message_index_offsets=offsets,
-                message_start_time=chunk.first,
-                uncompressed_size=len(data),
+                message_start_time=first,
+                uncompressed_size=chunk.uncompressed_size,
             )
         )
 
     def finish(self) -> None:
         """Write what is left, the index and the footer."""
         self.flush()
-        self._put(_bytes_of(DataEnd(0)))
-        start = self._position
-        groups: list[tuple[int, Sequence[Any]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, self._attachments),
-            (Opcode.METADATA_INDEX, self._metadata),
-        ]
-        summary = bytearray()
-        offsets = bytearray()
-        for opcode, records in groups:
-            data = b"".join(map(_bytes_of, records))
-            offsets += _bytes_of(SummaryOffset(opcode, start + len(summary), len(data)))
-            summary += data
-        offsets_start = start + len(summary)
-        summary += offsets
+        self._put(encoded(DataEnd(0)))
+        start = self.position
+        summary, offsets_start = self.summary()
         # The checksum of the index covers the footer up to the checksum itself.
-        footer = _bytes_of(Footer(start, offsets_start, 0))[: -struct.calcsize("<I")]
-        crc = zlib.crc32(footer, zlib.crc32(summary))
-        self._put(bytes(summary))
-        self._put(_bytes_of(Footer(start, offsets_start, crc)))
-        self._put(MAGIC)
+        covered = summary + encoded(Footer(start, offsets_start, 0))[: -struct.calcsize("<I")]
+        self._put(covered + struct.pack("<I", crc32(covered)) + MAGIC)
 
-    def _note(self, channel: int, stamp: NDArray[np.int64], offset: NDArray[np.int64]) -> None:
-        self._chunk.note(channel, stamp, offset)
-        messages = sum(self._counts.values())
-        self._first, self._last = _spanned(messages, self._first, self._last, stamp)
-        self._counts[channel] = self._counts.get(channel, 0) + len(stamp)
-
-    def _statistics(self) -> Statistics:
-        return Statistics(
+    def summary(self) -> tuple[bytes, int]:
+        """The summary, were it to begin here, and where its last group begins."""
+        first, last = self._times or (0, 0)
+        statistics = Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
             chunk_count=len(self._chunks),
             message_count=sum(self._counts.values()),
-            message_end_time=self._last,
-            message_start_time=self._first,
+            message_end_time=last,
+            message_start_time=first,
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
+        groups: list[tuple[int, Sequence[McapRecord]]] = [
+            (container.SCHEMA, [*self._schemas.values()]),
+            (container.CHANNEL, [*self._channels.values()]),
+            (container.STATISTICS, [statistics]),
+            (container.CHUNK_INDEX, self._chunks),
+            (container.ATTACHMENT_INDEX, self._attachments),
+            (container.METADATA_INDEX, self._metadata),
+        ]
+        summary, offsets = b"", b""
+        for opcode, records in groups:
+            data = b"".join(map(encoded, records))
+            offsets += encoded(SummaryOffset(opcode, self.position + len(summary), len(data)))
+            summary += data
+        return summary + offsets, self.position + len(summary)
 
-    def _put(self, data: bytes) -> int:
+    def _add(self, item: McapRecord, data: bytes) -> None:
+        place = self.position, len(data)
+        if isinstance(item, Metadata):
+            self._metadata.append(MetadataIndex(*place, item.name))
+        elif isinstance(item, Attachment):
+            times, size = (item.log_time, item.create_time), len(item.data)
+            index = AttachmentIndex(*place, *times, size, item.name, item.media_type)
+            self._attachments.append(index)
+        elif isinstance(item, Schema | Channel):
+            self.note(item)
+        self._put(data)
+
+    def _append(self, records: bytes) -> None:
+        self._parts.append(records)
+        self._size += len(records)
+
+    def _put(self, data: bytes) -> None:
         self._write(data)
-        self._position += len(data)
-        return len(data)
+        self.position += len(data)
 
 
-def _spanned(before: int, first: int, last: int, stamp: NDArray[np.int64]) -> tuple[int, int]:
-    """First and last stamp once these are added to `before` others."""
-    low, high = int(stamp.min()), int(stamp.max())
-    return (min(first, low) if before else low), max(last, high)
+def chunk_of(data: bytes, entries: Entries) -> Chunk:
+    """The chunk of these records, compressed as ours are."""
+    first, last = span(entries)
+    return Chunk(
+        _COMPRESSION, zstandard.compress(data, _LEVEL), last, first, crc32(data), len(data)
+    )
 
 
 @cache
@@ -283,19 +306,11 @@ def _records_dtype(sizes: tuple[int, ...]) -> np.dtype[np.void]:
     """The message records of one instant, one of each data size [bytes], without padding."""
     return np.dtype(
         [
-            (str(place), np.dtype([*_HEAD_FIELDS, ("data", f"V{size}")]))
+            (str(place), np.dtype([*_head_fields(), ("data", f"V{size}")]))
             for place, size in enumerate(sizes)
         ]
     )
 
 
-def _message_index(channel: int, entries: bytes) -> bytes:
-    after_length = _INDEX_HEAD.size - _BEFORE_LENGTH_COUNTS
-    head = (Opcode.MESSAGE_INDEX, after_length + len(entries), channel, len(entries))
-    return _INDEX_HEAD.pack(*head) + entries
-
-
-def _bytes_of(record: Any) -> bytes:
-    builder: Any = RecordBuilder()  # its methods are not annotated
-    record.write(builder)
-    return bytes(builder.end())
+def _head_fields() -> list[tuple[str, np.dtype[np.generic]]]:
+    return [(name, HEAD[name]) for name in HEAD.names or ()]

@@ -8,11 +8,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from hil.archive import container, foreign_json
-from hil.archive.names import WORDS, motion_name
+from hil.archive.header import WORDS, ArchiveHeader, ArchiveOutcome, motion_name
 from hil.archive.reader import Archive, open_archive
 from hil.archive.survey import survey
-from hil.whole_number import whole_number
 
 _MOST_EVENTS = 20
 _SHOWN_ELSEWHERE = frozenset(
@@ -79,18 +77,18 @@ def overview(path: str | PathLike[str]) -> Overview:
     duration = float(stamp[-1] - stamp[0]) * 1e-9 if len(stamp) else 0.0
     return Overview(
         path=archive.path,
-        title=_title(archive.metadata),
+        title=_title(archive.header),
         outcome=_outcome(archive),
-        lost=_lost(archive.outcome or {}),
+        lost="" if archive.outcome is None else _lost(archive.outcome),
         samples=archive.n_samples,
         duration=duration,
         period=archive.period,
         joint_names=archive.joint_names,
         size=found.size,
         per_minute=found.size / duration * 60.0 if duration else None,
-        chunks=sum(piece.opcode == container.CHUNK for piece in found.pieces),
+        chunks=found.chunks,
         channels=tuple(
-            (topic, found.types.get(topic, ""), count)
+            (topic, found.schema_name(topic), count)
             for topic, count in sorted(found.counts.items())
         ),
         attachments={name: len(data) for name, data in archive.attachments.items()},
@@ -102,39 +100,38 @@ def overview(path: str | PathLike[str]) -> Overview:
     )
 
 
-def _title(metadata: Mapping[str, str]) -> str:
-    kind, index = metadata["kind"], whole_number(metadata.get("index"))
-    if index is None:
-        return WORDS.get(kind, kind)
-    return f"{motion_name(kind, index)}, attempt {metadata.get('attempt', '1')}"
+def _title(header: ArchiveHeader) -> str:
+    if header.index is None:
+        return WORDS.get(header.kind, header.kind)
+    attempt = 1 if header.attempt is None else header.attempt
+    return f"{motion_name(header.kind, header.index)}, attempt {attempt}"
 
 
 def _outcome(archive: Archive) -> str:
-    outcome = archive.outcome
-    if outcome is None:
+    if archive.outcome is None:
         return "missing"
-    word, reason = outcome.get("outcome", "missing"), outcome.get("reason", "")
-    repaired = ", repaired with loss" if "repaired" in outcome else ""
+    word, reason = archive.outcome.outcome, archive.outcome.reason
+    repaired = ", repaired with loss" if archive.outcome.repaired else ""
     return f"{word}: {reason}{repaired}" if reason else f"{word}{repaired}"
 
 
-def _lost(outcome: Mapping[str, str]) -> str:
-    counted = ("lost_packets", "records_lost", "events_lost", "repaired.samples_lost")
-    words = [
-        f"{key.removeprefix('repaired.').replace('_', ' ')} {outcome[key]}"
-        for key in counted
-        if outcome.get(key, "0") != "0"
-    ]
-    if "repaired.losses" in outcome:
-        words += foreign_json.names(outcome["repaired.losses"]) or ()
-    return "; ".join(words)
+def _lost(outcome: ArchiveOutcome) -> str:
+    counts = {
+        "lost packets": outcome.lost_packets,
+        "records lost": outcome.records_lost,
+        "events lost": outcome.events_lost,
+        "samples lost": "unknown" if outcome.samples_lost is None else outcome.samples_lost,
+    }
+    lost = [f"{name} {count}" for name, count in counts.items() if count]
+    return "; ".join([*lost, *outcome.losses])
 
 
 def _further(archive: Archive) -> dict[str, str]:
-    entries = {key: value for key, value in archive.metadata.items() if key not in _SHOWN_ELSEWHERE}
+    entries = {
+        key: value for key, value in archive.header.entries.items() if key not in _SHOWN_ELSEWHERE
+    }
+    outcome = {} if archive.outcome is None else archive.outcome.entries
     entries |= {
-        f"outcome.{key}": value
-        for key, value in (archive.outcome or {}).items()
-        if key not in _SHOWN_ELSEWHERE
+        f"outcome.{key}": value for key, value in outcome.items() if key not in _SHOWN_ELSEWHERE
     }
     return entries

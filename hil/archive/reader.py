@@ -3,32 +3,35 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
 from hil.archive import container, schema
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
-from hil.archive.chunk import Bytes, ChunkParser, Messages
-from hil.archive.columns import Columns
-from hil.archive.container import Damage, Record
-from hil.archive.description import Description, DescriptionError
+from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
+from hil.archive.chunk import Bytes, Messages
+from hil.archive.container import Damage, Record, Summary
 from hil.archive.events import ArchivedEvent
-from hil.archive.index import Summary
-from hil.archive.intact import NUMBERS
-from hil.archive.messages import check_joints, decode_log, joint_state_of
-from hil.archive.order import Contested, Order, Written
-from hil.archive.schema import CYCLE, EVENTS, FORMAT_VERSION, LATER_FIELDS, METADATA
+from hil.archive.header import (
+    FORMAT_VERSION,
+    METADATA,
+    OUTCOME,
+    ArchiveHeader,
+    ArchiveOutcome,
+    is_known,
+)
+from hil.archive.scan import NUMBERS, Contested, Order, Scan
+from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
-from hil.reading import opened
+from hil.reading import json_of, opened
 
 _NANOSECONDS = 1_000_000_000
 _ALWAYS = 1 << 63  # ns, beyond every stamp
@@ -88,46 +91,121 @@ class Selection:
         return self.topics is None or schema.EVENTS in self.topics
 
 
-_NEEDED = ("kind", "joint_names", "attachments")
-_MOST_EXPECTED = 1 << 20  # samples that room is made for on the word of one chunk
-_MARGIN = 1.3  # room for chunks that are smaller than the one the count is guessed from
+_FIRST_ROOM = 4096  # samples
+_MOST_ROOM = 1 << 20  # samples that room is made for on the word of the outcome
 _BATCH = 1 << 20  # bytes of chunks decoded at once: few calls per chunk, and all in the cache
 _COLUMN_OF = {"effort": "torque"}  # where a message has another word for it than we
+_STAMP_FIELDS = ("sec", "nanosec")
 
 
-class _Waiting(NamedTuple):
-    """A chunk that passed its checksum and is decoded with others."""
+class _Block(NamedTuple):
+    """Fields of one type that lie side by side in a message: copied together, as bytes."""
 
-    offset: int
-    data: bytes
+    names: list[str]
+    start: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    raw: np.dtype[np.void]
+
+    @property
+    def end(self) -> int:
+        return self.start + len(self.names) * self.raw.itemsize
 
 
-class Content:
-    """What has been read from a file so far.
+class _Columns:
+    """Contiguous arrays, one per field of a message, appended to chunk by chunk.
+
+    Args:
+        layout: the messages; their time stamp becomes the column ``stamp`` in nanoseconds.
+        selection: fields and times wanted.
+        room: for so many at first, where all times are wanted.
+    """
+
+    def __init__(self, layout: MessageLayout, selection: Selection, room: int) -> None:
+        self._layout = layout
+        self._times = selection.times if selection.bounded else None
+        self._blocks = _blocks(layout, selection.fields)
+        self._stamps = np.empty(0, np.int64)
+        self._arrays = [np.empty((len(block.names), 0), block.raw) for block in self._blocks]
+        self._count = 0
+        if self._times is None:
+            self._grow(room)
+
+    def verified(self, messages: Messages, offset: int) -> Bytes:
+        """The messages as bytes (k, size), which must be like those before."""
+        data = messages.matrix(self._layout.size)
+        if data is None or not self._layout.is_kept_by(data):
+            raise Damage(offset, "(chunk) has messages that differ from those before")
+        return data
+
+    def append(self, messages: Bytes, stamp: NDArray[np.int64]) -> None:
+        """Append messages, shape (k, size), and their stamps (k,) [ns]."""
+        if self._times is not None:
+            wanted = (stamp >= self._times[0]) & (stamp < self._times[1])
+            messages, stamp = messages[wanted], stamp[wanted]
+        now = slice(self._count, self._count + len(messages))
+        if now.stop > len(self._stamps):
+            self._grow(max(_FIRST_ROOM, 2 * now.stop))
+        self._stamps[now] = stamp
+        for block, array in zip(self._blocks, self._arrays, strict=True):
+            array[:, now] = messages[:, block.start : block.end].view(block.raw).T
+        self._count = now.stop
+
+    def finished(self) -> dict[str, NDArray[Any]]:
+        """The columns by our names, contiguous and read-only."""
+        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
+        for block, array in zip(self._blocks, self._arrays, strict=True):
+            fields = array.view(block.dtype).reshape(*array.shape, *block.shape)
+            for name, values in zip(block.names, fields, strict=True):
+                columns[_COLUMN_OF.get(name, name)] = values[: self._count]
+        for column in columns.values():
+            column.flags.writeable = False
+        return columns
+
+    def _grow(self, room: int) -> None:
+        filled = slice(self._count)
+        stamps, self._stamps = self._stamps, np.empty(room, np.int64)
+        self._stamps[filled] = stamps[filled]
+        for index, array in enumerate(self._arrays):
+            self._arrays[index] = np.empty((len(array), room), array.dtype)
+            self._arrays[index][:, filled] = array[:, filled]
+
+
+def _blocks(layout: MessageLayout, fields: Collection[str] | None) -> list[_Block]:
+    """Gather the wanted fields into blocks of neighbours."""
+    blocks: list[_Block] = []
+    places: Mapping[str, Any] = layout.dtype.fields or {}
+    for name, (dtype, start, *_) in places.items():
+        unwanted = fields is not None and _COLUMN_OF.get(name, name) not in fields
+        if name in _STAMP_FIELDS or unwanted:
+            continue
+        base, shape = dtype.subdtype or (dtype, ())
+        last = blocks[-1] if blocks else None
+        if last and (last.end, last.dtype, last.shape) == (start, base, shape):
+            last.names.append(name)
+        else:
+            raw = np.dtype((np.void, base.itemsize * math.prod(shape)))
+            blocks.append(_Block([name], start, base, shape, raw))
+    return blocks
+
+
+class _Content(Scan):
+    """What is selected of a file, up to its first damage.
 
     Args:
         selection: what is wanted of it.
         order: the chunks that must come.
-        gapless: whether all chunks are read, so that the messages of a channel must count on from
-            chunk to chunk; otherwise their numbers need only grow.
+
+    Attributes:
+        events: what happened, in the order of writing.
     """
 
-    def __init__(self, selection: Selection, order: Order, *, gapless: bool = True) -> None:
-        self.metadata: dict[str, str] | None = None
-        self.description: Description | None = None
-        self.outcome: dict[str, str] | None = None
-        self.attachments: dict[str, bytes] = {}
+    def __init__(self, selection: Selection, order: Order) -> None:
+        super().__init__(order, topics=())
         self.events: list[ArchivedEvent] = []
-        self.parser = ChunkParser()
         self._selection = selection
-        self._order = order
-        self._gapless = gapless
-        self._size = 0
-        self._decompressor = zstandard.ZstdDecompressor()
-        self._channels: dict[str, _Channel] = {}
-        self._wanted: tuple[str, ...] = ()
-        self._n_events = 0
-        self._waiting: list[_Waiting] = []
+        self._columns: dict[str, _Columns] = {}
+        self._waiting: list[tuple[int, bytes]] = []  # chunks that are decoded with others
         self._waiting_size = 0
 
     def collect(self, records: Iterable[Record], size: int) -> Damage | None:
@@ -135,19 +213,18 @@ class Content:
 
         Args:
             records: of the data section, in the order of the file.
-            size: length of the file, or of the part of it that is read.
+            size: length of the file.
         """
-        self._size = size
         damage = None
         try:
             for record in records:
-                self._take(record)
+                self.take(record)
         except Damage as found:
             damage = found
         try:
             self._take_waiting()
             if damage is None:
-                self._check_counts(size)
+                self._check_end(size)
         except Damage as found:  # in an earlier record
             damage = found
         return damage
@@ -155,58 +232,29 @@ class Content:
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns read, all of the same length."""
         joined: dict[str, NDArray[Any]] = {"stamp": np.zeros(0, np.int64)}
-        for channel in self._channels.values():
-            joined |= channel.finished()
+        for columns in self._columns.values():
+            joined |= columns.finished()
         return joined
 
-    def _take(self, record: Record) -> None:
-        if record.opcode == container.CHUNK:
-            self._take_chunk(record)
-        elif record.opcode == container.ATTACHMENT:
-            name, data = container.attachment(record)
-            self.attachments[name] = data
-        elif record.opcode == container.METADATA:
-            self._take_metadata(record)
-        elif record.opcode in (container.SCHEMA, container.CHANNEL):
-            self.parser.known.take(record.opcode, record.body, record.offset)
-
-    def _take_metadata(self, record: Record) -> None:
-        name, entries = container.metadata(record)
-        if name not in (schema.METADATA, schema.OUTCOME):
-            return
-        claimed = entries.pop("checksum", None)
-        if claimed != schema.checksum(entries):
-            raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
-        if name == schema.OUTCOME:
-            if not schema.belong_together(self.metadata, entries):
-                reason = f"(metadata {name!r}) is that of another recording"
-                raise Damage(record.offset, reason)
-            self.outcome = {key: entries[key] for key in entries if key not in schema.SEALS}
-            return
-        if self.metadata is not None:
-            raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
-        if entries.get("format_version") != str(schema.FORMAT_VERSION):
-            self.metadata = entries
+    def take_metadata(self, record: Record, name: str, entries: dict[str, str]) -> None:
+        """Take header or outcome, which must be of what can be read here."""
+        super().take_metadata(record, name, entries)
+        if self.metadata is not None and not is_known(self.metadata):
             raise Damage(record.offset, "is of another version")
-        absent = [key for key in _NEEDED if key not in entries]
-        if absent:
-            raise Damage(record.offset, f"(metadata {name!r}) has no entry {absent[0]!r}")
-        self.metadata = entries
-        try:
-            self.description = Description.of(entries)
-        except DescriptionError as error:
-            raise Damage(record.offset, f"(metadata {name!r}) cannot be used: {error}") from error
+        if self.unusable is not None:
+            raise Damage(record.offset, f"(metadata {name!r}) cannot be used: {self.unusable}")
+        if self.outcome is not None and not self.outcome.belongs_to(self.header):
+            self.outcome = None
+            raise Damage(record.offset, f"(metadata {name!r}) is that of another recording")
 
-    def _take_chunk(self, record: Record) -> None:
-        if self.description is None:
-            return  # some other MCAP file, which will be refused as such
-        data = container.chunk_data(record, decompressor=self._decompressor)
-        self._order.check_chunk(container.chunk(record).crc, record.offset)
+    def take_chunk(self, record: Record) -> None:
+        """Take a chunk, or leave it to be decoded with others."""
+        _, data = self.opened(record)
         if not self.parser.repeats(data):
             self._take_waiting()
-            self._decode(self.parser.messages(data, record.offset), record.offset, len(record.body))
+            self._decode(self.parser.messages(data, record.offset), record.offset)
             return
-        self._waiting.append(_Waiting(record.offset, data))
+        self._waiting.append((record.offset, data))
         self._waiting_size += len(data)
         if self._waiting_size >= _BATCH:
             self._take_waiting()
@@ -217,180 +265,89 @@ class Content:
         if not waiting:
             return
         try:
-            found = self.parser.repeated([chunk.data for chunk in waiting])
+            found = self.parser.repeated([data for _, data in waiting])
             if found is not None:
-                self._decode(found, waiting[0].offset, 0)
+                self._decode(found, waiting[0][0])
                 return
         except Damage:
             pass  # in one of them
-        for chunk in waiting:
-            self._decode(self.parser.messages(chunk.data, chunk.offset), chunk.offset, 0)
+        for offset, data in waiting:
+            self._decode(self.parser.messages(data, offset), offset)
 
-    def _decode(self, found: dict[str, Messages], offset: int, compressed: int) -> None:
+    def _decode(self, numbered: dict[int, Messages], offset: int) -> None:
         """Decode messages, if they are what must follow now; else nothing of them counts."""
+        found = self.parser.by_topic(numbered, offset)
         recorded = self.parser.known.topics
         wanted = tuple(topic for topic in self._selection.numbers(recorded) if topic in recorded)
         counts = {len(found[topic]) if topic in found else 0 for topic in wanted}
         if len(counts) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
-        if any(counts):
-            self._wanted = self._wanted or wanted
-            elsewhere = wanted != self._wanted
-        else:
-            elsewhere = self._selection.topics is None and not found.keys().isdisjoint(NUMBERS)
-        if elsewhere:
+        elsewhere = self._selection.topics is None and not found.keys().isdisjoint(NUMBERS)
+        if elsewhere and not any(counts):
             raise Damage(offset, "(chunk) has samples in other channels than those before")
+        self._topics = (*wanted, EVENTS) if self._selection.events else wanted
         decoded = []
         for topic in wanted:
             if topic in found:
-                channel = self._channel(topic, found[topic], offset)
-                decoded.append((channel, channel.verified(found[topic], offset)))
-        if len(decoded) > 1:
-            times = [channel.stamps(messages) for channel, messages in decoded]
-            if not all(np.array_equal(one, times[0]) for one in times):
-                raise Damage(offset, "(chunk) has channels of different times")
-        logs = found.get(schema.EVENTS) if self._selection.events else None
-        events = self._decoded_events(logs, offset)
-        for channel, messages in decoded:
-            share = self._size / compressed if compressed else 0.0
-            expected = min(_MOST_EXPECTED, int(_MARGIN * len(messages) * share))
-            channel.append(messages, expected)
-        self._n_events += len(events)
-        start, stop = self._selection.times
-        self.events += [event for stamp, event in events if start <= stamp < stop]
+                columns = self._columns.get(topic) or self._begun(topic, found[topic], offset)
+                decoded.append((topic, columns, columns.verified(found[topic], offset)))
+        events = self._decoded_events(found.get(EVENTS), offset)
+        self.continued(found, offset)
+        for topic, columns, messages in decoded:
+            stamp = found[topic].stamps
+            self._columns[topic] = columns
+            columns.append(messages, stamp)
+        self.events += events
 
-    def _channel(self, topic: str, messages: Messages, offset: int) -> _Channel:
-        """The decoder of a topic, made from its schema or from its first message."""
-        if topic not in self._channels:
-            try:
-                layout = self._layout(topic, messages)
-            except LayoutError as error:
-                raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-            self._channels[topic] = _Channel(
-                layout,
-                self._selection,
-                gapless=self._gapless,
-                order=self._order if self._grows(topic) else None,
+    def missing(self, gaps: Mapping[str, int], offset: int) -> None:
+        """Messages may be missing where chunks were left out."""
+        if self._order.gapless:
+            super().missing(gaps, offset)
+
+    def _begun(self, topic: str, messages: Messages, offset: int) -> _Columns:
+        """The columns of a topic, from its schema or from its first message."""
+        assert self.header is not None
+        try:
+            layout = schema.message_layout(
+                topic, self.header.joint_names, self.parser.known.schema(topic), messages.first()
             )
-        return self._channels[topic]
+        except LayoutError as error:
+            raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
+        return _Columns(layout, self._selection, min(self._order.samples, _MOST_ROOM))
 
-    def _grows(self, topic: str) -> bool:
-        """Whether the messages of a topic are of cycles, one each."""
-        return topic in schema.PER_CYCLE and schema.CYCLE in self.parser.known.topics
-
-    def _layout(self, topic: str, messages: Messages) -> MessageLayout:
-        assert self.description is not None
-        joints = self.description.joint_names
-        if topic in (schema.MEASURED, schema.COMMANDED):
-            names, layout = joint_state_of(messages.first())
-            check_joints(names, layout, joints)
-            return layout
-        known = self.parser.known.schema(topic)
-        if known is None:
-            raise LayoutError("their schema is missing")
-        layout = fixed_layout(known.definition)
-        schema.check_fields(topic, layout, len(joints))
-        return layout
-
-    def _decoded_events(
-        self, messages: Messages | None, offset: int
-    ) -> list[tuple[int, ArchivedEvent]]:
-        """The events with their stamps [ns]."""
-        if messages is None:
+    def _decoded_events(self, messages: Messages | None, offset: int) -> list[ArchivedEvent]:
+        """The events of the time that is wanted."""
+        if messages is None or not self._selection.events:
             return []
-        _check_sequence(messages, self._n_events if self._gapless else None, offset)
         try:
             logs = [decode_log(message) for message in messages.all()]
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has an event that cannot be read: {error}") from error
-        return [(log.stamp, ArchivedEvent.from_log(log)) for log in logs]
+        start, stop = self._selection.times
+        return [ArchivedEvent.from_log(log) for log in logs if start <= log.stamp < stop]
 
-    def _check_counts(self, size: int) -> None:
+    def _check_end(self, size: int) -> None:
         """Compare what was read with what the writer says it wrote."""
-        if self.description is None:
+        if self.header is None:
             return
-        absent = sorted(set(self.description.attachments) - set(self.attachments))
+        absent = sorted(set(self.header.attachments) - set(self.attachments))
         if absent:
             raise Damage(size, f"(attachment {absent[0]!r}) is missing")
         if self.outcome is None:
-            raise Damage(size, f"(metadata {schema.OUTCOME!r}) is missing")
-        if not self._gapless:
+            raise Damage(size, f"(metadata {OUTCOME!r}) is missing")
+        if not self._order.gapless:
             return
-        counts = {"samples": max([channel.read for channel in self._channels.values()], default=0)}
+        counts = {}
+        if numbers := self._selection.numbers(self.parser.known.topics):
+            samples = "packets" if schema.PACKETS in numbers else "samples"
+            counts[samples] = max(self.counts.get(topic, 0) for topic in numbers)
         if self._selection.events:
-            counts["events"] = self._n_events
-        if not self._selection.numbers(self.parser.known.topics):
-            del counts["samples"]
-        elif schema.PACKETS in (self._selection.topics or ()):
-            counts["packets"] = counts.pop("samples")
+            counts["events"] = self.counts.get(EVENTS, 0)
         for key, count in counts.items():
-            if self.outcome.get(key) != str(count):
-                raise Damage(size, f"is missing: {self.outcome.get(key)} {key} were written")
+            stated = getattr(self.outcome, key)
+            if stated != count:
+                raise Damage(size, f"is missing: {stated} {key} were written")
         self._order.check_end(size)
-
-
-class _Channel:
-    """Decodes the messages of one topic into columns.
-
-    Attributes:
-        read: messages read so far, whether their time is wanted or not.
-    """
-
-    def __init__(
-        self, layout: MessageLayout, selection: Selection, *, gapless: bool, order: Order | None
-    ) -> None:
-        self.read = 0
-        self._order = order
-        self._layout = layout
-        self._times = selection.times if selection.bounded else None
-        self._gapless = gapless
-        self._next = 0
-        self._columns = Columns(layout, _wanted(layout, selection.fields))
-
-    def verified(self, messages: Messages, offset: int) -> Bytes:
-        """The messages as bytes (k, size): the next of this topic, and like those before."""
-        expected = self.read if self._gapless else None
-        _check_sequence(messages, expected, offset)
-        data = messages.matrix(self._layout.size)
-        if data is None or not self._layout.is_kept_by(data):
-            raise Damage(offset, "(chunk) has messages that differ from those before")
-        if self._order is not None and len(data):
-            begins = self._gapless and not self.read
-            self._order.check_cycles(self._columns.stamps(data), offset, begins=begins)
-        return data
-
-    def stamps(self, data: Bytes) -> NDArray[np.int64]:
-        """Time stamps of messages, shape (k,) [ns]."""
-        return self._columns.stamps(data)
-
-    def append(self, data: Bytes, expected: int) -> None:
-        """Append verified messages; `expected` is a guess at the final count."""
-        if self._order is not None and len(data):
-            self._order.take(int(self._columns.stamps(data[-1:])[0]))
-        self.read += len(data)
-        if self._times is not None:
-            stamp = self._columns.stamps(data)
-            data = data[(stamp >= self._times[0]) & (stamp < self._times[1])]
-        self._columns.append(data, expected)
-
-    def finished(self) -> dict[str, NDArray[Any]]:
-        """The columns by our names."""
-        columns = self._columns.finished()
-        return {_COLUMN_OF.get(name, name): column for name, column in columns.items()}
-
-
-def _wanted(layout: MessageLayout, fields: Collection[str] | None) -> list[str]:
-    names = layout.dtype.names or ()
-    return [name for name in names if fields is None or _COLUMN_OF.get(name, name) in fields]
-
-
-def _check_sequence(messages: Messages, expected: int | None, offset: int) -> None:
-    """Check that messages are numbered one by one, from `expected` on where it is known."""
-    sequence = messages.sequence
-    first = int(sequence[0]) if expected is None else expected
-    wanted = np.arange(first, first + len(sequence), dtype=np.int64) & 0xFFFFFFFF
-    if not np.array_equal(sequence, wanted):
-        raise Damage(offset, "(chunk) does not continue the one before it: a chunk is missing")
 
 
 _UNREAD = frozenset((container.MESSAGE_INDEX,))
@@ -436,10 +393,9 @@ class Archive:
 
     Attributes:
         path: the file.
-        metadata: entries of the ``hil`` record.
-        outcome: entries of the ``hil.outcome`` record, None when it is missing.
+        header: what it says of itself.
+        outcome: how the recording ended, None when that is missing.
         attachments: content by file name.
-        joint_names: joints in the order of the columns.
         columns: contiguous read-only arrays (m,) or (m, n) by name: the fields of the cycle
             message, or ``position``, ``velocity``, ``torque`` and ``motor_current`` of an imported
             recording as far as it has them; and ``stamp`` (m,), nanoseconds.
@@ -448,10 +404,9 @@ class Archive:
     """
 
     path: Path
-    metadata: Mapping[str, str]
-    outcome: Mapping[str, str] | None
+    header: ArchiveHeader
+    outcome: ArchiveOutcome | None
     attachments: Mapping[str, bytes]
-    joint_names: tuple[str, ...]
     columns: Mapping[str, NDArray[Any]]
     events: tuple[ArchivedEvent, ...]
     damage: ArchiveDamage | None
@@ -469,13 +424,17 @@ class Archive:
     @property
     def kind(self) -> str:
         """Why the arm moved, one of `hil.archive.KINDS`."""
-        return self.metadata["kind"]
+        return self.header.kind
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints in the order of the columns."""
+        return self.header.joint_names
 
     @property
     def period(self) -> float | None:
         """Cycle time [s]; None for an imported recording without a fixed one."""
-        text = self.metadata.get("period")
-        return None if text is None else float(text)
+        return self.header.period
 
     @property
     def n_samples(self) -> int:
@@ -517,6 +476,25 @@ class Archive:
                 field=name,
                 remedy="import the recording again with a URDF or a cell file in UTF-8",
             ) from error
+
+    def table(self, name: str) -> dict[str, Any]:
+        """An attachment that is a JSON object; empty where it is not there.
+
+        Raises:
+            ArchiveError: it is no JSON object.
+        """
+        try:
+            found = json_of(self.attachments.get(name, b"{}"))
+        except ValueError:
+            found = None
+        if not isinstance(found, dict):
+            raise ArchiveError(
+                self.path,
+                "is no JSON object",
+                field=name,
+                remedy="leave the archive out, or take the attachment from another of its campaign",
+            )
+        return found
 
     def cycles(self) -> Rows:
         """The cycle records as the session wrote them, structure of `drivers.cycle_dtype`.
@@ -569,11 +547,12 @@ def open_archive(
     try:
         with opened(path) as stream:
             size = os.fstat(stream.fileno()).st_size
-            written = Written.read(stream, size)
-            content = _by_index(stream, size, selection, written) if selection.partial else None
-            damage = None
+            summary, damage, content = Summary.read(stream, size), None, None
+            order = Order.read(stream, size, summary)
+            if selection.partial and summary is not None:
+                content = _by_index(stream, selection, order, summary)
             if content is None:
-                content, damage = _from_the_beginning(stream, size, selection, written)
+                content, damage = _from_the_beginning(stream, size, selection, order)
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "")
         raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
@@ -581,17 +560,16 @@ def open_archive(
         raise ArchiveError(
             path, "does not fit into memory", remedy="read a part of its time, or fewer columns"
         ) from error
-    metadata = _checked_metadata(path, size, content, damage)
+    header = _checked_header(path, size, content, damage)
     if damage is None:
         _check_topics(path, content, selection)
     columns = content.columns()
     stamp = columns["stamp"] if fields is None or fields else None
     return Archive(
         path=path,
-        metadata=metadata,
+        header=header,
         outcome=content.outcome,
         attachments=content.attachments,
-        joint_names=_described(path, metadata).joint_names,
         columns=columns,
         events=tuple(content.events),
         damage=None if damage is None else _damage(damage, size, content, stamp),
@@ -602,29 +580,26 @@ def _from_the_beginning(
     stream: BinaryIO,
     size: int,
     selection: Selection,
-    written: Written,
-    until: Contested | None = None,
-) -> tuple[Content, Damage | None]:
+    order: Order,
+) -> tuple[_Content, Damage | None]:
     """What is selected of the whole chunks before the first damage, and that."""
     stream.seek(0)
-    content = Content(selection, Order(written, until=until))
+    content = _Content(selection, order)
     damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
-    if until is None and isinstance(damage, Contested):  # some of what was read may be strange
-        return _from_the_beginning(stream, size, selection, written, damage)
+    if order.until is None and isinstance(damage, Contested):  # what was read may be strange
+        return _from_the_beginning(stream, size, selection, replace(order, until=damage))
     return content, damage
 
 
 def _by_index(
-    stream: BinaryIO, size: int, selection: Selection, written: Written
-) -> Content | None:
+    stream: BinaryIO, selection: Selection, order: Order, summary: Summary
+) -> _Content | None:
     """What is selected, found through the summary; None where that or what it names is damaged."""
-    summary = Summary.read(stream, size)
-    if summary is None:
-        return None
-    content = Content(selection, Order(written, gapless=False), gapless=False)
+    content = _Content(selection, replace(order, gapless=False))
     try:
         for record in summary.definitions:
-            content.parser.known.take(record.opcode, record.body, record.offset)
+            content.parser.known.take(record)
+        indexed, others = summary.chunks, summary.others
     except Damage:
         return None
     known = content.parser.known
@@ -635,16 +610,18 @@ def _by_index(
         topics.update(NUMBERS)  # a chunk that has others than those wanted is to be seen, too
     wanted = {channel.id for channel in known.channels.values() if channel.topic in topics}
     start, stop = selection.times
-    chunks = [chunk for chunk in summary.chunks if chunk.channels & wanted]
-    taken = [chunk for chunk in chunks if chunk.start_time < stop and chunk.end_time >= start]
+    chunks = [chunk for chunk in indexed if chunk.message_index_offsets.keys() & wanted]
+    within = [
+        one for one in chunks if one.message_start_time < stop and one.message_end_time >= start
+    ]
     # Where nothing falls into the range, one chunk still tells what columns there are.
-    places = [(chunk.offset, chunk.length) for chunk in taken or chunks[:1]]
-    records = (container.record_at(stream, *place) for place in sorted([*summary.others, *places]))
-    damage = content.collect(records, sum(length for _, length in places))
+    places = [(one.chunk_start_offset, one.chunk_length) for one in within or chunks[:1]]
+    records = (container.record_at(stream, *place) for place in sorted([*others, *places]))
+    damage = content.collect(records, 0)
     return content if damage is None and content.metadata is not None else None
 
 
-def _check_topics(path: Path, content: Content, selection: Selection) -> None:
+def _check_topics(path: Path, content: _Content, selection: Selection) -> None:
     """Check that the archive has the channels wanted."""
     recorded = sorted(content.parser.known.topics)
     for topic in selection.topics or ():
@@ -654,19 +631,23 @@ def _check_topics(path: Path, content: Content, selection: Selection) -> None:
             )
 
 
-def _checked_metadata(
-    path: Path, size: int, content: Content, damage: Damage | None
-) -> Mapping[str, str]:
-    """The ``hil`` record, whose version we know."""
+def _checked_header(
+    path: Path, size: int, content: _Content, damage: Damage | None
+) -> ArchiveHeader:
+    """The header, whose version we know."""
+    if content.header is not None:
+        return content.header
+    if content.unusable is not None:
+        field, problem = next(iter(content.unusable.problems.items()))
+        remedy = f"what wrote this archive does not keep the profile: its record {METADATA!r} "
+        raise ArchiveError(path, problem, field=field, remedy=f"{remedy}must be mended there")
     if content.metadata is not None:
         version = content.metadata.get("format_version")
-        if version != str(FORMAT_VERSION):
-            raise ArchiveVersionError(
-                path,
-                f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
-                remedy="install a newer hil",
-            )
-        return content.metadata
+        raise ArchiveVersionError(
+            path,
+            f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
+            remedy="install a newer hil",
+        )
     remedy = "record it again"
     if size == 0:
         problem = "is empty: the recording ended before anything was written"
@@ -681,21 +662,8 @@ def _checked_metadata(
     raise NotAnArchiveError(path, problem, remedy=remedy)
 
 
-def _described(path: Path, metadata: Mapping[str, str]) -> Description:
-    try:
-        return Description.of(metadata)
-    except DescriptionError as error:
-        raise ArchiveError(
-            path,
-            error.problem,
-            field=error.field,
-            remedy=f"what wrote this archive does not keep the profile: its record {METADATA!r} "
-            "must be mended there",
-        ) from error
-
-
 def _damage(
-    damage: Damage, size: int, content: Content, stamp: NDArray[np.int64] | None
+    damage: Damage, size: int, content: _Content, stamp: NDArray[np.int64] | None
 ) -> ArchiveDamage:
     return ArchiveDamage(
         offset=damage.offset,

@@ -6,31 +6,88 @@ says what is lost. Nothing is invented: what cannot be verified is left out.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
-import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import stat
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import IO, BinaryIO
 
+import numpy as np
 import zstandard
+from mcap.records import Chunk
 
-from hil.archive import container, foreign_json, index, schema
+from hil.archive import container, header, schema
+from hil.archive.chunk import HEAD, ChunkParser, Messages
 from hil.archive.container import Record
-from hil.archive.description import Description, DescriptionError
-from hil.archive.index import IndexBuilder, MessageHead
-from hil.archive.intact import Piece, Survey, announced_attachments
-from hil.archive.order import listed
+from hil.archive.header import ArchiveOutcome
+from hil.archive.mcap_writer import Entries, McapWriter, chunk_of, entries_of, span
 from hil.archive.reader import open_archive
-from hil.archive.rewrite import write_anew
-from hil.archive.survey import HEADER, survey
+from hil.archive.survey import Piece, Survey, survey
+from hil.archive.writer import sync_folder
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
-from hil.whole_number import whole_number
 
-_SEQUENCE_AT = container.RECORD.size + 2  # in a message record
+_NAMED = 40  # characters that the temporary file takes over of the name
+
+
+def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, IO[bytes]], None]) -> None:
+    """Make an archive of another one; `target` is at any moment what it was, or whole.
+
+    File and folder are on the disk when this returns, and the file has the mode of its source.
+
+    Args:
+        source: the archive to make it of.
+        target: the file to write or to replace, which may be the source.
+        fill: writes the content, given the source and the new file.
+
+    Raises:
+        ArchiveWriteError: the disk refuses.
+        ArchiveError: what was written cannot be read back; it is thrown away.
+    """
+    try:
+        with source.open("rb") as stream, _beside(target) as output:
+            os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
+            fill(stream, output)
+            output.flush()
+            os.fsync(output.fileno())
+            back = open_archive(output.name, fields=())
+            if not back.complete:
+                raise ArchiveError(
+                    source,
+                    f"cannot be written anew: {back.damage}",
+                    remedy="it is as it was, and what opens of it can be read: restore it from a "
+                    "copy, or record again",
+                )
+            Path(output.name).replace(target)
+        sync_folder(target.parent)
+    except OSError as error:
+        raise ArchiveWriteError(
+            target,
+            f"cannot be written: {error.strerror}",
+            remedy="what was there is as it was: make room or make its folder writable, "
+            "and do it again",
+        ) from error
+
+
+@contextlib.contextmanager
+def _beside(target: Path) -> Iterator[IO[bytes]]:
+    """A new file in the folder of another, of a name that nobody else has or can foresee."""
+    with NamedTemporaryFile(
+        dir=target.parent, prefix=f".{target.name[:_NAMED]}.", suffix=".part", delete=False
+    ) as output:
+        try:
+            yield output
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                Path(output.name).unlink()
+
+
+_SEQUENCE_AT = HEAD.fields["sequence"][1] if HEAD.fields else 0  # in a message record
 
 
 @dataclass(frozen=True)
@@ -72,7 +129,7 @@ def repair(
     is named, and left alone otherwise.
 
     Args:
-        path: the archive, which is kept unless `in_place`.
+        path: the archive, which stays as it is unless `in_place`.
         output: the file to write, which must not exist; `repaired_name` by default.
         in_place: replace the archive by the repaired one instead.
 
@@ -83,7 +140,7 @@ def repair(
     """
     path = Path(path)
     found = survey(path)
-    if not _is_described(found):
+    if found.header is None:
         open_archive(path, fields=())  # says why it is none
         raise NotAnArchiveError(path, "is not an archive")
     if found.mixed:
@@ -102,21 +159,10 @@ def repair(
     )
 
 
-def _is_described(found: Survey) -> bool:
-    """Whether the file says what is in it, in words that we know."""
-    if found.metadata is None:
-        return False
-    try:
-        Description.of(found.metadata)
-    except DescriptionError:
-        return False
-    return found.metadata.get("format_version") == str(schema.FORMAT_VERSION)
-
-
 def _samples_lost(found: Survey) -> int | None:
     if not found.losses:
         return 0
-    stated = None if found.outcome is None else whole_number(found.outcome.get("samples"))
+    stated = None if found.outcome is None else found.outcome.samples
     return None if stated is None else max(0, stated - found.samples)
 
 
@@ -125,122 +171,126 @@ def _write(found: Survey, target: Path) -> None:
 
     def fill(stream: BinaryIO, output: IO[bytes]) -> None:
         if found.faults:
-            ArchiveCopy(stream, output).write(found)
+            copy_of(found, stream, output)
         else:
             shutil.copyfileobj(stream, output)
 
     write_anew(found.path, target, fill)
 
 
-class ArchiveCopy:
-    """Copies what stands of a survey into a new file, with the outcome of the survey."""
+def copy_of(
+    found: Survey, stream: BinaryIO, output: IO[bytes], *, outcome: Mapping[str, str] | None = None
+) -> None:
+    """Write what stands of an archive as a new one.
 
-    def __init__(self, stream: BinaryIO, output: IO[bytes]) -> None:
-        self._stream = stream
-        self._output = output
-        self._offset = 0
-        self._index = IndexBuilder()
-        self._checksums: list[int] = []
-        self._decompressor = zstandard.ZstdDecompressor()
-        self._compressor = zstandard.ZstdCompressor()
-
-    def write(self, found: Survey) -> None:
-        """Write the file."""
-        assert found.metadata is not None
-        self._put(container.MAGIC + HEADER)
-        self._metadata(schema.METADATA, _description(found))
-        announced = False
-        for piece in found.pieces:
-            if piece.opcode == container.CHUNK and not announced:
-                announced = True
-                for record in found.definitions:
-                    self._announce(record)
-            self._piece(piece)
-        self._metadata(schema.OUTCOME, _outcome(found, self._checksums))
-        self._put(self._index.tail(self._offset))
-
-    def _put(self, data: bytes) -> None:
-        self._output.write(data)
-        self._offset += len(data)
-
-    def _metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        data = index.metadata(name, {**entries, "checksum": schema.checksum(entries)})
-        self._index.add_metadata(self._offset, len(data), name)
-        self._put(data)
-
-    def _announce(self, record: Record) -> None:
-        self._index.announce(record.opcode, record.body)
-        self._put(index.record(record.opcode, record.body))
-
-    def _piece(self, piece: Piece) -> None:
-        record = container.record_at(self._stream, piece.offset, piece.length)
-        if piece.opcode == container.CHUNK:
-            self._chunk(record, piece)
-        elif piece.opcode in (container.SCHEMA, container.CHANNEL):
-            self._announce(record)
-        else:
-            if piece.opcode == container.ATTACHMENT:
-                self._index.add_attachment(self._offset, record)
-            else:
-                name, _ = container.metadata(record)
-                self._index.add_metadata(self._offset, piece.length, name)
-            self._put(index.record(record.opcode, record.body))
-
-    def _chunk(self, record: Record, piece: Piece) -> None:
-        head = container.chunk(record)
-        data = container.chunk_data(record, decompressor=self._decompressor)
-        copy = index.record(record.opcode, record.body)
-        assert piece.times is not None
-        if piece.shift is not None:
-            data = _renumbered(data, piece)
-            copy = index.chunk(data, self._compressor.compress(data), "zstd", piece.times)
-        elif piece.times != (head.start_time, head.end_time):
-            copy = index.chunk(data, bytes(head.data), head.compression, piece.times)
-        taken = Record(self._offset, record.opcode, copy[container.RECORD.size :], 0)
-        indexes = self._index.add_chunk(self._offset, len(copy), container.chunk(taken), data)
-        self._checksums.append(container.chunk(taken).crc)
-        self._put(copy)
-        self._put(indexes)
+    Args:
+        found: what stands of it.
+        stream: the archive.
+        output: the new one.
+        outcome: entries of its outcome that are to be others than before.
+    """
+    writer, parser = McapWriter(output.write), ChunkParser()
+    described = _description(found)
+    writer.start(schema.PROFILE, schema.LIBRARY)
+    writer.add_metadata(header.METADATA, header.sealed(described))
+    recovered = found.definitions
+    for piece in found.pieces:
+        record = container.record_at(stream, piece.offset, piece.length)
+        if piece.opcode != container.CHUNK:
+            writer.copy(record)
+            continue
+        for definition in recovered:
+            parser.known.take(definition)
+            writer.copy(definition)
+        recovered = []
+        chunk, entries = _chunk(record, piece, parser)
+        for known in parser.known.definitions:
+            writer.note(known)
+        writer.add_chunk(chunk, entries)
+    stated = {**_outcome(found, writer.checksums), **(outcome or {})}
+    writer.add_metadata(header.OUTCOME, header.sealed(stated))
+    writer.finish()
 
 
-def _renumbered(data: bytes, piece: Piece) -> bytes:
-    """The records of a chunk with its messages counting on from those that stand before it."""
-    assert piece.shift is not None
-    changed = bytearray(data)
-    for item in index.messages(data, piece.offset):
-        if isinstance(item, MessageHead):
-            sequence = item.sequence - piece.shift[item.channel]
-            struct.pack_into("<I", changed, item.start + _SEQUENCE_AT, sequence)
-    return bytes(changed)
+def _chunk(record: Record, piece: Piece, parser: ChunkParser) -> tuple[Chunk, Entries]:
+    """A chunk as it stands, or with its messages counting on from those that stand before it."""
+    head = container.chunk(record)
+    data = container.chunk_data(record, decompressor=zstandard.ZstdDecompressor(), head=head)
+    found = parser.messages(data, record.offset)
+    entries = entries_of(found)
+    if piece.shift is not None:
+        return chunk_of(_renumbered(data, found, piece.shift), entries), entries
+    first, last = span(entries)
+    return replace(head, message_start_time=first, message_end_time=last), entries
+
+
+def _renumbered(data: bytes, found: Mapping[int, Messages], shift: Mapping[int, int]) -> bytes:
+    """The records of a chunk, with the numbers of its messages lower by so much, by channel."""
+    changed = np.frombuffer(bytearray(data), np.uint8)
+    for channel, messages in found.items():
+        numbers = messages.of_heads("sequence") - np.uint32(shift[channel])
+        places = messages.places[:, None] + _SEQUENCE_AT + np.arange(numbers.itemsize)
+        changed[places] = numbers.astype("<u4")[:, None].view(np.uint8)
+    return changed.tobytes()
 
 
 def _description(found: Survey) -> dict[str, str]:
     """The ``hil`` record: as it was, without the attachments that are lost."""
-    assert found.metadata is not None
-    announced = announced_attachments(found.metadata)
-    kept = [name for name in announced if name in found.attachments]
-    if kept == announced:
+    assert found.metadata is not None and found.header is not None
+    names = [*found.header.attachments]
+    found_names = [name for name in names if name in found.attachments]
+    if found_names == names:
         return found.metadata
-    return {**found.metadata, "attachments": json.dumps(kept)}
+    return {**found.metadata, "attachments": json.dumps(found_names)}
 
 
 def _outcome(found: Survey, chunks: Sequence[int]) -> dict[str, str]:
     """The ``hil.outcome`` record of a file of these chunks: as it was where nothing is lost."""
+    lists = {header.CHUNKS: header.chunk_list(chunks)}
     if not found.losses and found.outcome is not None:
-        lists = {schema.CHUNKS: listed(chunks)} if schema.CHUNKS in found.outcome else {}
-        return {**found.outcome, **lists}  # other than before if another program cut the chunks
-    before = found.outcome or {"outcome": "unknown", "reason": "the outcome is lost"}
-    lost, lost_before = _samples_lost(found), whole_number(before.get("repaired.samples_lost", "0"))
-    known = lost is not None and lost_before is not None
-    earlier = foreign_json.names(before.get("repaired.losses", "[]")) or ()
+        record = found.outcome.record  # other chunks than before if another program cut them
+        return {**record, **(lists if header.CHUNKS in record else {})}
+    unknown = {"outcome": "unknown", "reason": "the outcome is lost"}
+    outcome = found.outcome or ArchiveOutcome.of(unknown)
+    before, lost = outcome.record, _samples_lost(found)
+    known = lost is not None and outcome.samples_lost is not None
     return {
         **before,
-        schema.DESCRIPTION: schema.checksum(_description(found)),
-        schema.CHUNKS: listed(chunks),
+        header.DESCRIPTION: header.checksum(_description(found)),
+        **lists,
         "samples": str(found.samples),
         "events": str(found.events),
         **({"packets": str(found.counts.get(schema.PACKETS, 0))} if "packets" in before else {}),
         "repaired": "yes",
-        "repaired.samples_lost": str((lost or 0) + (lost_before or 0)) if known else "unknown",
-        "repaired.losses": json.dumps([*earlier, *found.losses]),
+        "repaired.samples_lost": str((lost or 0) + (outcome.samples_lost or 0))
+        if known
+        else "unknown",
+        "repaired.losses": json.dumps([*outcome.losses, *found.losses]),
     }
+
+
+def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
+    """Replace outcome and reason of a whole archive; all else stays as it was written.
+
+    The file is written anew beside its name, read back, and then takes its name: whatever
+    interrupts it leaves the old or the new file.
+
+    Args:
+        path: the archive.
+        outcome: how the interval is judged now, such as ``rejected``.
+        reason: why, in a sentence.
+
+    Raises:
+        ArchiveError: it is no whole archive.
+        ArchiveWriteError: the disk refuses; the archive is as it was.
+    """
+    path = Path(path)
+    found = survey(path)
+    if found.faults or found.metadata is None or found.outcome is None:
+        raise ArchiveError(path, "is not whole", remedy="repair it with `hil archive repair`")
+    amended = {"outcome": outcome, "reason": reason}
+
+    def fill(stream: BinaryIO, output: IO[bytes]) -> None:
+        copy_of(found, stream, output, outcome=amended)
+
+    write_anew(path, path, fill)

@@ -5,35 +5,28 @@
 
 from __future__ import annotations
 
-import json
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.records import Schema
 from numpy.typing import NDArray
 
 from drivers.packet_records import LONGEST_PACKET
-from hil.archive import definitions
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, fixed_layout
-from hil.archive.messages import joint_state_layout
+from hil.archive.cdr import (
+    LayoutError,
+    MessageLayout,
+    Rows,
+    fixed_layout,
+    joint_state_layout,
+)
 
 Array = NDArray[np.float64]
 
-FORMAT_VERSION = 1
 PROFILE = "ros2"
 LIBRARY = "hil"  # without version: the same recording gives the same bytes
-METADATA = "hil"
-OUTCOME = "hil.outcome"
-DESCRIPTION = "description"
-"""Entry of the outcome: checksum of the ``hil`` record it belongs to. Older files have none."""
-CHUNKS = "chunks"
-"""Entry of the outcome: the checksums of all chunks in order. Older files have none."""
-SEALS = (DESCRIPTION, CHUNKS)
-"""Entries of the outcome that serve to verify the file, and say nothing of the recording."""
-CONTROLLERS_OWN = "controller"
-"""Metadata entry ``motion`` of an archive whose motion was made by the controller's own program."""
 
 CYCLE = "/hil/cycle"
 MEASURED = "/joint_states"
@@ -52,16 +45,126 @@ _STAMP = ("sec", "nanosec")
 _STAMP_TYPES = {"sec": (np.dtype("<i4"),), "nanosec": (np.dtype("<u4"),)}
 
 
+_SEPARATOR = "=" * 80
+_TIME = """\
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_HEADER = """\
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+
+_JOINT_STATE = """\
+# Position [rad], velocity [rad/s] and effort [N.m] of the joints in `name`.
+# An array is as long as `name`, or empty when the quantity is not known.
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+"""
+
+_CYCLE = """\
+# One cycle of the controller link as the PC saw it. Joints in the order of the archive's
+# joint_names. Angles are those of the robot description (URDF); SI units.
+# header.stamp is the time since the controller's initialisation: cycle * period.
+std_msgs/Header header
+int64 cycle                     # cycles of the controller since its initialisation
+float64 arrival                 # s, clock of the PC, for diagnosis only
+float64[{n}] target_position      # rad, set-point inside the controller
+float64[{n}] target_velocity      # rad/s, set-point inside the controller
+float64[{n}] position             # rad, measured
+float64[{n}] velocity             # rad/s, measured
+float64[{n}] torque               # N.m, joint side, from target_current; NaN when unknown
+float64[{n}] target_current       # A, motor side, demanded by the controller's speed loop
+float64[{n}] model_current        # A, motor side, of the controller's dynamic model (extra 1)
+float64[{n}] diagonal_inertia     # kg.m2, as the controller sends it (extra 2)
+float64[{n}] extra3               # as the controller sends it (extra 3)
+float64[{n}] commanded_position   # rad, this packet's answer; NaN where no set-point was sent
+float64[{n}] commanded_velocity   # rad/s, this packet's answer; NaN where no set-point was sent
+int32[{n}] mode                   # mode of each axis, as on the wire
+int32 number                    # sequence number of the packet, as on the wire
+int32 gap                       # packets lost just before this one
+int32 interval                  # index of the interval of open mode
+uint8 state                     # state of the session
+uint8 status                    # status byte of the arm, as on the wire
+uint16[8] age                   # cycles since the oldest joint value of each of these was sent:
+                                # target_position, target_velocity, position, velocity,
+                                # target_current, model_current, diagonal_inertia, extra3
+"""
+
+_MOTOR_CURRENT = """\
+# Measured motor currents of a foreign recording, motor side.
+std_msgs/Header header
+float64[{n}] motor_current        # A
+"""
+
+_PACKET = """\
+# One packet of the controller link, byte by byte, in the order in which the PC received and sent.
+# header.stamp is that of the cycle in /hil/cycle to which it belongs.
+std_msgs/Header header
+int64 cycle                     # cycles of the controller since its initialisation
+float64 time                    # s, clock of the PC: when it arrived or was sent
+uint16 length                   # bytes
+uint8 sent                      # 1: sent by the PC, 0: received by it
+uint8[{size}] data               # the packet, then zeros
+"""
+
+_LOG = """\
+byte DEBUG=10
+byte INFO=20
+byte WARN=30
+byte ERROR=40
+byte FATAL=50
+builtin_interfaces/Time stamp   # time since the controller's initialisation
+uint8 level
+string name                     # kind of event
+string msg                      # one line of text; a second line, if any, is one JSON object
+string file
+string function
+uint32 line
+"""
+
+
 @dataclass(frozen=True)
 class Channel:
-    """One topic and the ros2msg schema of its messages."""
+    """One topic and the ros2msg schema of its messages, with all its dependencies.
+
+    The text is the one description of the messages: writer and reader compute their byte layouts
+    from it, and foreign programs decode with it.
+    """
 
     topic: str
     schema: str
     definition: str
 
 
-EVENT_CHANNEL = Channel(EVENTS, definitions.LOG, definitions.log())
+def _text(message: str, *dependencies: str) -> str:
+    return "".join([message, *(f"{_SEPARATOR}\n{part}" for part in dependencies)])
+
+
+EVENT_CHANNEL = Channel(EVENTS, "rcl_interfaces/msg/Log", _text(_LOG, _TIME))
+
+
+def profile(n_joints: int) -> Mapping[str, Channel]:
+    """The channels of the profile by topic, for so many joints."""
+    state = "sensor_msgs/msg/JointState", _text(_JOINT_STATE, _HEADER, _TIME)
+    cycle, current, packet = (
+        _text(text.format(n=n_joints, size=LONGEST_PACKET), _HEADER, _TIME)
+        for text in (_CYCLE, _MOTOR_CURRENT, _PACKET)
+    )
+    channels = (
+        Channel(CYCLE, f"hil_msgs/msg/Cycle{n_joints}", cycle),
+        Channel(MEASURED, *state),
+        Channel(COMMANDED, *state),
+        Channel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
+        Channel(PACKETS, "hil_msgs/msg/Packet", packet),
+        EVENT_CHANNEL,
+    )
+    return {channel.topic: channel for channel in channels}
 
 
 class Batch(NamedTuple):
@@ -69,11 +172,11 @@ class Batch(NamedTuple):
 
     Attributes:
         stamp: shape (k,), nanoseconds.
-        messages: per channel its k messages.
+        messages: by topic, k of each.
     """
 
     stamp: NDArray[np.int64]
-    messages: tuple[Rows, ...]
+    messages: Mapping[str, Rows]
 
 
 class CycleEncoder:
@@ -82,23 +185,20 @@ class CycleEncoder:
     `/hil/cycle` holds everything; the two JointState channels repeat what viewers plot.
 
     Attributes:
-        channels: the channels, in the order of the messages of a batch.
+        channels: the channels.
     """
 
     def __init__(self, joint_names: Sequence[str], period: float) -> None:
         n = len(joint_names)
         self._period_ns = period * 1e9
-        self._cycle = fixed_layout(definitions.cycle(n))
+        channels = profile(n)
+        self.channels = (channels[CYCLE], channels[MEASURED], channels[COMMANDED])
+        self._cycle = fixed_layout(channels[CYCLE].definition)
         self._measured = joint_state_layout(joint_names, position=n, velocity=n, effort=n)
         self._commanded = joint_state_layout(joint_names, position=n, velocity=n, effort=0)
         self._copied = [
             name for name in self._cycle.dtype.names or () if name not in (*_STAMP, "torque")
         ]
-        self.channels = (
-            Channel(CYCLE, definitions.cycle_name(n), definitions.cycle(n)),
-            Channel(MEASURED, definitions.JOINT_STATE, definitions.joint_state()),
-            Channel(COMMANDED, definitions.JOINT_STATE, definitions.joint_state()),
-        )
 
     def encode(self, records: Rows, torque: Array) -> Batch:
         """Encode k cycle records, and the joint torques (k, n) that belong to them."""
@@ -115,7 +215,7 @@ class CycleEncoder:
         measured["effort"] = torque
         commanded["position"] = records["commanded_position"]
         commanded["velocity"] = records["commanded_velocity"]
-        return Batch(stamp, (cycle, measured, commanded))
+        return Batch(stamp, {CYCLE: cycle, MEASURED: measured, COMMANDED: commanded})
 
 
 class PacketEncoder:
@@ -125,7 +225,7 @@ class PacketEncoder:
         channel: theirs.
     """
 
-    channel = Channel(PACKETS, definitions.PACKET, definitions.packet(LONGEST_PACKET))
+    channel = profile(0)[PACKETS]
 
     def __init__(self, period: float) -> None:
         self._period_ns = period * 1e9
@@ -137,7 +237,7 @@ class PacketEncoder:
         rows = _stamped(self._layout, stamp)
         for name in packets.dtype.names or ():
             rows[name] = packets[name]
-        return Batch(stamp, (rows,))
+        return Batch(stamp, {PACKETS: rows})
 
 
 class SampleEncoder:
@@ -146,7 +246,7 @@ class SampleEncoder:
     Quantities that the recording does not have are left out of the messages, not invented.
 
     Attributes:
-        channels: the channels, in the order of the messages of a batch.
+        channels: the channels.
     """
 
     def __init__(
@@ -156,11 +256,9 @@ class SampleEncoder:
         self._state = joint_state_layout(
             joint_names, position=n, velocity=n * velocity, effort=n * torque
         )
-        self._current = fixed_layout(definitions.motor_current(n)) if motor_current else None
-        self.channels = [Channel(MEASURED, definitions.JOINT_STATE, definitions.joint_state())]
-        if motor_current:
-            name, text = definitions.motor_current_name(n), definitions.motor_current(n)
-            self.channels.append(Channel(MOTOR_CURRENT, name, text))
+        current = profile(n)[MOTOR_CURRENT]
+        self._current = fixed_layout(current.definition) if motor_current else None
+        self.channels = [profile(n)[MEASURED], *([current] if motor_current else [])]
 
     def encode(
         self,
@@ -176,20 +274,38 @@ class SampleEncoder:
             if values is not None:
                 state[name] = values
         if self._current is None or motor_current is None:
-            return Batch(stamp, (state,))
+            return Batch(stamp, {MEASURED: state})
         current = _stamped(self._current, stamp)
         current["motor_current"] = motor_current
-        return Batch(stamp, (state, current))
+        return Batch(stamp, {MEASURED: state, MOTOR_CURRENT: current})
 
 
-def profile_layout(topic: str, n_joints: int) -> MessageLayout | None:
-    """How the messages of a topic of numbers are laid out; None where it is not the profile's."""
-    definition = {
-        CYCLE: definitions.cycle(n_joints),
-        MOTOR_CURRENT: definitions.motor_current(n_joints),
-        PACKETS: definitions.packet(LONGEST_PACKET),
-    }.get(topic)
-    return None if definition is None else fixed_layout(definition)
+def message_layout(
+    topic: str, joints: Sequence[str], record: Schema | None, first: bytes
+) -> MessageLayout:
+    """How the messages of a topic of numbers are laid out.
+
+    Args:
+        topic: theirs.
+        joints: names of the joints.
+        record: the schema that the file has of them, None where it has none.
+        first: one of them; joint states may lack quantities.
+
+    Raises:
+        LayoutError: they are not those of the profile.
+    """
+    if topic in (MEASURED, COMMANDED):
+        row = np.frombuffer(first, np.uint8)[None]
+        for position, velocity, effort in product((len(joints), 0), repeat=3):
+            state = joint_state_layout(joints, position=position, velocity=velocity, effort=effort)
+            if state.size == len(first) and state.is_kept_by(row):
+                return state
+        raise LayoutError(f"they are no joint states of these {len(joints)} joints")
+    if record is None:
+        raise LayoutError("their schema is missing")
+    layout = fixed_layout(record.data.decode(errors="replace"))
+    check_fields(topic, layout, len(joints))
+    return layout
 
 
 def check_fields(topic: str, layout: MessageLayout, n_joints: int) -> None:
@@ -199,28 +315,14 @@ def check_fields(topic: str, layout: MessageLayout, n_joints: int) -> None:
         LayoutError: one is missing, or of another type or length.
     """
     found: Mapping[str, Any] = layout.dtype.fields or {}
-    profile = profile_layout(topic, n_joints)
     expected: Mapping[str, Any] = _STAMP_TYPES
-    if profile is not None:
-        expected = profile.dtype.fields or {}
+    if topic in (CYCLE, MOTOR_CURRENT, PACKETS):
+        expected = fixed_layout(profile(n_joints)[topic].definition).dtype.fields or {}
     for name, (kind, *_) in expected.items():
         if name not in found and name not in LATER_FIELDS:
             raise LayoutError(f"they have no {name}")
         if name in found and found[name][0] != kind:
             raise LayoutError(f"their {name} is not that of {n_joints} joints")
-
-
-def checksum(entries: Mapping[str, str]) -> str:
-    """CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
-    text = json.dumps(dict(entries), sort_keys=True, separators=(",", ":"))
-    return f"{zlib.crc32(text.encode()):08x}"
-
-
-def belong_together(metadata: Mapping[str, str] | None, outcome: Mapping[str, str] | None) -> bool:
-    """Whether an outcome is that of the recording which the ``hil`` record describes, if known."""
-    if metadata is None or outcome is None:
-        return True
-    return outcome.get(DESCRIPTION) in (None, checksum(metadata))
 
 
 def _stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:

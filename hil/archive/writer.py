@@ -4,22 +4,212 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from itertools import pairwise
 from os import PathLike
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive.cdr import Rows
+from hil.archive.cdr import LogMessage, Rows, encode_log
 from hil.archive.events import ArchivedEvent, Level
-from hil.archive.file_writer import ArchiveFile
-from hil.archive.names import KINDS, ArchiveName
-from hil.archive.schema import CycleEncoder, PacketEncoder
+from hil.archive.header import (
+    CHUNKS,
+    DESCRIPTION,
+    FORMAT_VERSION,
+    KINDS,
+    METADATA,
+    OUTCOME,
+    ArchiveName,
+    checksum,
+    chunk_list,
+    sealed,
+)
+from hil.archive.mcap_writer import McapWriter
+from hil.archive.schema import (
+    CYCLE,
+    EVENT_CHANNEL,
+    EVENTS,
+    LIBRARY,
+    PACKETS,
+    PROFILE,
+    Batch,
+    Channel,
+    CycleEncoder,
+    PacketEncoder,
+    SampleEncoder,
+)
 from hil.errors import ArchiveWriteError
+
+_MOST_NUMBERS = 1 << 32  # message numbers are counted modulo this
+_MEDIA_TYPES = {
+    ".toml": "application/toml",
+    ".urdf": "application/xml",
+    ".json": "application/json",
+    ".csv": "text/csv",
+    ".txt": "text/plain",
+}
+
+
+class ArchiveFile:
+    """An MCAP file of the archive profile, open for writing.
+
+    The file gets its final name at once; one without footer is torn and readable up to its last
+    whole chunk. An existing file is never overwritten.
+
+    Args:
+        path: where to write.
+        channels: all channels.
+        metadata: entries of the ``hil`` metadata record.
+        attachments: file name to content.
+        durable: wait at each flush until the disk has the data.
+
+    Attributes:
+        counts: messages written so far, by topic.
+        slowest_flush: longest time that the disk took for what was handed to it at once [s].
+        closed: whether the file is closed, by `finish` or by a failure of the disk.
+
+    Raises:
+        ArchiveWriteError: the file exists or cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        channels: Sequence[Channel],
+        metadata: Mapping[str, str],
+        attachments: Mapping[str, bytes],
+        durable: bool,
+    ) -> None:
+        self.counts = {channel.topic: 0 for channel in channels}
+        self.slowest_flush = 0.0
+        self.closed = False
+        self._path = path
+        self._durable = durable
+        self._descriptor = _create(path)
+        self._parts: list[bytes] = []  # to be written at once
+        self._writer = McapWriter(self._parts.append)
+        names = json.dumps(sorted(attachments))
+        described = {**metadata, "format_version": str(FORMAT_VERSION), "attachments": names}
+        self._description = checksum(described)
+        with self._guarded():
+            self._writer.start(PROFILE, LIBRARY)
+            self._writer.add_metadata(METADATA, sealed(described))
+            for name, data in sorted(attachments.items()):
+                media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
+                self._writer.add_attachment(name, media_type, data)
+            self._write()
+            if durable:  # only now: the file is empty for as short a time as possible
+                sync_folder(path.parent)
+        self._numbers = {channel.topic: self._register(channel) for channel in channels}
+
+    def add(self, batch: Batch) -> None:
+        """Add messages of channels that count alike to the chunk in progress."""
+        topics = [*batch.messages]
+        numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _MOST_NUMBERS
+        channels = [self._numbers[topic] for topic in topics]
+        with self._guarded():
+            self._writer.add_rows(channels, batch.stamp, numbers, [*batch.messages.values()])
+        for topic in topics:
+            self.counts[topic] += len(batch.stamp)
+
+    def add_event(self, message: LogMessage) -> None:
+        """Add an event to the chunk in progress."""
+        number = self.counts[EVENTS] % _MOST_NUMBERS
+        with self._guarded():
+            data = encode_log(message)
+            self._writer.add_message(self._numbers[EVENTS], message.stamp, number, data)
+        self.counts[EVENTS] += 1
+
+    def flush(self) -> None:
+        """End the chunk in progress and hand everything to the operating system, or the disk."""
+        with self._guarded():
+            self._writer.flush()
+            self._write()
+
+    def finish(self, outcome: Mapping[str, str]) -> None:
+        """Write the outcome, index and footer, and close the file."""
+        if self.closed:
+            return
+        with self._guarded():
+            self._writer.flush()
+            seals = {DESCRIPTION: self._description, CHUNKS: chunk_list(self._writer.checksums)}
+            self._writer.add_metadata(OUTCOME, sealed({**outcome, **seals}))
+            self._writer.finish()
+            self._write()
+            self._close()  # some file systems tell only now that they did not take everything
+
+    def _write(self) -> None:
+        data = memoryview(b"".join(self._parts))
+        self._parts.clear()
+        begin = time.monotonic()
+        while data:
+            data = data[os.write(self._descriptor, data) :]
+        if self._durable:
+            os.fdatasync(self._descriptor)
+        self.slowest_flush = max(self.slowest_flush, time.monotonic() - begin)
+
+    def _register(self, channel: Channel) -> int:
+        definition = channel.definition.encode()
+        return self._writer.register(
+            channel.topic, "cdr", schema=channel.schema, encoding="ros2msg", definition=definition
+        )
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Turn a failure of the disk into our error, and close the file for good."""
+        if self.closed:
+            raise ArchiveWriteError(self._path, "the archive is closed")
+        try:
+            yield
+        except OSError as error:
+            with suppress(OSError):
+                self._close()
+            raise ArchiveWriteError(
+                self._path,
+                f"cannot be written further: {error.strerror}",
+                remedy="what was flushed before can be read; make room or mend the disk, "
+                "and record again",
+            ) from error
+
+    def _close(self) -> None:
+        if not self.closed:
+            self.closed = True
+            os.close(self._descriptor)
+
+
+def _create(path: Path) -> int:
+    try:
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+    except FileExistsError as error:
+        raise ArchiveWriteError(
+            path, "exists already", remedy="archives are never overwritten; choose another name"
+        ) from error
+    except OSError as error:
+        raise ArchiveWriteError(
+            path,
+            f"cannot be created: {error.strerror}",
+            remedy="see that its folder is there and writable and its disk has room, "
+            "and record again",
+        ) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the name of a new file survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
 
 Array = NDArray[np.float64]
 
@@ -77,15 +267,17 @@ class ArchiveWriter:
         self._last: int | None = None
         self._newest = 0
         self._lost = 0
+        own = {"joint_names": list(joint_names), "period": period}
         self._file = ArchiveFile(
             self._path,
-            channels=self._encoder.channels,
-            metadata=checked_metadata(
-                self._path, metadata, {"joint_names": list(joint_names), "period": period}
-            ),
+            channels=[
+                *self._encoder.channels,
+                EVENT_CHANNEL,
+                *([PacketEncoder.channel] if packets else []),
+            ],
+            metadata=checked_metadata(self._path, metadata, own),
             attachments=attachments or {},
             durable=durable,
-            packets=self._packet_encoder.channel if self._packet_encoder else None,
         )
 
     @property
@@ -214,12 +406,12 @@ class ArchiveWriter:
         self._emit(everything=True)
         self._emit_packets(None if self._first is None else self._newest)
         cycles = {
-            "samples": self._file.samples,
-            "events": self._file.events,
+            "samples": self._file.counts[CYCLE],
+            "events": self._file.counts[EVENTS],
             "lost_packets": self._lost,
         }
         if self._packet_encoder is not None:
-            cycles["packets"] = self._file.packets
+            cycles["packets"] = self._file.counts[PACKETS]
         if self._first is not None and self._last is not None:
             cycles |= {"first_cycle": self._first, "last_cycle": self._last}
         counted = {key: str(value) for key, value in cycles.items()}
@@ -268,7 +460,7 @@ class ArchiveWriter:
         count = len(packets)
         if last is not None:
             count = int(np.searchsorted(packets["cycle"], last, side="right"))
-        self._file.add_packets(self._packet_encoder.encode(packets[:count]))
+        self._file.add(self._packet_encoder.encode(packets[:count]))
         self._pending_packets = [packets[count:]] if count < len(packets) else []
 
     def _emit(self, *, everything: bool) -> None:
@@ -320,3 +512,90 @@ def checked_metadata(
             remedy=f"use {', '.join(KINDS)}",
         )
     return {**entries, **{key: json.dumps(value) for key, value in own.items()}}
+
+
+_SAMPLES_PER_CHUNK = 1000  # samples
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """A foreign recording, m samples of n joints, joint side in SI units.
+
+    Attributes:
+        stamp: (m,) nanoseconds, of whatever clock the recording has.
+        position: (m, n) [rad].
+        velocity: (m, n) [rad/s], None when it was not recorded.
+        torque: (m, n) [N·m], None when it was not recorded.
+        motor_current: (m, n) [A], motor side, None when it was not recorded.
+    """
+
+    stamp: NDArray[np.int64]
+    position: Array
+    velocity: Array | None = None
+    torque: Array | None = None
+    motor_current: Array | None = None
+
+
+def write_samples(
+    path: str | PathLike[str],
+    samples: Samples,
+    *,
+    joint_names: Sequence[str],
+    metadata: Mapping[str, str],
+    attachments: Mapping[str, bytes] | None = None,
+    period: float | None = None,
+    durable: bool = True,
+) -> Path:
+    """Write a foreign recording as an archive of kind ``imported``.
+
+    Args:
+        path: the file, which must not exist.
+        samples: what was recorded.
+        joint_names: joints in the order of the columns.
+        metadata: entries of the ``hil`` metadata record, such as where the recording comes from.
+        attachments: content by file name.
+        period: step [s] of a recording at a fixed rate; its time is then counted in samples.
+        durable: wait until the disk has the data.
+
+    Raises:
+        ArchiveWriteError: the file exists, the disk refuses, or a stamp cannot be stored.
+    """
+    path = Path(path)
+    if samples.stamp.size and not 0 <= samples.stamp.min() <= samples.stamp.max() < 2**31 * 10**9:
+        raise ArchiveWriteError(
+            path, "a stamp lies outside 0 .. 2^31 s", remedy="shift the recording's clock"
+        )
+    encoder = SampleEncoder(
+        joint_names,
+        velocity=samples.velocity is not None,
+        torque=samples.torque is not None,
+        motor_current=samples.motor_current is not None,
+    )
+    own: dict[str, object] = {"joint_names": list(joint_names)}
+    if period is not None:
+        own["period"] = period
+    file = ArchiveFile(
+        path,
+        channels=[*encoder.channels, EVENT_CHANNEL],
+        metadata=checked_metadata(path, {**metadata, "kind": "imported"}, own),
+        attachments=attachments or {},
+        durable=durable,
+    )
+    for start in range(0, len(samples.stamp), _SAMPLES_PER_CHUNK):
+        file.add(_encode(encoder, samples, slice(start, start + _SAMPLES_PER_CHUNK)))
+        file.flush()
+    file.finish({"outcome": "completed", "samples": str(len(samples.stamp)), "events": "0"})
+    return path
+
+
+def _encode(encoder: SampleEncoder, samples: Samples, part: slice) -> Batch:
+    def cut(values: Array | None) -> Array | None:
+        return None if values is None else values[part]
+
+    return encoder.encode(
+        samples.stamp[part],
+        samples.position[part],
+        cut(samples.velocity),
+        cut(samples.torque),
+        cut(samples.motor_current),
+    )

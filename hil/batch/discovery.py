@@ -9,7 +9,7 @@ from sys import intern
 from typing import Final, NamedTuple
 
 from hil.archive import ArchiveName
-from hil.archive.names import KINDS
+from hil.archive.header import KINDS
 from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder, Entry
 from hil.errors import ArchiveError

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final, NamedTuple, get_type_hints
 
-from hil.archive import Archive, ArchiveName, open_archive
+from hil.archive import Archive, ArchiveHeader, ArchiveName, ArchiveOutcome, open_archive
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable
 from hil.identify.settings import stated_delay
-from hil.whole_number import whole_number
 
 from .cache import Store, Where
 from .errors import ChangedError, TornError
@@ -165,9 +164,9 @@ def _inspected(place: Place, path: Path, store: Store) -> Facts:
     archive = open_archive(path, fields=(), stop=-1.0)
     if archive.damage is not None:
         raise TornError(place.location, str(archive.damage))
-    number, attempt = _interval(archive.metadata, place.name)
+    number, attempt = _interval(archive.header, place.name)
     kind = archive.kind
-    use = archive.metadata.get("use", "excitation") if kind == "imported" else kind
+    use = archive.header.serves_as
     plan = archive.attachments.get("plan.json")
     return Facts(
         sha256=sha256,
@@ -175,12 +174,12 @@ def _inspected(place: Place, path: Path, store: Store) -> Facts:
         use=use,
         number=number,
         attempt=attempt,
-        outcome=(archive.outcome or {}).get("outcome", "unknown"),
-        record=text_digest(json.dumps(dict(archive.metadata), sort_keys=True)),
+        outcome=(archive.outcome or ArchiveOutcome()).outcome,
+        record=text_digest(json.dumps(dict(archive.header.entries), sort_keys=True)),
         simulated=_simulated(archive),
         **(_of_cell(archive, store) if use in USES else _NO_CELL),
         motion="" if plan is None else text_digest(plan),
-        when=archive.metadata.get("recorded_at", ""),
+        when=archive.header.recorded_at or "",
     )
 
 
@@ -204,13 +203,12 @@ def _of_cell(archive: Archive, store: Store) -> dict[str, str]:
 
 
 def _simulated(archive: Archive) -> bool:
-    return archive.metadata.get("simulated") == "yes"
+    return archive.header.only_simulated
 
 
-def _interval(metadata: Mapping[str, str], name: str) -> tuple[int, int]:
+def _interval(header: ArchiveHeader, name: str) -> tuple[int, int]:
     """Index and attempt: as the archive says, whatever its file is called now; else by its name."""
-    index, attempt = (whole_number(metadata.get(key)) for key in ("index", "attempt"))
-    if index is not None and attempt is not None:
-        return index, attempt
+    if header.index is not None and header.attempt is not None:
+        return header.index, header.attempt
     parsed = ArchiveName.parse(name)
     return (0, 0) if parsed is None else (parsed.index, parsed.attempt)

@@ -16,13 +16,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.archive import CONTROLLERS_OWN, Archive, open_archive
+from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
 from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
 from hil.identify.sources import Source, known_doubts, source_of
-from hil.importers import Findings
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay_compensation import rate_products
@@ -150,7 +149,7 @@ def opened(ref: ArchiveRef) -> Iterator[Archive]:
         _require_same(path, ref)
         try:
             archive = open_archive(path, fields=_FIELDS)
-            if archive.metadata.get("motion") == CONTROLLERS_OWN:
+            if archive.header.controllers_own:
                 archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
         finally:
             if ref.stamp is not None:  # what was written meanwhile is no fault of the archive
@@ -242,13 +241,13 @@ def design_effect(estimate: Estimate, phase: PhaseFactor, weighting: Weighting) 
 
 
 def _doubts(archive: Archive, cell: Cell, source: Source) -> tuple[str, ...]:
-    doubts = [*known_doubts(cell, archive), *Findings.of(archive.metadata).warnings]
+    doubts = [*known_doubts(cell, archive), *archive.header.findings.warnings]
     if source.merged:
         doubts.append(
             f"{source.merged} samples had the time stamp of the one before and were averaged "
             "with it"
         )
-    if (archive.outcome or {}).get("repaired") == "yes":
+    if archive.outcome is not None and archive.outcome.repaired:
         doubts.append("it was repaired, and something is lost")
     return tuple(doubts)
 

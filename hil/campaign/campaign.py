@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from hil.archive.live_view import LiveView
+from hil.archive.live import LiveView
 from hil.cell import Cell
 from hil.design.folder import DESIGN_FILES
 from hil.errors import InputError, OutputError

@@ -6,11 +6,10 @@ import math
 from collections.abc import Callable
 from typing import TypeVar
 
-from hil.archive import ArchiveName, open_archive
+from hil.archive import ArchiveName, ArchiveOutcome, open_archive
 from hil.errors import ArchiveError, HilError
 from hil.plural import counted
 from hil.results.conduct import ConductResult, RecordedResult, StepResult, WarmUpResult
-from hil.whole_number import whole_number
 
 from .dry_run import DryRun
 from .folder import CampaignFolder, Entry
@@ -150,25 +149,20 @@ def _recorded(folder: CampaignFolder, entry: Entry) -> RecordedResult | None:
         archive = open_archive(folder.archives / entry.name, fields=())
     except ArchiveError:
         return None
-    stamp, said = archive.columns["stamp"], archive.outcome or {}
+    stamp, outcome = archive.columns["stamp"], archive.outcome or ArchiveOutcome()
     return RecordedResult(
         archive=entry.name,
         kind=archive.kind if name is None else name.kind,
-        when=archive.metadata.get("recorded_at"),
+        when=archive.header.recorded_at,
         seconds=float(stamp[-1] - stamp[0]) * 1e-9 if len(stamp) else 0.0,
         cycles=archive.n_samples,
-        missed=_count(said.get("lost_packets")),
-        late=_count(said.get("late_answers")),
-        not_taken=_count(said.get("answers_not_taken")),
-        lost=_count(said.get("records_lost")),
+        missed=outcome.lost_packets or 0,
+        late=outcome.late_answers or 0,
+        not_taken=outcome.answers_not_taken or 0,
+        lost=outcome.records_lost or 0,
         outcome=entry.outcome,
-        why=entry.reason or ("" if entry.outcome == "completed" else said.get("reason", "")),
+        why=entry.reason or ("" if entry.outcome == "completed" else outcome.reason),
     )
-
-
-def _count(text: str | None) -> int:
-    """A counter of an archive; 0 where it has none, or one that is no number."""
-    return whole_number(text) or 0
 
 
 def _tolerant(load: Callable[[], T]) -> T | str:

@@ -16,7 +16,6 @@ from hil.archive import open_archive
 from hil.cell import Cell
 from hil.files import write_or_tell
 from hil.reading import json_of, lies_there, text_of
-from hil.whole_number import whole_number
 
 from .errors import CampaignFolderError
 from .folder import CampaignFolder
@@ -179,7 +178,8 @@ class DryRun:
             behind = np.abs(columns["target_position"] - columns["position"])
             following = np.maximum(following, np.nanmax(behind, axis=0))
             missed += int(columns["gap"].sum())
-            late += whole_number((archive.outcome or {}).get("late_answers")) or 0
+            if archive.outcome is not None:
+                late += archive.outcome.late_answers or 0
             cycles += archive.n_samples
         gravity = GravityCheck.of(cell, [folder.archives / name for name in names])
         return cls(

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive.commands import Failed
+from hil.archive.supervised import Failed
 from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError, UnsafeError
 from hil.plural import counted
 

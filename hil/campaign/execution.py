@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hil.archive.live_view import LiveView
+from hil.archive.live import LiveView
 from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hil.archive import ArchiveName, ArchiveSpec
+from hil.archive import ArchiveHeader, ArchiveName, ArchiveSpec
 from hil.cell import Cell
 from hil.recording import dated_anew, origin_of
 from hil.version import software
@@ -58,10 +58,10 @@ class Archiving:
             durable=self.durable,
         )
 
-    def made(self, metadata: Mapping[str, str]) -> bool:
-        """Whether an archive with this metadata was made of exactly this plan, by such an arm."""
+    def made(self, header: ArchiveHeader) -> bool:
+        """Whether an archive with this header was made of exactly this plan, by such an arm."""
         arm = self.provenance.get(SIMULATED)
-        return metadata.get("plan_hash") == self.plan_hash and metadata.get(SIMULATED) == arm
+        return header.plan_hash == self.plan_hash and header.simulated == arm
 
     def _plan_of(self, interval: Interval) -> dict[str, Any]:
         """The trajectory of an interval, its moves, and how an excitation was found."""

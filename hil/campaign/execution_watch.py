@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 from typing import cast
 
-from hil.archive.names import WORDS
+from hil.archive.header import WORDS
 
 from .motion_watch import MotionProgress, OperatorRequest
 from .operator import DriftCurve, Operator, Phase, RunStatus

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from hil.archive import ArchiveName
-from hil.archive.amend import REJECTED
+from hil.archive.header import REJECTED
 from hil.files import write_atomically
 from hil.reading import digest_of, is_no_file, json_of, lies_there, opened, text_of
 

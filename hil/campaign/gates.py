@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.drive_train import TURN
-from hil.archive import open_archive
+from hil.archive import ArchiveHeader, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
@@ -21,7 +21,7 @@ from .folder import CampaignFolder
 from .gravity_check import AGAINST
 from .motion_link import MotionLink
 from .rehearsal import Rehearsal
-from .simulation_flag import SIMULATED, said_of
+from .simulation_flag import said_of
 
 _ADDRESS: Final = ("transport", "host", "port", "bind", "can", "packets")
 """Keys of `[controller]` that say where it is, and not what is exchanged."""
@@ -79,8 +79,8 @@ def require_one_world(folder: CampaignFolder, only_simulated: bool) -> None:
         CampaignFolderError: an archive that is there is of the other kind, or does not say of
             which it is.
     """
-    for metadata in _metadata_of_all(folder):
-        made_by = metadata.get(SIMULATED, "")
+    for header in _headers(folder):
+        made_by = header.simulated
         if made_by != said_of(only_simulated):
             break
     else:
@@ -94,12 +94,12 @@ def require_one_world(folder: CampaignFolder, only_simulated: bool) -> None:
     )
 
 
-def _metadata_of_all(folder: CampaignFolder) -> Iterator[Mapping[str, str]]:
+def _headers(folder: CampaignFolder) -> Iterator[ArchiveHeader]:
     """What the archives that can be read say of themselves; those that cannot are made anew."""
     for entry in folder.manifest():
         with suppress(ArchiveError):
             if (folder.archives / entry.name).is_file():
-                yield open_archive(folder.archives / entry.name, fields=()).metadata
+                yield open_archive(folder.archives / entry.name, fields=()).header
 
 
 def require_link_of(cell: Cell, link: MotionLink, root: Path) -> None:

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive.names import motion_name
+from hil.archive.header import motion_name
 from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 from planner import (

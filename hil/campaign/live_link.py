@@ -35,9 +35,16 @@ from drivers.packet_records import CAPACITY
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec
-from hil.archive.commands import Close, Closed, Failed, Open, Opened, Serve, Serving
-from hil.archive.live_view import LiveView, LiveViewError
-from hil.archive.supervised import ArchiveProcessHandle
+from hil.archive.live import LiveView, LiveViewError, Serve
+from hil.archive.supervised import (
+    ArchiveProcessHandle,
+    Close,
+    Closed,
+    Failed,
+    Open,
+    Opened,
+    Serving,
+)
 from hil.cell import Cell
 from hil.cell.link import stays_here
 from hil.errors import ControllerFault

@@ -12,7 +12,7 @@ from drivers.events import MotionEnded, Outcome
 from drivers.exchange import NO_ARCHIVE, WithdrawnError
 from drivers.motion_source import MotionSource
 from hil.archive import ArchiveSpec
-from hil.archive.commands import Closed, Failed
+from hil.archive.supervised import Closed, Failed
 from hil.errors import ControllerFault
 
 from .errors import write_error

@@ -12,7 +12,7 @@ from drivers.exchange import RingReader
 from drivers.exchange.liveness import Pulse
 from drivers.states import State
 from hil.archive import ArchiveSpec
-from hil.archive.wording import describe
+from hil.archive.recorder import describe
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 
 from .errors import write_error

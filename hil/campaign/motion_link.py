@@ -18,7 +18,7 @@ from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
-from hil.archive.wording import describe
+from hil.archive.recorder import describe
 from hil.cell import Cell
 from hil.errors import ControllerFault
 

@@ -18,7 +18,7 @@ from drivers.exchange.latency import quantile
 from drivers.guard import Guard
 from drivers.packets import InitPacket
 from drivers.states import State
-from hil.archive.wording import describe
+from hil.archive.recorder import describe
 from hil.cell import Cell
 
 from .motion_watch import Latency, MotionProgress, MotionWatch

@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import Final
 
 from hil.archive import ArchiveName, open_archive
-from hil.archive.amend import REJECTED, amend_outcome
+from hil.archive.header import REJECTED
+from hil.archive.repair import amend_outcome
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
@@ -175,7 +176,7 @@ class Entering:
                 archive = open_archive(self._folder.archives / name, fields=())
             except ArchiveError:
                 continue  # torn at its head: done again
-            outcome = (archive.outcome or {}).get("outcome")
-            if archive.complete and outcome == "completed" and archiving.made(archive.metadata):
+            completed = archive.outcome is not None and archive.outcome.outcome == "completed"
+            if archive.complete and completed and archiving.made(archive.header):
                 self.adopted.append(name)
                 self.enter(interval, name)

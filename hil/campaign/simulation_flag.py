@@ -21,6 +21,6 @@ def said_of(only_simulated: bool) -> str:
 def made_by(path: Path, only_simulated: bool) -> bool:
     """Whether an archive says that this kind of arm made it; a damaged one does not."""
     try:
-        return open_archive(path, fields=()).metadata.get(SIMULATED) == said_of(only_simulated)
+        return open_archive(path, fields=()).header.simulated == said_of(only_simulated)
     except ArchiveError:
         return False

@@ -15,7 +15,6 @@ from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
     STANDARD_GRAVITY,
     ColumnMap,
-    Findings,
     Robot,
     Use,
     convention_of,
@@ -268,7 +267,7 @@ for _name in ("csv", "npz"):
 
 def _tell(path: Path, *, json: bool) -> None:
     """What was read, as the archive keeps it."""
-    found = Findings.of(open_archive(path).metadata)
+    found = open_archive(path).header.findings
     if json:
         summary = {"archive": str(path), "found": found.lines, "warnings": found.warnings}
         typer.echo(json_format.dumps(summary))

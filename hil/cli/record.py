@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.status import Status
 
-from hil.archive.live_view import LiveView
+from hil.archive.live import LiveView
 from hil.campaign import Progress, Stop, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.campaign.motion_link import Recorded

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hil.archive import ArchiveName
-from hil.archive.live_view import LiveView
+from hil.archive.live import LiveView
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.execution_result import RunResult
 from hil.cell_link import require_watchable

@@ -94,7 +94,7 @@ def gather(
 def _simulated(repetition: LevelEstimate) -> bool:
     """Of one archive: simulations and recordings are never of one arm."""
     with local_file(repetition.archive) as path:
-        return open_archive(path, fields=()).metadata.get("simulated") == "yes"
+        return open_archive(path, fields=()).header.only_simulated
 
 
 def _folder(place: str) -> str:

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
-from hil.archive import CONTROLLERS_OWN, Archive, ArchiveName, foreign_json, open_archive
-from hil.archive.amend import REJECTED
+from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
+from hil.archive.header import REJECTED
 from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
-from hil.importers import Findings
 from hil.reading import digest_of
 from hil.recordings import recording_of
 from identification.signals.clock import true_times
@@ -72,7 +71,7 @@ class Sources:
 
     Attributes:
         cell: from the attachments of the first archive.
-        metadata: of the first archive.
+        header: of the first archive.
         plan: of the first archive; None where none was attached.
         training: what is fitted.
         same_motion: whether these are repetitions of one motion.
@@ -85,7 +84,7 @@ class Sources:
     """
 
     cell: Cell
-    metadata: dict[str, str]
+    header: ArchiveHeader
     plan: dict[str, Any] | None
     training: tuple[Source, ...]
     same_motion: bool
@@ -164,7 +163,7 @@ def gather_sources(
     doubts += [
         f"{archive.path.name}: {doubt}"
         for archive in archives
-        for doubt in Findings.of(archive.metadata).warnings
+        for doubt in archive.header.findings.warnings
     ]
     doubts += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
     if in_sample:
@@ -213,7 +212,7 @@ def all_fitted(
         training, same_motion = _aligned(training)
     return Sources(
         cell=cell,
-        metadata=dict(archives[0].metadata),
+        header=archives[0].header,
         plan=plan,
         training=training,
         same_motion=same_motion,
@@ -245,15 +244,7 @@ def _plan_of(archive: Archive) -> dict[str, Any] | None:
     """The plan that travels inside an archive, None where there is none."""
     if "plan.json" not in archive.attachments:
         return None
-    plan = foreign_json.loads(archive.attachments["plan.json"])
-    if not isinstance(plan, dict):
-        raise ArchiveError(
-            archive.path,
-            "is no JSON object",
-            field="plan.json",
-            remedy="leave the archive out, or take the attachment from another of its campaign",
-        )
-    return plan
+    return archive.table("plan.json")
 
 
 def _by_kind(archives: Sequence[Archive], predicted: Sequence[Archive]) -> dict[str, list[Archive]]:
@@ -266,7 +257,7 @@ def _by_kind(archives: Sequence[Archive], predicted: Sequence[Archive]) -> dict[
 
 def _kind(archive: Archive) -> str:
     """What an archive is for; an imported one says so beside its kind."""
-    return archive.metadata.get("use", "excitation") if archive.kind == "imported" else archive.kind
+    return archive.header.serves_as
 
 
 def _refuse_duplicates(paths: Sequence[Path]) -> None:
@@ -299,9 +290,9 @@ def _incomplete(archive: Archive) -> str | None:
     """What a reader must know about an archive that did not end as planned."""
     if archive.missing is not None:
         return archive.missing
-    outcome = (archive.outcome or {}).get("outcome", "completed")
-    if outcome == REJECTED:
-        reason = (archive.outcome or {}).get("reason", "")
+    outcome = "completed" if archive.outcome is None else archive.outcome.outcome
+    if archive.outcome is not None and outcome == REJECTED:
+        reason = archive.outcome.reason
         return f"{archive.path.name} was rejected and left out: {reason}"
     return None if outcome == "completed" else f"{archive.path.name} ended {outcome}"
 
@@ -323,20 +314,19 @@ def _not_judged(archive: Archive) -> str | None:
 
 def _rejected(archive: Archive) -> bool:
     """Whether the run that made an archive found that it is of no use."""
-    return (archive.outcome or {}).get("outcome") == REJECTED
+    return archive.outcome is not None and archive.outcome.outcome == REJECTED
 
 
 def known_doubts(cell: Cell, archive: Archive) -> list[str]:
     """What is known beforehand to stand between the numbers and the truth, in sentences."""
     doubts = []
-    if "drive_train.torque_constant" in cell.file.cell.assumed and (
-        archive.metadata.get("simulated") != "yes"
-    ):
+    assumed = "drive_train.torque_constant" in cell.file.cell.assumed
+    if assumed and not archive.header.only_simulated:
         doubts.append(
             "the torque constants are assumed: predictions are as good as they look, but every "
             "parameter is in their units"
         )
-    if "friction drift" in archive.metadata.get("effects", ""):
+    if any("friction drift" in effect for effect in archive.header.effects):
         doubts.append(
             "friction drift is switched on: the planted friction is that of a half-warm joint, "
             "and a short run is colder, so friction estimates differ from it"
@@ -386,7 +376,7 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     Where the PC moved the arm, those it commanded. Where the controller's own program did, those
     with the drive on: with it off the brakes carry the arm, and no current tells of it.
     """
-    if archive.metadata.get("motion") == CONTROLLERS_OWN and "status" in archive.columns:
+    if archive.header.controllers_own and "status" in archive.columns:
         powered = np.flatnonzero(archive.columns["status"] == DRIVE_ON)
         if not powered.size:
             raise ArchiveError(archive.path, "the drive was never on in it")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import foreign_json
+from hil.archive import ArchiveHeader
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.results import (
@@ -128,13 +126,13 @@ def summarise(
         for source, samples in zip(sources.training, training, strict=True)
     ]
     gram = information(_executed(cell.model, training, rows))
-    simulated = sources.metadata.get("simulated") == "yes"
-    truth = planted_in(cell, sources.metadata) if simulated else None
+    simulated = sources.header.only_simulated
+    truth = planted_in(cell, sources.header) if simulated else None
     return Results(
         name=name,
         cell=cell.name,
         simulated=simulated,
-        effects=json.loads(sources.metadata.get("effects", "[]")),
+        effects=[*sources.header.effects],
         joint_names=list(model.joint_names),
         period=_period(training[0]),
         software=software(),
@@ -177,31 +175,24 @@ def summarise(
     )
 
 
-def planted_in(cell: Cell, metadata: Mapping[str, str]) -> Array | None:
+def planted_in(cell: Cell, header: ArchiveHeader) -> Array | None:
     """What was planted in the simulated arm (p,): as the archive says, or else its cell.
 
     None where neither says it, and where the archive does not say it of each parameter. That of a
     torque ripple, whose phase is drawn, is NaN.
     """
-    if "planted" in metadata:
-        planted, model = foreign_json.loads(metadata["planted"]), cell.model
-        named = model.parameter_names[: model.element_part.start]
-        if not isinstance(planted, dict) or not all(_is_number(planted.get(n)) for n in named):
+    model, planted = cell.model, header.planted
+    if planted is not None:
+        if not planted.keys() >= {*model.parameter_names[: model.element_part.start]}:
             return None
-        given = [planted.get(name) for name in model.parameter_names]
-        return np.array([v if _is_number(v) else np.nan for v in given], dtype=np.float64)
+        return np.array([planted.get(name, np.nan) for name in model.parameter_names])
     if cell.file.simulation is None:
         return None
     values = planted_values(cell)
-    for one in cell.model.elements.identified:
+    for one in model.elements.identified:
         if isinstance(one.element, TorqueRipple):
-            values[cell.model.element_part][one.part] = np.nan
+            values[model.element_part][one.part] = np.nan
     return values
-
-
-def _is_number(value: object) -> bool:
-    most = sys.float_info.max
-    return isinstance(value, int | float) and type(value) is not bool and -most <= value <= most
 
 
 def _period(samples: Samples) -> float:

@@ -2,7 +2,6 @@
 
 from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
 from hil.importers.dh import Convention, convention_of, urdf_of_dh
-from hil.importers.findings import Findings
 from hil.importers.log import import_log
 from hil.importers.output import Use
 from hil.importers.robot import IMPORTED_LAW, STANDARD_GRAVITY, Robot
@@ -13,7 +12,6 @@ __all__ = [
     "STANDARD_GRAVITY",
     "ColumnMap",
     "Convention",
-    "Findings",
     "Quantity",
     "Robot",
     "TimeColumn",

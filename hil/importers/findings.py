@@ -7,7 +7,6 @@ a position is outside the limits of the URDF.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,14 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from hil.archive import Samples, foreign_json
+from hil.archive import Findings, Samples
 from identification.model.urdf_tree import urdf_tree
 from identification.signals.clock import time_base
 
 Array = NDArray[np.float64]
-
-METADATA: Final = "findings"
-"""Entry of an imported archive's metadata that holds them."""
 
 SLOWEST: Final = 20.0  # Hz; nothing of a robot's dynamics is left below
 FASTEST: Final = 20_000.0  # Hz
@@ -72,43 +68,6 @@ _SLIPS: Final = {
     -1.0: _Slip("the sign of the velocities", "the sign of the positions"),
 }  # fmt: skip
 """By how many times too large the velocities then are."""
-
-
-@dataclass(frozen=True)
-class Findings:
-    """What was found in a recording.
-
-    Attributes:
-        lines: the time base, and the range of each joint.
-        warnings: what looks like a slip of the column map, in sentences.
-    """
-
-    lines: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-    def text(self) -> str:
-        """As an entry of an archive's metadata."""
-        return json.dumps({"lines": self.lines, "warnings": self.warnings})
-
-    @classmethod
-    def of(cls, metadata: Mapping[str, str]) -> Findings:
-        """From an archive's metadata; nothing where they have none."""
-        if METADATA not in metadata:
-            return cls((), ())
-        stored = foreign_json.loads(metadata[METADATA])
-        entries = stored if isinstance(stored, dict) else {}
-        earlier = entries.get("doubts")  # their name before
-        lines = _sentences(entries.get("lines"))
-        warnings = _sentences(entries.get("warnings", earlier))
-        if lines is None or warnings is None:
-            return cls((), ("what its import found cannot be read",))
-        return cls(lines, warnings)
-
-
-def _sentences(stored: object) -> tuple[str, ...] | None:
-    if not isinstance(stored, list) or not all(isinstance(line, str) for line in stored):
-        return None
-    return tuple(stored)
 
 
 @dataclass(frozen=True)
@@ -177,7 +136,7 @@ def examine(
     held = [f"{name} at {position:.4g}" for name, position in (locked or {}).items()]
     lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
     if len(time) < 2:
-        return Findings((f"{len(time)} samples", *lines), ())
+        return Findings(lines=(f"{len(time)} samples", *lines), warnings=())
     base = time_base(time)
     lines = [f"time: {'; '.join(base.describe())}", *lines]
     warnings = []
@@ -197,7 +156,7 @@ def examine(
             time, base.rate, samples.position, samples.velocity, joint_names, limits
         )
     warnings += _torques(samples, joint_names, limits)
-    return Findings(tuple(lines), tuple(warnings))
+    return Findings(lines=tuple(lines), warnings=tuple(warnings))
 
 
 def urdf_limits(urdf: str) -> dict[str, Limits]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from hil.archive import Samples, write_samples
 from hil.errors import SourceError
-from hil.importers.findings import METADATA, clock_fault, examine
+from hil.importers.findings import clock_fault, examine
 from hil.importers.robot import Robot
 
 Use = Literal["excitation", "validation", "standstill"]
@@ -65,13 +65,14 @@ def write_imported(
             field="held joints",
             remedy=f"the robot's joints are {', '.join(robot.joint_names)}",
         )
+    findings = examine(samples, robot.joint_names, robot.urdf, locked=robot.locked)
     entries = {
         **metadata,
         "source": json.dumps([path.name for path in source]),
         "source_sha256": json.dumps([_digest(path) for path in source]),
         "held_joints": json.dumps(list(held_joints)),
         "use": use,
-        METADATA: examine(samples, robot.joint_names, robot.urdf, locked=robot.locked).text(),
+        "findings": json.dumps(findings.model_dump()),
     }
     return write_samples(
         output,

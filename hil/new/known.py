@@ -147,7 +147,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
             "carries neither a cell nor an init packet",
             remedy="name one that hil recorded",
         )
-    if archive.metadata.get("simulated") == "yes":
+    if archive.header.only_simulated:
         note = f"{archive.path.name} was recorded from a simulated controller"
         known |= Known(notes=(note,))
     return known

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
 from drivers.states import State
-from hil.archive import Archive, foreign_json, open_archive
+from hil.archive import Archive, open_archive
 from hil.archive.overview import Overview, overview
 from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
@@ -211,7 +211,10 @@ class _Scales:
             limits["velocity"] = _both(np.degrees(bounds.velocity))
             if cell.torque_limit is not None:
                 limits["torque"] = _both(cell.torque_limit)
-        table = foreign_json.loads(archive.attachments.get("drive_train.json", b"{}"))
+        try:
+            table = archive.table("drive_train.json")
+        except ArchiveError:
+            table = {}  # limits that cannot be read are not drawn
         for name, key in (("current", "current_limit"), ("following", "following_error")):
             if (limit := _limit_in(table, key, n)) is not None:
                 limits[name] = _both(limit)

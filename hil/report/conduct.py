@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hil.archive.names import ArchiveName
+from hil.archive.header import ArchiveName
 from hil.report import numbers
 from hil.report.figures.conduct import warm_up_panels
 from hil.results import RecordedResult, Results

@@ -10,7 +10,7 @@ from typing import Any, Final, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, foreign_json, open_archive
+from hil.archive import Archive, open_archive
 from hil.campaign import CampaignFolder
 from hil.campaign.plan import moves_from_dict
 from hil.errors import ArchiveError, InputError
@@ -363,8 +363,10 @@ def classes_of(run: Run) -> dict[MotionClass, list[str]]:
 
 def plan_in(archive: Archive) -> dict[str, Any]:
     """What an archive says of its planned motion; {} where it says nothing that can be read."""
-    plan = foreign_json.loads(archive.attachments.get("plan.json", b""))
-    return plan if isinstance(plan, dict) else {}
+    try:
+        return archive.table("plan.json")
+    except ArchiveError:
+        return {}
 
 
 def class_in(archive: Archive) -> MotionClass:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, foreign_json, open_archive
+from hil.archive import Archive, open_archive
 from hil.batch.keys import arm_digest
 from hil.batch.trend_words import short_names
 from hil.campaign import CampaignFolderError
@@ -70,17 +70,17 @@ class Recorded:
     @property
     def simulated(self) -> bool:
         """Whether no robot moved."""
-        return self.archive.metadata.get("simulated") == "yes"
+        return self.archive.header.only_simulated
 
     @property
     def effects(self) -> tuple[str, ...]:
         """Unmodelled effects of its simulated arm."""
-        return foreign_json.names(self.archive.metadata.get("effects", "[]")) or ()
+        return self.archive.header.effects
 
     @property
     def planted(self) -> Array | None:
         """Parameters (p,) of its simulated arm; None of a real one."""
-        return planted_in(self.cell, self.archive.metadata) if self.simulated else None
+        return planted_in(self.cell, self.archive.header) if self.simulated else None
 
     @cached_property
     def excitation(self) -> Excitation | None:

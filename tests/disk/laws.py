@@ -236,7 +236,7 @@ def _same(one: Archive, other: Archive) -> bool:
         and all(
             np.array_equal(one.columns[k], other.columns[k], equal_nan=True) for k in one.columns
         )
-        and one.metadata == other.metadata
+        and one.header == other.header
         and one.outcome == other.outcome
         and one.attachments == other.attachments
         and one.events == other.events

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.archive import open_archive
+from hil.archive import ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.cell import Cell
 from hil.demo_link import LOOPBACK, free_port, loopback_link
@@ -101,12 +101,8 @@ def lost(campaign: Campaign) -> dict[str, str]:
     for path in sorted(campaign.folder.archives.glob("*.mcap")):
         archive = open_archive(path)
         missed = int(np.diff(archive.columns["cycle"]).sum()) - (archive.n_samples - 1)
-        said = archive.outcome or {}
-        if (
-            not archive.complete
-            or said["records_lost"] != "0"
-            or missed != int(said["lost_packets"])
-        ):
+        said = archive.outcome or ArchiveOutcome()
+        if not archive.complete or said.records_lost != 0 or missed != said.lost_packets:
             found[path.name] = str(archive.missing or said)
     return found
 
@@ -137,9 +133,8 @@ def test_a_disk_that_hangs_for_longer_stops_the_arm_on_its_path_and_is_named(
     words = r"dryrun_000_a1\.mcap\) was stopped: .*\(its disk kept it waiting for [67]\.\d s"
     assert re.search(words, " ".join(ended.said.split())), ended.said
     assert ended.arm["ended"], "open mode was left, and the session ended"
-    assert (open_archive(campaign.folder.archives / "dryrun_000_a1.mcap").outcome or {})[
-        "outcome"
-    ] == "stopped"
+    dry_run = open_archive(campaign.folder.archives / "dryrun_000_a1.mcap")
+    assert (dry_run.outcome or ArchiveOutcome()).outcome == "stopped"
     assert not lost(campaign), "the ring held what the disk did not take"
     again = run(campaign, disk, None, "")
     assert again.status == 0, again.said
@@ -162,4 +157,4 @@ def test_after_an_archive_that_opened_too_late_the_same_link_goes_on(
         disk.do_wrong()
     assert result.complete
     late = open_archive(campaign.folder.archives / "move_000_a1.mcap")
-    assert (late.outcome or {})["outcome"] == "void"
+    assert (late.outcome or ArchiveOutcome()).outcome == "void"

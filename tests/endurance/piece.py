@@ -20,7 +20,7 @@ from typing import IO, Any, Final
 
 import psutil
 
-from hil.archive import open_archive
+from hil.archive import ArchiveOutcome, open_archive
 from hil.archive.check import check_archive
 from hil.campaign import Stop
 from hil.campaign.quick_design import design
@@ -149,10 +149,10 @@ class Watched:
             except HilError as error:
                 faulty.append(str(error))
                 continue
-            outcome = archive.outcome or {}
-            word = outcome.get("outcome", "none")
+            outcome = archive.outcome or ArchiveOutcome(outcome="none")
+            word = outcome.outcome
             outcomes[word] = outcomes.get(word, 0) + 1
-            lost += int(outcome.get("records_lost", 0))
+            lost += outcome.records_lost or 0
             records += check.samples
             if not check.keeps:
                 faulty.append(f"{path.name}: {dict(check.faults)}")

@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 import lz4.frame
 import zstandard
 
-from hil.archive import container, schema
-from hil.archive.index import IndexBuilder
-from hil.archive.order import listed
+from hil.archive import header
+from hil.archive.header import chunk_list
 from tests.fuzz.mutate_bytes import mutate_bytes
 from tests.fuzz.mutate_text import mutate_text
+from tests.hil.mcap_bytes import Indexed
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = range(1, 8)
@@ -102,30 +102,21 @@ def _opened(opcode: int, body: bytes) -> Record:
 
 def put_together(records: list[Record], *, index: bool) -> bytes:
     """The file, with right lengths and checksums, and an index of it where that is wanted."""
-    built = IndexBuilder()
-    file = bytearray(MAGIC)
-    described, checksums = _described(records), list[int]()
+    built = Indexed()
+    file = built.data
+    described = _described(records)
     for one in records:
-        at = len(file)
-        body = _sealed(one, {schema.DESCRIPTION: described, schema.CHUNKS: listed(checksums)})
-        if one.opcode == CHUNK and len(body) >= _CHUNK.size:
-            checksums.append(_CHUNK.unpack_from(body)[3])
-        file += _HEAD.pack(one.opcode, len(body)) + body
-        if not index:
+        body = _sealed(
+            one, {header.DESCRIPTION: described, header.CHUNKS: chunk_list(built.checksums)}
+        )
+        if index:
+            built.put(_HEAD.pack(one.opcode, len(body)) + body)
             continue
-        taken = container.Record(at, one.opcode, body, len(body))
-        if one.opcode in (SCHEMA, CHANNEL):
-            built.announce(one.opcode, body)
-        elif one.opcode == ATTACHMENT:
-            built.add_attachment(at, taken)
-        elif one.opcode == METADATA:
-            name, _ = container.metadata(taken)
-            built.add_metadata(at, len(body) + _HEAD.size, name)
-        elif one.opcode == CHUNK:
-            plain = _joined(one.inside or [])
-            file += built.add_chunk(at, len(body) + _HEAD.size, container.chunk(taken), plain)
+        if one.opcode == CHUNK and len(body) >= _CHUNK.size:
+            built.checksums.append(_CHUNK.unpack_from(body)[3])
+        file += _HEAD.pack(one.opcode, len(body)) + body
     if index:
-        return bytes(file) + built.tail(len(file))
+        return built.ended()
     end = _HEAD.pack(DATA_END, 4) + bytes(4)
     return bytes(file) + end + _HEAD.pack(FOOTER, 20) + bytes(20) + MAGIC
 
@@ -139,9 +130,9 @@ def _described(records: list[Record]) -> str:
     for one in records:
         with contextlib.suppress(Exception):  # damaged beyond reading: nothing to repeat
             name, entries = _entries(one.body) if one.opcode == METADATA else ("", {})
-            if name == schema.METADATA:
+            if name == header.METADATA:
                 entries.pop("checksum", None)
-                return schema.checksum(entries)
+                return header.checksum(entries)
     return ""
 
 
@@ -160,7 +151,7 @@ def _sealed(one: Record, seals: dict[str, str]) -> bytes:
             name, entries = _entries(one.body)
             if entries.pop("checksum", None) is not None:
                 entries |= {key: seals[key] for key in seals if key in entries}
-                return _metadata(name, {**entries, "checksum": schema.checksum(entries)})
+                return _metadata(name, {**entries, "checksum": header.checksum(entries)})
     return one.body
 
 

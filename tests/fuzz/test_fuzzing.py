@@ -18,7 +18,7 @@ import pytest
 from drivers import CyclicPacket, Guard, Session
 from drivers.transports.can import answers, ends
 from drivers.transports.can.ends import ControllerEnd, PcEnd
-from hil.archive import foreign_json, open_archive
+from hil.archive import ArchiveHeader, open_archive
 from hil.errors import ArchiveError
 from tests.fuzz import __main__ as command
 from tests.fuzz import findings, journal, keeping, lives, targets
@@ -104,11 +104,12 @@ class TestBrokenLawsAreFound:
         monkeypatch.setattr(end, one_way, emptied)
         assert self.in_the_codec()
 
-    def test_a_table_of_a_stranger_that_is_taken_for_json(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(foreign_json, "loads", json.loads)
-        assert any(cause.startswith("JSONDecode") for cause in self.broken("archive", 60))
+    def test_a_header_whose_errors_are_not_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def unnamed(entries: dict[str, str]) -> ArchiveHeader:
+            return ArchiveHeader.model_validate({**entries, "entries": entries})
+
+        monkeypatch.setattr(ArchiveHeader, "of", unnamed)
+        assert any(cause.startswith("ValidationError") for cause in self.broken("archive", 60))
 
 
 class TestMcap:

@@ -21,13 +21,12 @@ from hil.archive import (
     Level,
     Samples,
     container,
-    definitions,
+    header,
     open_archive,
     schema,
     write_samples,
 )
 from hil.archive.cdr import fixed_layout
-from hil.archive.definitions import cycle as cycle_definition
 from hil.errors import ArchiveError, ArchiveVersionError, ArchiveWriteError, NotAnArchiveError
 
 JOINTS = ("joint_1", "joint_2", "joint_3")
@@ -118,7 +117,7 @@ class TestRoundTrip:
         assert np.array_equal(archive.columns["torque"], torques(rows))
 
     def test_the_cycle_message_has_a_place_for_every_field_of_a_record(self):
-        message = fixed_layout(cycle_definition(4)).dtype
+        message = fixed_layout(schema.profile(4)[schema.CYCLE].definition).dtype
         recorded = cycle_dtype(4)
         for name in recorded.names or ():
             assert message[name] == recorded[name], name
@@ -149,7 +148,7 @@ class TestRoundTrip:
         assert archive.period == PERIOD
         assert archive.attachments == ATTACHMENTS
         expected = {"kind": "excitation", "index": "7", "attempt": "2", "campaign": "c1"}
-        assert expected.items() <= archive.metadata.items()
+        assert expected.items() <= archive.header.entries.items()
 
     def test_the_outcome_counts_what_was_written(self, tmp_path):
         rows = records(120)
@@ -157,7 +156,7 @@ class TestRoundTrip:
         with writer(tmp_path / NAME) as archive:
             archive.write(rows, torques(rows))
             archive.close("stopped", reason="Ctrl-C", details={"operator": "me"})
-        assert open_archive(tmp_path / NAME).outcome == {
+        assert open_archive(tmp_path / NAME).outcome.entries == {
             "outcome": "stopped",
             "reason": "Ctrl-C",
             "operator": "me",
@@ -366,16 +365,16 @@ class TestBadInput:
             raise RuntimeError("cable pulled")
         outcome = open_archive(tmp_path / NAME).outcome
         assert outcome is not None
-        assert outcome["outcome"] == "interrupted"
-        assert outcome["reason"] == "RuntimeError: cable pulled"
-        assert outcome["samples"] == "30"
+        assert outcome.outcome == "interrupted"
+        assert outcome.reason == "RuntimeError: cable pulled"
+        assert outcome.samples == 30
 
     def test_an_outcome_nobody_told_is_unknown(self, tmp_path):
         with writer(tmp_path / NAME):
             pass
         outcome = open_archive(tmp_path / NAME).outcome
         assert outcome is not None
-        assert outcome["outcome"] == "unknown"
+        assert outcome.outcome == "unknown"
 
     def test_a_file_that_is_not_there_is_named(self, tmp_path):
         with pytest.raises(ArchiveError, match=r"gone\.mcap: cannot be read: No such file"):
@@ -397,7 +396,7 @@ class TestBadInput:
             open_archive(tmp_path / "a.mcap")
 
     def test_an_archive_of_a_newer_profile_is_refused_by_version(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("hil.archive.file_writer.FORMAT_VERSION", 9)
+        monkeypatch.setattr("hil.archive.writer.FORMAT_VERSION", 9)
         write(tmp_path / NAME, records(5))
         with pytest.raises(ArchiveVersionError, match="version 9; this software reads version 1"):
             open_archive(tmp_path / NAME)
@@ -414,8 +413,8 @@ def test_an_archive_from_before_ages_were_known_is_still_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = records(300)
-    whole = definitions._CYCLE
-    monkeypatch.setattr(definitions, "_CYCLE", whole[: whole.index("uint16[8] age")])
+    whole = schema._CYCLE
+    monkeypatch.setattr(schema, "_CYCLE", whole[: whole.index("uint16[8] age")])
     path = write(tmp_path / NAME, rows)
     monkeypatch.undo()
     archive = open_archive(path)
@@ -428,9 +427,10 @@ def test_an_archive_from_before_ages_were_known_is_still_read(
 def test_the_documentation_shows_the_messages_as_they_are() -> None:
     page = Path(__file__).parents[2] / "docs" / "archive-format.md"
     text = page.read_text(encoding="utf-8")
-    for definition in (definitions.cycle(6), definitions.motor_current(6)):
+    profile = schema.profile(6)
+    for definition in (profile[topic].definition for topic in (schema.CYCLE, schema.MOTOR_CURRENT)):
         assert definition.partition("=" * 80)[0].strip() in text
     for topic in (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.EVENTS):
         assert f"`{topic}`" in text
-    assert f"version {schema.FORMAT_VERSION}" in text.splitlines()[0]
+    assert f"version {header.FORMAT_VERSION}" in text.splitlines()[0]
     assert all(f"`{kind}`" in text for kind in KINDS)

@@ -13,7 +13,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
-from hil.archive import Archive, ArchiveWriter, container, open_archive, schema
+from hil.archive import Archive, ArchiveWriter, container, header, open_archive, schema
 from hil.errors import ArchiveError
 
 JOINTS = ("a", "b")
@@ -81,7 +81,7 @@ def assert_nothing_lost(archive: Archive) -> None:
     assert len(archive.events) == EVENTS
     assert dict(archive.attachments) == ATTACHMENTS
     assert archive.outcome is not None
-    assert archive.outcome["outcome"] == "completed"
+    assert archive.outcome.entries["outcome"] == "completed"
 
 
 def chunk_ends(data: bytes, path: Path) -> list[int]:
@@ -332,5 +332,5 @@ def test_metadata_are_guarded_by_their_own_checksum(archive_bytes: bytes, tmp_pa
     assert archive_bytes.count(b"0.01") == 1
     changed = archive_bytes.replace(b"0.01", b"0.02")
     assert read_changed(changed, tmp_path / NAME) is None
-    assert schema.checksum({"a": "1", "b": "2"}) == schema.checksum({"b": "2", "a": "1"})
-    assert schema.checksum({"a": "1"}) != schema.checksum({"a": "2"})
+    assert header.checksum({"a": "1", "b": "2"}) == header.checksum({"b": "2", "a": "1"})
+    assert header.checksum({"a": "1"}) != header.checksum({"a": "2"})

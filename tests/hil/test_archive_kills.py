@@ -27,9 +27,8 @@ from drivers.exchange.shared_ring import _READ
 from drivers.record import cycle_dtype
 from hil.archive import ArchiveSpec, ArchiveWriter, open_archive
 from hil.archive.check import check_archive
-from hil.archive.commands import Open, Opened
 from hil.archive.repair import repair
-from hil.archive.supervised import ArchiveProcessHandle
+from hil.archive.supervised import ArchiveProcessHandle, Open, Opened
 
 PERIOD = 0.001
 FLUSH = 100  # cycles

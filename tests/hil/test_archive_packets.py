@@ -96,8 +96,8 @@ def test_a_recording_on_the_simulated_link_keeps_every_packet_of_both_ends(
     assert packets[inits[0]][3] == archive.attachments["init_packet.bin"]
     # One answer to each packet, in turns.
     assert [sent for _, sent, _, _ in packets] == [False, True] * (len(packets) // 2)
-    assert archive.outcome["packets"] == str(len(packets))
-    assert archive.outcome["packets_lost"] == "0"
+    assert archive.outcome.entries["packets"] == str(len(packets))
+    assert archive.outcome.entries["packets_lost"] == "0"
     assert check_archive(path).keeps, check_archive(path).faults
 
 
@@ -108,7 +108,7 @@ def test_the_cycles_are_those_of_an_archive_without_packets(tmp_path: Path, cell
     rich = open_archive(recorded(with_them, keeping_packets(cell)))
     poor = open_archive(recorded(without, cell))
     assert poor.outcome is not None
-    assert "packets" not in poor.outcome
+    assert poor.outcome.packets is None
     for name, column in poor.columns.items():
         assert column.tobytes() == rich.columns[name].tobytes(), name
     assert poor.events == rich.events
@@ -139,7 +139,7 @@ def test_a_recording_over_udp_keeps_every_packet_of_both_ends(tmp_path: Path, ce
     assert done.outcome == "completed"
     archive = open_archive(path)
     assert archive.outcome is not None
-    assert archive.outcome["packets_lost"] == "0"
+    assert archive.outcome.entries["packets_lost"] == "0"
     assert_decoded_packets_are_the_cycles(archive, path)
     first = next(packet for packet in packets_of(path) if len(packet[3]) == INIT_LENGTH)
     assert first[3] == archive.attachments["init_packet.bin"]

@@ -32,9 +32,16 @@ from drivers.exchange import (
 )
 from drivers.exchange import control as control_memory
 from hil.archive import Archive, ArchiveSpec, open_archive
-from hil.archive.commands import Answer, Channel, Close, Closed, Open, Opened
 from hil.archive.process import ArchiveProcess
-from hil.archive.supervised import ArchiveProcessHandle
+from hil.archive.supervised import (
+    Answer,
+    ArchiveProcessHandle,
+    Channel,
+    Close,
+    Closed,
+    Open,
+    Opened,
+)
 
 PERIOD = 0.001
 NAME = "excitation_000_a1.mcap"
@@ -133,7 +140,7 @@ def wait(for_what: Callable[[], bool]) -> None:
 def outcome(path: Path) -> tuple[str, str]:
     archive = whole(path)
     assert archive.outcome is not None
-    return archive.outcome["outcome"], archive.outcome["reason"]
+    return archive.outcome.entries["outcome"], archive.outcome.entries["reason"]
 
 
 def whole(path: Path) -> Archive:
@@ -168,7 +175,7 @@ def test_events_that_were_overwritten_are_counted_in_the_archive(rig: Rig) -> No
     assert done.events_lost > 0
     archive = whole(path)
     assert archive.outcome is not None
-    assert archive.outcome["events_lost"] == str(done.events_lost)
+    assert archive.outcome.entries["events_lost"] == str(done.events_lost)
     assert "EventsLost" in [event.name for event in archive.events]
 
 
@@ -185,7 +192,7 @@ def test_answers_late_and_not_taken_are_in_the_outcome(rig: Rig) -> None:
     assert (done.late, done.untaken) == (7, 2)
     kept = whole(path).outcome
     assert kept is not None
-    assert (kept["late_answers"], kept["answers_not_taken"]) == ("7", "2")
+    assert (kept.late_answers, kept.answers_not_taken) == (7, 2)
 
 
 def test_a_motion_that_was_never_asked_for_leaves_a_void_archive(rig: Rig) -> None:
@@ -297,8 +304,8 @@ def test_raw_packets_overwritten_as_the_archive_closes_are_counted(tmp_path: Pat
         process._close("completed", "")
     outcome = open_archive(tmp_path / NAME).outcome
     assert outcome is not None
-    assert int(outcome["packets_lost"]) + int(outcome["packets"]) == 30
-    assert outcome["packets_lost"] != "0"
+    assert int(outcome.entries["packets_lost"]) + outcome.packets == 30
+    assert outcome.entries["packets_lost"] != "0"
 
 
 def test_raw_packets_that_come_after_their_cycle_are_waited_for(tmp_path: Path) -> None:
@@ -314,7 +321,7 @@ def test_raw_packets_that_come_after_their_cycle_are_waited_for(tmp_path: Path) 
         late.join()
     outcome = open_archive(tmp_path / NAME).outcome
     assert outcome is not None
-    assert (outcome["packets"], outcome["packets_lost"]) == ("3", "0")
+    assert (outcome.packets, outcome.entries["packets_lost"]) == (3, "0")
 
 
 def test_raw_packets_that_never_come_are_not_waited_for_long(tmp_path: Path) -> None:

@@ -90,9 +90,9 @@ def test_an_archive_is_whole_in_itself(campaign: Campaign) -> None:
     assert set(archive.attachments) == {
         "cell.toml", "robot.urdf", "drive_train.json", "plan.json", "init_packet.bin"
     }  # fmt: skip
-    assert archive.metadata["simulated"] == "yes"
+    assert archive.header.entries["simulated"] == "yes"
     assert archive.outcome is not None
-    assert archive.outcome["outcome"] == "completed"
+    assert archive.outcome.entries["outcome"] == "completed"
 
 
 def test_the_commanded_motion_is_the_planned_one_and_keeps_the_limits(campaign: Campaign) -> None:
@@ -167,7 +167,7 @@ def test_a_stop_ends_the_motion_on_its_path_and_the_rest_is_resumed(
     stopped = open_archive(campaign.folder.archives / "move_000_a1.mcap")
     assert stopped.complete
     assert stopped.outcome is not None
-    assert stopped.outcome["outcome"] == "stopped"
+    assert stopped.outcome.entries["outcome"] == "stopped"
     assert np.abs(stopped.columns["velocity"][-1]).max() < 0.01  # three encoder counts a cycle
 
     again = Campaign.open(campaign.folder.root)

@@ -249,4 +249,4 @@ def test_ctrl_c_stops_the_arm_on_its_path_and_leaves_whole_archives(tmp_path: Pa
     archive = open_archive(last)
     assert archive.complete
     assert archive.outcome is not None
-    assert archive.outcome["outcome"] == "stopped"
+    assert archive.outcome.entries["outcome"] == "stopped"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.archive.names import motion_name
+from hil.archive.header import motion_name
 from hil.campaign import Campaign, MotionFailedError
 from hil.campaign.conduct import conduct_of
 from hil.campaign.dry_run import Acceptance, DryRun

@@ -41,7 +41,7 @@ def test_the_demo_runs_over_a_real_link_and_its_model_is_good(tmp_path: Path, li
     for path in campaign.folder.completed("excitation"):
         archive = open_archive(path)
         assert archive.outcome is not None
-        assert archive.outcome["records_lost"] == "0"
+        assert archive.outcome.entries["records_lost"] == "0"
 
 
 def test_a_simulated_controller_that_fails_says_why() -> None:

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from hil.archive import Samples, open_archive
+from hil.archive import ArchiveHeader, Findings, Samples, open_archive
 from hil.cli import app
 from hil.errors import SourceError
-from hil.importers import ColumnMap, Findings, Robot, import_log
-from hil.importers.findings import METADATA, clock_fault, examine
+from hil.importers import ColumnMap, Robot, import_log
+from hil.importers.findings import clock_fault, examine
 from tests.hil.simulated_logs import Simulated, simulate
 
 DEGREES = 57.29578
@@ -184,12 +184,14 @@ class TestCommand:
         assert "2000 samples in 19.99 s, 100 Hz" in result.stdout
         assert "warning: as mapped" in result.stdout
         assert 'write unit = "deg"' in result.stdout
-        metadata = open_archive(tmp_path / "log.mcap").metadata
-        assert metadata["use"] == "validation"
-        assert any("deg" in warning for warning in Findings.of(metadata).warnings)
-        assert json.loads(metadata["source"]) == ["log.npz"]
+        header = open_archive(tmp_path / "log.mcap").header
+        assert header.serves_as == "validation"
+        assert any("deg" in warning for warning in header.findings.warnings)
+        assert json.loads(header.entries["source"]) == ["log.npz"]
 
     def test_an_earlier_archive_gives_its_warnings_too(self) -> None:
         """They had another name in its metadata."""
         stored = json.dumps({"lines": ["a"], "doubts": ["b"]})
-        assert Findings.of({METADATA: stored}) == Findings(("a",), ("b",))
+        entries = {"kind": "imported", "joint_names": '["a"]', "attachments": "[]"}
+        found = ArchiveHeader.of({**entries, "findings": stored}).findings
+        assert found == Findings(lines=("a",), warnings=("b",))

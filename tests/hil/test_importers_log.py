@@ -289,7 +289,7 @@ class TestFilePerJoint:
         archive = open_archive(path)
         assert np.array_equal(archive.columns["position"], VALUES[:, 1:4])
         assert np.array_equal(archive.columns["torque"], VALUES[:, 4:])
-        assert "q_2.txt" in archive.metadata["source"]
+        assert "q_2.txt" in archive.header.entries["source"]
 
     def test_a_list_names_them_in_any_order(self, folder, robot):
         columns = column_map(

@@ -182,7 +182,7 @@ class TestImport:
         archive = open_archive(path)
         start = 1_700_000_000 * 10**9 + 123
         assert archive.columns["stamp"].tolist() == [start + 8_000_001 * i for i in range(5)]
-        assert archive.metadata["clock"] == "header"
+        assert archive.header.entries["clock"] == "header"
         assert open_recording(path).time.tolist() == pytest.approx(
             [8.000001e-3 * i for i in range(5)], abs=1e-15
         )
@@ -192,7 +192,7 @@ class TestImport:
         file = bag(tmp_path / "b.db3", {"/joint_states": (STATE, messages)})
         archive = open_archive(import_rosbag2(file, tmp_path / "a.mcap", robot=robot))
         assert archive.columns["stamp"].tolist() == [5, 13, 21]
-        assert archive.metadata["clock"] == "bag"
+        assert archive.header.entries["clock"] == "bag"
 
     def test_what_was_not_recorded_is_not_invented(self, tmp_path, robot):
         file = bag(tmp_path / "b.db3", {"/js": (STATE, [state(9, [1, 2]), state(10, [1, 3])])})
@@ -252,7 +252,7 @@ class TestImport:
         bag(folder / "bag_1.db3", {"/js": (STATE, messages[4:])})
         archive = open_archive(import_rosbag2(folder, tmp_path / "a.mcap", robot=robot))
         assert archive.n_samples == 6
-        assert archive.metadata["source"] == '["bag_0.db3", "bag_1.db3"]'
+        assert archive.header.entries["source"] == '["bag_0.db3", "bag_1.db3"]'
 
     def test_the_archive_says_where_it_comes_from(self, tmp_path, robot):
         file = bag(tmp_path / "b.db3", {"/js": (STATE, states())})

@@ -12,12 +12,13 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from hil.archive import container, index
+from hil.archive import container
 from hil.archive.cdr import ENCAPSULATION, LayoutError
 from hil.errors import SourceError
 from hil.importers import Robot, arrays, bags, import_rosbag2
 from hil.importers.arrays import layout_of, read_mcap
 from identification import FrictionLaw
+from tests.hil import mcap_bytes
 from tests.hil.test_importers_rosbag2 import STATE, URDF, bag, states
 
 TOPIC = "/joint_states"
@@ -139,7 +140,7 @@ def with_chunk(path: Path, body: bytes) -> None:
         records = list(container.records(stream, len(data)))
     first = next(record for record in records if record.opcode == container.CHUNK)
     path.write_bytes(
-        data[: first.offset] + index.record(container.CHUNK, body) + data[first.offset :]
+        data[: first.offset] + mcap_bytes.record(container.CHUNK, body) + data[first.offset :]
     )
 
 
@@ -164,7 +165,7 @@ class TestMcap:
         self, name: str, packed: bytes, claimed: int, tmp_path: Path
     ) -> None:
         path = chunked(tmp_path / "x.mcap", CompressionType.ZSTD)
-        head = struct.pack("<QQQI", 0, 0, claimed, 0) + index.text(name)
+        head = struct.pack("<QQQI", 0, 0, claimed, 0) + mcap_bytes.text(name)
         with_chunk(path, head + struct.pack("<Q", len(packed)) + packed)
         with pytest.raises(SourceError, match=r"claims|content size"):
             read_mcap(path)

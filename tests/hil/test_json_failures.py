@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hil.archive import Samples, write_samples
-from hil.archive.commands import Failed
+from hil.archive.supervised import Failed
 from hil.campaign import Campaign
 from hil.campaign.errors import write_error
 from hil.cli import COMMANDS, app, main
@@ -110,7 +110,7 @@ class TestDisk:
             raise refusal
 
         samples = Samples(np.arange(3) * 10**7, np.zeros((3, 1)))
-        monkeypatch.setattr("hil.archive.file_writer.os.write", refuse)
+        monkeypatch.setattr("hil.archive.writer.os.write", refuse)
         with pytest.raises(ArchiveWriteError) as caught:
             write_samples(tmp_path / "a.mcap", samples, joint_names=("a",), metadata={})
         assert exit_code_of(caught.value) == 1

@@ -65,8 +65,8 @@ def test_a_campaign_over_real_sockets_leaves_whole_gap_free_archives(tmp_path: P
         archive = open_archive(campaign.folder.archives / name)
         assert archive.complete
         assert archive.outcome is not None
-        assert archive.outcome["outcome"] == "completed"
-        assert archive.outcome["records_lost"] == "0"
+        assert archive.outcome.entries["outcome"] == "completed"
+        assert archive.outcome.entries["records_lost"] == "0"
         assert len(archive.attachments["init_packet.bin"]) == INIT_LENGTH
         columns = archive.columns
         # What is not in the file is in its gaps: cycles answered are cycles archived.
@@ -173,7 +173,7 @@ def test_a_refusal_comes_with_its_flight_recorder(
     assert 1 < len(recorder) <= 50
     archive = open_archive(campaign.folder.archives / campaign.folder.manifest()[-1].name)
     assert archive.outcome is not None
-    assert archive.outcome["outcome"] == "refused"
+    assert archive.outcome.entries["outcome"] == "refused"
     assert any(event.name == "Refused" for event in archive.events)
     assert recorder["cycle"][-1] in archive.columns["cycle"]
 

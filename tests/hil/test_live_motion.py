@@ -15,7 +15,7 @@ from drivers.motion_source import MotionSource
 from drivers.states import State
 from drivers.transports import TransportSpec, UdpSpec
 from hil.archive import ArchiveSpec, open_archive
-from hil.archive.live_view import LiveView, LiveViewError
+from hil.archive.live import LiveView, LiveViewError
 from hil.campaign import Stop
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.live_link import LiveLink
@@ -199,7 +199,7 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
             link.run(player, spec, Stop())
         told = open_archive(path).outcome
         assert told is not None
-        assert told["outcome"] == "void"
+        assert told.outcome == "void"
 
 
 @pytest.mark.slow  # waits for a real second of silence; test_heartbeat shows the rule by itself

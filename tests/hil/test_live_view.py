@@ -17,8 +17,7 @@ import pytest
 from drivers.drive_train import DriveTrain
 from drivers.events import GapSeen
 from drivers.record import cycle_dtype
-from hil.archive.commands import Serve
-from hil.archive.live_view import LiveView, LiveViewError
+from hil.archive.live import LiveView, LiveViewError, Serve
 
 pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
 pytest.importorskip("websockets", reason="websockets is not installed")

@@ -45,7 +45,7 @@ def test_the_arm_goes_home_and_every_cycle_is_archived(ns16: Cell, tmp_path: Pat
     archive = open_archive(str(summary["archive"]))
     assert archive.complete
     assert archive.kind == "move"
-    assert archive.metadata["simulated"] == "yes"
+    assert archive.header.entries["simulated"] == "yes"
     position = archive.columns["position"]
     np.testing.assert_allclose(position[0], ns16.initial, atol=1e-3)
     assert np.all(np.diff(archive.columns["cycle"]) == 1)
@@ -184,7 +184,7 @@ def test_over_udp_ctrl_c_brings_the_arm_to_rest_on_its_way(ns16: Cell, tmp_path:
     archive = open_archive(output)
     assert archive.complete
     assert archive.outcome is not None
-    assert archive.outcome["outcome"] == "stopped"
+    assert archive.outcome.entries["outcome"] == "stopped"
     sent = archive.columns["commanded_position"]
     sent = sent[np.isfinite(sent).all(axis=1)]
     share = (sent - ns16.initial) / (ns16.home - ns16.initial)

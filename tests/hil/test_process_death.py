@@ -198,7 +198,7 @@ def require_resumed(campaign: Campaign) -> None:
 
 def outcome_of(archive: Archive) -> tuple[str, str]:
     assert archive.outcome is not None
-    return archive.outcome["outcome"], archive.outcome["reason"]
+    return archive.outcome.entries["outcome"], archive.outcome.entries["reason"]
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ def test_every_cycle_from_the_first_on_is_archived_and_none_was_commanded(record
     archive = open_archive(recorded)
     assert archive.complete
     assert archive.outcome is not None
-    assert archive.outcome["records_lost"] == "0"
+    assert archive.outcome.entries["records_lost"] == "0"
     columns = archive.columns
     assert np.all(np.diff(columns["cycle"]) == 1)
     assert columns["state"][0] == State.DRIVE_OFF
@@ -69,7 +69,7 @@ def test_every_cycle_from_the_first_on_is_archived_and_none_was_commanded(record
 
 def test_the_archive_says_whose_motion_it_was_and_carries_the_init_packet(recorded: Path) -> None:
     archive = open_archive(recorded)
-    assert archive.metadata["motion"] == "controller"
+    assert archive.header.entries["motion"] == "controller"
     assert archive.kind == "excitation"
     assert set(archive.attachments) == {
         "cell.toml", "robot.urdf", "drive_train.json", "init_packet.bin"
@@ -144,7 +144,7 @@ def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> N
     assert sorted(set(steps.tolist())) == [1, 2]
     assert archive.columns["gap"].sum() == 1
     assert archive.outcome is not None
-    assert archive.outcome["lost_packets"] == "1"
+    assert archive.outcome.entries["lost_packets"] == "1"
 
 
 def test_a_refusal_is_shown_at_once_and_ends_the_recording_as_refused(
@@ -190,8 +190,8 @@ def test_a_controller_of_another_arm_is_not_recorded_unless_its_figures_are_acce
 
     attempt(accept_init=True)
     archive = open_archive(tmp_path / NAME)
-    assert archive.metadata["accepted_init"] == "yes"
-    assert "k65 of axis 6" in archive.metadata["accepted_init.differences"]
+    assert archive.header.entries["accepted_init"] == "yes"
+    assert "k65 of axis 6" in archive.header.entries["accepted_init.differences"]
     assert b"k65 = 0.045" in archive.attachments["cell.toml"]
     assert json.loads(archive.attachments["drive_train.json"])["k65"] == pytest.approx(0.035)
     # Joint angles in the file are those of the controller's figures.
@@ -282,8 +282,8 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
     assert summary["records_lost"] == summary["events_lost"] == 0
     assert summary["cycles"] == archive.n_samples
     assert archive.outcome is not None
-    assert archive.outcome["late_answers"] == str(summary["late"])
-    assert archive.outcome["answers_not_taken"] == str(summary["not_taken"])
+    assert archive.outcome.entries["late_answers"] == str(summary["late"])
+    assert archive.outcome.entries["answers_not_taken"] == str(summary["not_taken"])
     cycles = archive.columns["cycle"]
     assert archive.n_samples + archive.columns["gap"][1:].sum() == cycles[-1] - cycles[0] + 1
     assert np.isnan(archive.columns["commanded_position"]).all()
@@ -348,7 +348,7 @@ def test_a_session_that_ends_before_the_duration_is_over_is_told(
     assert "a.mcap" in words
     archive = open_archive(tmp_path / "a.mcap")
     assert archive.outcome is not None
-    assert archive.outcome["outcome"] == "completed"
+    assert archive.outcome.entries["outcome"] == "completed"
 
 
 def children(pid: int, module: str) -> int:
@@ -377,7 +377,7 @@ def test_a_killed_exchange_ends_a_recording_as_lost(
     assert "a.mcap" in errors
     outcome = open_archive(archive).outcome
     assert outcome is not None
-    assert (outcome["outcome"], outcome["reason"]) == ("lost", "the exchange process ended")
+    assert (outcome.outcome, outcome.reason) == ("lost", "the exchange process ended")
 
 
 @pytest.mark.slow

@@ -130,7 +130,7 @@ def test_lost_records_are_an_event_and_in_the_outcome(recorder: Recorder) -> Non
     recorder.take(cycles(17, 10), [], lost=7)
     archive = read(recorder)
     assert archive.outcome is not None
-    assert archive.outcome["records_lost"] == "7"
+    assert archive.outcome.entries["records_lost"] == "7"
     assert [event.text for event in archive.events] == ["7 records overwritten"]
 
 

@@ -83,7 +83,7 @@ def test_exactly_the_plan_is_run_noisy_and_with_a_faulty_link(designed: Campaign
     assert len(twin.folder.completed("excitation")) == 3
     assert len(twin.folder.completed("validation")) == len(designed.plan.validation)
     archives = [open_archive(twin.folder.archives / e.name) for e in twin.folder.manifest()]
-    assert all(archive.metadata["rehearsal"] == "yes" for archive in archives)
+    assert all(archive.header.entries["rehearsal"] == "yes" for archive in archives)
     assert sum(int(archive.columns["gap"].sum()) for archive in archives) > 0
 
 

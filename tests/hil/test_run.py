@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from drivers.transports import SimulatedTransport
 from hil.archive import open_archive
-from hil.archive.amend import amend_outcome
 from hil.archive.check import check_archive
+from hil.archive.repair import amend_outcome
 from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError
 from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import (
@@ -344,8 +344,8 @@ def test_a_repetition_that_was_slowed_is_rejected_with_its_reason_and_run_again(
     archive = open_archive(campaign.folder.archives / rejected.archive)
     assert archive.complete
     assert archive.outcome is not None
-    assert archive.outcome["outcome"] == "rejected"
-    assert archive.outcome["reason"] == rejected.reason
+    assert archive.outcome.entries["outcome"] == "rejected"
+    assert archive.outcome.entries["reason"] == rejected.reason
     # Whoever names all files of the folder does not pool it either.
     loose = sorted(campaign.folder.archives.glob("excitation_*"))
     sources = gather_sources(loose, split=0.5)
@@ -449,10 +449,10 @@ def test_an_amended_archive_keeps_its_content(tmp_path: Path, undisturbed: Campa
     after = open_archive(path)
     assert after.complete
     assert check_archive(path).keeps
-    assert after.outcome == {
-        **(before.outcome or {}), "outcome": "rejected", "reason": "something touched it"
+    assert after.outcome.entries == {
+        **before.outcome.entries, "outcome": "rejected", "reason": "something touched it"
     }  # fmt: skip
-    assert after.metadata == before.metadata
+    assert after.header.entries == before.header.entries
     assert after.attachments == before.attachments
     assert after.events == before.events
     for name, column in before.columns.items():

@@ -243,7 +243,7 @@ def test_the_link_says_which_kind_of_arm_moved_whatever_the_caller_says(
     campaign.run(twin, provenance=said, dry_run_only=True)
     monkeypatch.undo()
     first = next(campaign.folder.archives.iterdir())
-    kind = open_archive(first, fields=()).metadata.get("simulated")
+    kind = open_archive(first, fields=()).header.entries.get("simulated")
     assert kind == (None if said is None else "yes")
     real = Real(simulated_link(campaign.cell, instead_of_hardware=True))
     with pytest.raises(CampaignFolderError, match=r"holds archives of .*leads to a real one"):

@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from drivers.states import State
-from hil.archive import Archive, ArchiveName, open_archive
+from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.campaign.folder import Entry
 from hil.errors import ArchiveError
@@ -207,8 +207,8 @@ def _readable(one: Kept, seen: Seen) -> Iterator[str]:
     if found != one.cycles.size:
         yield f"{one.path.name}: {one.cycles.size} cycles, but {found} for the plain mcap reader"
     outcome = one.archive.outcome
-    if outcome is not None and outcome.get("records_lost", "0") != "0":
-        yield f"{one.path.name} says that {outcome['records_lost']} records were lost"
+    if outcome is not None and outcome.records_lost:
+        yield f"{one.path.name} says that {outcome.records_lost} records were lost"
 
 
 def _counted_plainly(path: Path, *, whole: bool) -> int:
@@ -247,8 +247,8 @@ def _outcome(one: Kept, seen: Seen) -> Iterator[str]:
     """A file that was completed says how its motion ended, and no less than what happened."""
     if one.archive.outcome is None:
         return
-    outcome = one.archive.outcome["outcome"]
-    if int(one.archive.outcome["samples"]) != one.cycles.size:
+    outcome = one.archive.outcome.entries["outcome"]
+    if int(one.archive.outcome.entries["samples"]) != one.cycles.size:
         yield f"{one.path.name} has {one.cycles.size} cycles and says {one.archive.outcome}"
     if outcome not in ("completed", "stopped", "void", "lost", "refused"):
         yield f"the outcome of {one.path.name} is {outcome}"
@@ -334,7 +334,7 @@ def _motions(kept: list[Kept], seen: Seen, campaign: Campaign) -> Iterator[str]:
             yield f"the motion of {one.path.name} left its path"
         ends = motion.sample(np.array([0.0, motion.duration]))[0]
         short = np.abs(commanded[-1] - commanded[0] - (ends[1] - ends[0])).max() > 1e-6
-        if short and (one.archive.outcome or {}).get("outcome") == "completed":
+        if short and (one.archive.outcome or ArchiveOutcome()).outcome == "completed":
             yield f"{one.path.name} is said to be completed, and its motion was not"
 
 

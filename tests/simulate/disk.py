@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from hil.archive import file_writer
+from hil.archive import writer
 from hil.campaign import folder as campaign_folder
 from hil.files import write_atomically
 from tests.simulate.script import Mishap, Script
@@ -145,7 +145,7 @@ def _span(mishap: Mishap) -> range:
 def planted(disk: Disk) -> Iterator[None]:
     """Everything that this thread archives goes through `disk`."""
     with ExitStack() as undo:
-        undo.enter_context(patch.object(file_writer, "os", disk))
+        undo.enter_context(patch.object(writer, "os", disk))
         undo.enter_context(
             patch.object(
                 campaign_folder,

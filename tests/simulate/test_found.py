@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drivers import State
 from drivers.exchange import exchange
 from drivers.transports import SimulatedTransport
-from hil.archive import ArchiveSpec, open_archive
+from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
 from hil.campaign import Link
 from hil.campaign import link as link_module
 from hil.campaign.intervals import START_TOLERANCE
@@ -75,7 +75,7 @@ def test_a_motion_whose_drive_goes_off_before_it_begins_is_not_waited_for_withou
     motion, spec = short_way(cell, where, tmp_path)
     with pytest.raises(ControllerFault, match="went off before the motion began; nothing was sent"):
         link.run(motion, spec, Stop())
-    assert (open_archive(spec.path).outcome or {})["outcome"] == "void"
+    assert (open_archive(spec.path).outcome or ArchiveOutcome()).outcome == "void"
 
 
 def test_a_motion_that_is_stopped_while_its_axes_open_leaves_them_closed(tmp_path: Path) -> None:
@@ -109,9 +109,10 @@ def test_a_repetition_in_which_a_joint_was_stuck_is_run_again(tmp_path: Path) ->
     seen = Stage(tmp_path).observed(4982, ["following-error@349x26:axis=1"])
     assert seen.complete
     assert seen.found is not None, seen.unidentified
-    first = open_archive(seen.folder / "archives" / "excitation_000_a1.mcap").outcome or {}
-    assert first["outcome"] == "rejected"
-    assert first["reason"].startswith("joint_1 is stuck: its position stays the same from 0.")
+    first = open_archive(seen.folder / "archives" / "excitation_000_a1.mcap").outcome
+    assert first is not None
+    assert first.outcome == "rejected"
+    assert first.reason.startswith("joint_1 is stuck: its position stays the same from 0.")
     assert "excitation_000_a2.mcap" in seen.found.pooled
 
 

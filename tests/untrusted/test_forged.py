@@ -8,16 +8,15 @@ import subprocess
 import sys
 import zlib
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
 
-from hil.archive import Archive
+from hil.archive import Archive, ArchiveHeader
 from hil.batch.cache import _HEAD, _MAGIC, _TEXT, Store, decoded, encoded
-from hil.identify.summary import _is_number
 from hil.study.analysis import class_of, plan_in
+
+HEADER = {"kind": "move", "joint_names": '["a"]', "attachments": "[]"}
 
 
 @pytest.mark.parametrize(
@@ -68,13 +67,17 @@ def test_a_kept_sum_that_somebody_forged_badly_counts_as_absent(
 
 @pytest.mark.parametrize("value", [10**400, True, float("nan"), float("inf"), "1", None])
 def test_planted_values_that_are_no_numbers_are_none(value: object) -> None:
-    assert _is_number(-1.5)
-    assert not _is_number(value)
+    def planted(of_x: object) -> object:
+        return ArchiveHeader.of({**HEADER, "planted": json.dumps({"x": of_x})}).planted
+
+    assert planted(-1.5) == {"x": -1.5}
+    assert planted(value) == {}
 
 
 @pytest.mark.parametrize("text", [b"[1]", b"{bad", b"[" * 100_000, b"\xff", b'{"trajectory": 3}'])
-def test_a_plan_that_is_none_tells_no_other_class(text: bytes) -> None:
-    told = plan_in(cast("Archive", SimpleNamespace(attachments={"plan.json": text})))
+def test_a_plan_that_is_none_tells_no_other_class(text: bytes, tmp_path: Path) -> None:
+    header = ArchiveHeader.of(HEADER)
+    told = plan_in(Archive(tmp_path, header, None, {"plan.json": text}, {}, (), None))
     assert class_of(told) == "fly-by"
 
 

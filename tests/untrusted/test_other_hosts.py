@@ -188,7 +188,7 @@ def went_on(told: Told) -> None:
     assert told.archive is not None
     assert told.archive.complete
     assert told.archive.outcome is not None
-    assert told.archive.outcome["lost_packets"] == "0"
+    assert told.archive.outcome.entries["lost_packets"] == "0"
 
 
 OWN = {

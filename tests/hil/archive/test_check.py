@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from hil.archive import Samples, container, schema, write_samples
+from hil.archive import Samples, container, header, schema, write_samples
 from hil.archive.check import ASPECTS, check_archive
 from hil.errors import NotAnArchiveError
 
@@ -79,7 +79,7 @@ class Content:
 
     @staticmethod
     def _describe(writer: Any, name: str, entries: dict[str, str]) -> None:
-        writer.add_metadata(name, {**entries, "checksum": schema.checksum(entries)})
+        writer.add_metadata(name, {**entries, "checksum": header.checksum(entries)})
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def content(written) -> Content:
         metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
     for entries in metadata.values():
         entries.pop("checksum")
-    del metadata["hil.outcome"][schema.CHUNKS]  # of chunks that are changed here
+    del metadata["hil.outcome"][header.CHUNKS]  # of chunks that are changed here
     return Content(messages, metadata["hil"], metadata["hil.outcome"], dict(written.attachments))
 
 

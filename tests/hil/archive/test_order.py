@@ -14,10 +14,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from drivers.record import cycle_dtype
-from hil.archive import ArchiveWriter, container, index, open_archive, schema
-from hil.archive.amend import amend_outcome
+from hil.archive import ArchiveWriter, container, header, open_archive, schema
 from hil.archive.check import check_archive
-from hil.archive.repair import repair
+from hil.archive.repair import amend_outcome, repair
+from tests.hil import mcap_bytes
 
 NAME = "validation_003_a1.mcap"
 
@@ -68,14 +68,14 @@ def earlier(data: bytes, path: Path) -> bytes:
     opcode, length = container.RECORD.unpack_from(data, at)
     body = data[at + container.RECORD.size : at + container.RECORD.size + length]
     name, entries = container.metadata(container.Record(at, opcode, body, length))
-    for key in (schema.CHUNKS, schema.DESCRIPTION, "checksum"):
+    for key in (header.CHUNKS, header.DESCRIPTION, "checksum"):
         del entries[key]
     path.parent.mkdir(parents=True, exist_ok=True)
-    entries["checksum"] = schema.checksum(entries)
-    path.write_bytes(data[:at] + index.metadata(name, entries))
+    entries["checksum"] = header.checksum(entries)
+    path.write_bytes(data[:at] + mcap_bytes.metadata(name, entries))
     done = repair(path, in_place=True)  # makes the index anew
     assert done.losses == ()
-    assert schema.CHUNKS.encode() + b"\x28" not in path.read_bytes()
+    assert header.CHUNKS.encode() + b"\x28" not in path.read_bytes()
     return path.read_bytes()
 
 
@@ -113,7 +113,7 @@ def test_an_archive_of_an_earlier_version_opens_as_before(ours, written, path):
     assert archive.complete
     assert archive.n_samples == 43
     assert archive.outcome is not None
-    assert schema.CHUNKS not in archive.outcome
+    assert header.CHUNKS not in archive.outcome.entries
     assert check_archive(path).keeps
     assert repair(path).whole
 
@@ -139,7 +139,7 @@ def test_cycles_that_two_chunks_claim_are_not_believed(ours, written, path):
     part = open_archive(path, start=50.1, stop=50.3)
     assert part.n_samples == 0
     assert not part.complete
-    listed = schema.CHUNKS.encode() + b"\x28" in ours
+    listed = header.CHUNKS.encode() + b"\x28" in ours
     assert_saved(path, written, [0, 2, 3, 4] if listed else [0])
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from drivers.packet_records import PACKET_DTYPE
 from drivers.record import cycle_dtype
-from hil.archive.pre_trigger_buffer import RECENT, Recent
+from hil.archive.process import RECENT, Recent
 
 
 def records(*cycles: int) -> NDArray[np.void]:

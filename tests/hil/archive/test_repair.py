@@ -15,7 +15,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from hil.archive import Samples, container, open_archive, rewrite, write_samples
+from hil.archive import Samples, container, open_archive, write_samples
+from hil.archive import repair as repairing
 from hil.archive.check import check_archive
 from hil.archive.repair import Repair, repair
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
@@ -48,14 +49,14 @@ def assert_sound(done: Repair, written) -> None:
     written.assert_true(archive)
     assert archive.outcome is not None
     if done.losses:
-        assert archive.outcome["repaired"] == "yes"
-        assert json.loads(archive.outcome["repaired.losses"]) == list(done.losses)
+        assert archive.outcome.entries["repaired"] == "yes"
+        assert json.loads(archive.outcome.entries["repaired.losses"]) == list(done.losses)
         lost = "unknown" if done.samples_lost is None else str(done.samples_lost)
-        assert archive.outcome["repaired.samples_lost"] == lost
+        assert archive.outcome.entries["repaired.samples_lost"] == lost
     else:
         assert archive.n_samples == 43
         assert len(archive.events) == 3
-        assert "repaired" not in archive.outcome
+        assert not archive.outcome.repaired
 
 
 def sweep(broken: Path, variants: Any, written) -> dict[str, int]:
@@ -119,7 +120,7 @@ class TestLoss:
         assert_sound(done, written)
         assert done.samples == 20
         assert done.samples_lost is None
-        outcome = open_archive(done.output).outcome
+        outcome = open_archive(done.output).outcome.entries
         assert outcome["outcome"] == "unknown"
         assert outcome["samples"] == "20"
 
@@ -131,7 +132,7 @@ class TestLoss:
         kept = [*range(10), *range(20, 43)]
         assert archive.columns["cycle"].tolist() == [5000 + index for index in kept]
         assert done.samples_lost == 10
-        assert archive.outcome["outcome"] == "completed"
+        assert archive.outcome.entries["outcome"] == "completed"
 
     def test_channels_are_found_in_the_index_where_the_first_chunk_is_lost(self, broken, written):
         done, _ = mended(broken, written.changed(written.chunks[0], -5))
@@ -169,7 +170,7 @@ class TestLoss:
         assert_sound(done, written)
         archive = open_archive(done.output)
         assert list(archive.attachments) == ["robot.urdf"]
-        assert "cell.toml" in archive.outcome["repaired.losses"]
+        assert "cell.toml" in archive.outcome.entries["repaired.losses"]
 
     def test_damage_after_a_repair_adds_to_what_was_lost(self, broken, written):
         _, first = mended(broken, written.changed(written.chunks[1], -5))
@@ -180,7 +181,7 @@ class TestLoss:
         data = bytearray(first)
         data[chunk.end - 5] ^= 0xFF
         done, _ = mended(broken, bytes(data))
-        outcome = open_archive(done.output).outcome
+        outcome = open_archive(done.output).outcome.entries
         assert outcome["samples"] == "23"
         assert outcome["repaired.samples_lost"] == "20"
         assert len(json.loads(outcome["repaired.losses"])) > len(done.losses)
@@ -263,7 +264,7 @@ class TestRefused:
     ):
         broken.write_bytes(written.data[:-100])
         torn = open_archive(broken)
-        monkeypatch.setattr(rewrite, "open_archive", lambda *_, **__: torn)
+        monkeypatch.setattr(repairing, "open_archive", lambda *_, **__: torn)
         with pytest.raises(ArchiveError, match=r"cannot be written anew.*restore it from a copy"):
             repair(broken)
         assert [path.name for path in broken.parent.iterdir()] == [broken.name]
@@ -308,11 +309,11 @@ def test_repairs_of_one_archive_at_once_do_not_meet(broken: Path, written, monke
     second: list[Repair] = []
 
     def meanwhile(path: object, **options: Any) -> Any:
-        monkeypatch.setattr(rewrite, "open_archive", open_archive)
+        monkeypatch.setattr(repairing, "open_archive", open_archive)
         second.append(repair(broken, in_place=True))
         return open_archive(path, **options)
 
-    monkeypatch.setattr(rewrite, "open_archive", meanwhile)
+    monkeypatch.setattr(repairing, "open_archive", meanwhile)
     first = repair(broken, in_place=True)
     assert broken.read_bytes() == written.data
     assert first.samples == second[0].samples == 43

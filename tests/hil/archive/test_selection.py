@@ -54,7 +54,7 @@ class TestTimes:
         archive = open_archive(written.path, start=50.1, stop=50.2)
         whole = open_archive(written.path)
         assert archive.attachments == whole.attachments
-        assert archive.metadata == whole.metadata
+        assert archive.header.entries == whole.header.entries
         assert archive.outcome == whole.outcome
         assert archive.complete
 

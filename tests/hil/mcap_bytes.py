@@ -1,0 +1,103 @@
+"""Bytes of MCAP files as tests make and change them; sound by their own checksums."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import zstandard
+from mcap.records import Attachment, Chunk, Metadata
+
+from hil.archive import container
+from hil.archive.chunk import ChunkParser
+from hil.archive.container import Record, encoded
+from hil.archive.mcap_writer import McapWriter, entries_of
+
+
+class Head(NamedTuple):
+    """Where a message stands in a chunk, and what precedes its data."""
+
+    channel: int
+    sequence: int
+    log_time: int
+    start: int
+    data: int
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    return container.RECORD.pack(opcode, len(body)) + body
+
+
+def text(value: str) -> bytes:
+    data = value.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def metadata(name: str, entries: Mapping[str, str]) -> bytes:
+    return encoded(Metadata(name, dict(entries)))
+
+
+def chunk(content: bytes, times: tuple[int, int] = (0, 0), level: int = 3) -> bytes:
+    packed = zstandard.compress(content, level)
+    return encoded(Chunk("zstd", packed, times[1], times[0], zlib.crc32(content), len(content)))
+
+
+def attachment(name: str, content: bytes) -> bytes:
+    return encoded(Attachment(0, 0, name, "", content))
+
+
+def heads(chunk: bytes) -> Iterator[Head]:
+    """The messages of a decompressed chunk."""
+    head = struct.Struct("<HIQQ")
+    for item in container.split(chunk, 0):
+        if item.opcode == container.MESSAGE:
+            channel, sequence, log_time, _ = head.unpack_from(item.body)
+            start = item.offset + container.RECORD.size
+            yield Head(channel, sequence, log_time, item.offset, start + head.size)
+
+
+COPIED = (container.METADATA, container.ATTACHMENT, container.SCHEMA, container.CHANNEL)
+
+
+class Indexed:
+    """A file that grows record by record, and gets an index that fits."""
+
+    def __init__(self) -> None:
+        self.data, self._parser = bytearray(container.MAGIC), ChunkParser()
+        self._writer = McapWriter(self.data.extend)
+        self._writer.position = len(self.data)
+
+    @property
+    def checksums(self) -> list[int]:
+        """Those of the chunks so far."""
+        return self._writer.checksums
+
+    def put(self, data: bytes) -> None:
+        """Append a record, given with its head."""
+        opcode, length = container.RECORD.unpack_from(data)
+        item = Record(len(self.data), opcode, data[container.RECORD.size :], length)
+        if opcode in (
+            container.METADATA,
+            container.ATTACHMENT,
+            container.SCHEMA,
+            container.CHANNEL,
+        ):
+            self._writer.copy(item)
+        elif opcode == container.CHUNK:
+            head = container.chunk(item)
+            content = container.chunk_data(item, decompressor=zstandard.ZstdDecompressor())
+            parser = ChunkParser()
+            found = parser.messages(content, item.offset)
+            for definition in parser.known.definitions:
+                self._writer.note(definition)
+            self._writer.add_chunk(head, entries_of(found))
+        else:
+            self.data += data
+            self._writer.position = len(self.data)
+
+    def ended(self) -> bytes:
+        """The file, whole."""
+        self._writer.finish()
+        return bytes(self.data)
