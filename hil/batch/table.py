@@ -10,7 +10,6 @@ import csv
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.util import find_spec
@@ -20,9 +19,11 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from hil.batch.types import Arm, BatchResult, LevelEstimate
+from hil.files import replacing
 from hil.timestamps import instant
 from hil.version import software
+
+from .types import Arm, BatchResult, LevelEstimate
 
 SCHEMA_VERSION: Final = 1
 """Raised when a column changes its meaning or goes; new columns do not raise it."""
@@ -122,7 +123,7 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
             "relative_error": relative_error(level.noise_std, level.torque_rms, level.samples),
             "unseen_relative_error": relative_error(level.unseen_rms, level.unseen_torque_rms),
             "method": level.method,
-            "doubts": "; ".join(level.doubts),
+            "doubts": "; ".join(level.warnings),
             "estimator": result.estimator,
             "settings": level.settings,
             "code": result.code,
@@ -240,7 +241,7 @@ def relative_error(
 
 def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
     columns = table.plain_columns
-    with _replaced(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         for row in table.rows(result):
@@ -281,7 +282,7 @@ def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
     )
     rows = table.rows(result)
     with (
-        _replaced(path) as temporary,
+        replacing(path) as temporary,
         pyarrow.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,
     ):
         while portion := list(islice(rows, _PORTION)):
@@ -294,17 +295,3 @@ def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
 
 def _cell(value: Any) -> Any:
     return value.encode("utf-8", "replace").decode("utf-8") if isinstance(value, str) else value
-
-
-@contextmanager
-def _replaced(path: Path) -> Iterator[Path]:
-    """A file to write in place of another, which is kept if the writing fails."""
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.unlink(missing_ok=True)  # in an untrusted folder it may be a link
-    try:
-        yield temporary
-        temporary.replace(path)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise

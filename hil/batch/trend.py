@@ -1,54 +1,90 @@
-"""What became of an arm: its parameters, axes and payload from campaign to campaign.
+"""What became of an arm: friction, torque error, parameters and payload from campaign to campaign.
 
-`trends` is pure; `write_trend` makes the page of it. What counts as a change, and how often that
-is said of an arm that has not changed, is in `docs/batch.md`.
+A robust control chart asks of each figure of an axis whether it could belong to the values before
+it. Location is their median and scale their Qn (Rousseeuw and Croux 1993), so that an odd value in
+the history neither moves the centre nor widens the limits. Values that departed are no history for
+later ones, unless `FEWEST` of them in a row stay on one side: they are a new level, by which later
+ones are judged. A value that belongs to an earlier level has returned to it. Scatter is that about
+all levels.
+
+The limits are Student's: Qn of n normal values is as uncertain as a standard deviation of about
+0.6 (n - 1) + 0.5 values, found by simulation (n = 5 to 30, tail 1e-2 and 1e-3, on the safe side).
+
+Drift is Kendall's rank correlation with time (Mann 1945), exact for few values, with the slope of
+Theil and Sen (Sen 1968). What counts as a change is in `docs/batch.md`.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import kendalltau, theilslopes
+from scipy.stats import t as student
 
-from hil.batch.axis_figures import friction_of, friction_weights
-from hil.batch.chart import Drift, Limits, chart, drift
-from hil.batch.payload_trend import LEAST_EFFECT, PayloadTrend, payload_trend
-from hil.batch.types import BatchResult, Broken, LevelEstimate
 from hil.timestamps import instant
 from identification import RobotModel
+from identification.factor.gram import Factor
+from identification.model.friction import Viscous
+
+from .payload import PayloadTrend, payload_trend
+from .types import BatchResult, Broken, LevelEstimate
 
 Array = NDArray[np.float64]
 
+FEWEST: Final = 5
+"""Earlier values without which nothing is judged, and values in a row that make a new level."""
 FALSE_ALARMS: Final = 0.01
-"""Share of campaigns of an unchanged arm of which any one of three rules says something: friction
+"""Share of campaigns of an unchanged arm in which any one of three rules finds a change: friction
 of an axis, torque error of an axis, payload. Each has a third, shared equally among the axes.
 The test for drift, which is made once for the whole history, has as much, shared likewise."""
-
 LEAST_FRICTION: Final = 0.05
-"""A change of friction by less than this share is not told, however certain."""
+"""A change of friction by less than this share is not reported, however certain."""
 LEAST_ERROR: Final = 0.10
 """The same of the torque error."""
-FILE_NAME: Final = "trend.html"
 
-_RULES = 3
-_DAY = 86400.0
+_RULES: Final = 3
+_DAY: Final = 86400.0
+_QN_NORMAL: Final = 2.2219
+_CONFIDENCE: Final = 0.95  # of the interval of a drift
+# Speed [rad/s, m/s] where the data cannot say how fast an axis went: it has no viscous friction.
+_ANY_SPEED: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where a value would be, judged by those before it.
+
+    Attributes:
+        centre: median of the earlier values.
+        low: lower limit, -inf or 0 where only a rise counts.
+        high: upper limit.
+        history: number of earlier values used.
+    """
+
+    centre: float
+    low: float
+    high: float
+    history: int
 
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """One figure of an axis over c campaigns.
+    """One figure over c campaigns, judged campaign by campaign.
 
     Attributes:
-        values: (c,) [N·m, N]; NaN where there is none.
+        values: (c,); NaN where there is none.
         stds: (c,); zero where only the scatter of the history is known.
-        limits: of each campaign by those before, None while these are too few.
-        departs: which campaigns are outside, and by enough to matter.
-        levels: see :class:`hil.batch.chart.Chart`.
+        limits: by the level that the value belongs to, or was expected at; None before there are
+            enough values.
+        departs: which values belong to no level that was known then, by enough to matter.
+        levels: number of the level that a value belongs to, from 0; -1 for one that is not known,
+            or departed and made no new level.
     """
 
     values: Array
@@ -58,10 +94,29 @@ class Watched:
     levels: tuple[int, ...]
 
     @property
-    def settled(self) -> NDArray[np.bool_]:
+    def at_last_level(self) -> NDArray[np.bool_]:
         """Campaigns at the level that was reached last (c,)."""
         known = [level for level in self.levels if level >= 0]
         return np.asarray(np.array(self.levels) == (known[-1] if known else 0))
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A slope in time.
+
+    Attributes:
+        slope: per unit of time.
+        low: lower end of its 95 % interval.
+        high: upper end.
+        p_value: of no drift, two-sided.
+        span: time from the first value to the last.
+    """
+
+    slope: float
+    low: float
+    high: float
+    p_value: float
+    span: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +131,7 @@ class AxisTrend:
         friction: mean of both directions.
         error: standard deviation of what the model leaves of the torque.
         drift: of the friction at the level reached last [unit per day, or per campaign]; None if
-            it cannot be told.
+            there are too few campaigns.
         drifts: whether that is more than chance, and enough to matter.
     """
 
@@ -118,7 +173,7 @@ class ArmTrend:
         dated: whether times are known. If not, campaigns are in the order of their names.
         setups: what the cells state that campaigns of one arm may differ in, in words.
         undated: folders of further campaigns, without a time, that are no part of the history.
-        doubts: what a reader must know of the archives.
+        warnings: what a reader must know of the archives.
     """
 
     name: str
@@ -131,20 +186,12 @@ class ArmTrend:
     payload: PayloadTrend
     setups: tuple[str, ...] = ()
     undated: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Trends:
-    """All arms of a batch, and what was not used for it.
-
-    Attributes:
-        arms: by name.
-        broken: what could not be used.
-        estimator: by name.
-        archives: that were fitted.
-        skipped: what is not meant to be used.
-    """
+    """All arms of a batch by name, what was not used for it, and how many archives were fitted."""
 
     arms: tuple[ArmTrend, ...]
     broken: tuple[Broken, ...]
@@ -153,25 +200,15 @@ class Trends:
     skipped: tuple[Broken, ...] = ()
 
 
-def write_trend(folder: Path, found: Trends) -> Path:
-    """Write the trend report of a batch into a folder, and return its path."""
-    # Figures need matplotlib, which is slow to import.
-    from hil.report.trend import write_trend_report
-
-    path = folder / FILE_NAME
-    write_trend_report(path, found)
-    return path
-
-
 def trends(result: BatchResult) -> Trends:
     """Find what changed on every arm of a batch."""
     found = []
     for digest, arm in sorted(result.arms.items(), key=lambda item: item[1].name):
         campaigns = [one for one in result.campaigns if one.arm == digest]
         if campaigns:
-            doubts = [text for one in result.pooled if one.arm == digest for text in one.doubts]
+            own = [text for one in result.pooled if one.arm == digest for text in one.warnings]
             trend = arm_trend(arm.name, arm.cell.model, campaigns)
-            found.append(replace(trend, doubts=tuple(dict.fromkeys(doubts))))
+            found.append(replace(trend, warnings=tuple(dict.fromkeys(own))))
     return Trends(
         tuple(found), result.broken, result.estimator, len(result.repetitions), result.skipped
     )
@@ -183,14 +220,21 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
     Campaigns without a time of recording are left out if others have one, since nobody knows where
     they belong. If none has, all are taken in the order of their folders' names.
     """
-    ordered, time, dated = _in_time(campaigns)
+    known = [(at.timestamp(), one) for one in campaigns if (at := instant(one.when)) is not None]
+    if known:
+        known.sort(key=lambda pair: (pair[0], pair[1].campaign))
+        ordered = [one for _, one in known]
+        time = (np.array([at for at, _ in known]) - known[0][0]) / _DAY
+    else:
+        ordered = sorted(campaigns, key=lambda one: _natural(one.campaign))
+        time = np.arange(1.0, len(ordered) + 1.0)
     within = {id(one) for one in ordered}
     return ArmTrend(
         name=name,
         campaigns=tuple(one.campaign for one in ordered),
         when=tuple(one.when for one in ordered),
         time=time,
-        dated=dated,
+        dated=bool(known),
         axes=_axes(model, ordered, time),
         parameters=tuple(
             ParameterTrend(
@@ -208,76 +252,110 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
     )
 
 
-def _in_time(
-    campaigns: Sequence[LevelEstimate],
-) -> tuple[list[LevelEstimate], Array, bool]:
-    """Campaigns with a time, and their days; if none has one, all by name, and their numbers."""
-    known = [(at.timestamp(), one) for one in campaigns if (at := instant(one.when)) is not None]
-    if not known:
-        named = sorted(campaigns, key=lambda one: _natural(one.campaign))
-        return named, np.arange(1.0, len(named) + 1.0), False
-    known.sort(key=lambda pair: (pair[0], pair[1].campaign))
-    time = np.array([at for at, _ in known])
-    return [one for _, one in known], (time - time[:1]) / _DAY, True
-
-
 def _natural(name: str) -> list[tuple[int, str]]:
     """Names in the order that people count in: the ninth before the tenth."""
     parts = re.split(r"([0-9]+)", name)
     return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
 
 
+# Friction and torque error of the axes
+
+
+def speed_rms(model: RobotModel, factor: Factor) -> Array:
+    """Root mean square speed per axis (n,) [rad/s, m/s], from the columns of viscous friction.
+
+    That of the motor where only the coupled motor has friction; NaN where no column is a speed.
+    """
+    squares = np.full(model.n_joints, np.nan)
+    for k, term in enumerate(model.friction.terms):
+        if isinstance(term.term, Viscous) and (not term.motor or np.isnan(squares[term.owner])):
+            column = model.base.rank + k
+            squares[term.owner] = factor.gram[term.owner, column, column]
+    rows = factor.samples
+    return np.where(rows > 0, np.sqrt(squares / np.maximum(rows, 1)), np.nan)
+
+
+def friction_weights(model: RobotModel, speed: Array) -> Array:
+    """Weights G (n, p): ``G @ values`` is the friction of each axis at a speed [N·m, N].
+
+    The mean of forwards and backwards, so that an offset and a difference by direction are no
+    part of it. Where coupled motors have friction, that of the axis' own motor counts as well.
+
+    Args:
+        model: the robot.
+        speed: of each axis (n,) [rad/s, m/s], above zero; NaN for half a radian or metre a second.
+    """
+    weights = np.zeros((model.n_joints, model.n_parameters))
+    for k, term in enumerate(model.friction.terms):
+        own = float(speed[term.owner])
+        at = own if math.isfinite(own) and own > 0.0 else _ANY_SPEED
+        forwards, backwards = term.term.column(np.array([at, -at]), np.array([1.0, -1.0]))
+        weights[term.owner, model.base.rank + k] = 0.5 * (forwards - backwards)
+    return weights
+
+
+def friction_of(values: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:
+    """Friction of each axis and its standard deviation, each (n,) [N·m, N].
+
+    NaN for an axis without friction, or with a coefficient that the data do not determine.
+
+    Args:
+        values: parameters (p,).
+        covariance: (p, p), infinite variances of what is undetermined.
+        weights: (n, p), see :func:`friction_weights`.
+    """
+    known = np.isfinite(np.diag(covariance))
+    finite = np.where(np.isfinite(covariance), covariance, 0.0)
+    variance = np.einsum("ji,ik,jk->j", weights, finite, weights)
+    whole = weights.any(axis=1) & ~weights[:, ~known].any(axis=1)
+    value = np.where(whole, weights @ values, np.nan)
+    return value, np.where(whole, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+
+
 def _axes(
     model: RobotModel, campaigns: Sequence[LevelEstimate], time: Array
 ) -> tuple[AxisTrend, ...]:
-    speed = _reference_speed(model, campaigns)
+    # One speed per axis for the whole history: the median of what the campaigns had.
+    speeds = [one.speed_rms for one in campaigns if one.speed_rms is not None]
+    speed = np.full(model.n_joints, np.nan)
+    for j in range(model.n_joints):
+        known = [row[j] for row in speeds if np.isfinite(row[j])]
+        speed[j] = np.median(known) if known else np.nan
     weights = friction_weights(model, speed)
-    friction, stds = (
-        np.array(columns)
-        for columns in zip(*(_friction_of(one, weights) for one in campaigns), strict=True)
-    )
+    each = [
+        friction_of(
+            one.values,
+            np.diag(one.std**2) if one.covariance is None else one.covariance,
+            weights,
+        )
+        for one in campaigns
+    ]
+    friction, stds = (np.array(columns) for columns in zip(*each, strict=True))
     error = np.array([one.noise_std for one in campaigns])
     share = FALSE_ALARMS / _RULES / model.n_joints
     found = []
     for j, joint in enumerate(model.joint_names):
         turns = bool(model.chain.revolute[j])
-        friction_watch = _friction(friction[:, j], stds[:, j], share)
-        slope = _drift(time, friction_watch)
+        known = np.abs(friction[np.isfinite(friction[:, j]), j])
+        least = LEAST_FRICTION * (float(np.median(known)) if len(known) else 0.0)
+        watched = chart(friction[:, j], stds[:, j], share, least=least)
+        # At one level: a step is no drift.
+        slope = drift(time, np.where(watched.at_last_level, watched.values, np.nan))
         found.append(
             AxisTrend(
                 joint=joint,
                 unit="N·m" if turns else "N",
                 speed=float(speed[j]),
                 speed_unit="rad/s" if turns else "m/s",
-                friction=friction_watch,
+                friction=watched,
                 error=_error(error[:, j], share),
                 drift=slope,
-                drifts=_matters(slope, friction[:, j], FALSE_ALARMS / model.n_joints),
+                drifts=slope is not None
+                and slope.p_value < FALSE_ALARMS / model.n_joints
+                and abs(slope.slope) * slope.span >= least,
             )
         )
     return tuple(found)
-
-
-def _friction_of(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
-    covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
-    return friction_of(level.values, covariance, weights)
-
-
-def _reference_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Array:
-    """One speed per axis (n,) for the whole history: the median of what the campaigns had."""
-    speeds = [one.speed_rms for one in campaigns if one.speed_rms is not None]
-    found = np.full(model.n_joints, np.nan)
-    for j in range(model.n_joints):
-        known = [float(row[j]) for row in speeds if np.isfinite(row[j])]
-        if known:
-            found[j] = np.median(known)
-    return found
-
-
-def _friction(values: Array, stds: Array, share: float) -> Watched:
-    least = LEAST_FRICTION * _size(values)
-    judged = chart(values, stds, share, least=least)
-    return Watched(values, stds, judged.limits, judged.departs, judged.levels)
 
 
 def _error(values: Array, share: float) -> Watched:
@@ -287,45 +365,138 @@ def _error(values: Array, share: float) -> Watched:
     """
     with np.errstate(divide="ignore"):
         logarithm = np.where(values > 0.0, np.log(values), np.nan)
-    nothing = np.zeros(len(values))
-    judged = chart(logarithm, nothing, share, least=float(np.log1p(LEAST_ERROR)), rise_only=True)
+    least = float(np.log1p(LEAST_ERROR))
+    judged = chart(logarithm, np.zeros(len(values)), share, least=least, rise_only=True)
     limits = tuple(
-        None
-        if band is None
-        else Limits(float(np.exp(band.centre)), 0.0, float(np.exp(band.high)), band.history)
+        band and replace(band, centre=math.exp(band.centre), low=0.0, high=math.exp(band.high))
         for band in judged.limits
     )
-    return Watched(values, nothing, limits, judged.departs, judged.levels)
+    return replace(judged, values=values, limits=limits)
 
 
-def _drift(time: Array, friction: Watched) -> Drift | None:
-    """Slope at one level: a step is no drift."""
-    return drift(time, np.where(friction.settled, friction.values, np.nan))
+# The chart
 
 
-def _matters(slope: Drift | None, values: Array, share: float) -> bool:
-    if slope is None or not slope.p_value < share:
-        return False
-    return bool(abs(slope.slope) * slope.span >= LEAST_FRICTION * _size(values))
+def chart(
+    values: Array,
+    stds: Array,
+    share: float,
+    *,
+    least: float = 0.0,
+    rise_only: bool = False,
+) -> Watched:
+    """Judge each value by those before it that did not depart themselves.
+
+    Args:
+        values: in order of time (n,); NaN where there is none.
+        stds: standard deviations that they came with (n,).
+        share: of values beyond the limits if nothing has changed.
+        least: smallest departure from the centre that matters.
+        rise_only: whether only values above the history count.
+    """
+    known = Levels(values, stds, 2.0 * share if rise_only else share, [[]])
+    now, away = 0, list[int]()
+    found: list[Limits | None] = []
+    departs, levels = [False] * len(values), [-1] * len(values)
+    for k, value in enumerate(values):
+        expected = known.limits(now, float(stds[k]))
+        if not math.isfinite(value):
+            found.append(expected)
+            continue
+        home = known.home(k, now, least, rise_only=rise_only)
+        if home is not None:
+            now, levels[k], away = home, home, []
+            found.append(known.limits(home, float(stds[k])))
+            known.members[home].append(k)
+            continue
+        assert expected is not None
+        found.append(expected)
+        departs[k] = True
+        if away and (value > expected.centre) != (values[away[-1]] > expected.centre):
+            away = []
+        away.append(k)
+        if len(away) == FEWEST:
+            now = len(known.members)
+            known.members.append(away)
+            for one in away:
+                levels[one] = now
+            away = []
+    if rise_only:
+        found = [band and replace(band, low=-math.inf) for band in found]
+    return Watched(values, stds, tuple(found), tuple(departs), tuple(levels))
 
 
-def _size(values: Array) -> float:
-    known = np.abs(values[np.isfinite(values)])
-    return float(np.median(known)) if len(known) else 0.0
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Levels of a history, which scatter alike.
+
+    Attributes:
+        values: (n,).
+        stds: standard deviations that they came with (n,); zero where unknown.
+        share: of values beyond the limits if nothing has changed.
+        members: places of the values of each level.
+    """
+
+    values: Array
+    stds: Array
+    share: float
+    members: list[list[int]]
+
+    def limits(self, level: int, std: float) -> Limits | None:
+        """Where a value with a standard deviation would be if it belonged to a level."""
+        own = self.members[level]
+        if len(own) < FEWEST:
+            return None
+        centre = float(np.median(self.values[own]))
+        every = np.concatenate(self.members)
+        residuals = np.concatenate(
+            [self.values[one] - np.median(self.values[one]) for one in self.members]
+        )
+        # Each level has taken its own median from its residuals.
+        spare = len(every) - len(self.members)
+        scatter = qn_scale(residuals) * math.sqrt((len(every) - 1) / spare)
+        typical = float(np.median(self.stds[every]))
+        # Few values may lie close together by chance, but not closer than each is known.
+        scale = max(scatter, typical)
+        # A campaign of fewer repetitions than usual is known less well than the history scatters.
+        one = scale**2 + max(0.0, std**2 - typical**2)
+        spread = math.sqrt(one + scale**2 * math.pi / (2.0 * len(own)))
+        reach = float(student.isf(self.share / 2.0, 0.6 * spare - 0.5)) * spread
+        return Limits(centre, centre - reach, centre + reach, len(own))
+
+    def home(self, k: int, now: int, least: float, *, rise_only: bool) -> int | None:
+        """The level that a value belongs to: the present one rather than those before it."""
+        value, std = float(self.values[k]), float(self.stds[k])
+        for level in (now, *(one for one in reversed(range(len(self.members))) if one != now)):
+            band = self.limits(level, std)
+            if band is None or band.low <= value <= band.high or abs(value - band.centre) < least:
+                return level
+        below = value < float(np.median(self.values[self.members[now]]))
+        return now if rise_only and below else None
 
 
-__all__ = [
-    "FALSE_ALARMS",
-    "LEAST_EFFECT",
-    "LEAST_ERROR",
-    "LEAST_FRICTION",
-    "ArmTrend",
-    "AxisTrend",
-    "ParameterTrend",
-    "PayloadTrend",
-    "Trends",
-    "Watched",
-    "arm_trend",
-    "trends",
-    "write_trend",
-]
+def qn_scale(values: Array) -> float:
+    """Qn, a robust standard deviation: a low quantile of all distances between two values.
+
+    Half of the values (n,) may be anything.
+    """
+    n = len(values)
+    if n < 2:
+        return 0.0
+    first, second = np.triu_indices(n, 1)
+    half = n // 2 + 1
+    place = half * (half - 1) // 2 - 1
+    distance = np.partition(np.abs(values[first] - values[second]), place)[place]
+    correction = n / (n + (1.4 if n % 2 else 3.8))
+    return float(_QN_NORMAL * correction * distance)
+
+
+def drift(time: Array, values: Array) -> Drift | None:
+    """Slope of values (n,) in time (n,), None for fewer than `FEWEST` or one instant."""
+    known = np.isfinite(values)
+    at, own = time[known], values[known]
+    if len(own) < FEWEST or np.ptp(at) == 0.0 or np.ptp(own) == 0.0:
+        return None
+    slope, _, low, high = theilslopes(own, at, _CONFIDENCE)
+    p_value = float(kendalltau(at, own).pvalue)
+    return Drift(float(slope), float(low), float(high), p_value, float(np.ptp(at)))

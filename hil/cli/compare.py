@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 import typer
 
-from hil.batch.local import LocalWorkers
+from hil.batch.workers import LocalWorkers
 from hil.compare import compare_campaigns, gather
 from hil.compare.record import to_dict
 from hil.compare.words import caveat, told, verdict

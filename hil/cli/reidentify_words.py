@@ -10,9 +10,9 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
+from hil.batch.findings import findings, summary
 from hil.batch.table import relative_error
 from hil.batch.trend import ArmTrend, Trends
-from hil.batch.trend_words import findings, summary
 from hil.batch.types import Arm, BatchResult, Broken, LevelEstimate
 from hil.plural import counted
 
@@ -62,8 +62,8 @@ def _arm_lines(
         if several and (before is None or before.setup != one.setup):
             yield f"    stated: {one.setup or 'nothing'}"
         yield _campaign_line(one, above)
-    for doubt in dict.fromkeys(doubt for one in pooled for doubt in one.doubts):
-        yield f"  note: {doubt}"
+    for warning in dict.fromkeys(text for one in pooled for text in one.warnings):
+        yield f"  note: {warning}"
     if trend is not None:
         for finding in findings(trend):
             if finding.level == "alarm":
@@ -186,7 +186,7 @@ def _level(one: LevelEstimate) -> dict[str, Any]:
             name: {"value": float(value), "std": float(std) if math.isfinite(std) else None}
             for name, value, std in zip(one.names, one.values, one.std, strict=True)
         },
-        "doubts": list(one.doubts),
+        "doubts": list(one.warnings),
     }
 
 

@@ -9,11 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.batch.axis_figures import friction_of, friction_weights
 from hil.batch.estimates import errors
-from hil.batch.payload_trend import PayloadTrend, freedom_of, payload_trend
-from hil.batch.trend import FALSE_ALARMS, LEAST_FRICTION
-from hil.batch.trend_words import short_names
+from hil.batch.findings import short_names
+from hil.batch.payload import PayloadTrend, freedom_of, payload_trend
+from hil.batch.trend import FALSE_ALARMS, LEAST_FRICTION, friction_of, friction_weights
 from hil.batch.types import LevelEstimate
 from identification import RobotModel
 
@@ -159,7 +158,7 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
     own = tuple(
         f"{name}: {doubt}"
         for name, one in zip(called, campaigns, strict=True)
-        for doubt in one.doubts
+        for doubt in one.warnings
     )
     return Comparison(
         arm=gathered.arm.name,

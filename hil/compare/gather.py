@@ -9,7 +9,8 @@ from typing import Final
 
 from hil.archive import open_archive
 from hil.batch import run
-from hil.batch.factors import cell_in, local_file, opened
+from hil.batch.factors import cell_in, opened
+from hil.batch.remote import local_file
 from hil.batch.types import ArchiveRef, Arm, Broken, LevelEstimate
 from hil.batch.workers import Workers
 from hil.cell import Cell

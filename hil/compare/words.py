@@ -8,9 +8,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from hil.batch.chart import FEWEST
-from hil.batch.trend import LEAST_FRICTION, ArmTrend
-from hil.batch.trend_words import campaign_name, payload_findings
+from hil.batch.findings import campaign_name, payload_findings
+from hil.batch.trend import FEWEST, LEAST_FRICTION, ArmTrend
 
 from .comparison import AxisChange, Comparison
 

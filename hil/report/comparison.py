@@ -7,7 +7,8 @@ import string
 from dataclasses import dataclass
 from typing import Any
 
-from hil.batch.trend import FALSE_ALARMS, LEAST_EFFECT, LEAST_FRICTION
+from hil.batch.payload import LEAST_EFFECT
+from hil.batch.trend import FALSE_ALARMS, LEAST_FRICTION
 from hil.compare import words
 from hil.compare.comparison import AxisChange, Comparison, ParameterChange
 from hil.compare.spread import FEWEST, Known

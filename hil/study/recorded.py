@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive, foreign_json, open_archive
-from hil.batch.keys import arm_digest
-from hil.batch.trend_words import short_names
+from hil.batch.cache import arm_digest
+from hil.batch.findings import short_names
 from hil.campaign import CampaignFolderError
 from hil.cell import Cell
 from hil.compare.gather import apart

@@ -11,8 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hil.batch.axis_figures import speed_rms
-from hil.batch.trend import ArmTrend, arm_trend
+from hil.batch.trend import ArmTrend, arm_trend, speed_rms
 from hil.batch.types import LevelEstimate
 from hil.cell import Cell
 from identification import Motion, RobotModel

@@ -39,7 +39,7 @@ def result() -> BatchResult:
         std=undetermined,
         undetermined=(one.names[3],),
         when="",
-        doubts=("stood still at first", "two gaps"),
+        warnings=("stood still at first", "two gaps"),
     )
     pooled = replace(one, level="pooled", campaign="", unseen_rms=0.1 * one.torque_rms)
     return BatchResult(

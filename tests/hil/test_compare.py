@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from hil.batch.local import LocalWorkers
 from hil.batch.types import Arm, LevelEstimate
+from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign, CampaignPlan
 from hil.campaign.quick_design import design
 from hil.cell import Cell
@@ -133,7 +133,7 @@ def test_one_campaign_or_two_arms_are_refused_before_anything_is_estimated(
     def estimated(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("hil.batch.run.Work", estimated)
+    monkeypatch.setattr("hil.batch.run._Batch", estimated)
     for pair in ("march", "march"), ("march", "other"):
         with pytest.raises(InputError):
             compared(*(folders[name] for name in pair))

@@ -154,7 +154,7 @@ def _band(axes: Axes, arm: ArmTrend, watched: Watched, low: float, high: float) 
 
 def _slope(axes: Axes, arm: ArmTrend, axis: AxisTrend) -> None:
     assert axis.drift is not None
-    known = np.flatnonzero(axis.friction.settled)
+    known = np.flatnonzero(axis.friction.at_last_level)
     middle = float(np.median(arm.time[known]))
     centre = float(np.median(axis.friction.values[known]))
     ends = arm.time[known[[0, -1]]]
