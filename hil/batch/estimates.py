@@ -24,10 +24,10 @@ from identification.factor.estimation import Estimate, mark_undetermined, nothin
 from identification.factor.gram import Factor
 from identification.factor.phases import PhaseFactor
 from identification.factor.qr import QR_CONDITION
+from identification.model.friction import Viscous
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 
-from .trend import speed_rms
 from .types import ArchiveRef, BatchEstimator, Level, LevelEstimate, Summary
 
 Array = NDArray[np.float64]
@@ -303,6 +303,40 @@ def errors(factor: Factor, values: Array) -> tuple[Array, Array]:
     squares = np.einsum("i,jik,k->j", augmented, factor.gram, augmented)
     rows = np.where(factor.samples > 0, factor.samples, np.nan)
     return np.sqrt(np.maximum(squares, 0.0) / rows), _torque_rms(factor)
+
+
+def relative_error(
+    error: Array,
+    torque: Array,
+    rows: NDArray[np.intp] | None = None,
+) -> float:
+    """Error over torque, root of the sums of squares over all joints; NaN where unknown.
+
+    Args:
+        error: RMS or standard deviation per joint (n,).
+        torque: RMS per joint (n,).
+        rows: of each joint (n,); equally many if left out.
+    """
+    count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
+    known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
+    if not known.any():
+        return math.nan
+    whole = float(count[known] @ torque[known] ** 2)
+    return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
+
+
+def speed_rms(model: RobotModel, factor: Factor) -> Array:
+    """Root mean square speed per axis (n,) [rad/s, m/s], from the columns of viscous friction.
+
+    That of the motor where only the coupled motor has friction; NaN where no column is a speed.
+    """
+    squares = np.full(model.n_joints, np.nan)
+    for k, term in enumerate(model.friction.terms):
+        if isinstance(term.term, Viscous) and (not term.motor or np.isnan(squares[term.owner])):
+            column = model.base.rank + k
+            squares[term.owner] = factor.gram[term.owner, column, column]
+    rows = factor.samples
+    return np.where(rows > 0, np.sqrt(squares / np.maximum(rows, 1)), np.nan)
 
 
 def _torque_rms(factor: Factor) -> Array:

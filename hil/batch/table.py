@@ -17,12 +17,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import numpy as np
-
 from hil.files import replacing
 from hil.timestamps import instant
 from hil.version import software
 
+from .estimates import relative_error
 from .types import Arm, BatchResult, LevelEstimate
 
 SCHEMA_VERSION: Final = 1
@@ -217,26 +216,6 @@ TABLES: Final = (
     ),
     Table("not_used", {"path": "text", "kind": "text", "reason": "text"}, _unused_rows),
 )
-
-
-def relative_error(
-    error: np.ndarray[Any, np.dtype[np.float64]],
-    torque: np.ndarray[Any, np.dtype[np.float64]],
-    rows: np.ndarray[Any, np.dtype[np.intp]] | None = None,
-) -> float:
-    """Error over torque, root of the sums of squares over all joints; NaN where unknown.
-
-    Args:
-        error: RMS or standard deviation per joint (n,).
-        torque: RMS per joint (n,).
-        rows: of each joint (n,); equally many if left out.
-    """
-    count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
-    known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
-    if not known.any():
-        return math.nan
-    whole = float(count[known] @ torque[known] ** 2)
-    return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
 
 
 def _write_csv(path: Path, table: Table, result: BatchResult) -> None:

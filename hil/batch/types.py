@@ -242,7 +242,7 @@ class LevelEstimate:
         method: in words.
         settings: digest of the settings; "" where campaigns with different ones are pooled.
         warnings: what a reader must know.
-        speed_rms: per axis (n,), see :func:`hil.batch.trend.speed_rms`; None for a repetition.
+        speed_rms: per axis (n,), see :func:`hil.batch.estimates.speed_rms`; None for a repetition.
         information: weighted Gram matrix (p, p) of the fitted rows; None for a repetition.
         setup: what the cell states that archives of one arm may differ in, in words; "" if
             nothing, or if campaigns with different ones are pooled.

@@ -13,7 +13,6 @@ import typer
 from hil.batch import run
 from hil.batch.cache import code_digest
 from hil.batch.table import write_tables
-from hil.batch.trend import Trends, trends
 from hil.batch.types import BatchEstimator, BatchResult
 from hil.batch.workers import TIMEOUT, LocalWorkers, Workers
 from hil.cli import reidentify_words as words
@@ -27,6 +26,7 @@ from hil.cli.identify_options import (
     VelocityOption,
     options_from,
 )
+from hil.compare.trend import Trends, trends
 from hil.files import make_folder, writing_to
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter

@@ -10,10 +10,10 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
-from hil.batch.findings import findings, summary
-from hil.batch.table import relative_error
-from hil.batch.trend import ArmTrend, Trends
+from hil.batch.estimates import relative_error
 from hil.batch.types import Arm, BatchResult, Broken, LevelEstimate
+from hil.compare.findings import findings, summary
+from hil.compare.trend import ArmTrend, Trends
 from hil.plural import counted
 
 _LISTED: Final = 20

@@ -9,15 +9,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.batch.estimates import errors
-from hil.batch.findings import short_names
-from hil.batch.payload import PayloadTrend, freedom_of, payload_trend
-from hil.batch.trend import FALSE_ALARMS, LEAST_FRICTION, friction_of, friction_weights
+from hil.batch.estimates import errors, relative_error
 from hil.batch.types import LevelEstimate
 from identification import RobotModel
 
 from .gather import Gathered
+from .payload import PayloadTrend, freedom_of, payload_trend
 from .spread import Difference, Known, difference, holm, known
+from .trend import (
+    FALSE_ALARMS,
+    LEAST_FRICTION,
+    friction_in,
+    friction_weights,
+    short_names,
+    typical_speed,
+)
 
 Array = NDArray[np.float64]
 
@@ -176,9 +182,9 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
 
 def _axes(model: RobotModel, gathered: Gathered) -> tuple[AxisChange, ...]:
     campaigns, repetitions = gathered.campaigns, gathered.repetitions
-    speed = _typical_speed(model, campaigns)
+    speed = typical_speed(model, campaigns)
     weights = friction_weights(model, speed)
-    pooled = [friction_of(one.values, _covariance(one), weights) for one in campaigns]
+    pooled = [friction_in(one, weights) for one in campaigns]
     single = [_per_repetition(own, weights) for own in repetitions]
     rows = [
         tuple(
@@ -255,24 +261,7 @@ def _differences(row: Sequence[Known]) -> tuple[Difference | None, ...]:
 
 def _per_repetition(own: Sequence[LevelEstimate], weights: Array) -> Array:
     """Friction of each axis by each repetition (m, n)."""
-    return np.array(
-        [friction_of(one.values, np.diag(one.std**2), weights)[0] for one in own]
-    ).reshape(len(own), len(weights))
-
-
-def _covariance(level: LevelEstimate) -> Array:
-    return np.diag(level.std**2) if level.covariance is None else level.covariance
-
-
-def _typical_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Array:
-    """One speed for each axis (n,), the median of what the campaigns had; NaN if none has one."""
-    speeds = np.array([one.speed_rms for one in campaigns if one.speed_rms is not None])
-    found = np.full(model.n_joints, np.nan)
-    for j in range(model.n_joints):
-        own = speeds[:, j][np.isfinite(speeds[:, j])] if len(speeds) else speeds
-        if len(own):
-            found[j] = np.median(own)
-    return found
+    return np.array([friction_in(one, weights)[0] for one in own]).reshape(len(own), len(weights))
 
 
 def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction:
@@ -288,9 +277,7 @@ def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction
                 continue  # what it cannot know may be needed there
             left, torque = errors(motion.unseen, one.values)
             joints[row, column] = left / np.where(torque > 0.0, torque, np.nan)
-            overall[row, column] = np.sqrt(
-                np.nansum(rows * left**2) / max(float(np.nansum(rows * torque**2)), 1e-300)
-            )
+            overall[row, column] = relative_error(left, torque, rows)
     return Prediction(overall, joints)
 
 

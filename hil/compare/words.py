@@ -8,10 +8,9 @@ from typing import Final, Literal
 
 import numpy as np
 
-from hil.batch.findings import campaign_name, payload_findings
-from hil.batch.trend import FEWEST, LEAST_FRICTION, ArmTrend
-
 from .comparison import AxisChange, Comparison
+from .findings import payload_findings
+from .trend import FEWEST, LEAST_FRICTION, campaign_names
 
 _LEAST: Final = f"{100.0 * LEAST_FRICTION:g} %"
 _PREDICTS_WORSE: Final = 1.1
@@ -35,8 +34,7 @@ class Told:
 
 def names(found: Comparison) -> list[str]:
     """What each campaign is called: the last part of its folder, and its day."""
-    arm = _as_history(found)
-    return [campaign_name(arm, k) for k in range(len(found.campaigns))]
+    return campaign_names(found.campaigns, days=found.dated)
 
 
 def verdict(found: Comparison) -> str:
@@ -66,7 +64,7 @@ def told(found: Comparison) -> list[Told]:
         for k in range(1, len(called))
         if axis.changed[k]
     ]
-    for finding in payload_findings(_as_history(found)):
+    for finding in payload_findings(found.payload, called):
         level: Literal["changed", "same"] = "same" if finding.level == "quiet" else "changed"
         every.append(Told(level, finding.words, finding.next_step))
     every += _slight(found, called)
@@ -172,21 +170,6 @@ def _predictions(found: Comparison, called: list[str]) -> list[Told]:
             )
         )
     return sentences
-
-
-def _as_history(found: Comparison) -> ArmTrend:
-    """The campaigns as sentences on payloads want them."""
-    return ArmTrend(
-        name=found.arm,
-        campaigns=tuple(one.campaign for one in found.campaigns),
-        when=tuple(one.when for one in found.campaigns),
-        time=np.arange(float(len(found.campaigns))),
-        dated=found.dated,
-        axes=(),
-        parameters=(),
-        payload=found.payload,
-        setups=tuple(one.setup for one in found.campaigns),
-    )
 
 
 def _listed(words: list[str]) -> str:

@@ -7,11 +7,11 @@ import string
 from dataclasses import dataclass
 from typing import Any
 
-from hil.batch.payload import LEAST_EFFECT
-from hil.batch.trend import FALSE_ALARMS, LEAST_FRICTION
 from hil.compare import words
 from hil.compare.comparison import AxisChange, Comparison, ParameterChange
+from hil.compare.payload import LEAST_EFFECT
 from hil.compare.spread import FEWEST, Known
+from hil.compare.trend import FALSE_ALARMS, LEAST_FRICTION
 from hil.report import numbers
 from hil.report.figures.comparison import friction_panels
 from hil.report.rendering import Numbering, environment, page_bytes

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from hil.batch.findings import Finding, campaign_folder, findings, summary
-from hil.batch.payload import LEAST_EFFECT, Statement, Verdict
-from hil.batch.trend import (
+from hil.compare.findings import Finding, findings, summary
+from hil.compare.payload import LEAST_EFFECT, Statement, Verdict
+from hil.compare.trend import (
     FALSE_ALARMS,
     FEWEST,
     LEAST_ERROR,
@@ -178,7 +178,7 @@ def _campaign_row(arm: ArmTrend, k: int) -> CampaignRow:
         f"{axis.joint} ({' and '.join(what)})" for axis in arm.axes if (what := _what(axis, k))
     ]
     return CampaignRow(
-        name=campaign_folder(arm, k),
+        name=arm.labels[k],
         when=arm.when[k][:16].replace("T", " ") if arm.dated else numbers.MISSING,
         mass=_with_std(float(payload.mass[k]), float(payload.mass_std[k])),
         p_value=numbers.MISSING if change is None else numbers.significant(change.p_value, 2),

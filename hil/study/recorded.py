@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from hil.archive import Archive, foreign_json, open_archive
 from hil.batch.cache import arm_digest
-from hil.batch.findings import short_names
 from hil.campaign import CampaignFolderError
 from hil.cell import Cell
 from hil.compare.gather import apart
+from hil.compare.trend import short_names
 from hil.errors import InputError
 from hil.identify.sources import cell_of
 from hil.identify.summary import planted_in

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import subprocess
 import sys
@@ -40,6 +41,7 @@ from hil.campaign import Campaign
 from hil.errors import InputError
 from hil.identify.options import FIXED
 from hil.progress import Silent
+from hil.version import install_command
 from tests.hil import batch_work as work
 from tests.hil.dask_cluster import Cluster, running
 from tests.hil.web_folder import served
@@ -377,7 +379,7 @@ def test_nothing_of_dask_is_imported_before_it_is_asked_for() -> None:
 
 def test_without_dask_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_cluster, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match=r"pip install 'hil\[cluster\]'"):
+    with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
         DaskWorkers("tcp://127.0.0.1:9", identity=work.identity)
 
 

@@ -18,9 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kendalltau
 
-from hil.batch import payload
-from hil.batch.findings import findings, shifts, summary
-from hil.batch.trend import (
+from hil.batch.types import Broken
+from hil.compare import payload
+from hil.compare.findings import findings, shifts, summary
+from hil.compare.trend import (
     FALSE_ALARMS,
     FEWEST,
     ArmTrend,
@@ -34,7 +35,6 @@ from hil.batch.trend import (
     friction_weights,
     qn_scale,
 )
-from hil.batch.types import Broken
 from hil.report.trend import render_trend_report, write_trend_report
 from identification.model.payload import Payload
 

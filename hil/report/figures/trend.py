@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from hil.batch.trend import ArmTrend, AxisTrend, ParameterTrend, Watched
+from hil.compare.trend import ArmTrend, AxisTrend, ParameterTrend, Watched
 from hil.report import numbers
 from hil.report.figures.canvas import TICK_SIZE, blank, headed, place, ruled
 from hil.report.figures.palette import BAND, FIRST, MUTED, OUTSIDE_3, SECOND

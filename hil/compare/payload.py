@@ -33,11 +33,10 @@ from scipy.optimize import brentq
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
+from hil.batch.types import LevelEstimate
 from identification import RobotModel
 from identification.model.payload import Payload
 from identification.model.wrench import LINK_SYMBOLS
-
-from .types import LevelEstimate
 
 Array = NDArray[np.float64]
 

@@ -27,13 +27,11 @@ from numpy.typing import NDArray
 from scipy.stats import kendalltau, theilslopes
 from scipy.stats import t as student
 
+from hil.batch.types import BatchResult, Broken, LevelEstimate
 from hil.timestamps import instant
 from identification import RobotModel
-from identification.factor.gram import Factor
-from identification.model.friction import Viscous
 
 from .payload import PayloadTrend, payload_trend
-from .types import BatchResult, Broken, LevelEstimate
 
 Array = NDArray[np.float64]
 
@@ -171,7 +169,8 @@ class ArmTrend:
         when: of each, ISO 8601, "" where unknown.
         time: (c,) [days since the first]; number of the campaign where no time is known.
         dated: whether times are known. If not, campaigns are in the order of their names.
-        setups: what the cells state that campaigns of one arm may differ in, in words.
+        labels: see `campaign_names`.
+        names: the same with their days, if known.
         undated: folders of further campaigns, without a time, that are no part of the history.
         warnings: what a reader must know of the archives.
     """
@@ -184,7 +183,8 @@ class ArmTrend:
     axes: tuple[AxisTrend, ...]
     parameters: tuple[ParameterTrend, ...]
     payload: PayloadTrend
-    setups: tuple[str, ...] = ()
+    labels: tuple[str, ...]
+    names: tuple[str, ...]
     undated: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -247,7 +247,8 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
             for k in range(model.n_parameters)
         ),
         payload=payload_trend(model, ordered, FALSE_ALARMS / _RULES),
-        setups=tuple(one.setup for one in ordered),
+        labels=tuple(campaign_names(ordered)),
+        names=tuple(campaign_names(ordered, days=bool(known))),
         undated=tuple(one.campaign for one in campaigns if id(one) not in within),
     )
 
@@ -258,21 +259,34 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
 
 
-# Friction and torque error of the axes
+def campaign_names(campaigns: Sequence[LevelEstimate], *, days: bool = False) -> list[str]:
+    """Campaigns as people call them: the last part of the folder, and if wanted the day.
 
-
-def speed_rms(model: RobotModel, factor: Factor) -> Array:
-    """Root mean square speed per axis (n,) [rad/s, m/s], from the columns of viscous friction.
-
-    That of the motor where only the coupled motor has friction; NaN where no column is a speed.
+    Where a folder holds several campaigns also what their cells state.
     """
-    squares = np.full(model.n_joints, np.nan)
-    for k, term in enumerate(model.friction.terms):
-        if isinstance(term.term, Viscous) and (not term.motor or np.isnan(squares[term.owner])):
-            column = model.base.rank + k
-            squares[term.owner] = factor.gram[term.owner, column, column]
-    rows = factor.samples
-    return np.where(rows > 0, np.sqrt(squares / np.maximum(rows, 1)), np.nan)
+    folders = [one.campaign for one in campaigns]
+    names = []
+    for k, name in enumerate(short_names(folders)):
+        name = name or f"campaign {k + 1}"
+        if folders.count(folders[k]) > 1:
+            name += f", {campaigns[k].setup or 'nothing stated'}"
+        names.append(f"{name} ({campaigns[k].when[:10]})" if days else name)
+    return names
+
+
+def short_names(folders: Sequence[str]) -> list[str]:
+    """The end of each folder's path that no other one of them ends with: mostly its last part."""
+    paths = [folder.rstrip("/") for folder in folders]
+    return [_short(path, [f"/{other}" for other in paths if other != path]) for path in paths]
+
+
+def _short(path: str, others: Sequence[str]) -> str:
+    parts = path.split("/")
+    ends = ("/".join(parts[-count:]) for count in range(1, len(parts)))
+    return next((end for end in ends if not any(o.endswith(f"/{end}") for o in others)), path)
+
+
+# Friction and torque error of the axes
 
 
 def friction_weights(model: RobotModel, speed: Array) -> Array:
@@ -312,24 +326,25 @@ def friction_of(values: Array, covariance: Array, weights: Array) -> tuple[Array
     return value, np.where(whole, np.sqrt(np.maximum(variance, 0.0)), np.nan)
 
 
+def friction_in(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
+    """Friction of each axis by one estimate, see :func:`friction_of`."""
+    covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
+    return friction_of(level.values, covariance, weights)
+
+
+def typical_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Array:
+    """One speed for each axis (n,), the median of what the campaigns had; NaN if none has one."""
+    speeds = [one.speed_rms for one in campaigns if one.speed_rms is not None]
+    columns = [[row[j] for row in speeds if np.isfinite(row[j])] for j in range(model.n_joints)]
+    return np.array([np.median(own) if own else np.nan for own in columns])
+
+
 def _axes(
     model: RobotModel, campaigns: Sequence[LevelEstimate], time: Array
 ) -> tuple[AxisTrend, ...]:
-    # One speed per axis for the whole history: the median of what the campaigns had.
-    speeds = [one.speed_rms for one in campaigns if one.speed_rms is not None]
-    speed = np.full(model.n_joints, np.nan)
-    for j in range(model.n_joints):
-        known = [row[j] for row in speeds if np.isfinite(row[j])]
-        speed[j] = np.median(known) if known else np.nan
+    speed = typical_speed(model, campaigns)
     weights = friction_weights(model, speed)
-    each = [
-        friction_of(
-            one.values,
-            np.diag(one.std**2) if one.covariance is None else one.covariance,
-            weights,
-        )
-        for one in campaigns
-    ]
+    each = [friction_in(one, weights) for one in campaigns]
     friction, stds = (np.array(columns) for columns in zip(*each, strict=True))
     error = np.array([one.noise_std for one in campaigns])
     share = FALSE_ALARMS / _RULES / model.n_joints

@@ -13,7 +13,7 @@ import numpy as np
 from hil.plural import counted as plural
 from identification.model.payload import Payload
 
-from .payload import Change, Statement, Verdict
+from .payload import Change, PayloadTrend, Statement, Verdict
 from .trend import FEWEST, ArmTrend, AxisTrend, Watched
 
 Level = Literal["alarm", "past", "quiet"]
@@ -60,7 +60,7 @@ class Finding:
 
 def findings(arm: ArmTrend) -> tuple[Finding, ...]:
     """What was found of an arm, what concerns its last campaign first; never empty."""
-    found = payload_findings(arm)
+    found = payload_findings(arm.payload, arm.names)
     for axis in arm.axes:
         found += _shift_findings(arm, axis, axis.friction, "friction")
         found += _shift_findings(arm, axis, axis.error, "torque error")
@@ -84,35 +84,6 @@ def summary(arm: ArmTrend) -> str:
     if len(arm.campaigns) <= FEWEST:
         return "no change found, but too few campaigns to judge the axes"
     return "as before"
-
-
-# Names of campaigns
-
-
-def campaign_name(arm: ArmTrend, k: int) -> str:
-    """A campaign as the page calls it: the last part of its folder, and its day."""
-    name = campaign_folder(arm, k)
-    return f"{name} ({arm.when[k][:10]})" if arm.dated else name
-
-
-def campaign_folder(arm: ArmTrend, k: int) -> str:
-    """The last part of its folder, and what its cell states where a folder holds several."""
-    name = short_names(arm.campaigns)[k] or f"campaign {k + 1}"
-    if arm.campaigns.count(arm.campaigns[k]) == 1:
-        return name
-    return f"{name}, {arm.setups[k] or 'nothing stated'}"
-
-
-def short_names(folders: Sequence[str]) -> list[str]:
-    """The end of each folder's path that no other one of them ends with: mostly its last part."""
-    paths = [folder.rstrip("/") for folder in folders]
-    return [_short(path, [f"/{other}" for other in paths if other != path]) for path in paths]
-
-
-def _short(path: str, others: Sequence[str]) -> str:
-    parts = path.split("/")
-    ends = ("/".join(parts[-count:]) for count in range(1, len(parts)))
-    return next((end for end in ends if not any(o.endswith(f"/{end}") for o in others)), path)
 
 
 # Friction and torque error
@@ -191,11 +162,11 @@ def _shift_words(arm: ArmTrend, axis: AxisTrend, shift: Shift, what: str) -> tup
     if what == "friction" and math.isfinite(axis.speed):
         at = f" at {axis.speed:.2g} {axis.speed_unit}"
     if shift.first == shift.last:
-        when = f" in {campaign_name(arm, shift.first)}"
+        when = f" in {arm.names[shift.first]}"
     elif shift.lasts:
-        when = f", since {campaign_name(arm, shift.first)}"
+        when = f", since {arm.names[shift.first]}"
     else:
-        when = f", from {campaign_name(arm, shift.first)} to {campaign_name(arm, shift.last)}"
+        when = f", from {arm.names[shift.first]} to {arm.names[shift.last]}"
     value, before = f"{shift.value:.3g}", f"{shift.before:.3g} {axis.unit}"
     if shift.kind == "returns":
         words = f"has returned to an earlier level of {what}{at}: {value} after {before}{when}."
@@ -220,7 +191,7 @@ def _drift_findings(arm: ArmTrend, axis: AxisTrend) -> list[Finding]:
     per, low, high = (100.0 * one * scale / size for one in (slope.slope, slope.low, slope.high))
     total = 100.0 * slope.slope * slope.span / size
     first = int(np.flatnonzero(axis.friction.at_last_level)[0])
-    over = f"since {campaign_name(arm, first)}" if first else "over all campaigns"
+    over = f"since {arm.names[first]}" if first else "over all campaigns"
     words = (
         f"Friction of {axis.joint} {'rises' if per > 0 else 'falls'} steadily: {per:+.2g} %"
         f" {unit} (95 %: {low:+.2g} to {high:+.2g}), {total:+.0f} % {over}."
@@ -240,18 +211,18 @@ def _per(arm: ArmTrend, span: float) -> tuple[str, float]:
 # Payload
 
 
-def payload_findings(arm: ArmTrend) -> list[Finding]:
+def payload_findings(payload: PayloadTrend, names: Sequence[str]) -> list[Finding]:
     """What was found of what an arm carries, campaign by campaign."""
-    payload, last = arm.payload, len(arm.payload.changes) - 1
+    last = len(payload.changes) - 1
     found = []
     for k, change in enumerate(payload.changes):
         statement = payload.statements[k]
         level: Level = "alarm" if k == last else "past"
         if statement is not None:
-            found.append(_statement_finding(arm, k, statement, level))
+            found.append(_statement_finding(names[k], statement, level))
         if change is None or not (payload.changed[k] or payload.other[k]):
             continue
-        where = f"between {campaign_name(arm, k - 1)} and {campaign_name(arm, k)}"
+        where = f"between {names[k - 1]} and {names[k]}"
         if payload.changed[k]:
             beside = "" if statement is None else ", beside what is stated,"
             words = f"What the arm carries{beside} has changed {where}: {_what(change)}."
@@ -266,10 +237,10 @@ def payload_findings(arm: ArmTrend) -> list[Finding]:
     return found
 
 
-def _statement_finding(arm: ArmTrend, k: int, statement: Statement, level: Level) -> Finding:
+def _statement_finding(name: str, statement: Statement, level: Level) -> Finding:
     """A payload that a cell states is no discovery; whether the torques agree is."""
     words = (
-        f"From {campaign_name(arm, k)} on the cell states {_load(statement.after)} instead of"
+        f"From {name} on the cell states {_load(statement.after)} instead of"
         f" {_load(statement.before)}; {_VERDICTS[statement.verdict]}."
     )
     if statement.verdict != "differs":
@@ -334,7 +305,7 @@ def _order_findings(arm: ArmTrend) -> list[Finding]:
         return []
     words = (
         "No campaign has a time of recording: they are taken in the order of their folders'"
-        f" names, from {campaign_name(arm, 0)} to {campaign_name(arm, len(arm.campaigns) - 1)}."
+        f" names, from {arm.names[0]} to {arm.names[len(arm.campaigns) - 1]}."
         " If that is not the order of time, before and after mean nothing here."
     )
     return [Finding("quiet", words)]
