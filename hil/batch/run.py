@@ -542,7 +542,7 @@ def _setups(keys: Collection[GroupKey]) -> list[str]:
         for setup, count in sorted(counts.items())
     )
     return [
-        f"pooled over campaigns whose cells state different things, known and taken off: {stated}"
+        f"pooled over campaigns whose cells state different things, known and compensated: {stated}"
     ]
 
 

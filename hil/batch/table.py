@@ -15,7 +15,7 @@ from datetime import datetime
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 from hil.files import replacing
 from hil.timestamps import instant
@@ -49,21 +49,9 @@ class Table:
     rows: Callable[[BatchResult], Iterator[Row]]
 
     @property
-    def plain_columns(self) -> list[str]:
+    def csv_columns(self) -> list[str]:
         """Those that CSV has: all but lists."""
         return [name for name, kind in self.columns.items() if kind != "numbers"]
-
-
-_ESTIMATE_COLUMNS: Final[Mapping[str, Kind]] = {
-    "level": "text",
-    "arm": "text",
-    "arm_digest": "text",
-    "campaign": "text",
-    "setup": "text",
-    "archive": "text",
-    "archive_sha256": "text",
-    "when": "time",
-}
 
 
 def write_tables(folder: Path, result: BatchResult) -> list[Path]:
@@ -171,55 +159,38 @@ def _unused_rows(result: BatchResult) -> Iterator[Row]:
             yield {"path": one.path, "kind": kind, "reason": one.reason}
 
 
+def _columns(text: str) -> dict[str, Kind]:
+    """Columns from their names, each with its kind behind a colon unless that is text."""
+    pairs = (one.partition(":") for one in text.split())
+    return {name: cast(Kind, kind or "text") for name, _, kind in pairs}
+
+
+_ESTIMATE: Final = "level arm arm_digest campaign setup archive archive_sha256 when:time"
 TABLES: Final = (
     Table(
         "parameters",
-        {
-            **_ESTIMATE_COLUMNS,
-            "parameter": "text",
-            "kind": "text",
-            "axis": "text",
-            "unit": "text",
-            "value": "number",
-            "std": "number",
-            "low": "number",
-            "high": "number",
-            "determined": "truth",
-            "archives": "count",
-            "samples": "count",
-            "condition": "number",
-            "relative_error": "number",
-            "unseen_relative_error": "number",
-            "method": "text",
-            "doubts": "text",
-            "estimator": "text",
-            "settings": "text",
-            "code": "text",
-            "software": "text",
-            "covariance": "numbers",
-        },
+        _columns(
+            f"{_ESTIMATE} parameter kind axis unit value:number std:number low:number high:number "
+            "determined:truth archives:count samples:count condition:number relative_error:number "
+            "unseen_relative_error:number method doubts estimator settings code software "
+            "covariance:numbers"
+        ),
         _parameter_rows,
     ),
     Table(
         "axes",
-        {
-            **_ESTIMATE_COLUMNS,
-            "axis": "text",
-            "unit": "text",
-            "samples": "count",
-            "torque_rms": "number",
-            "error_std": "number",
-            "unseen_torque_rms": "number",
-            "unseen_error_rms": "number",
-        },
+        _columns(
+            f"{_ESTIMATE} axis unit samples:count torque_rms:number error_std:number "
+            "unseen_torque_rms:number unseen_error_rms:number"
+        ),
         _axis_rows,
     ),
-    Table("not_used", {"path": "text", "kind": "text", "reason": "text"}, _unused_rows),
+    Table("not_used", _columns("path kind reason"), _unused_rows),
 )
 
 
 def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
-    columns = table.plain_columns
+    columns = table.csv_columns
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
@@ -235,10 +206,7 @@ def _as_text(value: Any) -> Any:
         return value.isoformat()
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, str):
-        # A file name may hold bytes that are no text.
-        return value.encode("utf-8", "replace").decode("utf-8")
-    return value
+    return _clean(value)
 
 
 def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
@@ -266,11 +234,12 @@ def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
     ):
         while portion := list(islice(rows, _PORTION)):
             arrays = [
-                pyarrow.array([_cell(row[name]) for row in portion], types[kind])
+                pyarrow.array([_clean(row[name]) for row in portion], types[kind])
                 for name, kind in table.columns.items()
             ]
             writer.write_table(pyarrow.Table.from_arrays(arrays, schema=schema))
 
 
-def _cell(value: Any) -> Any:
+def _clean(value: Any) -> Any:
+    """Without the bytes in a file name that are no text."""
     return value.encode("utf-8", "replace").decode("utf-8") if isinstance(value, str) else value

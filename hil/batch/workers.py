@@ -127,6 +127,12 @@ def sum_tree(terms: Sequence[T | None], add: Callable[[T, T], T]) -> T | None:
     return sums.result()
 
 
+def joined(parts: Sequence[Summed[T, S]], add: Callable[[T, T], T]) -> Summed[T, S]:
+    """The sum of successive runs of tasks, each a whole branch of the tree."""
+    notes = tuple(note for part in parts for note in part.notes)
+    return Summed(sum_tree([part.total for part in parts], add), notes)
+
+
 def summed(parts: Sequence[Part[T, S] | Broken], add: Callable[[T, T], T]) -> Summed[T, S]:
     """What comes of the tasks of one group."""
     return Summed(

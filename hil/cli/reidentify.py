@@ -66,7 +66,7 @@ def reidentify(
         str | None,
         typer.Option(
             metavar="FOLDER|none",
-            help="Where factors are kept. If left out: in .hil-cache beside the archives, or below "
+            help="Where factors are cached. If left out: .hil-cache beside the archives, or below "
             "the user's cache folder where those cannot be written to.",
             show_default=False,
         ),
@@ -91,12 +91,12 @@ def reidentify(
 ) -> None:
     """Identify every arm from all archives below some folders, campaign by campaign.
 
-    What an archive contributes is kept, so that a second run, by another estimator or with more
-    archives, reads only what is new. Ctrl-C loses nothing that was kept.
+    What an archive contributes is cached, so that a second run, by another estimator or with more
+    archives, reads only what is new. Ctrl-C loses nothing of the cache.
 
     Exit status: 0 every archive that is meant to be fitted was used, 5 some could not be (they are
-    listed with the reason), 2 there is nothing to fit. What is not meant to be fitted, such as
-    moves, motions that were stopped, and copies, is left alone, and counted by reason.
+    reported with the reason), 2 there is nothing to fit. What is not meant to be fitted, such as
+    moves, motions that were stopped, and copies, is left alone, and summed up by reason.
     """
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:

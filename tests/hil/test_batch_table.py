@@ -149,7 +149,7 @@ def test_parquet_has_the_same_rows_with_types(folder: Path) -> None:
         typed = read.to_pylist()
         assert len(plain) == len(typed)
         for text, row in zip(plain, typed, strict=True):
-            assert all(same(text[name], row[name]) for name in one.plain_columns), text
+            assert all(same(text[name], row[name]) for name in one.csv_columns), text
 
 
 def same(text: str, value: object) -> bool:
