@@ -6,6 +6,7 @@ import json
 import operator
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,6 +106,18 @@ class TestCache:
         text = json.dumps({"key": KEY, "content": array}).encode()
         body = text + bytes(-len(text) % 8)
         assert decoded(_HEAD.pack(_MAGIC, len(text), crc32(body)) + body, KEY) is None
+
+    def test_two_writers_never_leave_half_an_entry(self, tmp_path: Path) -> None:
+        store, contents = Store(tmp_path), [np.full(20_000, number) for number in (1.0, 2.0)]
+        with ThreadPoolExecutor(2) as pool:
+            writing = [
+                pool.submit(lambda c=one: [store.put(KEY, c) for _ in range(100)])
+                for one in contents
+            ]
+            found = [store.get(KEY) for _ in range(100)]
+        assert all(one.exception() is None for one in writing)
+        assert {float(np.ptp(one)) for one in found if one is not None} <= {0.0}
+        assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [KEY]
 
     def test_a_forged_sum_counts_as_absent(self, tmp_path: Path) -> None:
         settings, where = Settings(Preprocessing()), Where(str(tmp_path))
