@@ -48,8 +48,8 @@ class AxisChange:
         differences: of each campaign against the first; the first's is None.
         p_values: adjusted for all axes and campaigns (k,); NaN of the first.
         changed: which campaigns differ from the first by more than chance and enough to matter.
-        slight: which differ by more than chance, and too little to be told as a change.
-        smallest: change that would have been told (k,), as a share; NaN of the first.
+        slight: which differ by more than chance, and too little to count as a change.
+        smallest: detection limit (k,), as a share; NaN of the first.
     """
 
     joint: str
@@ -132,7 +132,7 @@ class Comparison:
 
     @property
     def changed(self) -> bool:
-        """Whether anything is told to have changed."""
+        """Whether anything has changed."""
         return self.friction_changed or self.load_changed
 
     @property
@@ -142,7 +142,7 @@ class Comparison:
 
     @property
     def friction_slight(self) -> bool:
-        """Whether friction of any axis differs, but by too little to be told as a change."""
+        """Whether friction of any axis differs, but by too little to count as a change."""
         return any(any(axis.slight) for axis in self.axes)
 
     @property

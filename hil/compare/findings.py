@@ -1,4 +1,4 @@
-"""What the trends of an arm mean, in sentences: the first thing a reader sees."""
+"""What trends and comparisons of an arm mean, in sentences: the first thing a reader sees."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from identification.model.payload import Payload
 from .payload import Change, PayloadTrend, Statement, Verdict
 from .trend import FEWEST, ArmTrend, AxisTrend, Watched
 
-Level = Literal["alarm", "past", "quiet"]
+Level = Literal["alarm", "past", "quiet", "changed", "same"]
 _ORDER: Final[tuple[Level, ...]] = get_args(Level)
 
 _MONTH: Final = 365.25 / 12.0
@@ -48,7 +48,8 @@ class Finding:
     """One thing to know about an arm.
 
     Attributes:
-        level: "alarm" concerns the last campaign, "past" earlier ones, "quiet" nothing.
+        level: "alarm" concerns the last campaign, "past" earlier ones, "quiet" nothing; in a
+            comparison "changed", or "same" for what did not, or by little, or is not known.
         words: a sentence.
         next_step: what to do about it; "" for nothing.
     """
