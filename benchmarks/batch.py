@@ -28,18 +28,24 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 
 from benchmarks.archive_files import PERIOD, repetitions
-from hil.batch.local import LocalWorkers
-from hil.batch.on_workers import ArchiveTask, Summed, run_task
 from hil.batch.run import Plan, reidentify
 from hil.batch.types import BatchResult
-from hil.batch.workers import Workers, summed
+from hil.batch.workers import (
+    ArchiveTask,
+    Done,
+    LocalWorkers,
+    Summed,
+    Workers,
+    run_task,
+    summed,
+)
 from hil.identify.options import FIXED
 from hil.progress import Silent
 
@@ -54,16 +60,16 @@ class InThisProcess(Workers):
 
     near = True
 
-    def sums(
+    def sums_in_turn(
         self,
         groups: Sequence[Sequence[ArchiveTask[T, S]]],
         add: Callable[[T, T], T],
         *,
-        done: Callable[[int], None] | None = None,
-    ) -> list[Summed[T, S]]:
+        done: Done | None = None,
+    ) -> Iterator[Summed[T, S]]:
         """See `hil.batch.workers.Workers`."""
         del done
-        return [summed([run_task(task) for task in group], add) for group in groups]
+        return (summed([run_task(task) for task in group], add) for group in groups)
 
 
 def archives_to_estimate(paths: Sequence[Path]) -> float:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hil import Campaign, Cell
-from hil.batch.local import LocalWorkers
+from hil.batch.workers import LocalWorkers
 from hil.campaign import design
 from hil.cell.text import replaced_value
 from hil.compare import compare_campaigns, gather

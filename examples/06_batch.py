@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 
 from hil import Campaign, Cell
-from hil.batch.local import LocalWorkers
 from hil.batch.run import Plan, reidentify
+from hil.batch.workers import LocalWorkers
 from hil.campaign import design
 from hil.cell.text import replaced_value
 from hil.progress import Silent

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 from tempfile import TemporaryDirectory
 
 from hil.errors import InputError, OutputError
@@ -30,15 +31,27 @@ def make_folder(path: Path) -> None:
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Replace `path` by `content`: a crash leaves the old or the new file, never half of one."""
-    temporary = path.with_suffix(path.suffix + ".tmp")
-    try:
+    with replacing(path, path.with_suffix(path.suffix + ".tmp")) as temporary:
         _write_through(temporary, content)
+    _sync_folder(path.parent)
+
+
+@contextmanager
+def replacing(path: Path, temporary: Path | None = None) -> Iterator[Path]:
+    """Replace `path` by what is written to the yielded name beside it; keep it if that fails.
+
+    Args:
+        path: its folder exists.
+        temporary: the name to write to; by default one that nobody else has.
+    """
+    temporary = temporary or path.with_name(f".{path.name[:200]}.{token_hex(4)}.tmp")
+    try:
+        yield temporary
         temporary.replace(path)
-    except OSError:
+    except BaseException:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
 
 
 def write_or_tell(path: Path, content: str | bytes) -> None:

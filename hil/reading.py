@@ -7,7 +7,6 @@ A pipe without a writer is waited for without end, and a device has none. What i
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import stat
@@ -63,16 +62,6 @@ def text_of(path: Path, longest: int = LONGEST_TEXT) -> str:
             raise OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
         text = stream.read().decode("utf-8")
     return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def digest_of(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits.
-
-    Raises:
-        OSError: as `opened`; or it cannot be read.
-    """
-    with opened(path) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def is_no_file(trouble: OSError) -> bool:

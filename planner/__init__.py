@@ -8,7 +8,7 @@ set-point per controller cycle, at an override that may change, and stops it on 
 from __future__ import annotations
 
 from planner.batch import PlanningPool, plan_many
-from planner.children import chunks_of, map_in_children
+from planner.children import chunks_of, map_in_children, stream_in_children
 from planner.commands import FlyDistance, FlyPercent, Move, Overrides, Stop
 from planner.errors import (
     InvalidLimits,
@@ -65,6 +65,7 @@ __all__ = [
     "close_child",
     "WorkerProcess",
     "map_in_children",
+    "stream_in_children",
     "chunks_of",
     "pack",
     "load",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from multiprocessing.connection import wait
 from time import monotonic
 from typing import Any, Final, Generic, TypeVar
@@ -34,6 +34,19 @@ def map_in_children(
     *,
     done: Callable[[int], None] | None = None,
 ) -> list[T | PlannerCrashed | PlanningTimedOut]:
+    """Return, for each index in order, what `stream_in_children` yields of it."""
+    found = dict(stream_in_children(children, function, chunks, arguments, done=done))
+    return [found[index] for index in range(len(found))]
+
+
+def stream_in_children(
+    children: Sequence[WorkerProcess],
+    function: Callable[..., Iterable[T]],
+    chunks: Iterable[Chunk],
+    arguments: Callable[[Chunk], tuple[Any, ...]],
+    *,
+    done: Callable[[int], None] | None = None,
+) -> Generator[tuple[int, T | PlannerCrashed | PlanningTimedOut], None, None]:
     """Call a function chunk by chunk in child processes; a crash costs one item, not its chunk.
 
     A chunk that ends its process, or takes longer than the children's time for one call, is tried
@@ -42,85 +55,90 @@ def map_in_children(
     as children become free, so the function must give an item the same result in any company.
 
     Args:
-        children: at least one; they are closed if this is interrupted, and start anew when used.
+        children: at least one; those at work are closed if this is interrupted, and start anew
+            when used.
         function: importable in a child; returns one result for each index of its chunk.
-        chunks: the indices 0 to count - 1, each once.
+        chunks: the indices 0 to count - 1, each once; asked for when a child is free.
         arguments: of the function, for some of the indices.
         done: called with a number of items whenever so many more have their result.
 
-    Returns:
-        For each index in order its result, or the error that it met alone.
+    Yields:
+        Each index with its result, or with the error that it met alone, in any order.
 
     Raises:
         PlannerNotStarted: a child died before it was given anything to do, several times.
         Exception: whatever the function itself raised.
     """
-    work, idle = _Work[T](chunks, done), list(children)
+    work, idle = _Work[T](chunks), list(children)
     busy: dict[Any, tuple[WorkerProcess, Chunk]] = {}
+    found: list[tuple[int, T | PlannerCrashed | PlanningTimedOut]] = []
     try:
-        while work.waiting or busy:
-            while work.waiting and idle:
-                child, chunk = idle.pop(), work.waiting.popleft()
+        while True:
+            while idle and (chunk := work.next_chunk()) is not None:
+                child = idle.pop()
                 _begin(child, function, arguments(chunk))
                 busy[child.connection] = child, chunk
+            if done is not None and found:
+                done(len(found))
+            yield from found  # children are at work meanwhile
+            if not busy:
+                return
             nearest = min(child.deadline for child, _ in busy.values()) - monotonic()
             ready = wait(list(busy), max(0.0, nearest))
             late = [link for link, (child, _) in busy.items() if child.deadline <= monotonic()]
+            found = []
             for link in {*ready, *late}:
                 child, chunk = busy.pop(link)
                 idle.append(child)
-                work.fetch(child, chunk)
-    except BaseException:  # Ctrl-C, or a fault of ours: nobody will fetch what is under way
+                found += work.fetch(child, chunk)
+    finally:  # after Ctrl-C, a fault of ours or a break: nobody will fetch what is under way
         for child in children:
-            child.close()
-        raise
-    return work.results()
+            if child not in idle:
+                child.close()
 
 
 class _Work(Generic[T]):
-    """What is still to be done, and what came of the rest."""
+    """What is still to be done, and how often it went wrong."""
 
-    def __init__(self, chunks: Sequence[Chunk], done: Callable[[int], None] | None) -> None:
-        self.waiting: deque[Chunk] = deque(chunks)
-        self._done = done
-        self._results: dict[int, T | PlannerCrashed | PlanningTimedOut] = {}
+    def __init__(self, chunks: Iterable[Chunk]) -> None:
+        self._chunks = iter(chunks)
+        self._again: deque[Chunk] = deque()
         self._crashes: Counter[int] = Counter()
         self._not_started: Counter[int] = Counter()
 
-    def fetch(self, child: WorkerProcess, chunk: Chunk) -> None:
-        """Take the results of a chunk from a child, or have it tried again."""
+    def next_chunk(self) -> Chunk | None:
+        """Return what is to be handed out next, None if nothing is."""
+        return self._again.popleft() if self._again else next(self._chunks, None)
+
+    def fetch(
+        self, child: WorkerProcess, chunk: Chunk
+    ) -> list[tuple[int, T | PlannerCrashed | PlanningTimedOut]]:
+        """Return the results of a chunk from a child; nothing if it is to be tried again."""
         try:
             found = list(child.receive())
         except PlannerNotStarted:
             self._not_started[id(child)] += 1
             if self._not_started[id(child)] > _FRESH_STARTS:
                 raise
-            self.waiting.append(chunk)
+            self._again.append(chunk)
+            return []
         except (PlannerCrashed, PlanningTimedOut) as error:
-            self._tried_again(chunk, error)
-        else:
-            del self._not_started[id(child)]
-            self._enter(chunk, found)
+            return self._failed(chunk, error)
+        del self._not_started[id(child)]
+        return list(zip(chunk, found, strict=True))
 
-    def results(self) -> list[T | PlannerCrashed | PlanningTimedOut]:
-        """Return the results in order."""
-        return [self._results[index] for index in range(len(self._results))]
-
-    def _tried_again(self, chunk: Chunk, error: PlannerCrashed | PlanningTimedOut) -> None:
+    def _failed(
+        self, chunk: Chunk, error: PlannerCrashed | PlanningTimedOut
+    ) -> list[tuple[int, T | PlannerCrashed | PlanningTimedOut]]:
         if len(chunk) > 1:
-            self.waiting.extend([index] for index in chunk)
-            return
+            self._again.extend([index] for index in chunk)
+            return []
         (index,) = chunk
         self._crashes[index] += isinstance(error, PlannerCrashed)
         if isinstance(error, PlannerCrashed) and self._crashes[index] < _CRASHES_ALONE:
-            self.waiting.append(chunk)
-        else:
-            self._enter(chunk, [error])
-
-    def _enter(self, chunk: Chunk, found: Sequence[T | PlannerCrashed | PlanningTimedOut]) -> None:
-        self._results.update(zip(chunk, found, strict=True))
-        if self._done is not None:
-            self._done(len(chunk))
+            self._again.append(chunk)
+            return []
+        return [(index, error)]
 
 
 def _begin(child: WorkerProcess, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:

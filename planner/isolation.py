@@ -195,7 +195,7 @@ class WorkerProcess:
         self.close()
         self._start()
 
-    def _crashed(self) -> PlannerCrashed | PlannerNotStarted:
+    def _crashed(self) -> PlannerCrashed | PlannerNotStarted | PlanningTimedOut:
         """Return the error that tells how the process ended; start another if it ever ran."""
         assert self._process is not None
         try:
@@ -206,6 +206,8 @@ class WorkerProcess:
             self.close()
             return PlannerNotStarted(status)
         self._restart()
+        if status == -signal.SIGALRM:  # by its own clock
+            return PlanningTimedOut(self._timeout)
         return PlannerCrashed(status)
 
 

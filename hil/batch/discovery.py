@@ -1,95 +1,52 @@
-"""Which archives there are: found below folders, examined where they lie, told apart."""
+"""Which archives there are: found below folders, examined where they lie, sorted.
+
+Workers hash an archive and look into it; no sample is decoded. What an archive is goes into the
+cache, and is believed as long as nobody has touched the file and the programs are the same.
+"""
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Iterator, Sequence
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
+from stat import S_ISREG
 from sys import intern
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from hil.archive import ArchiveName
+from hil.archive import Archive, ArchiveHeader, ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.header import KINDS
 from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder, Entry
-from hil.errors import ArchiveError
-from hil.progress import Reporter, Silent, Task
+from hil.cell import Cell
+from hil.cell.schema import PayloadTable
+from hil.errors import ArchiveError, InputError
+from hil.identify.settings import stated_delay
+from hil.io.digest import digest, json_digest
+from hil.progress import Reporter, Silent
 
-from .cache import Where
-from .errors import NothingToFitError
-from .examining import USES, Examined, Facts, examined, noted
-from .on_workers import ArchiveTask
-from .places import Place, below
-from .types import ArchiveRef, Broken
-from .workers import Workers
+from .cache import BESIDE, Store, Where, arm_digest, belief_digest, code_digest
+from .factors import cell_in, digest_of, stamp_of
+from .remote import archives_below, is_url, local_file
+from .types import ArchiveRef, Broken, ChangedError, FileStamp, NothingToFitError, TornError
+from .workers import ArchiveTask, Part, Workers
 
+USES: Final = ("excitation", "validation", "standstill")
+"""What archives are used for; those of other kinds are left alone."""
 
-class Manifests:
-    """The manifests of the campaigns that archives lie in, each read once.
-
-    Attributes:
-        broken: manifests that cannot be read; nothing can be checked against them.
-    """
-
-    def __init__(self) -> None:
-        self.broken: list[Broken] = []
-        self._known: dict[str, dict[str, Entry] | None] = {}
-
-    def objection(self, place: Place, sha256: str) -> str:
-        """Why the manifest says that an archive is not what was recorded; "" if it does not."""
-        entry = self._entry(place)
-        if entry is None or entry.sha256 == sha256:
-            return ""
-        return "is not what its campaign's manifest.json says"
-
-    def outcome(self, place: Place) -> str:
-        """How the manifest says that an archive ended; "" if it does not say."""
-        entry = self._entry(place)
-        return "" if entry is None else entry.outcome
-
-    def not_entered(self, place: Place) -> bool:
-        """Whether an archive of a campaign's motion is not in the campaign's manifest.
-
-        A run that was killed may have closed it and not lived to judge it.
-        """
-        entries = self._entries(place)
-        return (
-            entries is not None
-            and place.name not in entries
-            and bool(ArchiveName.parse(place.name))
-        )
-
-    def _entry(self, place: Place) -> Entry | None:
-        return (self._entries(place) or {}).get(place.name)
-
-    def _entries(self, place: Place) -> dict[str, Entry] | None:
-        """Those of its campaign by name; None where there is no manifest to be read."""
-        if place.remote or place.campaign == place.folder:
-            return None
-        if place.campaign not in self._known:
-            self._known[place.campaign] = self._read(Path(place.campaign))
-        return self._known[place.campaign]
-
-    def _read(self, campaign: Path) -> dict[str, Entry] | None:
-        folder = CampaignFolder(campaign)
-        try:
-            return {entry.name: entry for entry in folder.manifest()} if folder.sealed else None
-        except CampaignFolderError as error:
-            reason = f"{error}; the campaign's archives are used without being checked against it"
-            self.broken.append(Broken((campaign / "manifest.json").as_posix(), reason))
-            return None
-
-
-_TOGETHER: Final = 512
-"""Archives whose facts are fetched at once: few enough to be held beside all others."""
-
+_SUFFIX: Final = ".mcap"
+_ARCHIVES: Final = "archives"  # folder of a campaign's archives
 _REHEARSAL: Final = "/rehearsal/"  # see `hil.campaign.folder`
+_COMPLETED: Final = "completed"
+_NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
 _NOT_ENTERED: Final = (
     "is not named in its campaign's manifest.json: nobody has judged it (a run was killed; the "
     "next one takes it in)"
 )
-_COMPLETED: Final = "completed"
-_NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
+_UNTOUCHED: Final = 2_000_000_000
+"""ns that a file must have been left alone before its time stamps are believed to show the next
+change: file systems count in steps, some of them of two seconds."""
 
 
 class Discovery(NamedTuple):
@@ -114,118 +71,351 @@ def discover(
 ) -> Discovery:
     """Find every archive at or below some places.
 
-    Workers hash archives and look into them; here only small facts are gathered. An archive that
-    was examined before, and whose file nobody has touched since, is not opened.
+    An archive that was examined before, and whose file nobody has touched since, is not opened.
 
     Args:
         roots: folders, archives, or URLs of either.
-        where: notes on archives are kept.
+        where: what is known of archives is cached.
         workers: who does the work on archives.
         reporter: of progress.
 
     Raises:
         InputError: a place does not exist, or an address cannot be read.
         NothingToFitError: there is no archive below any.
-        CacheError: nothing can be kept where it should be.
+        CacheError: the cache cannot be written.
     """
-    places = below(roots)
-    if not places.found:
-        raise _nothing(roots, places.refused)
-    with reporter.task("looking into archives", len(places.found)) as task:
-        if workers.near:
-            known = {place: one for place in places.found if (one := _noted(place, where))}
+    places, refused, left = places_below(roots)
+    if not places:
+        problem = "there is no archive (*.mcap) in it"
+        if refused:
+            problem += f", and {refused[0].path} {refused[0].reason}"
+        raise NothingToFitError(roots[0] if roots else None, problem, remedy="name others")
+    known: dict[Place, ArchiveRef | Broken] = {}
+    with reporter.task("looking into archives", len(places)) as task:
+        if workers.near:  # else the cache is where the archives are
+            for place in places:
+                try:
+                    if (ref := _known(place, where)) is not None:
+                        known[place] = ref
+                except ArchiveError as error:
+                    known[place] = Broken(place.location, str(error))
             task.advance(len(known))
-        else:
-            known = {}  # the notes are where the archives are
-        unknown = [place for place in places.found if place not in known]
-        known.update(zip(unknown, _examined(unknown, where, workers, task), strict=True))
-    found = _sorted_out(places.found, [known[place] for place in places.found])
-    return Discovery(found.refs, (*places.refused, *found.broken), (*places.left, *found.skipped))
-
-
-def _nothing(roots: Sequence[str], refused: Sequence[Broken]) -> NothingToFitError:
-    problem = "there is no archive (*.mcap) in it"
-    if refused:
-        problem += f", and {refused[0].path} {refused[0].reason}"
-    return NothingToFitError(roots[0] if roots else None, problem, remedy="name others")
-
-
-def _noted(place: Place, where: Where) -> Examined | Broken | None:
-    try:
-        return noted(place, where)
-    except ArchiveError as error:
-        return Broken(place.location, str(error))
-
-
-def _examined(
-    places: Sequence[Place], where: Where, workers: Workers, task: Task
-) -> Iterator[Examined | Broken]:
-    groups = [
-        [
-            ArchiveTask(place.location, examined, (place, where))
-            for place in places[begin : begin + _TOGETHER]
+        unknown = [place for place in places if place not in known]
+        tasks: list[ArchiveTask[None, ArchiveRef]] = [
+            ArchiveTask(place.location, examined, (place, where)) for place in unknown
         ]
-        for begin in range(0, len(places), _TOGETHER)
-    ]
-    for one in workers.sums_in_turn(groups, operator.add, done=task.advance):
-        yield from one.notes
+        notes = workers.notes(tasks, done=task.advance)
+        known.update(zip(unknown, notes, strict=True))
+    found_in = _sorted_out([(place, known[place]) for place in places])
+    return Discovery(found_in.refs, (*refused, *found_in.broken), (*left, *found_in.skipped))
 
 
-def _sorted_out(places: Sequence[Place], found: Sequence[Examined | Broken]) -> Discovery:
-    refs: list[ArchiveRef] = []
-    harmed: list[tuple[Place, Broken]] = []
-    skipped: list[Broken] = []
-    manifests = Manifests()
-    read: list[tuple[Place, Examined]] = []
-    for place, one in zip(places, found, strict=True):
-        if isinstance(one, Broken):
-            harmed.append((place, one))
-        elif reason := manifests.objection(place, one.facts.sha256):
-            harmed.append((place, Broken(place.location, reason)))
-        elif one.facts.use in USES and manifests.not_entered(place):
-            skipped.append(Broken(place.location, _NOT_ENTERED))
+# Where archives lie
+
+
+class Place(NamedTuple):
+    """Where an archive lies, and what is known of its file without opening it.
+
+    Attributes:
+        location: path or URL.
+        version: of a remote object's content, "" where its store does not say.
+    """
+
+    location: str
+    version: str = ""
+
+    @property
+    def name(self) -> str:
+        """File name."""
+        return self.location.rsplit("/", 1)[-1]
+
+    @property
+    def folder(self) -> str:
+        """Folder of the file."""
+        return self.location.rsplit("/", 1)[0]
+
+    @property
+    def campaign(self) -> str:
+        """The campaign's folder: that of the archives, or the one above."""
+        above, _, name = self.folder.rpartition("/")
+        return above if name == _ARCHIVES and above else self.folder
+
+
+def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[Broken]]:
+    """Find every archive at or below some folders, archives, or URLs of either.
+
+    Links are followed, and a folder that several lead to is looked into once, under its own name.
+
+    Returns:
+        Archives in the order of their locations; folders and files that cannot be looked into;
+        links that lead nowhere.
+
+    Raises:
+        InputError: a place does not exist, or an address cannot be read.
+    """
+    found: set[Place] = set()
+    refused: list[Broken] = []
+    left: list[Broken] = []
+    visited: set[Path] = set()
+
+    def refuse(error: OSError) -> None:
+        where = Path(os.fsdecode(error.filename)).as_posix()
+        refused.append(Broken(where, f"cannot be looked into: {error.strerror}"))
+
+    def is_archive(path: Path) -> bool:
+        if path.suffix != _SUFFIX:
+            if path.is_symlink() and not path.exists():
+                left.append(Broken(path.as_posix(), "is a link that leads nowhere"))
+            return False
+        try:
+            regular = S_ISREG(path.stat().st_mode)
+        except OSError as error:  # a link to nothing, or to itself
+            refuse(error)
+            return False
+        if not regular:
+            refused.append(Broken(path.as_posix(), "is no file"))
+        return regular
+
+    def walk(root: Path) -> Iterator[Path]:
+        for name, folders, files in os.walk(root, followlinks=True, onerror=refuse):
+            folder = Path(name).resolve()
+            if folder in visited:
+                folders.clear()
+                continue
+            visited.add(folder)
+            if BESIDE in folders:
+                folders.remove(BESIDE)
+            yield from (folder / file for file in files if is_archive(folder / file))
+
+    for root in roots:
+        path = Path(root)
+        if is_url(root):
+            found.update(Place(url, version) for url, version in archives_below(root))
+        elif path.is_file():
+            found.add(Place(path.resolve().as_posix()))
+        elif path.is_dir():
+            found.update(Place(file.as_posix()) for file in walk(path.resolve()))
         else:
-            read.append((place, _with_outcome(one, manifests.outcome(place))))
-    sieve = _Sieve(read)
-    broken: list[Broken] = []
-    for place, harm in harmed:
-        reason = sieve.replaced(place)
-        if reason:
-            skipped.append(Broken(harm.path, reason))
-        else:
-            broken.append(harm)
-    for place, one in read:
-        reason = sieve.objection(place, one.facts)
-        if reason:
-            skipped.append(Broken(place.location, reason))
-        else:
-            refs.append(_ref(place, one))
-    return Discovery(
-        tuple(sorted(refs, key=lambda ref: ref.order)),
-        (*manifests.broken, *broken),
-        tuple(skipped),
+            raise InputError(root, "does not exist", remedy="name a folder with archives below it")
+    return sorted(found), refused, left
+
+
+# What an archive is
+
+
+def setup_of(cell: Cell) -> str:
+    """Delay of the torque and payload of a cell in words, with every digit; "" for neither."""
+    delay = stated_delay(cell)
+    lag = f"torque lags by {1e3 * delay:.12g} ms" if delay else ""
+    return ", ".join(filter(None, (lag, _load(cell.file.robot.payload))))
+
+
+def _load(payload: PayloadTable | None) -> str:
+    if payload is None or not (payload.mass or any(payload.inertia)):
+        return ""
+    frame = f" in {payload.frame}" if payload.frame else ""
+    words = f"carries {payload.mass:.12g} kg at {_row(payload.centre)} m{frame}"
+    return words + (f", {_row(payload.inertia)} kg·m²" if any(payload.inertia) else "")
+
+
+def _row(figures: Iterable[float]) -> str:
+    return f"({', '.join(f'{figure:.12g}' for figure in figures)})"
+
+
+def examined(place: Place, where: Where) -> Part[None, ArchiveRef]:
+    """Find out what an archive is, and cache it.
+
+    Raises:
+        HilError: it cannot be read, is torn, or was changed meanwhile.
+        CacheError: the cache cannot be written.
+    """
+    known = _known(place, where)
+    if known is not None:
+        return Part(None, known)
+    begun, stamp = time.time_ns(), _stamp(place)
+    store = where.store(place.location)
+    with local_file(place.location) as path:
+        ref = replace(_inspected(place, path, store), stamp=stamp)
+        if stamp is not None and stamp_of(path) != stamp:
+            raise ChangedError(place.location)
+    untouched = stamp is None or begun - max(stamp.mtime_ns, stamp.ctime_ns) > _UNTOUCHED
+    if _shows_changes(place, stamp) and untouched:
+        facts = asdict(ref)
+        for own in ("location", "campaign", "stamp"):
+            del facts[own]
+        store.put(_key(place), {"token": _token(place, stamp), "facts": facts})
+    return Part(None, ref)
+
+
+def _known(place: Place, where: Where) -> ArchiveRef | None:
+    """What is known of an archive without opening it; None if nothing.
+
+    Raises:
+        ArchiveError: there is no such file.
+    """
+    stamp = _stamp(place)
+    if not _shows_changes(place, stamp):
+        return None
+    note = where.store(place.location).get(_key(place))
+    if note is None or note.get("token") != _token(place, stamp):
+        return None
+    return ArchiveRef(
+        location=place.location, campaign=place.campaign, stamp=stamp, **note["facts"]
     )
 
 
-def _with_outcome(one: Examined, recorded: str) -> Examined:
-    """What the manifest says of the outcome counts if it is worse than what the archive says."""
-    if recorded in ("", _COMPLETED):
-        return one
-    return one._replace(facts=one.facts._replace(outcome=recorded))
+def _stamp(place: Place) -> FileStamp | None:
+    return None if is_url(place.location) else stamp_of(Path(place.location))
+
+
+def _shows_changes(place: Place, stamp: FileStamp | None) -> bool:
+    """Whether a change of the file would show; of other remote objects only their bytes tell."""
+    return stamp is not None or bool(place.version)
+
+
+def _key(place: Place) -> str:
+    return digest(f"archive {place.name}".encode("utf-8", "surrogateescape"))
+
+
+def _token(place: Place, stamp: FileStamp | None) -> list[Any]:
+    return [code_digest(), place.version, *(stamp or ())]
+
+
+def _inspected(place: Place, path: Path, store: Store) -> ArchiveRef:
+    """Hash a file, look into it, and cache the texts of its cell."""
+    sha256 = digest_of(path)
+    # Of a whole file this reads its summary and what stands outside of chunks, and one chunk.
+    archive = open_archive(path, fields=(), stop=-1.0)
+    if archive.damage is not None:
+        raise TornError(place.location, str(archive.damage))
+    header, use = archive.header, archive.header.serves_as
+    index, attempt = _interval(header, place.name)
+    plan = archive.attachments.get("plan.json")
+    ref = ArchiveRef(
+        location=place.location,
+        sha256=sha256,
+        use=use,
+        arm="",
+        campaign=place.campaign,
+        index=index,
+        cell="",
+        motion="" if plan is None else digest(plan),
+        when=header.recorded_at or "",
+        kind=archive.kind,
+        attempt=attempt,
+        outcome=(archive.outcome or ArchiveOutcome()).outcome,
+        record=json_digest(dict(header.entries)),
+        simulated=header.only_simulated,
+    )
+    return _with_cell(ref, archive, store) if use in USES else ref
+
+
+def _with_cell(ref: ArchiveRef, archive: Archive, store: Store) -> ArchiveRef:
+    """The reference with what the archive's cell says; its texts go into the cache."""
+    cell = cell_in(archive)
+    key = json_digest([cell.text, cell.urdf])
+    if not store.has(key):
+        store.put(key, [cell.text, cell.urdf])
+    drives = archive.attachments.get("drive_train.json")
+    return replace(
+        ref,
+        arm=arm_digest(cell, drives, simulated=ref.simulated),
+        cell=key,
+        setup=setup_of(cell),
+        belief=belief_digest(cell),
+    )
+
+
+def _interval(header: ArchiveHeader, name: str) -> tuple[int, int]:
+    """Index and attempt: as the archive says, whatever its file is called now; else by its name."""
+    if header.index is not None and header.attempt is not None:
+        return header.index, header.attempt
+    parsed = ArchiveName.parse(name)
+    return (0, 0) if parsed is None else (parsed.index, parsed.attempt)
+
+
+# Which archives are meant to be fitted
+
+
+class _Manifests:
+    """The manifests of the campaigns that archives lie in, each read once.
+
+    Attributes:
+        broken: manifests that cannot be read; nothing can be checked against them.
+    """
+
+    def __init__(self) -> None:
+        self.broken: list[Broken] = []
+        self._known: dict[str, dict[str, Entry] | None] = {}
+
+    def entries(self, place: Place) -> dict[str, Entry] | None:
+        """Those of its campaign by name; None where there is no manifest to be read."""
+        if is_url(place.location) or place.campaign == place.folder:
+            return None
+        if place.campaign not in self._known:
+            self._known[place.campaign] = self._read(CampaignFolder(Path(place.campaign)))
+        return self._known[place.campaign]
+
+    def _read(self, folder: CampaignFolder) -> dict[str, Entry] | None:
+        try:
+            return {entry.name: entry for entry in folder.manifest()} if folder.sealed else None
+        except CampaignFolderError as error:
+            reason = f"{error}; the campaign's archives are used without being checked against it"
+            self.broken.append(Broken((folder.root / "manifest.json").as_posix(), reason))
+            return None
+
+
+def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery:
+    manifests = _Manifests()
+    read: list[ArchiveRef] = []
+    harmed: list[tuple[Place, Broken]] = []
+    skipped: list[Broken] = []
+    for place, one in found:
+        entries = manifests.entries(place)
+        entry = None if entries is None else entries.get(place.name)
+        if isinstance(one, Broken):
+            harmed.append((place, one))
+        elif entry is not None and entry.sha256 != one.sha256:
+            reason = "is not what its campaign's manifest.json says"
+            harmed.append((place, Broken(place.location, reason)))
+        elif entry is not None and entry.outcome not in ("", _COMPLETED):
+            read.append(replace(one, outcome=entry.outcome))
+        elif entry is None and entries is not None and _is_motion(place) and one.use in USES:
+            # A run that was killed may have closed it and not lived to judge it.
+            skipped.append(Broken(place.location, _NOT_ENTERED))
+        else:
+            read.append(one)
+    sieve = _Sieve(read)
+    broken: list[Broken] = []
+    for place, harm in harmed:
+        reason = sieve.replacement(place)
+        skipped += [Broken(harm.path, reason)] if reason else []
+        broken += [] if reason else [harm]
+    refs: list[ArchiveRef] = []
+    for ref in read:
+        reason = sieve.objection(ref)
+        skipped += [Broken(ref.location, reason)] if reason else []
+        refs += [] if reason else [_small(ref)]
+    refs.sort(key=lambda ref: ref.order)
+    return Discovery(tuple(refs), (*manifests.broken, *broken), tuple(skipped))
+
+
+def _is_motion(place: Place) -> bool:
+    return ArchiveName.parse(place.name) is not None
 
 
 class _Sieve:
     """Tells archives that are meant to be fitted from copies, failures and earlier attempts."""
 
-    def __init__(self, read: Sequence[tuple[Place, Examined]]) -> None:
+    def __init__(self, read: Iterable[ArchiveRef]) -> None:
         self._latest: dict[tuple[str, str, int], int] = {}
         self._seen: dict[str, str] = {}
-        for place, (facts, _) in read:
-            if facts.attempt and facts.outcome == _COMPLETED:
-                key = (place.folder, facts.kind, facts.number)
-                self._latest[key] = max(self._latest.get(key, 0), facts.attempt)
+        for ref in read:
+            if ref.attempt and ref.outcome == _COMPLETED:
+                key = (Place(ref.location).folder, ref.kind, ref.index)
+                self._latest[key] = max(self._latest.get(key, 0), ref.attempt)
 
-    def replaced(self, place: Place) -> str:
+    def replacement(self, place: Place) -> str:
         """Why nothing is missing with an archive that cannot be used; "" if something is.
 
         A run that was killed, or whose disk was full, leaves torn ones, and the next run makes the
@@ -239,41 +429,32 @@ class _Sieve:
         last = self._latest.get((place.folder, name.kind, name.index), 0)
         return f"attempt {last} took the place of this unusable one" if name.attempt < last else ""
 
-    def objection(self, place: Place, facts: Facts) -> str:
+    def objection(self, ref: ArchiveRef) -> str:
         """Why an archive is not meant to be fitted; "" if it is."""
-        if facts.use not in USES:
-            return f"is a {facts.use}"
-        if facts.simulated and _REHEARSAL in place.location:
+        if ref.use not in USES:
+            return f"is a {ref.use}"
+        if ref.simulated and _REHEARSAL in ref.location:
             return "belongs to a rehearsal"
-        if facts.outcome != _COMPLETED:
-            return f"ended {facts.outcome}"
-        last = self._latest.get((place.folder, facts.kind, facts.number), facts.attempt)
-        if facts.attempt and facts.attempt < last:
+        if ref.outcome != _COMPLETED:
+            return f"ended {ref.outcome}"
+        folder = Place(ref.location).folder
+        last = self._latest.get((folder, ref.kind, ref.index), ref.attempt)
+        if ref.attempt and ref.attempt < last:
             return f"attempt {last} took its place"
-        if facts.sha256 in self._seen and facts.use != "standstill":
-            return f"holds the same as {self._seen[facts.sha256]}"
-        if facts.attempt:
-            first = self._seen.setdefault(f"{place.folder} {facts.record}", place.name)
-            if first != place.name:
+        if ref.sha256 in self._seen and ref.use != "standstill":
+            return f"holds the same as {self._seen[ref.sha256]}"
+        if ref.attempt:
+            first = self._seen.setdefault(f"{folder} {ref.record}", ref.name)
+            if first != ref.name:
                 return f"is a copy of {first}, or was repaired from it"
-        self._seen[facts.sha256] = place.location
+        self._seen[ref.sha256] = ref.location
         return ""
 
 
-def _ref(place: Place, one: Examined) -> ArchiveRef:
+_SHARED: Final = ("use", "arm", "campaign", "cell", "motion", "when", "setup", "belief", "kind")
+
+
+def _small(ref: ArchiveRef) -> ArchiveRef:
     """Texts that many archives share are held once: there may be very many archives."""
-    facts = one.facts
-    return ArchiveRef(
-        location=place.location,
-        sha256=facts.sha256,
-        use=intern(facts.use),
-        arm=intern(facts.arm),
-        campaign=intern(place.campaign),
-        index=facts.number,
-        cell=intern(facts.cell),
-        motion=intern(facts.motion),
-        when=intern(facts.when),
-        setup=intern(facts.setup),
-        belief=intern(facts.belief),
-        stamp=one.stamp,
-    )
+    shared: dict[str, Any] = {name: intern(getattr(ref, name)) for name in _SHARED}
+    return replace(ref, record="", **shared)

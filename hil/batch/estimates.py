@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -30,59 +30,16 @@ from identification.factor.factor import (
     solve,
 )
 from identification.factor.phases import PhaseFactor
+from identification.model.friction import Viscous
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 
-from .axis_figures import speed_rms
 from .types import ArchiveRef, BatchEstimator, Level, LevelEstimate, Summary
-
-_TOLD: Final = 12
-"""Different doubts that are told; of very many archives there may be very many."""
-
-
-class Doubts:
-    """Counts in how many archives there is reason for which doubt."""
-
-    def __init__(self) -> None:
-        self._archives = 0
-        self._found: dict[str, tuple[int, str]] = {}
-
-    def note(self, summary: Summary) -> None:
-        """Take in those of an archive."""
-        self._archives += 1
-        name = f"{summary.ref.campaign.rsplit('/', 1)[-1]}/{summary.ref.name}"
-        self._count((text, 1, name) for text in summary.doubts)
-
-    def add(self, other: Doubts) -> None:
-        """Take in those of other archives."""
-        self._archives += other._archives
-        self._count((text, count, name) for text, (count, name) in other._found.items())
-
-    def lines(self) -> tuple[str, ...]:
-        """In sentences, each with what it concerns; most archives first."""
-        ordered = sorted(self._found.items(), key=lambda item: -item[1][0])
-        found = [self._line(text, count, name) for text, (count, name) in ordered[:_TOLD]]
-        if len(ordered) > _TOLD:
-            found.append(f"{len(ordered) - _TOLD} more doubts stand with the repetitions")
-        return tuple(found)
-
-    def _count(self, found: Iterable[tuple[str, int, str]]) -> None:
-        for text, count, name in found:
-            known, first = self._found.get(text, (0, name))
-            self._found[text] = (known + count, first)
-
-    def _line(self, text: str, count: int, name: str) -> str:
-        if count == self._archives:
-            return text
-        if count == 1:
-            return f"{name}: {text}"
-        return f"{count} of {self._archives} archives, such as {name}: {text}"
-
 
 Array = NDArray[np.float64]
 
-Estimated = tuple[Estimate, tuple[str, ...]]
-"""An estimate, and what a reader must know of it."""
+_NAMED: Final = 12
+"""Different warnings that are named; of very many archives there may be very many."""
 
 
 class Estimator:
@@ -99,17 +56,18 @@ class Estimator:
 
     def __init__(self, name: BatchEstimator, cell: Cell, settings: Settings) -> None:
         self.name, self.delay_variance = name, settings.delay_variance
-        self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
         self.model: RobotModel = cell.model
+        self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
         self._prior = required(cad_prior(cell)) if name == "prior" else None
+        self._weighting: Weighting = "ordinary" if name == "ols" else "weighted"
 
     @property
-    def draws(self) -> bool:
+    def shrinks(self) -> bool:
         """Whether the estimate of an archive depends on the centre of all."""
         return 0.0 < self._shrinkage.strength < math.inf
 
     def centre(self, phase: PhaseFactor) -> Array | None:
-        """What estimates from a sum and its archives are drawn towards (p,); None for nothing.
+        """What estimates from a sum and its archives are shrunk towards (p,); None for nothing.
 
         Raises:
             IdentificationError: there is not one usable row, or no consistent solution.
@@ -122,41 +80,42 @@ class Estimator:
         weight = self._shrinkage.prior_weight
         return consistent_centre(self.model, total, self.weights(total), weight).estimate.values
 
-    def of_archive(self, summary: Summary, centre: Array | None) -> Estimated:
-        """The estimate from one archive alone, drawn towards the centre of all.
+    def of_archive(self, summary: Summary, centre: Array | None) -> Estimate:
+        """The estimate from one archive alone, shrunk towards the centre of all.
 
         Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
-        repetitions is about noise. Blocks of time are not kept of an archive: with a prior the
-        covariance is that of white residuals times the design effect, and of what is drawn towards
-        the centre it is that of the free estimate, drawn alike.
+        repetitions is about noise. A summary has no blocks of time: with a prior the covariance is
+        that of white residuals times the design effect, and of what is shrunk it is that of the
+        free estimate, shrunk alike.
         """
         free, total = summary.fits[self._weighting], summary.total.total
+        own, effect = free.estimate, max(1.0, free.design_effect)
         if self._prior is not None:
-            weights, effect = self.weights(total), max(1.0, free.design_effect)
-            found = with_prior(self.model, total, self._prior, weights, design_effect=effect)
-            factor = free.estimate.interval_factor
-            return replace(found.estimate, interval_factor=factor), ()
-        if centre is None or not self.draws:
-            return free.estimate, ()
-        drawn = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
-        own, equations = free.estimate, total.weighted(self.weights(total))
+            found = with_prior(
+                self.model, total, self._prior, self.weights(total), design_effect=effect
+            )
+            return replace(found.estimate, interval_factor=own.interval_factor)
+        if centre is None or not self.shrinks:
+            return own
+        shrunk = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
+        equations = total.weighted(self.weights(total))
         prior = self._shrinkage.strength * np.diag(equations.A)
         solution = solve(equations._replace(A=equations.A + np.diag(prior)))
         share = solution.inverse @ equations.A
         known = np.where(np.isfinite(own.covariance), own.covariance, 0.0)
         covariance = share @ known @ share.T
-        covariance += max(1.0, free.design_effect) * (solution.inverse * prior) @ solution.inverse
+        covariance += effect * (solution.inverse * prior) @ solution.inverse
         mark_undetermined(covariance, solution.determined)
         words = own.method.partition(", ")[2]
         return replace(
-            drawn,
+            shrunk,
             covariance=covariance,
             interval_factor=own.interval_factor,
             method=f"weighted least squares, {self._shrinkage.describe()}; {words}",
-        ), ()
+        )
 
-    def of_sum(self, phase: PhaseFactor, centre: Array | None) -> Estimated:
-        """The estimate from a sum over archives, drawn towards its centre.
+    def of_sum(self, phase: PhaseFactor, centre: Array | None) -> Estimate:
+        """The estimate from a sum over archives, shrunk towards its centre.
 
         Raises:
             IdentificationError: there is no consistent solution.
@@ -169,7 +128,7 @@ class Estimator:
             found = fit_least_squares(self.model, (), self._weighting, phase=phase)
         if self.name == "consistent":
             found = consistent_estimate(self.model, phase.total, found).estimate
-        return _checked(found)
+        return found
 
     def weights(self, total: Factor) -> Array:
         """Weight of each joint's rows (n,)."""
@@ -177,70 +136,48 @@ class Estimator:
             return np.ones(self.model.n_joints)
         return joint_weights(total)
 
-    @property
-    def _weighting(self) -> Weighting:
-        return "ordinary" if self.name == "ols" else "weighted"
+
+class WarningCounts:
+    """In how many archives there is reason for which warning."""
+
+    def __init__(self) -> None:
+        self._archives = 0
+        self._found: dict[str, tuple[int, str]] = {}  # count, and the first archive
+
+    def count(self, summary: Summary) -> None:
+        """Add those of an archive."""
+        self._archives += 1
+        name = f"{summary.ref.campaign.rsplit('/', 1)[-1]}/{summary.ref.name}"
+        self._add((text, 1, name) for text in summary.warnings)
+
+    def add(self, other: WarningCounts) -> None:
+        """Add those of other archives."""
+        self._archives += other._archives
+        self._add((text, count, name) for text, (count, name) in other._found.items())
+
+    def lines(self) -> tuple[str, ...]:
+        """In sentences, each with what it concerns; most archives first."""
+        ordered = sorted(self._found.items(), key=lambda item: -item[1][0])
+        found = [self._line(text, count, name) for text, (count, name) in ordered[:_NAMED]]
+        if len(ordered) > _NAMED:
+            found.append(f"{len(ordered) - _NAMED} more warnings stand with the repetitions")
+        return tuple(found)
+
+    def _add(self, found: Iterable[tuple[str, int, str]]) -> None:
+        for text, count, name in found:
+            known, first = self._found.get(text, (0, name))
+            self._found[text] = (known + count, first)
+
+    def _line(self, text: str, count: int, name: str) -> str:
+        if count == self._archives:
+            return text
+        if count == 1:
+            return f"{name}: {text}"
+        return f"{count} of {self._archives} archives, such as {name}: {text}"
 
 
-def _checked(found: Estimate) -> Estimated:
-    if found.undetermined or found.condition <= QR_CONDITION:
-        return found, ()
-    return found, (
-        f"the scaled condition number is {found.condition:.2g}: the motion hardly tells some "
-        "parameters apart, and sums of squares lose digits there; `hil identify` on these archives "
-        "uses QR",
-    )
-
-
-def errors(factor: Factor, values: Array) -> tuple[Array, Array]:
-    """RMS per joint (n,) of the torque that is left by parameters (p,), and of the torque."""
-    augmented = np.append(-values, 1.0)
-    squares = np.einsum("i,jik,k->j", augmented, factor.gram, augmented)
-    rows = np.where(factor.samples > 0, factor.samples, np.nan)
-    return np.sqrt(np.maximum(squares, 0.0) / rows), _torque_rms(factor)
-
-
-def _figures(found: Estimate) -> dict[str, Any]:
-    return {
-        name: getattr(found, name)
-        for name in (
-            "names",
-            "units",
-            "values",
-            "std",
-            "interval_factor",
-            "samples",
-            "noise_std",
-            "condition",
-            "undetermined",
-            "method",
-        )
-    }
-
-
-def _own(found: Estimate, model: RobotModel) -> dict[str, Any]:
-    """Figures that keep nothing else in memory: of a batch there may be very many."""
-    return {
-        "names": model.parameter_names,
-        "units": model.units,
-        "values": found.values.copy(),
-        "noise_std": found.noise_std.copy(),
-        "samples": found.samples.copy(),
-    }
-
-
-def _torque_rms(factor: Factor) -> Array:
-    rows = np.where(factor.samples > 0, factor.samples, np.nan)
-    return np.asarray(np.sqrt(factor.gram[:, -1, -1] / rows))
-
-
-def of_one_motion(refs: Sequence[ArchiveRef]) -> bool:
-    """Whether the excitations among archives repeat one planned motion."""
-    motions = {ref.motion for ref in refs if ref.use == "excitation"}
-    return len(motions) == 1 and "" not in motions
-
-
-class Together:
+@dataclass(eq=False)
+class Group:
     """What is fitted together and what is predicted by it, beside the sum of the factors.
 
     Attributes:
@@ -248,40 +185,46 @@ class Together:
         repetitions: the estimate of each.
         unseen: sum of the totals of what is predicted; None if nothing is.
         products: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`.
-        doubts: about all archives.
+        warnings: about all archives.
         settings: digests.
     """
 
-    def __init__(self) -> None:
-        self.refs: list[ArchiveRef] = []
-        self.repetitions: list[LevelEstimate] = []
-        self.unseen: PhaseFactor | None = None
-        self.products: Array | None = None
-        self.doubts = Doubts()
-        self.settings: set[str] = set()
+    refs: list[ArchiveRef] = field(default_factory=list)
+    repetitions: list[LevelEstimate] = field(default_factory=list)
+    unseen: PhaseFactor | None = None
+    products: Array | None = None
+    warnings: WarningCounts = field(default_factory=WarningCounts)
+    settings: set[str] = field(default_factory=set)
 
-    def add(self, other: Together) -> None:
-        """Take in what is fitted elsewhere."""
+    def add_archive(self, summary: Summary) -> None:
+        """Add an archive; its estimate is added apart."""
+        self.warnings.count(summary)
+        if summary.ref.use == "excitation":
+            self.refs.append(summary.ref)
+            self.products = _plus(self.products, summary.products)
+        else:
+            self.unseen = _plus(self.unseen, summary.total)
+
+    def add(self, other: Group) -> None:
+        """Add what is fitted elsewhere."""
         self.refs += other.refs
         self.repetitions += other.repetitions
-        self.unseen = plus(self.unseen, other.unseen)
-        self.products = plus(self.products, other.products)
-        self.doubts.add(other.doubts)
+        self.unseen = _plus(self.unseen, other.unseen)
+        self.products = _plus(self.products, other.products)
+        self.warnings.add(other.warnings)
         self.settings |= other.settings
-
-
-def plus(one: Any, other: Any) -> Any:
-    """The sum of two terms that may be nothing."""
-    return one if other is None else other if one is None else one + other
 
 
 def repetition_level(
     estimator: Estimator, summary: Summary, settings: str, centre: Array | None = None
 ) -> LevelEstimate:
-    """The estimate of one archive, drawn towards the centre of those that are fitted together."""
-    ref = summary.ref
-    found, doubts = estimator.of_archive(summary, centre)
-    nothing = np.full(estimator.model.n_joints, np.nan)
+    """The estimate of one archive, shrunk towards the centre of those that are fitted together.
+
+    It refers to nothing else in memory: of a batch there may be very many.
+    """
+    ref, model = summary.ref, estimator.model
+    found = estimator.of_archive(summary, centre)
+    own = {name: getattr(found, name).copy() for name in ("values", "noise_std", "samples")}
     return LevelEstimate(
         level="repetition",
         arm=ref.arm,
@@ -290,13 +233,13 @@ def repetition_level(
         sha256=ref.sha256,
         when=ref.when,
         repetitions=1,
-        **(_figures(found) | _own(found, estimator.model)),
+        **(_figures(found) | own | {"names": model.parameter_names, "units": model.units}),
         covariance=None,
         torque_rms=_torque_rms(summary.total.total),
-        unseen_rms=nothing,
-        unseen_torque_rms=nothing,
+        unseen_rms=np.full(model.n_joints, np.nan),
+        unseen_torque_rms=np.full(model.n_joints, np.nan),
         settings=settings,
-        doubts=(*summary.doubts, *doubts),
+        warnings=summary.warnings,
         setup=ref.setup,
     )
 
@@ -304,10 +247,10 @@ def repetition_level(
 def sum_level(
     level: Level,
     estimator: Estimator,
-    together: Together,
+    group: Group,
     phase: PhaseFactor,
     centre: Array | None,
-    doubts: Sequence[str] = (),
+    warnings: Sequence[str] = (),
     payload: Payload | None = None,
 ) -> LevelEstimate:
     """The estimate of a campaign, or of all campaigns of an arm.
@@ -317,25 +260,25 @@ def sum_level(
     Args:
         level: which.
         estimator: of the arm.
-        together: archives that were fitted, and what is known beside them.
+        group: archives that were fitted, and what is known beside them.
         phase: the sum of their factors.
         centre: of that sum, see `Estimator.centre`.
-        doubts: about setups.
+        warnings: about setups.
         payload: that the campaign's cell states.
 
     Raises:
         IdentificationError: there is no estimate.
     """
-    found, own = estimator.of_sum(phase, centre)
-    refs, total = together.refs, phase.total
-    unseen = None if together.unseen is None else together.unseen.total
-    if of_one_motion(refs):
-        values = np.array([one.values for one in together.repetitions])
+    refs, total, model = group.refs, phase.total, estimator.model
+    found = estimator.of_sum(phase, centre)
+    unseen = None if group.unseen is None else group.unseen.total
+    if len({ref.motion for ref in refs}) == 1 and refs[0].motion:
+        values = np.array([one.values for one in group.repetitions])
         found = replace(found, covariance=no_narrower(found.covariance, values))
-    if together.products is not None:
-        found = with_uncertain_delay(found, total, together.products, estimator.delay_variance)
-    setups, settings = {ref.setup for ref in refs}, together.settings
-    nothing = np.full(phase.n_joints, np.nan)
+    if group.products is not None:
+        found = with_uncertain_delay(found, total, group.products, estimator.delay_variance)
+    setups = {ref.setup for ref in refs}
+    nothing = np.full(model.n_joints, np.nan)
     left, torque = (nothing, nothing) if unseen is None else errors(unseen, found.values)
     return LevelEstimate(
         level=level,
@@ -350,11 +293,83 @@ def sum_level(
         torque_rms=_torque_rms(total),
         unseen_rms=left,
         unseen_torque_rms=torque,
-        settings=next(iter(settings)) if len(settings) == 1 else "",
-        doubts=(*own, *doubts, *together.doubts.lines()),
-        speed_rms=speed_rms(estimator.model, total),
+        settings=next(iter(group.settings)) if len(group.settings) == 1 else "",
+        warnings=(*_conditioning(found), *warnings, *group.warnings.lines()),
+        speed_rms=speed_rms(model, total),
         information=total.weighted(estimator.weights(total)).A,
         setup=setups.pop() if len(setups) == 1 else "",
         payload=payload,
         unseen=unseen,
     )
+
+
+def errors(factor: Factor, values: Array) -> tuple[Array, Array]:
+    """RMS per joint (n,) of the torque that is left by parameters (p,), and of the torque."""
+    augmented = np.append(-values, 1.0)
+    squares = np.einsum("i,jik,k->j", augmented, factor.gram, augmented)
+    rows = np.where(factor.samples > 0, factor.samples, np.nan)
+    return np.sqrt(np.maximum(squares, 0.0) / rows), _torque_rms(factor)
+
+
+def relative_error(
+    error: Array,
+    torque: Array,
+    rows: NDArray[np.intp] | None = None,
+) -> float:
+    """Error over torque, root of the sums of squares over all joints; NaN where unknown.
+
+    Args:
+        error: RMS or standard deviation per joint (n,).
+        torque: RMS per joint (n,).
+        rows: of each joint (n,); equally many if left out.
+    """
+    count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
+    known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
+    if not known.any():
+        return math.nan
+    whole = float(count[known] @ torque[known] ** 2)
+    return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
+
+
+def speed_rms(model: RobotModel, factor: Factor) -> Array:
+    """Root mean square speed per axis (n,) [rad/s, m/s], from the columns of viscous friction.
+
+    That of the motor where only the coupled motor has friction; NaN where no column is a speed.
+    """
+    squares = np.full(model.n_joints, np.nan)
+    for k, term in enumerate(model.friction.terms):
+        if isinstance(term.term, Viscous) and (not term.motor or np.isnan(squares[term.owner])):
+            column = model.base.rank + k
+            squares[term.owner] = factor.gram[term.owner, column, column]
+    rows = factor.samples
+    return np.where(rows > 0, np.sqrt(squares / np.maximum(rows, 1)), np.nan)
+
+
+def _torque_rms(factor: Factor) -> Array:
+    rows = np.where(factor.samples > 0, factor.samples, np.nan)
+    return np.asarray(np.sqrt(factor.gram[:, -1, -1] / rows))
+
+
+_FIGURES: Final = (
+    *("names", "units", "values", "std", "interval_factor", "samples", "noise_std", "condition"),
+    *("undetermined", "method"),
+)
+
+
+def _figures(found: Estimate) -> dict[str, Any]:
+    return {name: getattr(found, name) for name in _FIGURES}
+
+
+def _conditioning(found: Estimate) -> list[str]:
+    if found.undetermined or found.condition <= QR_CONDITION:
+        return []
+    return [
+        f"the scaled condition number is {found.condition:.2g}: the motion hardly tells some "
+        "parameters apart, and sums of squares lose digits there; `hil identify` on these archives "
+        "uses QR"
+    ]
+
+
+def _plus(one: Any, other: Any) -> Any:
+    """The sum of two terms that may be nothing."""
+    return one if other is None else other if one is None else one + other

@@ -1,16 +1,13 @@
 """From archives to factors: one alone, and several of a campaign added up.
 
-Everything here is a pure function of the bytes of archives and of settings; what is kept on a disk
-is only what would be computed again.
+Everything here is a pure function of the bytes of archives and of settings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import lru_cache
-from hashlib import file_digest
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +19,7 @@ from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
 from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
 from hil.identify.sources import Source, known_doubts, source_of
+from hil.io.digest import file_digest
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay_compensation import rate_products
@@ -31,11 +29,11 @@ from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-from .errors import ChangedError, TornError
-from .types import ArchiveFactor, ArchiveRef, Broken, Bundle, FileStamp, Fit, Summary
+from .remote import local_file
+from .types import ArchiveRef, Broken, Bundle, ChangedError, FileStamp, Fit, Summary, TornError
 
 BUNDLE: Final = 16
-"""Archives of a campaign that are reduced together. Of each a summary is kept, of all of them one
+"""Archives of a campaign that are reduced together. Of each a summary is cached, of all of them one
 sum, which is fifty times the size of a summary."""
 
 WEIGHTINGS: Final[tuple[Weighting, ...]] = ("weighted", "ordinary")
@@ -51,8 +49,8 @@ _FIELDS: Final = (
 )
 
 
-def archive_factor(ref: ArchiveRef, settings: Settings) -> ArchiveFactor:
-    """Reduce one archive.
+def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseFactor]:
+    """Reduce one archive: its summary, and its factor block by block of time.
 
     Raises:
         HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
@@ -62,17 +60,16 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> ArchiveFactor:
     source = signals_of(source, settings)
     cell, fitted = cell_in(archive, settings), ref.use == "excitation"
     samples = (samples_of if fitted else judged_samples)(source, cell, settings)
-    model, time = cell.model, source.recording.time
+    model = cell.model
     phase = PhaseFactor.from_samples(model, samples)
     summary = Summary(
         ref=ref,
         total=phase.merged(max(1, len(phase))),
         fits=_fits(model, samples, phase) if fitted else {},
-        duration=float(time[-1] - time[0]),
-        doubts=_doubts(archive, cell, source),
+        warnings=_warnings(archive, cell, source),
         products=rate_products(model, samples) if fitted and settings.delay_variance else None,
     )
-    return ArchiveFactor(summary, phase)
+    return summary, phase
 
 
 def source_in(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]:
@@ -90,6 +87,12 @@ def source_in(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]
             remedy="find the torque constants with `hil gains` and import it again",
         )
     return archive, source
+
+
+def bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
+    """Archives of one campaign in canonical order, in runs that are reduced together."""
+    ordered = sorted(refs, key=lambda ref: ref.order)
+    return [tuple(ordered[k : k + BUNDLE]) for k in range(0, len(ordered), BUNDLE)]
 
 
 def reduce_bundle(
@@ -114,7 +117,7 @@ def reduce_bundle(
         phase, known, lasting = begin.phase, len(begin.refs), begin.lasting
     for ref in refs[known:]:
         try:
-            one = archive_factor(ref, settings)
+            summary, own = archive_factor(ref, settings)
         except (HilError, IdentificationError) as error:
             broken.append(Broken(ref.location, str(error)))
             lasting &= _of_the_bytes(error)
@@ -123,9 +126,9 @@ def reduce_bundle(
             broken.append(Broken(ref.location, f"{type(error).__name__}: {error}"))
             lasting = False
             continue
-        summaries.append(one.summary)
+        summaries.append(summary)
         if ref.use == "excitation":
-            phase = one.phase if phase is None else phase + one.phase
+            phase = own if phase is None else phase + own
     return Bundle(tuple(refs), tuple(summaries), phase, tuple(broken), lasting)
 
 
@@ -161,21 +164,8 @@ def opened(ref: ArchiveRef) -> Iterator[Archive]:
 
 def _require_same(path: Path, ref: ArchiveRef) -> None:
     """Of a fetched copy only the bytes tell whether it is what was found."""
-    same = digest_of(path) == ref.sha256 if ref.stamp is None else stamp_of(path) == ref.stamp
-    if not same:
+    if (digest_of(path) != ref.sha256) if ref.stamp is None else (stamp_of(path) != ref.stamp):
         raise ChangedError(ref.location)
-
-
-@contextmanager
-def local_file(location: str) -> Iterator[Path]:
-    """The file at a path or URL, fetched if need be."""
-    if "://" not in location:
-        yield Path(location)
-        return
-    from .remote_files import local_copy  # needs an extra
-
-    with local_copy(location) as path:
-        yield path
 
 
 def digest_of(path: Path) -> str:
@@ -185,8 +175,7 @@ def digest_of(path: Path) -> str:
         ArchiveError: it cannot be read.
     """
     try:
-        with path.open("rb") as stream:
-            return file_digest(stream, "sha256").hexdigest()
+        return file_digest(path)
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
 
@@ -240,18 +229,13 @@ def design_effect(estimate: Estimate, phase: PhaseFactor, weighting: Weighting) 
     return float(np.einsum("ij,ji->", information, estimate.covariance)) / phase.n_parameters
 
 
-def _doubts(archive: Archive, cell: Cell, source: Source) -> tuple[str, ...]:
-    doubts = [*known_doubts(cell, archive), *archive.header.findings.warnings]
+def _warnings(archive: Archive, cell: Cell, source: Source) -> tuple[str, ...]:
+    warnings = [*known_doubts(cell, archive), *archive.header.findings.warnings]
     if source.merged:
-        doubts.append(
+        warnings.append(
             f"{source.merged} samples had the time stamp of the one before and were averaged "
             "with it"
         )
     if archive.outcome is not None and archive.outcome.repaired:
-        doubts.append("it was repaired, and something is lost")
-    return tuple(doubts)
-
-
-def without_sum(bundle: Bundle) -> Bundle:
-    """The bundle without its large part."""
-    return replace(bundle, phase=None)
+        warnings.append("it was repaired, and something is lost")
+    return tuple(warnings)

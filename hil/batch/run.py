@@ -1,31 +1,44 @@
-"""The whole batch: found, settled, reduced, added up, estimated."""
+"""The whole batch: archives found, settings decided, archives reduced, added up, estimated."""
 
 from __future__ import annotations
 
-import tempfile
+import operator
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
-from typing import cast
+from typing import Any, Final, NamedTuple, cast
 
+from hil.archive import Archive
 from hil.cell import Cell
-from hil.errors import InputError
+from hil.errors import HilError, InputError
+from hil.identify.deciding import MOST_READ, carried_over, decide, with_noise
 from hil.identify.options import Options
-from hil.progress import Reporter
+from hil.identify.settings import Settings
+from hil.identify.sources import Source, all_fitted
+from hil.io.digest import json_digest
+from hil.plural import counted as plural
+from hil.progress import Reporter, Silent, Task
 from identification import IdentificationError
 from identification.factor.phases import PhaseFactor
 from identification.model.payload import Payload
 
-from .cache import Where
+from .cache import (
+    Where,
+    bundle_with_cache,
+    cached_bundle,
+    cached_settings,
+    code_digest,
+    decision_digest,
+    is_cached,
+    put_settings,
+    settings_digest,
+)
 from .discovery import discover
-from .errors import NothingToFitError
-from .estimates import Estimator, Together, plus, repetition_level, sum_level
-from .factors import cell_from, cell_in, opened
-from .keys import code_digest, settings_digest
-from .tree_sum import TreeSum
+from .estimates import Estimator, Group, repetition_level, sum_level
+from .factors import bundles, cell_from, cell_in, opened, source_in
 from .types import (
     ESTIMATORS,
     ArchiveRef,
@@ -33,12 +46,16 @@ from .types import (
     BatchEstimator,
     BatchResult,
     Broken,
+    Bundle,
     GroupKey,
     LevelEstimate,
+    NothingToFitError,
     Summary,
 )
-from .work import Campaign, Work
-from .workers import Workers
+from .workers import ArchiveTask, Part, Summed, TreeSum, Workers
+
+_ROUNDS: Final = 3
+"""How often archives are reduced again without those that end their process."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +65,8 @@ class Plan:
     Attributes:
         options: as of `hil identify`, with an estimator that needs no sample; a single recording is
             never split.
-        cache: folder for what is kept; None: beside the archives.
-        keep: whether anything is kept at all.
+        cache: folder of the cache; None: beside the archives.
+        keep: whether anything is cached at all.
     """
 
     options: Options = Options()
@@ -94,76 +111,335 @@ def reidentify(
     Raises:
         NothingToFitError: there is not one archive that can be fitted.
         InputError: a place does not exist, or the estimator does not suit an arm.
-        CacheError: nothing can be kept where it should be.
+        CacheError: the cache cannot be written.
     """
-    with _kept(plan) as where:
-        found = discover(roots, where, workers, reporter)
-        check(found.refs)
-        work = Work(workers, plan.options, where, reporter)
-        work.broken += found.broken
-        campaigns = [
-            Campaign(key, tuple(refs)) for key, refs in groupby(found.refs, lambda ref: ref.key)
-        ]
-        campaigns = work.settle(campaigns)
-        work.reduce(campaigns)
-        return _Estimates(plan, work, where).result(campaigns, found.skipped)
+    where = Where(None if plan.cache is None else str(plan.cache.resolve()), plan.keep)
+    found = discover(roots, where, workers, reporter)
+    check(found.refs)
+    batch = _Batch(plan, workers, where, reporter)
+    batch.broken += found.broken
+    return batch.result(found.refs, found.skipped)
 
 
-@contextmanager
-def _kept(plan: Plan) -> Iterator[Where]:
-    """Where results of single archives are kept, if only as long as the batch runs."""
-    if plan.keep:
-        yield Where(None if plan.cache is None else str(plan.cache.resolve()))
-        return
-    with tempfile.TemporaryDirectory(prefix="hil-batch-") as folder:
-        yield Where(folder)
+# On a worker
 
 
-class _Estimates:
-    """What comes of the work, arm by arm, with one bundle in memory at a time."""
+class Decision(NamedTuple):
+    """Settings of a campaign.
 
-    def __init__(self, plan: Plan, work: Work, where: Where) -> None:
-        self._plan, self._work, self._where = plan, work, where
+    Attributes:
+        settings: None where there is not one archive to decide them from.
+        broken: archives that could not be read for it.
+    """
+
+    settings: Settings | None
+    broken: tuple[Broken, ...]
+
+
+def decided(
+    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
+) -> Part[None, Decision]:
+    """Decide a campaign's settings from some of its archives, and cache them.
+
+    Args:
+        refs: see `Campaign.consulted`.
+        options: what is open.
+        arms: settings of the arm; None where this campaign decides on them.
+        where: they are cached.
+
+    Raises:
+        RecordingError: a recording cannot be prepared.
+        IdentificationError: a delay was asked for and there is not one usable row.
+    """
+    known = _known_settings(refs, options, arms, where)
+    if known is not None:
+        return Part(None, Decision(known, ()))
+    broken: list[Broken] = []
+    rest: Source | None = None
+    fitted: list[tuple[Archive, Source]] = []
+    for ref in refs:
+        try:
+            if ref.use != "standstill":
+                fitted.append(source_in(ref))
+            elif rest is None:
+                rest = source_in(ref, to_fit=False)[1]
+        except (HilError, IdentificationError) as error:
+            broken.append(Broken(ref.location, str(error)))
+    if not fitted:
+        return Part(None, Decision(None, tuple(broken)))
+    sources, _ = with_noise(
+        all_fitted(cell_in(fitted[0][0]), fitted, None if rest is None else rest.recording)
+    )
+    if arms is None:
+        settings = decide(sources, options, Silent()).settings
+    else:
+        settings = carried_over(arms, sources, options)
+    if not broken:
+        key = decision_digest(options, arms, refs)
+        put_settings(where.store(refs[0].location), key, settings)
+    return Part(None, Decision(settings, tuple(broken)))
+
+
+def _known_settings(
+    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
+) -> Settings | None:
+    if not refs:
+        return None
+    return cached_settings(where.store(refs[0].location), decision_digest(options, arms, refs))
+
+
+def reduced(
+    refs: Sequence[ArchiveRef], settings: Settings, where: Where
+) -> Part[PhaseFactor, Bundle]:
+    """Reduce a bundle: its sum, and the rest of it."""
+    bundle = bundle_with_cache(refs, settings, where)
+    return Part(bundle.phase, replace(bundle, phase=None))
+
+
+def opened_alone(ref: ArchiveRef) -> Part[None, None]:
+    """Open an archive, to see whether that fails, or ends this process."""
+    with opened(ref):
+        return Part(None, None)
+
+
+# In the process that gives work out
+
+
+@dataclass(eq=False)
+class Campaign:
+    """Archives of one group on their way.
+
+    Attributes:
+        key: of the group.
+        refs: archives, without those found to be broken.
+        arms: settings of its arm; None where it decides on them.
+        settings: None until they are decided.
+        jobs: bundles that are reduced and added up together, and whether they are in the cache.
+    """
+
+    key: GroupKey
+    refs: tuple[ArchiveRef, ...]
+    arms: Settings | None = None
+    settings: Settings | None = None
+    jobs: list[tuple[list[tuple[ArchiveRef, ...]], bool]] = field(default_factory=list)
+
+    @property
+    def consulted(self) -> tuple[ArchiveRef, ...]:
+        """The archives that its settings depend on."""
+        ordered = sorted(self.refs, key=lambda ref: ref.order)
+        rest = [ref for ref in ordered if ref.use == "standstill"]
+        fitted = [ref for ref in ordered if ref.use == "excitation"]
+        return (*rest, *fitted[: 1 if self.arms is not None and rest else MOST_READ])
+
+    @property
+    def ready(self) -> Settings:
+        """The settings, once they are decided."""
+        assert self.settings is not None
+        return self.settings
+
+    @property
+    def reduced(self) -> list[ArchiveRef]:
+        """Archives that are reduced: all but those at standstill."""
+        return [ref for ref in self.refs if ref.use != "standstill"]
+
+
+class _Batch:
+    """One run: gives out work, and estimates arm by arm with few bundles in memory at a time."""
+
+    def __init__(self, plan: Plan, workers: Workers, where: Where, reporter: Reporter) -> None:
+        self._plan, self._options, self._where = plan, plan.options, where
+        self._workers, self._reporter = workers, reporter
+        self._task: Task | None = None
+        self._stream: Iterator[Summed[PhaseFactor, Bundle]] = iter(())
+        self.broken: list[Broken] = []
+        self._read = self._cached = 0
         self._arms: dict[str, Arm] = {}
         self._repetitions: list[LevelEstimate] = []
         self._campaigns: list[LevelEstimate] = []
         self._pooled: list[LevelEstimate] = []
 
-    def result(self, campaigns: Sequence[Campaign], skipped: tuple[Broken, ...]) -> BatchResult:
+    def result(self, refs: Sequence[ArchiveRef], skipped: tuple[Broken, ...]) -> BatchResult:
         """Estimate everything."""
-        with self._work.collecting(campaigns):
+        found = [Campaign(key, tuple(own)) for key, own in groupby(refs, lambda ref: ref.key)]
+        campaigns = self._with_settings(found)
+        archives = sum(len(one.reduced) for one in campaigns)
+        self._begin(campaigns)
+        with self._reporter.task("reading archives and estimating", archives) as self._task:
             for digest, members in groupby(campaigns, lambda one: one.key.arm):
                 self._arm(digest, list(members))
+        self._task = None
+        broken = tuple(dict.fromkeys(map(_without_path, self.broken)))
         if not self._repetitions:
-            raise self._nothing()
+            raise _nothing_to_fit(broken)
         return BatchResult(
             estimator=self._plan.estimator,
             arms=self._arms,
             repetitions=tuple(self._repetitions),
             campaigns=tuple(self._campaigns),
             pooled=tuple(self._pooled),
-            broken=tuple(dict.fromkeys(map(_once, self._work.broken))),
+            broken=broken,
             skipped=skipped,
-            read=self._work.read,
-            cached=sum(len(refs) for one in campaigns for refs in one.bundles) - self._work.read,
+            read=self._read,
+            cached=self._cached,
             code=code_digest(),
         )
+
+    # Settings
+
+    def _with_settings(self, campaigns: Sequence[Campaign]) -> list[Campaign]:
+        """Give each campaign its settings; returns those that have some.
+
+        Those of an arm are decided on the first of its campaigns that can be read, and the others
+        take them over with their own noise: comparisons in time need one law, and sums the same
+        columns. A campaign is asked again as long as archives that it was asked for turn out to be
+        broken.
+        """
+        arms: dict[str, Settings] = {}
+        waiting = list(campaigns)
+        while waiting:
+            first = {one.key.arm: one for one in reversed(waiting) if one.key.arm not in arms}
+            asked = list(first.values()) or waiting
+            waiting = [one for one in waiting if first and first.get(one.key.arm) is not one]
+            while asked:
+                asked = self._decide(asked, arms)
+            arms |= {arm: one.settings for arm, one in first.items() if one.settings is not None}
+        return [one for one in campaigns if one.settings is not None]
+
+    def _decide(
+        self, campaigns: Sequence[Campaign], arms: Mapping[str, Settings]
+    ) -> list[Campaign]:
+        """Decide settings of campaigns; returns those to be asked again."""
+        for one in campaigns:
+            one.arms = arms.get(one.key.arm)
+            one.settings = _known_settings(one.consulted, self._options, one.arms, self._where)
+        left = [one for one in campaigns if one.settings is None]
+        tasks = [
+            ArchiveTask(
+                one.key.campaign, decided, (one.consulted, self._options, one.arms, self._where)
+            )
+            for one in left
+        ]
+        again = []
+        for one, note in zip(left, self._notes(tasks, "deciding settings"), strict=True):
+            count, failed = len(one.refs), isinstance(note, Broken)
+            broken = self._unreadable(one.consulted) if failed else note.broken
+            one.settings = None if failed else note.settings
+            self.broken += broken
+            paths = {each.path for each in broken}
+            one.refs = tuple(ref for ref in one.refs if ref.location not in paths)
+            if one.settings is not None or (not one.refs and not failed):
+                continue
+            if 0 < len(one.refs) < count:
+                again.append(one)
+            elif failed:
+                self.broken.append(Broken(one.key.campaign, note.reason))
+            else:
+                why = "none of its archives says how it is to be read"
+                why = why if one.consulted else "it holds no excitation"
+                self.broken.append(Broken(one.key.campaign, why))
+        return again
+
+    def _unreadable(self, refs: Sequence[ArchiveRef]) -> list[Broken]:
+        tasks = [ArchiveTask(ref.location, opened_alone, (ref,)) for ref in refs]
+        notes = self._notes(tasks, "opening archives one by one")
+        return [note for note in notes if isinstance(note, Broken)]
+
+    # Factors
+
+    def _begin(self, campaigns: Sequence[Campaign]) -> None:
+        """Give out the work on archives; what the cache has is read here where that can be seen."""
+        groups = []
+        for one in campaigns:
+            every = bundles(one.reduced)
+            if self._workers.near:
+                one.jobs = [([refs], is_cached(refs, one.ready, self._where)) for refs in every]
+            else:  # few sums to be sent
+                one.jobs = [(every, False)]
+            groups += [self._tasks(one, job) for job, in_cache in one.jobs if not in_cache]
+        archives = sum(len(task.arguments[0]) for group in groups for task in group)
+        share = archives / max(1, sum(map(len, groups)))
+        self._stream = self._workers.sums_in_turn(
+            groups, operator.add, done=lambda count: self._advance(share * count)
+        )
+
+    def _tasks(
+        self, one: Campaign, job: Sequence[tuple[ArchiveRef, ...]]
+    ) -> list[ArchiveTask[PhaseFactor, Bundle]]:
+        return [ArchiveTask(r[0].location, reduced, (r, one.ready, self._where)) for r in job]
+
+    def _collected(self, one: Campaign) -> Iterator[Summed[PhaseFactor, Bundle]]:
+        """Sums of a campaign and the bundles in them, in turn."""
+        for job, in_cache in one.jobs:
+            if not in_cache:
+                yield self._without_crashes(one, job, next(self._stream))
+                continue
+            bundle = cached_bundle(job[0], one.ready, self._where)
+            if bundle is not None:
+                yield Summed(bundle.phase, (bundle,))
+            else:  # damaged
+                (found,) = self._workers.sums([self._tasks(one, job)], operator.add)
+                yield self._without_crashes(one, job, found)
+            self._advance(len(job[0]), one.key.campaign)
+
+    def _without_crashes(
+        self,
+        one: Campaign,
+        job: Sequence[tuple[ArchiveRef, ...]],
+        found: Summed[PhaseFactor, Bundle],
+    ) -> Summed[PhaseFactor, Bundle]:
+        """The sum of bundles; again without the archives that ended their process."""
+        for _ in range(_ROUNDS):
+            if not any(isinstance(note, Broken) for note in found.notes):
+                break
+            pairs = list(zip(job, found.notes, strict=True))
+            job = [self._survivors(one, r) if isinstance(note, Broken) else r for r, note in pairs]
+            job = [refs for refs in job if refs]
+            (found,) = self._workers.sums([self._tasks(one, job)], operator.add)
+        for refs, note in zip(job, found.notes, strict=True):
+            if isinstance(note, Broken):
+                self.broken += [Broken(ref.location, note.reason) for ref in refs]
+        return found
+
+    def _survivors(self, one: Campaign, refs: Sequence[ArchiveRef]) -> tuple[ArchiveRef, ...]:
+        """Those of a bundle that do not end their process when they are reduced alone."""
+        tasks = self._tasks(one, [(ref,) for ref in refs])
+        notes = list(self._notes(tasks, f"reading {refs[0].name} and others one by one"))
+        pairs = list(zip(refs, notes, strict=True))
+        self.broken += [Broken(r.location, note.reason) for r, note in pairs if _is_broken(note)]
+        return tuple(ref for ref, note in pairs if not _is_broken(note))
+
+    def _notes(self, tasks: Sequence[ArchiveTask[Any, Any]], title: str) -> Iterator[Any]:
+        """What is noted of tasks; at most one bar of progress is shown."""
+        if not tasks or self._task is not None:
+            self._advance(0, title)
+            yield from self._workers.notes(tasks)
+            return
+        with self._reporter.task(title, len(tasks)) as progress:
+            found = list(self._workers.notes(tasks, done=progress.advance))
+        yield from found
+
+    def _advance(self, units: float, note: str = "") -> None:
+        if self._task is not None:
+            self._task.advance(units, note)
+
+    # Estimates
 
     def _arm(self, digest: str, members: Sequence[Campaign]) -> None:
         """Campaigns of one arm, and all of them together."""
         settings = members[0].ready
-        self._arms[digest] = Arm(digest, settings.law(self._cell(members[0].refs[0])))
+        arm = Arm(digest, settings.law(self._cell(members[0].refs[0])))
+        self._arms[digest] = arm
         if self._plan.estimator == "prior":
             _require_one_belief(members)
-        estimator = Estimator(self._plan.estimator, self._arms[digest].cell, settings)
-        everything, sums = Together(), TreeSum[PhaseFactor]()
+        estimator = Estimator(self._plan.estimator, arm.cell, settings)
+        everything, sums = Group(), TreeSum[PhaseFactor]()
         levels: list[LevelEstimate] = []
         for one in members:
-            together, phase, found = self._campaign(one, estimator)
+            group, phase, found = self._campaign(one, estimator)
             levels += found
             if phase is not None:
                 sums.add(phase)
-                everything.add(together)
+                everything.add(group)
         self._campaigns += levels
         whole, keys = sums.result(), {ref.key for ref in everything.refs}
         if len(keys) == 1:
@@ -172,84 +448,85 @@ class _Estimates:
             ]
         elif whole is not None:
             with self._failing(f"arm {digest[:8]}"):
-                centre = estimator.centre(whole)
+                centre, apart = estimator.centre(whole), _setups(keys)
                 self._pooled.append(
-                    sum_level("pooled", estimator, everything, whole, centre, _setups(keys))
+                    sum_level("pooled", estimator, everything, whole, centre, apart)
                 )
 
     def _campaign(
         self, one: Campaign, estimator: Estimator
-    ) -> tuple[Together, PhaseFactor | None, list[LevelEstimate]]:
+    ) -> tuple[Group, PhaseFactor | None, list[LevelEstimate]]:
         """Archives of one campaign, the sum of those that are fitted, and the estimate if any."""
-        together, used = Together(), settings_digest(one.ready)
-        together.settings.add(used)
+        used = settings_digest(one.ready)
+        group, sums = Group(settings={used}), TreeSum[PhaseFactor]()
         waiting: list[Summary] = []  # for the centre of all; of very many archives if need be only
-        collected = self._work.collected(one)
-        for bundle in collected:
-            self._work.broken += bundle.broken
-            for summary in bundle.summaries:
-                together.doubts.note(summary)
-                if summary.ref.use == "excitation":
-                    if estimator.draws:
+        for found in self._collected(one):
+            sums.add(found.total)
+            for bundle in found.notes:
+                if isinstance(bundle, Broken):
+                    continue
+                self.broken += bundle.broken
+                self._read += bundle.read
+                self._cached += len(bundle.refs) - bundle.read
+                for summary in bundle.summaries:
+                    group.add_archive(summary)
+                    if summary.ref.use == "excitation" and estimator.shrinks:
                         waiting.append(summary)
-                    else:
-                        together.repetitions.append(repetition_level(estimator, summary, used))
-                    together.refs.append(summary.ref)
-                    together.products = plus(together.products, summary.products)
-                else:
-                    together.unseen = plus(together.unseen, summary.total)
-        phase = collected.total
+                    elif summary.ref.use == "excitation":
+                        group.repetitions.append(repetition_level(estimator, summary, used))
+        phase = sums.result()
         levels: list[LevelEstimate] = []
         if phase is None:
-            return together, None, levels
+            return group, None, levels
         with self._failing(one.key.campaign):
             centre = estimator.centre(phase)
-            together.repetitions += [
+            group.repetitions += [
                 repetition_level(estimator, summary, used, centre) for summary in waiting
             ]
-            payload = _carried(self._cell(together.refs[0]))
-            levels.append(
-                sum_level("campaign", estimator, together, phase, centre, payload=payload)
-            )
-        self._repetitions += together.repetitions
-        return together, phase, levels
+            payload = _payload(self._cell(group.refs[0]))
+            levels.append(sum_level("campaign", estimator, group, phase, centre, (), payload))
+        self._repetitions += group.repetitions
+        return group, phase, levels
 
     @contextmanager
     def _failing(self, name: str) -> Iterator[None]:
-        """What cannot be estimated is listed with the reason, and costs nothing else."""
+        """What cannot be estimated is reported with the reason, and costs nothing else."""
         try:
             yield
         except IdentificationError as error:
-            self._work.broken.append(Broken(name, str(error)))
+            self.broken.append(Broken(name, str(error)))
 
     def _cell(self, ref: ArchiveRef) -> Cell:
         """The cell of an archive."""
-        kept = self._where.store(ref.location).get(ref.cell)
-        texts = [] if kept is None else [kept.header.get(n) for n in ("cell.toml", "robot.urdf")]
-        if texts and all(isinstance(text, str) for text in texts):
+        texts = self._where.store(ref.location).get(ref.cell)
+        if texts is not None and json_digest(texts) == ref.cell:
             return cell_from(*texts)
         with opened(ref) as archive:
             return cell_in(archive)
 
-    def _nothing(self) -> NothingToFitError:
-        problem = "there is no excitation and no imported recording that can be fitted"
-        broken = list(dict.fromkeys(map(_once, self._work.broken)))
-        if broken:
-            path, reason = broken[0]
-            problem += (
-                f"; {path} could not be used: {reason}"
-                if len(broken) == 1
-                else f"; {len(broken)} could not be used, the first of them {path}: {reason}"
-            )
-        return NothingToFitError(None, problem)
+
+def _is_broken(note: object) -> bool:
+    return isinstance(note, Broken)
 
 
-def _once(one: Broken) -> Broken:
+def _nothing_to_fit(broken: Sequence[Broken]) -> NothingToFitError:
+    problem = "there is no excitation and no imported recording that can be fitted"
+    if broken:
+        path, reason = broken[0]
+        problem += (
+            f"; {path} could not be used: {reason}"
+            if len(broken) == 1
+            else f"; {len(broken)} could not be used, the first of them {path}: {reason}"
+        )
+    return NothingToFitError(None, problem)
+
+
+def _without_path(one: Broken) -> Broken:
     """Without the path in the reason, where it stands already."""
     return Broken(one.path, one.reason.removeprefix(f"{one.path}: "))
 
 
-def _carried(cell: Cell) -> Payload | None:
+def _payload(cell: Cell) -> Payload | None:
     """The payload that a cell states; None for one of no weight and inertia."""
     payload = cell.model.payload
     return payload if payload is not None and payload.parameters.any() else None
@@ -261,11 +538,11 @@ def _setups(keys: Collection[GroupKey]) -> list[str]:
     if len(counts) < 2:
         return []
     stated = "; ".join(
-        f"{setup or 'nothing'} ({count} {'campaign' if count == 1 else 'campaigns'})"
+        f"{setup or 'nothing'} ({plural(count, 'campaign')})"
         for setup, count in sorted(counts.items())
     )
     return [
-        f"pooled over campaigns whose cells state different things, known and taken off: {stated}"
+        f"pooled over campaigns whose cells state different things, known and compensated: {stated}"
     ]
 
 

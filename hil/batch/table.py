@@ -10,19 +10,19 @@ import csv
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
-import numpy as np
-
-from hil.batch.types import Arm, BatchResult, LevelEstimate
+from hil.files import replacing
 from hil.timestamps import instant
 from hil.version import software
+
+from .estimates import relative_error
+from .types import Arm, BatchResult, LevelEstimate
 
 SCHEMA_VERSION: Final = 1
 """Raised when a column changes its meaning or goes; new columns do not raise it."""
@@ -49,21 +49,9 @@ class Table:
     rows: Callable[[BatchResult], Iterator[Row]]
 
     @property
-    def plain_columns(self) -> list[str]:
+    def csv_columns(self) -> list[str]:
         """Those that CSV has: all but lists."""
         return [name for name, kind in self.columns.items() if kind != "numbers"]
-
-
-_ESTIMATE_COLUMNS: Final[Mapping[str, Kind]] = {
-    "level": "text",
-    "arm": "text",
-    "arm_digest": "text",
-    "campaign": "text",
-    "setup": "text",
-    "archive": "text",
-    "archive_sha256": "text",
-    "when": "time",
-}
 
 
 def write_tables(folder: Path, result: BatchResult) -> list[Path]:
@@ -122,7 +110,7 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
             "relative_error": relative_error(level.noise_std, level.torque_rms, level.samples),
             "unseen_relative_error": relative_error(level.unseen_rms, level.unseen_torque_rms),
             "method": level.method,
-            "doubts": "; ".join(level.doubts),
+            "doubts": "; ".join(level.warnings),
             "estimator": result.estimator,
             "settings": level.settings,
             "code": result.code,
@@ -171,76 +159,39 @@ def _unused_rows(result: BatchResult) -> Iterator[Row]:
             yield {"path": one.path, "kind": kind, "reason": one.reason}
 
 
+def _columns(text: str) -> dict[str, Kind]:
+    """Columns from their names, each with its kind behind a colon unless that is text."""
+    pairs = (one.partition(":") for one in text.split())
+    return {name: cast(Kind, kind or "text") for name, _, kind in pairs}
+
+
+_ESTIMATE: Final = "level arm arm_digest campaign setup archive archive_sha256 when:time"
 TABLES: Final = (
     Table(
         "parameters",
-        {
-            **_ESTIMATE_COLUMNS,
-            "parameter": "text",
-            "kind": "text",
-            "axis": "text",
-            "unit": "text",
-            "value": "number",
-            "std": "number",
-            "low": "number",
-            "high": "number",
-            "determined": "truth",
-            "archives": "count",
-            "samples": "count",
-            "condition": "number",
-            "relative_error": "number",
-            "unseen_relative_error": "number",
-            "method": "text",
-            "doubts": "text",
-            "estimator": "text",
-            "settings": "text",
-            "code": "text",
-            "software": "text",
-            "covariance": "numbers",
-        },
+        _columns(
+            f"{_ESTIMATE} parameter kind axis unit value:number std:number low:number high:number "
+            "determined:truth archives:count samples:count condition:number relative_error:number "
+            "unseen_relative_error:number method doubts estimator settings code software "
+            "covariance:numbers"
+        ),
         _parameter_rows,
     ),
     Table(
         "axes",
-        {
-            **_ESTIMATE_COLUMNS,
-            "axis": "text",
-            "unit": "text",
-            "samples": "count",
-            "torque_rms": "number",
-            "error_std": "number",
-            "unseen_torque_rms": "number",
-            "unseen_error_rms": "number",
-        },
+        _columns(
+            f"{_ESTIMATE} axis unit samples:count torque_rms:number error_std:number "
+            "unseen_torque_rms:number unseen_error_rms:number"
+        ),
         _axis_rows,
     ),
-    Table("not_used", {"path": "text", "kind": "text", "reason": "text"}, _unused_rows),
+    Table("not_used", _columns("path kind reason"), _unused_rows),
 )
 
 
-def relative_error(
-    error: np.ndarray[Any, np.dtype[np.float64]],
-    torque: np.ndarray[Any, np.dtype[np.float64]],
-    rows: np.ndarray[Any, np.dtype[np.intp]] | None = None,
-) -> float:
-    """Error over torque, root of the sums of squares over all joints; NaN where unknown.
-
-    Args:
-        error: RMS or standard deviation per joint (n,).
-        torque: RMS per joint (n,).
-        rows: of each joint (n,); equally many if left out.
-    """
-    count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
-    known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
-    if not known.any():
-        return math.nan
-    whole = float(count[known] @ torque[known] ** 2)
-    return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
-
-
 def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
-    columns = table.plain_columns
-    with _replaced(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    columns = table.csv_columns
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         for row in table.rows(result):
@@ -255,10 +206,7 @@ def _as_text(value: Any) -> Any:
         return value.isoformat()
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, str):
-        # A file name may hold bytes that are no text.
-        return value.encode("utf-8", "replace").decode("utf-8")
-    return value
+    return _clean(value)
 
 
 def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
@@ -281,30 +229,17 @@ def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
     )
     rows = table.rows(result)
     with (
-        _replaced(path) as temporary,
+        replacing(path) as temporary,
         pyarrow.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,
     ):
         while portion := list(islice(rows, _PORTION)):
             arrays = [
-                pyarrow.array([_cell(row[name]) for row in portion], types[kind])
+                pyarrow.array([_clean(row[name]) for row in portion], types[kind])
                 for name, kind in table.columns.items()
             ]
             writer.write_table(pyarrow.Table.from_arrays(arrays, schema=schema))
 
 
-def _cell(value: Any) -> Any:
+def _clean(value: Any) -> Any:
+    """Without the bytes in a file name that are no text."""
     return value.encode("utf-8", "replace").decode("utf-8") if isinstance(value, str) else value
-
-
-@contextmanager
-def _replaced(path: Path) -> Iterator[Path]:
-    """A file to write in place of another, which is kept if the writing fails."""
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.unlink(missing_ok=True)  # in an untrusted folder it may be a link
-    try:
-        yield temporary
-        temporary.replace(path)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise

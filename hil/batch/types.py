@@ -1,4 +1,4 @@
-"""What passes between the parts of the batch: references, settings, factors, results."""
+"""What passes between the parts of a batch: references, summaries, estimates, results, errors."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
+from hil.errors import ArchiveError, InputError
 from identification.factor.factor import Estimate, Factor
 from identification.factor.phases import PhaseFactor
 from identification.model.payload import Payload
@@ -21,6 +22,32 @@ BatchEstimator = Literal["auto", "wls", "ols", "prior", "consistent"]
 
 ESTIMATORS: Final[tuple[BatchEstimator, ...]] = get_args(BatchEstimator)
 """The estimators that need factors only, and no sample."""
+
+
+class TornError(ArchiveError):
+    """An archive that is not whole; a batch uses none in part."""
+
+    def __init__(self, location: str, damage: str) -> None:
+        super().__init__(location, damage, remedy=f"hil archive repair {location}")
+
+
+class ChangedError(ArchiveError):
+    """An archive that was written to while the batch ran."""
+
+    def __init__(self, location: str) -> None:
+        super().__init__(location, "was changed while it was read", remedy="run the batch again")
+
+
+class UnavailableError(InputError):
+    """An address that cannot be read now, for reasons that are not those of its content."""
+
+
+class NothingToFitError(InputError):
+    """A batch without one archive that can be fitted."""
+
+
+class CacheError(InputError):
+    """A cache folder that cannot be written to."""
 
 
 class GroupKey(NamedTuple):
@@ -53,8 +80,10 @@ class ArchiveRef:
     Attributes:
         location: path or URL.
         sha256: of all bytes.
-        use: "excitation" (fitted), "validation" (predicted), "standstill" (noise).
-        arm: see :class:`GroupKey`.
+        use: "excitation" (fitted), "validation" (predicted), "standstill" (noise), or the kind of
+            an archive that a batch does not use.
+        arm: see :class:`GroupKey`; "" for an archive that a batch does not use, as all that its
+            cell says.
         campaign: see :class:`GroupKey`.
         index: of the interval within its kind; 0 for imported ones.
         cell: digest of the texts of cell file and URDF.
@@ -63,6 +92,11 @@ class ArchiveRef:
         setup: see :class:`GroupKey`.
         belief: digest of what the cell's `[nominal]` says of the arm.
         stamp: of the file when it was hashed; None of a remote one.
+        kind: as its metadata say.
+        attempt: at the interval; 0 where the archive does not number them.
+        outcome: how the recording ended.
+        record: digest of the metadata.
+        simulated: whether no arm moved.
     """
 
     location: str
@@ -77,6 +111,11 @@ class ArchiveRef:
     setup: str = ""
     belief: str = ""
     stamp: FileStamp | None = None
+    kind: str = ""
+    attempt: int = 0
+    outcome: str = "completed"
+    record: str = ""
+    simulated: bool = False
 
     @property
     def name(self) -> str:
@@ -116,14 +155,13 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """What is kept of each archive beside the sum of all: some ten kilobytes.
+    """What is cached of each archive beside the sum of all.
 
     Attributes:
         ref: the archive.
         total: its factor as one block.
         fits: by weighting, "weighted" and "ordinary"; none of a validation run.
-        duration: from first to last sample [s].
-        doubts: what a reader must know of it.
+        warnings: what a reader must know of it.
         products: (n, p, p + 1), see
             :func:`identification.estimators.delay_compensation.rate_products`; None where the delay
             is known, or nothing is fitted.
@@ -132,22 +170,13 @@ class Summary:
     ref: ArchiveRef
     total: PhaseFactor
     fits: Mapping[str, Fit]
-    duration: float
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     products: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class ArchiveFactor:
-    """An archive reduced: its summary, and its factor block by block of time."""
-
-    summary: Summary
-    phase: PhaseFactor
-
-
-@dataclass(frozen=True, eq=False)
 class Bundle:
-    """Some archives of one campaign, reduced together: what travels from a worker.
+    """Some archives of one campaign, reduced together.
 
     Attributes:
         refs: those asked for, in their order.
@@ -155,6 +184,7 @@ class Bundle:
         phase: sum of the factors of those that are fitted; None where none is.
         broken: the others.
         lasting: whether those would be broken another time as well, as long as they stay the same.
+        read: archives that were read for it; the rest comes from the cache.
     """
 
     refs: tuple[ArchiveRef, ...]
@@ -162,6 +192,7 @@ class Bundle:
     phase: PhaseFactor | None
     broken: tuple[Broken, ...] = ()
     lasting: bool = True
+    read: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +240,8 @@ class LevelEstimate:
         undetermined: names.
         method: in words.
         settings: digest of the settings; "" where campaigns with different ones are pooled.
-        doubts: what a reader must know.
-        speed_rms: per axis (n,), see :mod:`hil.batch.axis_figures`; None for a repetition.
+        warnings: what a reader must know.
+        speed_rms: per axis (n,), see :func:`hil.batch.estimates.speed_rms`; None for a repetition.
         information: weighted Gram matrix (p, p) of the fitted rows; None for a repetition.
         setup: what the cell states that archives of one arm may differ in, in words; "" if
             nothing, or if campaigns with different ones are pooled.
@@ -240,7 +271,7 @@ class LevelEstimate:
     undetermined: tuple[str, ...]
     method: str
     settings: str
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     speed_rms: Array | None = None
     information: Array | None = None
     setup: str = ""

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Final
 from hil.archive import ArchiveName
 from hil.archive.header import REJECTED
 from hil.files import write_atomically
-from hil.reading import digest_of, is_no_file, json_of, lies_there, opened, text_of
+from hil.io.digest import digest, file_digest, json_digest
+from hil.reading import is_no_file, json_of, lies_there, opened, text_of
 
 from . import folder_lock
 from .errors import CampaignFolderError, NotRehearsedError
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from .plan import CampaignPlan
 
 
-import hashlib
 import io
 from collections.abc import Mapping
 
@@ -43,11 +43,6 @@ _PACKAGE: Final = "package://"
 _FILE: Final = "file://"
 
 
-def checksum(content: bytes) -> str:
-    """SHA-256 in hexadecimal digits."""
-    return hashlib.sha256(content).hexdigest()
-
-
 def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
     """Checksums of the inputs of a plan, and of the collision meshes that they name.
 
@@ -58,7 +53,7 @@ def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
     Returns:
         By file name; a mesh that cannot be read is "missing" (no motion is checked without).
     """
-    sums = {name: checksum(content) for name, content in contents.items()}
+    sums = {name: digest(content) for name, content in contents.items()}
     for mesh in _collision_meshes(contents.get("robot.urdf", b"")):
         places = _places(mesh, _mesh_folders(contents.get("cell.toml", b""), root), root)
         sums[MESH + mesh] = next(filter(None, map(_read, places)), MISSING)
@@ -67,7 +62,7 @@ def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
 
 def combined(sums: Mapping[str, str]) -> str:
     """One checksum over all."""
-    return checksum(json.dumps(dict(sums), sort_keys=True).encode())
+    return json_digest(dict(sums))
 
 
 def as_text(content: bytes) -> str:
@@ -102,7 +97,7 @@ def _places(mesh: str, folders: list[Path], root: Path) -> list[Path]:
 
 def _read(path: Path) -> str | None:
     try:
-        return digest_of(path)
+        return file_digest(path)
     except OSError:
         return None
 
@@ -306,7 +301,7 @@ class CampaignFolder:
             CampaignFolderError: the disk refuses.
         """
         content = self._content()
-        entry = Entry(name, outcome, digest_of(self.archives / name), reason)
+        entry = Entry(name, outcome, file_digest(self.archives / name), reason)
         self._save(content | {"archives": [*content["archives"], asdict(entry)]})
 
     def reject(self, name: str, reason: str) -> None:
@@ -316,7 +311,7 @@ class CampaignFolder:
             CampaignFolderError: the disk refuses.
         """
         content = self._content()
-        now = asdict(Entry(name, REJECTED, digest_of(self.archives / name), reason))
+        now = asdict(Entry(name, REJECTED, file_digest(self.archives / name), reason))
         entries = [now if one["name"] == name else one for one in content["archives"]]
         self._save(content | {"archives": entries})
 
@@ -370,7 +365,7 @@ class CampaignFolder:
 
     def _unchanged(self, entry: Entry) -> bool:
         try:
-            return digest_of(self.archives / entry.name) == entry.sha256
+            return file_digest(self.archives / entry.name) == entry.sha256
         except OSError as error:
             if is_no_file(error):
                 return False

@@ -8,10 +8,10 @@ from typing import Annotated, Final
 
 import typer
 
-from hil.batch.local import LocalWorkers
+from hil.batch.workers import LocalWorkers
 from hil.compare import compare_campaigns, gather
 from hil.compare.record import to_dict
-from hil.compare.words import caveat, told, verdict
+from hil.compare.words import caveat, findings, verdict
 from hil.files import make_folder, write_together
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
@@ -60,7 +60,7 @@ def compare(
         typer.echo(json_module.dumps(to_dict(found)))
     else:
         if not quiet:
-            for one in told(found):
+            for one in findings(found):
                 typer.echo(printable(f"{one.words} {one.next_step}".rstrip()), err=True)
             for doubt in found.doubts:
                 typer.echo(printable(f"note: {doubt}"), err=True)

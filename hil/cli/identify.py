@@ -16,15 +16,12 @@ from hil.cli.identify_options import (
     StandstillOption,
     TorqueBandwidthOption,
     VelocityOption,
-    bandwidth_from,
-    delay_from,
-    torque_bandwidth_from,
+    options_from,
 )
 from hil.cli.verdict import finish
 from hil.errors import InputError
 from hil.files import make_folder
-from hil.identify import Options, identify_archives, identify_campaign
-from hil.identify.options import friction_from
+from hil.identify import identify_archives, identify_campaign
 from hil.outcome import write_outcome
 from hil.progress import reporter as make_reporter
 from hil.reading import lies_there
@@ -101,16 +98,16 @@ def identify(
     Exit status 0 if the model is good, 5 if it is not.
     """
     reporter = make_reporter(quiet=quiet or json)
-    options = Options(
+    options = options_from(
         method="paper" if paper else "default",
         split=split,
-        delay=delay_from(delay),
-        torque_bandwidth=torque_bandwidth_from(torque_bandwidth),
+        delay=delay,
+        torque_bandwidth=torque_bandwidth,
         smoother=smoother,
         estimator=estimator,
-        bandwidth=bandwidth_from(bandwidth),
+        bandwidth=bandwidth,
         velocity=velocity,
-        friction="auto" if friction == "auto" else friction_from(friction),
+        friction=friction,
         standstill=standstill,
         in_sample=in_sample,
     )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import typer
 
 from hil.errors import InputError
-from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator
+from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator, Options, friction_from
 from identification.signals.samples import Smoother
 
 LONGEST_DELAY: Final = 0.5
@@ -72,6 +72,38 @@ TorqueBandwidthOption = Annotated[
         'the model is then filtered alike. "none", or "auto": estimated, of imported torques.',
     ),
 ]
+
+
+def options_from(
+    *,
+    estimator: Estimator,
+    bandwidth: str,
+    velocity: Literal["auto", "position", "measured"],
+    friction: str,
+    standstill: Literal["auto", "rests", "slow", "none"],
+    delay: str | None,
+    smoother: Smoother,
+    torque_bandwidth: str,
+    **others: Any,
+) -> Options:
+    """The options of an identification as the command line says them.
+
+    What is not text on the command line is given as :class:`hil.identify.options.Options` has it.
+
+    Raises:
+        InputError: one of them cannot be used.
+    """
+    return Options(
+        estimator=estimator,
+        bandwidth=bandwidth_from(bandwidth),
+        velocity=velocity,
+        friction="auto" if friction == "auto" else friction_from(friction),
+        standstill=standstill,
+        delay=delay_from(delay),
+        smoother=smoother,
+        torque_bandwidth=torque_bandwidth_from(torque_bandwidth),
+        **others,
+    )
 
 
 def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:

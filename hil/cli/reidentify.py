@@ -11,12 +11,10 @@ from typing import Annotated, Final
 import typer
 
 from hil.batch import run
-from hil.batch.keys import code_digest
-from hil.batch.local import TIMEOUT, LocalWorkers
+from hil.batch.cache import code_digest
 from hil.batch.table import write_tables
-from hil.batch.trend import Trends, trends, write_trend
 from hil.batch.types import BatchEstimator, BatchResult
-from hil.batch.workers import Workers
+from hil.batch.workers import TIMEOUT, LocalWorkers, Workers
 from hil.cli import reidentify_words as words
 from hil.cli.identify_options import (
     BandwidthOption,
@@ -26,12 +24,10 @@ from hil.cli.identify_options import (
     StandstillOption,
     TorqueBandwidthOption,
     VelocityOption,
-    bandwidth_from,
-    delay_from,
-    torque_bandwidth_from,
+    options_from,
 )
+from hil.compare.trend import Trends, trends
 from hil.files import make_folder, writing_to
-from hil.identify.options import Options, friction_from
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
@@ -70,7 +66,7 @@ def reidentify(
         str | None,
         typer.Option(
             metavar="FOLDER|none",
-            help="Where factors are kept. If left out: in .hil-cache beside the archives, or below "
+            help="Where factors are cached. If left out: .hil-cache beside the archives, or below "
             "the user's cache folder where those cannot be written to.",
             show_default=False,
         ),
@@ -95,26 +91,26 @@ def reidentify(
 ) -> None:
     """Identify every arm from all archives below some folders, campaign by campaign.
 
-    What an archive contributes is kept, so that a second run, by another estimator or with more
-    archives, reads only what is new. Ctrl-C loses nothing that was kept.
+    What an archive contributes is cached, so that a second run, by another estimator or with more
+    archives, reads only what is new. Ctrl-C loses nothing of the cache.
 
     Exit status: 0 every archive that is meant to be fitted was used, 5 some could not be (they are
-    listed with the reason), 2 there is nothing to fit. What is not meant to be fitted, such as
-    moves, motions that were stopped, and copies, is left alone, and counted by reason.
+    reported with the reason), 2 there is nothing to fit. What is not meant to be fitted, such as
+    moves, motions that were stopped, and copies, is left alone, and summed up by reason.
     """
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:
         make_folder(output)
     keep = cache != "none"
     plan = run.Plan(
-        Options(
-            delay=delay_from(delay),
-            torque_bandwidth=torque_bandwidth_from(torque_bandwidth),
+        options_from(
+            delay=delay,
+            torque_bandwidth=torque_bandwidth,
             smoother=smoother,
             estimator=estimator,
-            bandwidth=bandwidth_from(bandwidth),
+            bandwidth=bandwidth,
             velocity=velocity,
-            friction=friction_from(friction),
+            friction=friction,
             standstill=standstill,
         ),
         cache=Path(cache) if keep and cache is not None else None,
@@ -125,8 +121,12 @@ def reidentify(
     found = trends(result)
     written: list[Path] = []
     if output is not None:
+        from hil.report.trend import FILE_NAME, write_trend_report  # matplotlib is slow to import
+
+        page = output / FILE_NAME
         with writing_to(output):
-            written = [*write_tables(output, result), write_trend(output, found)]
+            written = [*write_tables(output, result), page]
+            write_trend_report(page, found)
     if json:
         typer.echo(json_module.dumps(words.as_dict(result, found, written)))
     else:
@@ -140,7 +140,7 @@ def _workers(
 ) -> AbstractContextManager[Workers]:
     if address is None:
         return LocalWorkers(count)
-    from hil.batch.distributed import DaskWorkers  # an extra
+    from hil.batch.cluster import DaskWorkers  # an extra
 
     hands = DaskWorkers(address, identity=code_digest, timeout=TIMEOUT)
     try:

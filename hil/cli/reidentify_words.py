@@ -10,11 +10,11 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
-from hil.batch.table import relative_error
-from hil.batch.trend import ArmTrend, Trends
-from hil.batch.trend_words import findings, summary
+from hil.batch.estimates import relative_error
 from hil.batch.types import Arm, BatchResult, Broken, LevelEstimate
-from hil.plural import counted
+from hil.compare.findings import findings, summary
+from hil.compare.trend import ArmTrend, Trends
+from hil.plural import counted as plural
 
 _LISTED: Final = 20
 _WIDTH: Final = 42
@@ -56,14 +56,14 @@ def _arm_lines(
         )
     shown = campaigns[-_LISTED:]
     if len(campaigns) > len(shown):
-        yield f"  … {len(campaigns) - len(shown)} more, listed with --output and --json"
+        yield f"  … {len(campaigns) - len(shown)} more: see --output and --json"
     several = len({one.setup for one in campaigns}) > 1
     for before, one in zip([None, *shown], shown, strict=False):
         if several and (before is None or before.setup != one.setup):
             yield f"    stated: {one.setup or 'nothing'}"
         yield _campaign_line(one, above)
-    for doubt in dict.fromkeys(doubt for one in pooled for doubt in one.doubts):
-        yield f"  note: {doubt}"
+    for warning in dict.fromkeys(text for one in pooled for text in one.warnings):
+        yield f"  note: {warning}"
     if trend is not None:
         for finding in findings(trend):
             if finding.level == "alarm":
@@ -108,7 +108,7 @@ def broken_lines(broken: Sequence[Broken]) -> Iterator[str]:
     for one in broken[:_LISTED]:
         yield f"{one.path} could not be used: {one.reason}"
     if len(broken) > _LISTED:
-        yield f"and {len(broken) - _LISTED} more, listed with --output and --json"
+        yield f"and {len(broken) - _LISTED} more: see --output and --json"
 
 
 def skipped_line(skipped: Sequence[Broken]) -> str:
@@ -116,8 +116,8 @@ def skipped_line(skipped: Sequence[Broken]) -> str:
     if not skipped:
         return ""
     counts = Counter(_kind(one.reason) for one in skipped)
-    listed = "; ".join(_times(reason, count) for reason, count in counts.most_common())
-    return f"left alone, as not meant to be fitted: {listed}"
+    reasons = "; ".join(_times(reason, count) for reason, count in counts.most_common())
+    return f"left alone, as not meant to be fitted: {reasons}"
 
 
 def _kind(reason: str) -> str:
@@ -136,12 +136,12 @@ def _times(reason: str, count: int) -> str:
 def last_line(result: BatchResult) -> str:
     """What was used, and what was not."""
     counts = (
-        counted(len(result.repetitions), "repetition"),
-        counted(len(result.campaigns), "campaign"),
-        counted(len(result.arms), "arm"),
+        plural(len(result.repetitions), "repetition"),
+        plural(len(result.campaigns), "campaign"),
+        plural(len(result.arms), "arm"),
     )
     return (
-        f"{counts[0]} in {counts[1]} of {counts[2]}; {counted(result.read, 'archive')} read,"
+        f"{counts[0]} in {counts[1]} of {counts[2]}; {plural(result.read, 'archive')} read,"
         f" {result.cached} known, {len(result.skipped)} left alone, {len(result.broken)} broken"
     )
 
@@ -186,7 +186,7 @@ def _level(one: LevelEstimate) -> dict[str, Any]:
             name: {"value": float(value), "std": float(std) if math.isfinite(std) else None}
             for name, value, std in zip(one.names, one.values, one.std, strict=True)
         },
-        "doubts": list(one.doubts),
+        "doubts": list(one.warnings),
     }
 
 

@@ -9,16 +9,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.batch.axis_figures import friction_of, friction_weights
-from hil.batch.estimates import errors
-from hil.batch.payload_trend import PayloadTrend, freedom_of, payload_trend
-from hil.batch.trend import FALSE_ALARMS, LEAST_FRICTION
-from hil.batch.trend_words import short_names
+from hil.batch.estimates import errors, relative_error
 from hil.batch.types import LevelEstimate
 from identification import RobotModel
 
 from .gather import Gathered
+from .payload import PayloadTrend, freedom_of, payload_trend
 from .spread import Difference, Known, difference, holm, known
+from .trend import (
+    FALSE_ALARMS,
+    LEAST_FRICTION,
+    friction_in,
+    friction_weights,
+    short_names,
+    typical_speed,
+)
 
 Array = NDArray[np.float64]
 
@@ -43,8 +48,8 @@ class AxisChange:
         differences: of each campaign against the first; the first's is None.
         p_values: adjusted for all axes and campaigns (k,); NaN of the first.
         changed: which campaigns differ from the first by more than chance and enough to matter.
-        slight: which differ by more than chance, and too little to be told as a change.
-        smallest: change that would have been told (k,), as a share; NaN of the first.
+        slight: which differ by more than chance, and too little to count as a change.
+        smallest: detection limit (k,), as a share; NaN of the first.
     """
 
     joint: str
@@ -127,7 +132,7 @@ class Comparison:
 
     @property
     def changed(self) -> bool:
-        """Whether anything is told to have changed."""
+        """Whether anything has changed."""
         return self.friction_changed or self.load_changed
 
     @property
@@ -137,7 +142,7 @@ class Comparison:
 
     @property
     def friction_slight(self) -> bool:
-        """Whether friction of any axis differs, but by too little to be told as a change."""
+        """Whether friction of any axis differs, but by too little to count as a change."""
         return any(any(axis.slight) for axis in self.axes)
 
     @property
@@ -159,7 +164,7 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
     own = tuple(
         f"{name}: {doubt}"
         for name, one in zip(called, campaigns, strict=True)
-        for doubt in one.doubts
+        for doubt in one.warnings
     )
     return Comparison(
         arm=gathered.arm.name,
@@ -177,9 +182,9 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
 
 def _axes(model: RobotModel, gathered: Gathered) -> tuple[AxisChange, ...]:
     campaigns, repetitions = gathered.campaigns, gathered.repetitions
-    speed = _typical_speed(model, campaigns)
+    speed = typical_speed(model, campaigns)
     weights = friction_weights(model, speed)
-    pooled = [friction_of(one.values, _covariance(one), weights) for one in campaigns]
+    pooled = [friction_in(one, weights) for one in campaigns]
     single = [_per_repetition(own, weights) for own in repetitions]
     rows = [
         tuple(
@@ -256,24 +261,7 @@ def _differences(row: Sequence[Known]) -> tuple[Difference | None, ...]:
 
 def _per_repetition(own: Sequence[LevelEstimate], weights: Array) -> Array:
     """Friction of each axis by each repetition (m, n)."""
-    return np.array(
-        [friction_of(one.values, np.diag(one.std**2), weights)[0] for one in own]
-    ).reshape(len(own), len(weights))
-
-
-def _covariance(level: LevelEstimate) -> Array:
-    return np.diag(level.std**2) if level.covariance is None else level.covariance
-
-
-def _typical_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Array:
-    """One speed for each axis (n,), the median of what the campaigns had; NaN if none has one."""
-    speeds = np.array([one.speed_rms for one in campaigns if one.speed_rms is not None])
-    found = np.full(model.n_joints, np.nan)
-    for j in range(model.n_joints):
-        own = speeds[:, j][np.isfinite(speeds[:, j])] if len(speeds) else speeds
-        if len(own):
-            found[j] = np.median(own)
-    return found
+    return np.array([friction_in(one, weights)[0] for one in own]).reshape(len(own), len(weights))
 
 
 def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction:
@@ -289,9 +277,7 @@ def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction
                 continue  # what it cannot know may be needed there
             left, torque = errors(motion.unseen, one.values)
             joints[row, column] = left / np.where(torque > 0.0, torque, np.nan)
-            overall[row, column] = np.sqrt(
-                np.nansum(rows * left**2) / max(float(np.nansum(rows * torque**2)), 1e-300)
-            )
+            overall[row, column] = relative_error(left, torque, rows)
     return Prediction(overall, joints)
 
 

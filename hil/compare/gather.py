@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from hil.archive import open_archive
 from hil.batch import run
-from hil.batch.factors import cell_in, local_file, opened
+from hil.batch.factors import cell_in, opened
 from hil.batch.types import ArchiveRef, Arm, Broken, LevelEstimate
 from hil.batch.workers import Workers
 from hil.cell import Cell
@@ -50,7 +49,7 @@ def gather(
         places: campaign folders, or folders with campaigns below; the `results.json` of a campaign
             stands for its folder.
         workers: read the archives.
-        reporter: told of the progress.
+        reporter: of progress.
         plan: how to identify; by default with least squares, which draw no change towards
             anything.
 
@@ -58,12 +57,18 @@ def gather(
         InputError: there is one campaign only, or campaigns are of different arms.
     """
     roots = [_folder(place) for place in places]
+    refs: list[ArchiveRef] = []
+
+    def check(found: Sequence[ArchiveRef]) -> None:
+        _require_campaigns_of_one_arm(found)
+        refs.extend(found)
+
     result = run.reidentify(
         roots,
         plan or run.Plan(Options(estimator="wls")),
         workers,
         reporter,
-        check=_require_campaigns_of_one_arm,
+        check=check,
     )
     campaigns = list(result.campaigns)
     if len(campaigns) < 2:
@@ -87,14 +92,8 @@ def gather(
         ),
         dated=dated,
         broken=result.broken,
-        simulated=_simulated(result.repetitions[0]),
+        simulated=refs[0].simulated,  # as all of one arm
     )
-
-
-def _simulated(repetition: LevelEstimate) -> bool:
-    """Of one archive: simulations and recordings are never of one arm."""
-    with local_file(repetition.archive) as path:
-        return open_archive(path, fields=()).header.only_simulated
 
 
 def _folder(place: str) -> str:

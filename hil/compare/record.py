@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from .comparison import AxisChange, Comparison, ParameterChange
-from .words import caveat, names, told, verdict
+from .words import caveat, findings, names, verdict
 
 
 def to_dict(found: Comparison) -> dict[str, Any]:
@@ -20,7 +20,7 @@ def to_dict(found: Comparison) -> dict[str, Any]:
         "friction_slight": found.friction_slight,
         "load_changed": found.load_changed,
         "verdict": verdict(found),
-        "told": [vars(one) for one in told(found)],
+        "told": [vars(one) for one in findings(found)],
         "caveat": caveat(found),
         "doubts": list(found.doubts),
         "campaigns": [

@@ -3,41 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from hil.batch.chart import FEWEST
-from hil.batch.trend import LEAST_FRICTION, ArmTrend
-from hil.batch.trend_words import campaign_name, payload_findings
-
 from .comparison import AxisChange, Comparison
+from .findings import Finding, payload_findings
+from .trend import FEWEST, LEAST_FRICTION, campaign_names
 
 _LEAST: Final = f"{100.0 * LEAST_FRICTION:g} %"
 _PREDICTS_WORSE: Final = 1.1
 """Ratio of prediction errors from which a model is said to predict worse."""
 
 
-@dataclass(frozen=True)
-class Told:
-    """One thing to know.
-
-    Attributes:
-        level: "changed", or "same" for what did not, did by little, or could not be told.
-        words: a sentence.
-        next_step: what to do about it; "" for nothing.
-    """
-
-    level: Literal["changed", "same"]
-    words: str
-    next_step: str = ""
-
-
 def names(found: Comparison) -> list[str]:
     """What each campaign is called: the last part of its folder, and its day."""
-    arm = _as_history(found)
-    return [campaign_name(arm, k) for k in range(len(found.campaigns))]
+    return campaign_names(found.campaigns, days=found.dated)
 
 
 def verdict(found: Comparison) -> str:
@@ -54,22 +35,22 @@ def verdict(found: Comparison) -> str:
         axes = [axis.joint for axis in found.axes if any(axis.slight)]
         return f"No change of {_LEAST} or more; friction of {_listed(axes)} differs by less"
     if not parts:
-        return "No change can be told"
+        return "No significant change"
     return f"Changed: {_listed(parts)}"
 
 
-def told(found: Comparison) -> list[Told]:
+def findings(found: Comparison) -> list[Finding]:
     """Everything in sentences, what changed first; never empty."""
     called = names(found)
     every = [
-        Told("changed", _axis_words(axis, k, called), _axis_step(axis, k))
+        Finding("changed", _axis_words(axis, k, called), _axis_step(axis, k))
         for axis in found.axes
         for k in range(1, len(called))
         if axis.changed[k]
     ]
-    for finding in payload_findings(_as_history(found)):
+    for finding in payload_findings(found.payload, called):
         level: Literal["changed", "same"] = "same" if finding.level == "quiet" else "changed"
-        every.append(Told(level, finding.words, finding.next_step))
+        every.append(Finding(level, finding.words, finding.next_step))
     every += _slight(found, called)
     every += _unchanged(found)
     every += _predictions(found, called)
@@ -107,8 +88,8 @@ def _axis_step(axis: AxisChange, k: int) -> str:
     return "Was it warmer, or has gear or lubricant been changed?"
 
 
-def _slight(found: Comparison, called: list[str]) -> list[Told]:
-    """What differs by more than chance, and by less than is told as a change."""
+def _slight(found: Comparison, called: list[str]) -> list[Finding]:
+    """What differs by more than chance, and by less than counts as a change."""
     sentences = []
     for k in range(1, len(called)):
         axes = [axis for axis in found.axes if axis.slight[k]]
@@ -119,14 +100,14 @@ def _slight(found: Comparison, called: list[str]) -> list[Told]:
         size = low if low == high else f"{low} to {high}"
         words = (
             f"Friction of {_listed([axis.joint for axis in axes])} has changed by {size} % from"
-            f" {called[0]} to {called[k]}: more than chance, and less than the {_LEAST} that is"
-            " told as a change."
+            f" {called[0]} to {called[k]}: more than chance, and less than the {_LEAST} that"
+            " count as a change."
         )
-        sentences.append(Told("same", words))
+        sentences.append(Finding("same", words))
     return sentences
 
 
-def _unchanged(found: Comparison) -> list[Told]:
+def _unchanged(found: Comparison) -> list[Finding]:
     same = [axis for axis in found.axes if not any(axis.changed) and not any(axis.slight)]
     judged = [axis for axis in same if np.isfinite(axis.p_values).any()]
     silent = [axis.joint for axis in same if not np.isfinite(axis.p_values).any()]
@@ -135,24 +116,24 @@ def _unchanged(found: Comparison) -> list[Told]:
         worst = max(judged, key=lambda axis: float(np.nanmax(axis.smallest)))
         axes = _listed([axis.joint for axis in judged])
         sentences.append(
-            Told(
+            Finding(
                 "same",
-                f"Friction of {axes} has not changed, as far as can be told; a change by "
-                f"{100.0 * float(np.nanmax(worst.smallest)):.0f} % would have been told of each"
-                + (f" (least well known: {worst.joint})." if len(judged) > 1 else "."),
+                f"Friction of {axes} has not changed significantly; the detection limit is "
+                f"{100.0 * float(np.nanmax(worst.smallest)):.0f} %"
+                + (f" (of {worst.joint}, the least well known)." if len(judged) > 1 else "."),
             )
         )
     if silent:
-        sentences.append(Told("same", f"Friction of {_listed(silent)} is not determined."))
+        sentences.append(Finding("same", f"Friction of {_listed(silent)} is not determined."))
     if found.payload.untested:
         words = f"Whether it carries the same was not tested: {found.payload.untested}."
-        sentences.append(Told("same", words))
+        sentences.append(Finding("same", words))
     elif not found.load_changed:
-        sentences.append(Told("same", "What it carries has not changed, as far as can be told."))
+        sentences.append(Finding("same", "What it carries has not changed significantly."))
     return sentences
 
 
-def _predictions(found: Comparison, called: list[str]) -> list[Told]:
+def _predictions(found: Comparison, called: list[str]) -> list[Finding]:
     """How the first model does on the motions of the others, beside their own models."""
     sentences = []
     for k in range(1, len(called)):
@@ -166,28 +147,13 @@ def _predictions(found: Comparison, called: list[str]) -> list[Told]:
             else "as well as that campaign's own model"
         )
         sentences.append(
-            Told(
+            Finding(
                 "same",
                 f"The model of {called[0]} predicts the validation motions of {called[k]} "
                 f"{how}: {100.0 * first:.2g} % against {100.0 * own:.2g} % of the torque.",
             )
         )
     return sentences
-
-
-def _as_history(found: Comparison) -> ArmTrend:
-    """The campaigns as sentences on payloads want them."""
-    return ArmTrend(
-        name=found.arm,
-        campaigns=tuple(one.campaign for one in found.campaigns),
-        when=tuple(one.when for one in found.campaigns),
-        time=np.arange(float(len(found.campaigns))),
-        dated=found.dated,
-        axes=(),
-        parameters=(),
-        payload=found.payload,
-        setups=tuple(one.setup for one in found.campaigns),
-    )
 
 
 def _listed(words: list[str]) -> str:

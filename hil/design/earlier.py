@@ -24,8 +24,8 @@ from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.settings import samples_of
 from hil.identify.sources import cell_of, gather_sources
+from hil.io.digest import file_digest
 from hil.progress import Reporter
-from hil.reading import digest_of
 from identification.excitation import SAMPLE_PERIOD
 from identification.factor.factor import Factor
 
@@ -67,7 +67,9 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
         samples=samples,
         repetitions=cell.campaign.repetitions,
         archives=tuple(
-            (path.name, digest_of(path)) for path in archives if open_archive(path).kind in _MOTIONS
+            (path.name, file_digest(path))
+            for path in archives
+            if open_archive(path).kind in _MOTIONS
         ),
     )
 

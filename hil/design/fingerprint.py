@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from typing import Any
 
 from pydantic import BaseModel
 
 from hil.cell import Cell
+from hil.io.digest import json_digest
 
 _DIGITS = 16
 # What a motion and its criteria are made from. A change of the rest (walls, motors, home) leaves
@@ -38,10 +37,7 @@ def fingerprint(cell: Cell) -> dict[str, str]:
         "workspace": _plain(cell.file.workspace),
         "home": None if home is None else home.home_deg,
     }
-    return {
-        name: hashlib.sha256(json.dumps(part, sort_keys=True).encode()).hexdigest()[:_DIGITS]
-        for name, part in parts.items()
-    }
+    return {name: json_digest(part)[:_DIGITS] for name, part in parts.items()}
 
 
 def _plain(table: BaseModel | None) -> Any:

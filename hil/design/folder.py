@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ from typing import BinaryIO, cast
 
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically
+from hil.io.lock import locked
 from hil.reading import opened
 
 from .result import RESULT
@@ -61,26 +60,22 @@ class DesignFolder:
             InputError: another search is at work in it, it cannot be made, or not be locked.
         """
         make_folder(self.root)
-        with self._written():
-            descriptor = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise InputError(
+
+        def refusal(error: OSError) -> InputError:
+            if isinstance(error, BlockingIOError):
+                return InputError(
                     self.root,
                     "a search is running in it",
                     remedy="wait for its end, stop it (Ctrl-C), or name another folder (-o)",
-                ) from error
-            except OSError as error:
-                raise InputError(
-                    self.root,
-                    f"cannot be locked against a second search ({error.strerror})",
-                    remedy="name a folder on a disk of this PC (-o)",
-                ) from error
+                )
+            return InputError(
+                self.root,
+                f"cannot be locked against a second search ({error.strerror})",
+                remedy="name a folder on a disk of this PC (-o)",
+            )
+
+        with locked(self.root, refusal):
             yield
-        finally:
-            os.close(descriptor)
 
     def begin(self, settings: DesignSettings, *, force: bool) -> None:
         """Make room for a new design, and write down what is asked for; the folder is held.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import write_atomically
+from hil.io.digest import digest, json_digest
 from hil.reading import text_of
 from hil.version import software
 from identification.excitation import (
@@ -88,7 +88,7 @@ def joints_of(data: Mapping[str, Any]) -> tuple[str, ...]:
 
 def motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
     """Return what two motions share only if they are the same to the last bit."""
-    return hashlib.sha256(json.dumps(trajectory.to_dict()).encode()).hexdigest()
+    return digest(json.dumps(trajectory.to_dict()))
 
 
 Array = NDArray[np.float64]
@@ -418,4 +418,4 @@ def _seal(text: str) -> str:
     """Return a digest of what a text says; comments, blanks and the seal itself do not count."""
     data = tomllib.loads(text, parse_float=str)
     data.pop("seal", None)
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+    return json_digest(data)

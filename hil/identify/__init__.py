@@ -1,6 +1,21 @@
 """From archives to a result: reads archives and nothing else."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from .options import Options
-from .run import Identification, identify_archives, identify_campaign
+
+if TYPE_CHECKING:
+    from .run import Identification, identify_archives, identify_campaign
 
 __all__ = ["Identification", "Options", "identify_archives", "identify_campaign"]
+
+
+def __getattr__(name: str) -> Any:
+    """What needs the pages of a report is imported when it is used: workers of a batch do not."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from . import run
+
+    return getattr(run, name)

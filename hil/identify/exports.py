@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
+from hil.io.digest import file_digest
 from hil.results import ExportResult, Results
 from identification import Estimate, IdentificationError, RobotModel
 from identification.estimators.consistent import ConsistentEstimate
@@ -99,7 +99,7 @@ def exports_of(
 
 def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:
     """Where a result comes from: cell, archives with their digests, software and verdict."""
-    digests = (f"{path.name} sha256 {_digest(path)}" for path in archives)
+    digests = (f"{path.name} sha256 {file_digest(path)}" for path in archives)
     return {
         "robot": results.cell,
         "simulated": "yes" if results.simulated else "no",
@@ -107,11 +107,6 @@ def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:
         "software": ", ".join(f"{name} {version}" for name, version in results.software.items()),
         "verdict": ("good" if results.verdict.good else "NOT GOOD") + f": {results.verdict.line}",
     }
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _friction(

@@ -18,7 +18,7 @@ from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
-from hil.reading import digest_of
+from hil.io.digest import file_digest
 from hil.recordings import recording_of
 from identification.signals.clock import true_times
 from identification.signals.noise import standstill_variance
@@ -265,7 +265,7 @@ def _refuse_duplicates(paths: Sequence[Path]) -> None:
     seen: dict[str, Path] = {}
     for path in paths:
         try:
-            digest = digest_of(path)
+            digest = file_digest(path)
         except OSError:
             continue  # opening it will say so
         if digest in seen:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from os import PathLike
@@ -15,6 +14,7 @@ from hil.archive import Samples, write_samples
 from hil.errors import SourceError
 from hil.importers.findings import clock_fault, examine
 from hil.importers.robot import Robot
+from hil.io.digest import file_digest
 
 Use = Literal["excitation", "validation", "standstill"]
 
@@ -69,7 +69,7 @@ def write_imported(
     entries = {
         **metadata,
         "source": json.dumps([path.name for path in source]),
-        "source_sha256": json.dumps([_digest(path) for path in source]),
+        "source_sha256": json.dumps([file_digest(path) for path in source]),
         "held_joints": json.dumps(list(held_joints)),
         "use": use,
         "findings": json.dumps(findings.model_dump()),
@@ -106,8 +106,3 @@ def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
                 remedy="cut the recording there, or leave the quantity out (numbers up to "
                 f"{_MOST:g} can be used)",
             )
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

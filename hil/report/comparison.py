@@ -7,10 +7,11 @@ import string
 from dataclasses import dataclass
 from typing import Any
 
-from hil.batch.trend import FALSE_ALARMS, LEAST_EFFECT, LEAST_FRICTION
 from hil.compare import words
 from hil.compare.comparison import AxisChange, Comparison, ParameterChange
+from hil.compare.payload import LEAST_EFFECT
 from hil.compare.spread import FEWEST, Known
+from hil.compare.trend import FALSE_ALARMS, LEAST_FRICTION
 from hil.report import numbers
 from hil.report.figures.comparison import friction_panels
 from hil.report.rendering import Numbering, environment, page_bytes
@@ -43,7 +44,7 @@ def _context(found: Comparison) -> dict[str, Any]:
         "found": found,
         "letters": letters,
         "verdict": words.verdict(found),
-        "told": words.told(found),
+        "told": words.findings(found),
         "caveat": words.caveat(found),
         "names": words.names(found),
         "campaigns": [_campaign(found, k) for k in range(len(letters))],

@@ -9,11 +9,11 @@ from typing import Final
 
 import numpy as np
 
-from hil.batch.chart import FEWEST
-from hil.batch.payload_trend import Statement, Verdict
-from hil.batch.trend import (
+from hil.compare.findings import Finding, findings, summary
+from hil.compare.payload import LEAST_EFFECT, Statement, Verdict
+from hil.compare.trend import (
     FALSE_ALARMS,
-    LEAST_EFFECT,
+    FEWEST,
     LEAST_ERROR,
     LEAST_FRICTION,
     ArmTrend,
@@ -22,7 +22,6 @@ from hil.batch.trend import (
     Trends,
     Watched,
 )
-from hil.batch.trend_words import Finding, campaign_folder, findings, summary
 from hil.files import write_atomically
 from hil.report import numbers
 from hil.report.figures.svg import Panel
@@ -33,6 +32,8 @@ from hil.report.figures.trend import (
     payload_panels,
 )
 from hil.report.rendering import Numbering, environment, page_bytes
+
+FILE_NAME: Final = "trend.html"
 
 _NORMAL_INTERVAL = 1.96
 _VERDICTS: Final[dict[Verdict, str]] = {
@@ -96,7 +97,7 @@ class ArmPart:
     good: bool
     line: str
     findings: list[Finding]
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     campaigns: int
     span: str
     untested: str
@@ -148,7 +149,7 @@ def _arm_part(arm: ArmTrend, key: str) -> ArmPart:
         good=all(one.level != "alarm" for one in found),
         line=summary(arm),
         findings=found,
-        doubts=arm.doubts,
+        warnings=arm.warnings,
         campaigns=len(arm.campaigns),
         span=_span(arm),
         untested=arm.payload.untested,
@@ -177,7 +178,7 @@ def _campaign_row(arm: ArmTrend, k: int) -> CampaignRow:
         f"{axis.joint} ({' and '.join(what)})" for axis in arm.axes if (what := _what(axis, k))
     ]
     return CampaignRow(
-        name=campaign_folder(arm, k),
+        name=arm.labels[k],
         when=arm.when[k][:16].replace("T", " ") if arm.dated else numbers.MISSING,
         mass=_with_std(float(payload.mass[k]), float(payload.mass_std[k])),
         p_value=numbers.MISSING if change is None else numbers.significant(change.p_value, 2),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
-from hil.batch.keys import arm_digest
-from hil.batch.trend_words import short_names
+from hil.batch.cache import arm_digest
 from hil.campaign import CampaignFolderError
 from hil.cell import Cell
 from hil.compare.gather import apart
+from hil.compare.trend import short_names
 from hil.errors import InputError
 from hil.identify.sources import cell_of
 from hil.identify.summary import planted_in
+from hil.io.digest import digest
 from hil.progress import Reporter
 from hil.version import software
 from identification.excitation import Excitation
@@ -252,7 +252,7 @@ def homes(runs: Sequence[Run]) -> list[Run]:
     for run in runs:
         paths = [run.folder.archives / name for name, _ in run.archives("validation")]
         texts = [open_archive(one, fields=()).attachments.get("plan.json") for one in paths]
-        plans[run.key] = {hashlib.sha256(text).hexdigest() for text in texts if text is not None}
+        plans[run.key] = {digest(text) for text in texts if text is not None}
     every = [motion for own in plans.values() for motion in own]
     return [run for run in runs if plans[run.key]] if len(every) > len(set(every)) else []
 

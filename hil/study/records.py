@@ -8,8 +8,6 @@ one matrix for each motion gives the error of every estimate, without its archiv
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.files import make_folder, write_or_tell
+from hil.io.digest import json_digest
 from hil.reading import text_of
 from hil.results.frozen import Frozen
 from identification import RobotModel
@@ -143,8 +142,7 @@ def write_record(path: Path, record: Record) -> None:
 
 def digest(archives: Sequence[tuple[str, str]], others: Mapping[str, Any]) -> str:
     """Digest of archives (name, checksum) and of whatever else a record rests on."""
-    content = json.dumps([VERSION, list(archives), others], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()
+    return json_digest([VERSION, list(archives), others])
 
 
 def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.design import preset
+from hil.io.digest import digest
 from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
 from hil.version import software
@@ -88,8 +88,7 @@ def run_study(
         cell = Cell.load(CELL_PATH)
     else:
         simulated_link(cell)  # refuses real hardware before anything is searched
-        digest = hashlib.sha256((cell.text + cell.urdf).encode()).hexdigest()
-        settings = settings.model_copy(update={"cell": digest})
+        settings = settings.model_copy(update={"cell": digest(cell.text + cell.urdf)})
     with folder.locked():
         folder.begin(settings)
         stages = Stages(root)

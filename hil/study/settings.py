@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import time
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from pydantic import Field
 
 from hil.errors import InputError, OutputError
 from hil.files import make_folder, write_or_tell
+from hil.io.lock import locked
 from hil.reading import text_of
 from hil.results.frozen import Frozen
 
@@ -155,19 +155,17 @@ class StudyFolder:
             InputError: another study is running in it, or it cannot be made.
         """
         make_folder(self.root)
-        descriptor = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise InputError(
-                    self.root,
-                    "another study is running in it",
-                    remedy="wait for its end, stop it (Ctrl-C), or name another folder (--output)",
-                ) from error
+
+        def refusal(error: OSError) -> InputError:
+            if isinstance(error, BlockingIOError):
+                problem = "another study is running in it"
+                remedy = "wait for its end, stop it (Ctrl-C), or name another folder (--output)"
+                return InputError(self.root, problem, remedy=remedy)
+            problem = f"cannot be locked against a second study ({error.strerror})"
+            return InputError(self.root, problem, remedy="name another folder (--output)")
+
+        with locked(self.root, refusal):
             yield
-        finally:
-            os.close(descriptor)
 
     def begin(self, settings: StudySettings) -> None:
         """Write down what is asked for, or resume a study that was asked for the same.

@@ -22,8 +22,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hil.batch.local import LocalWorkers
-from hil.batch.workers import Workers
+from hil.batch.workers import LocalWorkers, Workers
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
 from tests.arguments import whole_number

@@ -205,7 +205,7 @@ def _by_archive(
     found[""] = (result.pooled[0].values, result.pooled[0].std)
     said = [f"{one.path}: {one.reason}" for one in (*result.broken, *result.skipped)]
     levels = (*result.repetitions, *result.campaigns, *result.pooled)
-    said += [doubt for one in levels for doubt in one.doubts]
+    said += [doubt for one in levels for doubt in one.warnings]
     return found, said
 
 

@@ -12,7 +12,7 @@ import pytest
 from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import repair
-from hil.batch.local import LocalWorkers
+from hil.batch.workers import LocalWorkers
 from hil.errors import ArchiveError, InputError
 from hil.identify import identify_archives
 from hil.progress import Silent

@@ -11,10 +11,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hil.batch.axis_figures import speed_rms
-from hil.batch.trend import ArmTrend, arm_trend
+from hil.batch.estimates import speed_rms
 from hil.batch.types import LevelEstimate
 from hil.cell import Cell
+from hil.compare.trend import ArmTrend, arm_trend
 from identification import Motion, RobotModel
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import estimate, joint_weights

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.batch.on_workers import ArchiveTask, Part
+from hil.batch.workers import ArchiveTask, Part
 from hil.errors import ArchiveError
 
 Array = NDArray[np.float64]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
-from hil.batch.on_workers import ArchiveTask, Part, Summed, run_task
-from hil.batch.places import Place
+from hil.batch.discovery import Place
 from hil.batch.types import ArchiveRef, Broken
-from hil.batch.workers import Workers, summed
+from hil.batch.workers import ArchiveTask, Part, Summed, Workers, run_task, summed
 
 NOTHING_OPEN: Final = (
     *("--bandwidth", "40", "--velocity", "position", "--friction", "coulomb,viscous"),
@@ -24,14 +23,14 @@ class Here(Workers):
         self.deadly, self.near = deadly, near
         self.tasks: list[ArchiveTask[Any, Any]] = []
 
-    def sums(
+    def sums_in_turn(
         self,
         groups: Sequence[Sequence[ArchiveTask[Any, Any]]],
         add: Callable[[Any, Any], Any],
         *,
         done: Callable[[int], None] | None = None,
-    ) -> list[Summed[Any, Any]]:
-        return [summed([self._part(task, done) for task in group], add) for group in groups]
+    ) -> Iterator[Summed[Any, Any]]:
+        return (summed([self._part(task, done) for task in group], add) for group in groups)
 
     def _part(
         self, task: ArchiveTask[Any, Any], done: Callable[[int], None] | None

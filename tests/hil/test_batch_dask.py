@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import subprocess
 import sys
@@ -17,24 +18,30 @@ from hypothesis import strategies as st
 from hil.archive import container
 from hil.batch import cluster as dask_cluster
 from hil.batch import run
-from hil.batch.cluster import ClusterError
-from hil.batch.distributed import DaskWorkers
-from hil.batch.examining import examined
-from hil.batch.keys import code_digest
-from hil.batch.local import LocalWorkers
-from hil.batch.on_workers import (
-    StrangeWorkerError,
-    Summed,
+from hil.batch.cache import code_digest
+from hil.batch.cluster import (
+    ClusterError,
+    DaskWorkers,
+    WorkerSoftwareError,
     release_children,
     software,
     sum_archives,
 )
-from hil.batch.tree import FAN_IN, runs, sum_run, sum_tree
+from hil.batch.run import reduced
 from hil.batch.types import BatchResult, Broken
+from hil.batch.workers import (
+    FAN_IN,
+    LocalWorkers,
+    Summed,
+    Workers,
+    sum_run,
+    sum_tree,
+)
 from hil.campaign import Campaign
 from hil.errors import InputError
 from hil.identify.options import FIXED
 from hil.progress import Silent
+from hil.version import install_command
 from tests.hil import batch_work as work
 from tests.hil.dask_cluster import Cluster, running
 from tests.hil.web_folder import served
@@ -77,12 +84,6 @@ def connected(cluster: Cluster, timeout: float = PATIENCE, patience: float = PAT
 # The order of a sum
 
 
-@given(st.integers(0, 600))
-def test_the_runs_of_a_sum_take_every_term_once_and_in_order(count: int) -> None:
-    assert [k for run in runs(count) for k in run] == list(range(count))
-    assert all(1 <= len(run) <= FAN_IN for run in runs(count))
-
-
 @given(st.lists(st.one_of(st.none(), st.text(max_size=2)), max_size=200))
 def test_a_tree_adds_what_is_there_from_first_to_last(terms: list[str | None]) -> None:
     present = [term for term in terms if term is not None]
@@ -91,9 +92,9 @@ def test_a_tree_adds_what_is_there_from_first_to_last(terms: list[str | None]) -
 
 @given(st.lists(st.floats(-1e10, 1e10), min_size=1, max_size=300))
 def test_a_run_may_be_added_apart_without_a_difference(terms: list[float]) -> None:
+    runs = [terms[k : k + FAN_IN] for k in range(0, len(terms), FAN_IN)]
     whole = sum_tree(terms, float.__add__)
-    parts = [sum_run([terms[k] for k in run], float.__add__) for run in runs(len(terms))]
-    assert sum_tree(parts, float.__add__) == whole
+    assert sum_tree([sum_run(run, float.__add__) for run in runs], float.__add__) == whole
 
 
 # What a cluster computes
@@ -225,7 +226,7 @@ def test_a_worker_with_other_code_is_refused(
 
 def test_a_worker_with_other_code_that_joins_later_computes_nothing() -> None:
     expected = software(work.identity) | {"hil": "other code"}
-    with pytest.raises(StrangeWorkerError, match=r"hil the code of .* instead of other code"):
+    with pytest.raises(WorkerSoftwareError, match=r"hil the code of .* instead of other code"):
         sum_archives(
             [work.task(work.numbers, 0)],
             work.add,
@@ -304,7 +305,7 @@ def test_archives_behind_a_web_server_are_read_by_the_workers(
     assert [values for _, values in _figures(found)] == [values for _, values in _figures(expected)]
 
 
-class _KillsOne:
+class _KillsOne(Workers):
     """Workers of which one is killed as soon as the first archives were reduced."""
 
     near = False
@@ -319,13 +320,9 @@ class _KillsOne:
     def __exit__(self, *_: object) -> None:
         self._hands.close()
 
-    def sums(self, groups, add, *, done=None):
-        return self._hands.sums(groups, add, done=done)
-
     def sums_in_turn(self, groups, add, *, done=None):
         """The work on archives."""
-
-        begun = groups[0][0].function is not examined
+        begun = any(task.function is reduced for group in groups for task in group)
 
         def killing(count: int) -> None:
             if begun:
@@ -371,7 +368,7 @@ def _figures(result: BatchResult) -> list[tuple[str, tuple[bytes, ...]]]:
 
 def test_nothing_of_dask_is_imported_before_it_is_asked_for() -> None:
     program = (
-        "import sys, hil.batch.distributed, hil.batch.remote_files, hil.batch.on_workers\n"
+        "import sys, hil.batch.cluster, hil.batch.remote\n"
         "print([name for name in ('dask', 'distributed', 'fsspec') if name in sys.modules])"
     )
     found = subprocess.run(
@@ -382,7 +379,7 @@ def test_nothing_of_dask_is_imported_before_it_is_asked_for() -> None:
 
 def test_without_dask_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_cluster, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match=r"pip install 'hil\[cluster\]'"):
+    with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
         DaskWorkers("tcp://127.0.0.1:9", identity=work.identity)
 
 

@@ -16,16 +16,13 @@ import numpy as np
 import pytest
 
 from hil.archive import Samples, write_samples
-from hil.batch import examining, factors
-from hil.batch.cache import Where
+from hil.batch import discovery, factors
+from hil.batch.cache import Where, bundle_with_cache, cached_bundle
 from hil.batch.discovery import Discovery, discover
-from hil.batch.errors import ChangedError, NothingToFitError, UnavailableError
 from hil.batch.factors import opened, reduce_bundle
-from hil.batch.keeping import bundle_with_cache, kept_bundle
-from hil.batch.keys import code_digest
-from hil.batch.local import LocalWorkers
 from hil.batch.run import Plan, reidentify
-from hil.batch.types import ArchiveRef
+from hil.batch.types import ArchiveRef, ChangedError, NothingToFitError, UnavailableError
+from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign
 from hil.cell import Cell
 from hil.errors import InputError
@@ -283,7 +280,7 @@ def test_a_damaged_manifest_is_told_and_does_not_stop_the_batch(folder: Path) ->
 def old_archive(tmp_path: Path, arm: Cell, monkeypatch: pytest.MonkeyPatch) -> Path:
     """One that nobody has touched for long."""
     path = recording(tmp_path / "data" / "a.mcap", arm)
-    monkeypatch.setattr(examining, "_SETTLED", 0)
+    monkeypatch.setattr(discovery, "_UNTOUCHED", 0)
     time.sleep(0.01)
     return path
 
@@ -291,13 +288,13 @@ def old_archive(tmp_path: Path, arm: Cell, monkeypatch: pytest.MonkeyPatch) -> P
 def counted(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     """How many archives were opened since."""
     calls: list[Path] = []
-    whole = examining.open_archive
+    whole = discovery.open_archive
 
     def counting(path: Path, **how: object):
         calls.append(path)
         return whole(path, **how)
 
-    monkeypatch.setattr(examining, "open_archive", counting)
+    monkeypatch.setattr(discovery, "open_archive", counting)
     return lambda: len(calls)
 
 
@@ -308,24 +305,11 @@ def test_a_note_is_believed_until_the_programs_change(
     first = found_in(old_archive)
     assert found_in(old_archive) == first
     assert opened_so_far() == 1
-    monkeypatch.setattr(examining, "code_digest", lambda: "other programs")
-    monkeypatch.setattr(examining, "arm_digest", lambda *_, **__: "another idea of an arm")
+    monkeypatch.setattr(discovery, "code_digest", lambda: "other programs")
+    monkeypatch.setattr(discovery, "arm_digest", lambda *_, **__: "another idea of an arm")
     (ref,) = found_in(old_archive).refs
     assert ref.arm == "another idea of an arm"
     assert opened_so_far() == 2
-
-
-@pytest.mark.parametrize("name", ["examining.py", "keys.py", "setup.py", "factors.py"])
-def test_a_change_of_the_programs_changes_their_digest(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here, read = code_digest(), Path.read_bytes
-
-    def changed(path: Path) -> bytes:
-        return read(path) + (b"\n" if path.parent.name == "batch" and path.name == name else b"")
-
-    monkeypatch.setattr(Path, "read_bytes", changed)
-    assert code_digest.__wrapped__() != here
 
 
 def test_workers_look_into_what_is_not_noted_and_only_that(tmp_path: Path, arm: Cell) -> None:
@@ -363,9 +347,9 @@ def test_a_remote_archive_replaced_after_it_was_hashed_is_not_taken_for_it(
     fsspec.filesystem("memory").pipe(address, other)
     with pytest.raises(ChangedError), opened(ref):
         pass
-    kept = bundle_with_cache((ref,), SETTINGS, where)
-    assert "changed" in kept.bundle.broken[0].reason
-    assert kept_bundle((ref,), SETTINGS, where) is None
+    reduced = bundle_with_cache((ref,), SETTINGS, where)
+    assert "changed" in reduced.broken[0].reason
+    assert cached_bundle((ref,), SETTINGS, where) is None
 
 
 def test_what_a_file_met_while_it_was_written_to_is_no_fault_of_it(
@@ -395,16 +379,16 @@ def test_a_store_that_fails_is_told_and_not_remembered(
     def busy(*_: object) -> None:
         raise RuntimeError("503, Service Unavailable")
 
-    monkeypatch.setattr("hil.batch.remote_files._PAUSES", (0.0,))
+    monkeypatch.setattr("hil.batch.remote._PAUSES", (0.0,))
     with monkeypatch.context() as patch:
         patch.setattr(fsspec.get_filesystem_class("memory"), "get_file", busy)
         with pytest.raises(UnavailableError, match="503"), opened(ref):
             pass
         failed = bundle_with_cache((ref,), SETTINGS, where)
-        assert "503" in failed.bundle.broken[0].reason
+        assert "503" in failed.broken[0].reason
     again = bundle_with_cache((ref,), SETTINGS, where)
     assert again.read == 1
-    assert "503" not in str(again.bundle.broken)
+    assert "503" not in str(again.broken)
 
 
 def test_a_fault_of_the_bytes_is_remembered(tmp_path: Path, arm: Cell) -> None:

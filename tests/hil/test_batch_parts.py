@@ -1,10 +1,12 @@
-"""Parts of the batch by themselves: what is kept, how sums are made, who does the work."""
+"""Parts of the batch by themselves: the cache, sums, keys, workers."""
 
 from __future__ import annotations
 
+import json
 import operator
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,17 +14,26 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from isal.isal_zlib import crc32
 
-from hil.batch.cache import Store, Where, decoded, encoded
-from hil.batch.cache_codec import settings_from, settings_header
-from hil.batch.errors import CacheError
-from hil.batch.keeping import BUNDLE, bundles
-from hil.batch.keys import arm_digest, settings_digest, sum_key
-from hil.batch.local import LocalWorkers
-from hil.batch.on_workers import ArchiveTask, Part
-from hil.batch.tree import sum_tree
-from hil.batch.tree_sum import TreeSum
-from hil.batch.types import ArchiveRef, Broken
+from hil.batch.cache import (
+    _HEAD,
+    _MAGIC,
+    Store,
+    Where,
+    arm_digest,
+    cached_bundle,
+    cached_settings,
+    code_digest,
+    decoded,
+    encoded,
+    put_settings,
+    settings_digest,
+    sum_key,
+)
+from hil.batch.factors import BUNDLE, bundles
+from hil.batch.types import ArchiveRef, Broken, CacheError
+from hil.batch.workers import ArchiveTask, LocalWorkers, Part, TreeSum, sum_tree
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
 from hil.identify.settings import Settings
@@ -40,23 +51,23 @@ def a_ref(index: int, campaign: str = "/data/one") -> ArchiveRef:
     return ArchiveRef(name, f"{index:064x}", "excitation", "arm", campaign, index, "cell", "motion")
 
 
-# Sums
+class TestTreeSum:
+    @given(st.lists(st.none() | st.floats(-1e6, 1e6), max_size=600))
+    def test_adds_runs_of_eight_then_their_sums(self, terms: list[float | None]) -> None:
+        """To the last bit, whoever adds which run."""
+        expected = terms
+        while len(expected) > 1:
+            runs = [expected[k : k + 8] for k in range(0, len(expected), 8)]
+            present = [[term for term in run if term is not None] for run in runs]
+            expected = [None if not run else sum(run[1:], run[0]) for run in present]
+        assert sum_tree(terms, operator.add) == (expected[0] if terms else None)
 
-
-@given(st.lists(st.none() | st.floats(-1e6, 1e6), max_size=200))
-def test_a_sum_of_terms_that_come_one_by_one_is_that_of_the_tree(terms: list[float | None]) -> None:
-    sums = TreeSum[float]()
-    for term in terms:
-        sums.add(term)
-    assert sums.result() == sum_tree(terms, lambda a, b: a + b)  # to the last bit
-
-
-def test_many_terms_are_not_kept() -> None:
-    sums = TreeSum[float]()
-    for _ in range(8**4 + 5):
-        sums.add(1.0)
-    assert len(sums._levels) == 5
-    assert sums.result() == 8**4 + 5
+    def test_holds_one_sum_per_level(self) -> None:
+        sums = TreeSum[float]()
+        for _ in range(8**4 + 5):
+            sums.add(1.0)
+        assert len(sums._levels) == 5
+        assert sums.result() == 8**4 + 5
 
 
 @given(st.permutations(range(40)))
@@ -66,40 +77,104 @@ def test_bundles_do_not_depend_on_the_order_of_archives(order: list[int]) -> Non
     assert [ref.index for one in found for ref in one] == list(range(40))
 
 
-# What is kept
+class TestCache:
+    @given(st.data())
+    def test_an_entry_with_one_wrong_bit_is_none(self, data: st.DataObject) -> None:
+        content = {"a": [1.5, "x"], "values": np.arange(7.0), "none": [np.zeros((0, 3))]}
+        whole = encoded(KEY, content)
+        found = decoded(whole, KEY)
+        assert found["a"] == [1.5, "x"]
+        assert found["values"].tobytes() == np.arange(7.0).tobytes()
+        assert found["none"][0].shape == (0, 3)
+        bit = data.draw(st.integers(0, 8 * len(whole) - 1))
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert decoded(bytes(damaged), KEY) is None
+        assert decoded(whole[: data.draw(st.integers(0, len(whole) - 1))], KEY) is None
+        assert decoded(whole, KEY[::-1]) is None
+
+    @pytest.mark.parametrize(
+        "array",
+        [
+            *({"array": "O", "shape": [1], "at": 0}, {"array": "(2,", "shape": [1], "at": 0}),
+            *({"array": "f", "shape": [1 << 62, 4], "at": 0}, {"array": "f", "shape": 3, "at": 0}),
+            *({"array": "f", "shape": [1], "at": -1}, {"array": ["a", "<f8"]}, {"array": "f"}),
+        ],
+    )
+    def test_a_forged_array_is_none(self, array: dict[str, object]) -> None:
+        """An untrusted file may carry a checksum that is right; numpy is given no type of it."""
+        text = json.dumps({"key": KEY, "content": array}).encode()
+        body = text + bytes(-len(text) % 8)
+        assert decoded(_HEAD.pack(_MAGIC, len(text), crc32(body)) + body, KEY) is None
+
+    def test_two_writers_never_leave_half_an_entry(self, tmp_path: Path) -> None:
+        store, contents = Store(tmp_path), [np.full(20_000, number) for number in (1.0, 2.0)]
+        with ThreadPoolExecutor(2) as pool:
+            writing = [
+                pool.submit(lambda c=one: [store.put(KEY, c) for _ in range(100)])
+                for one in contents
+            ]
+            found = [store.get(KEY) for _ in range(100)]
+        assert all(one.exception() is None for one in writing)
+        assert {float(np.ptp(one)) for one in found if one is not None} <= {0.0}
+        assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [KEY]
+
+    def test_a_forged_sum_counts_as_absent(self, tmp_path: Path) -> None:
+        settings, where = Settings(Preprocessing()), Where(str(tmp_path))
+        key = sum_key([a_ref(0)], settings_digest(settings))
+        where.store(a_ref(0).location).put(key, {"sum": {"gram": 3}})
+        assert cached_bundle([a_ref(0)], settings, where) is None
+
+    def test_a_store_that_cannot_be_written_names_a_remedy(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        with pytest.raises(CacheError, match="--cache"):
+            Store(tmp_path / "file").put(KEY, {})
+        assert Store(tmp_path / "file").get(KEY) is None
+
+    def test_archives_of_a_folder_share_a_store(self, tmp_path: Path) -> None:
+        here, there = str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")
+        for where in (Where(), Where(str(tmp_path / "elsewhere"))):
+            assert where.store(here) == where.store(there)
+            assert where.store(here) != where.store(str(tmp_path / "sub" / "a.mcap"))
+        assert Where().store(here).folder == tmp_path / ".hil-cache"
+        remote = Where(str(tmp_path)).store("s3://bucket/one/a.mcap")
+        assert remote.folder is not None
+        assert remote.folder.parent == tmp_path
+
+    def test_a_file_in_place_of_the_folder_is_left_alone(self, tmp_path: Path) -> None:
+        (tmp_path / ".hil-cache").write_text("not a folder")
+        store = Where().store(str(tmp_path / "excitation_000_a1.mcap"))
+        assert store.folder is not None
+        assert tmp_path not in store.folder.parents
+
+    def test_settings_are_cached_to_the_last_bit(self, tmp_path: Path) -> None:
+        settings = Settings(
+            Preprocessing(torque_bandwidth=1.0 / 3.0, torque_shape=LowPassShape(2, causal=True)),
+            friction={"presliding": 1e-4, "third": "none"},
+            noise_variance=(1e-9 / 3.0,) * 6,
+            shrinkage=Shrinkage(np.inf),
+            choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
+        )
+        store = Store(tmp_path)
+        put_settings(store, KEY, settings)
+        assert cached_settings(store, KEY) == settings
+        store.put(KEY, {"smoother": "spline", "torque_delay": 0.0})
+        assert cached_settings(store, KEY) is None
 
 
-@given(st.data())
-def test_an_entry_with_one_wrong_bit_is_none(data: st.DataObject) -> None:
-    whole = encoded(KEY, {"a": [1.5, "x"]}, {"values": np.arange(7.0), "none": np.zeros((0, 3))})
-    entry = decoded(whole, KEY)
-    assert entry is not None
-    assert entry.header == {"a": [1.5, "x"]}
-    assert entry.arrays["values"].tobytes() == np.arange(7.0).tobytes()
-    assert entry.arrays["none"].shape == (0, 3)
-    bit = data.draw(st.integers(0, 8 * len(whole) - 1))
-    damaged = bytearray(whole)
-    damaged[bit // 8] ^= 1 << bit % 8
-    assert decoded(bytes(damaged), KEY) is None
-    assert decoded(whole[: data.draw(st.integers(0, len(whole) - 1))], KEY) is None
-    assert decoded(whole, KEY[::-1]) is None
+@pytest.mark.parametrize(
+    "name", ["batch/discovery.py", "batch/factors.py", "signals/samples.py", "record.py"]
+)
+def test_a_change_of_the_programs_changes_their_digest(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, read = code_digest(), Path.read_bytes
 
+    def changed(path: Path) -> bytes:
+        return read(path) + (b"\n" if path.as_posix().endswith(name) else b"")
 
-def test_a_store_that_cannot_be_written_to_is_an_error_with_a_remedy(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(CacheError, match="--cache"):
-        Store(tmp_path / "file").put(KEY, {})
-    assert Store(tmp_path / "file").get(KEY) is None
-
-
-def test_archives_of_a_folder_share_a_store_wherever_it_is(tmp_path: Path) -> None:
-    here, there = str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")
-    for where in (Where(), Where(str(tmp_path / "elsewhere"))):
-        assert where.store(here) == where.store(there)
-        assert where.store(here) != where.store(str(tmp_path / "sub" / "a.mcap"))
-    assert Where().store(here).folder == tmp_path / ".hil-cache"
-    remote = Where(str(tmp_path)).store("s3://bucket/one/a.mcap")
-    assert remote.folder.parent == tmp_path
+    monkeypatch.setattr(Path, "read_bytes", changed)
+    assert code_digest.__wrapped__() != here
 
 
 # What things are known by
@@ -127,39 +202,24 @@ def test_an_arm_is_its_links_friction_and_drives_and_not_its_payload_or_campaign
 
 
 def test_factors_are_known_by_everything_they_depend_on() -> None:
-    plain = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
+    stated = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
     for_the_estimate = replace(
-        plain, shrinkage=Shrinkage(0.1), choices=(Choice("rows", (), (), 0),)
+        stated, shrinkage=Shrinkage(0.1), choices=(Choice("rows", (), (), 0),)
     )
-    assert settings_digest(plain) == settings_digest(for_the_estimate)
+    assert settings_digest(stated) == settings_digest(for_the_estimate)
     others = [
-        plain.preprocessed(smoother="butterworth"),
-        plain.preprocessed(torque_delay=0.004),
-        plain.preprocessed(torque_bandwidth=30.0),
-        replace(plain, noise_variance=(1e-9 * (1 + 2e-16),) * 6),
-        replace(plain, noise_variance=None),
-        replace(plain, friction={"presliding": 1e-4}),
-        replace(plain, axis_delays=(0.001,) * 6),
-        replace(plain, delay_variance=1e-9),
+        stated.preprocessed(smoother="butterworth"),
+        stated.preprocessed(torque_delay=0.004),
+        stated.preprocessed(torque_bandwidth=30.0),
+        replace(stated, noise_variance=(1e-9 * (1 + 2e-16),) * 6),
+        replace(stated, noise_variance=None),
+        replace(stated, friction={"presliding": 1e-4}),
+        replace(stated, axis_delays=(0.001,) * 6),
+        replace(stated, delay_variance=1e-9),
     ]
-    assert len({settings_digest(one) for one in (plain, *others)}) == 1 + len(others)
-    digest = settings_digest(plain)
+    assert len({settings_digest(one) for one in (stated, *others)}) == 1 + len(others)
+    digest = settings_digest(stated)
     assert sum_key([a_ref(0), a_ref(1)], digest) != sum_key([a_ref(1), a_ref(0)], digest)
-
-
-def test_settings_are_kept_to_the_last_bit() -> None:
-    settings = Settings(
-        Preprocessing(torque_bandwidth=1.0 / 3.0, torque_shape=LowPassShape(2, causal=True)),
-        friction={"presliding": 1e-4, "third": "none"},
-        noise_variance=(1e-9 / 3.0,) * 6,
-        shrinkage=Shrinkage(np.inf),
-        choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
-    )
-    entry = decoded(encoded(KEY, settings_header(settings), {}), KEY)
-    assert entry is not None
-    assert settings_from(entry.header) == settings
-    assert settings_from(entry.header | {"preprocessing": {"smoother": "none"}}) is None
-    assert settings_from({"smoother": "spline", "torque_delay": 0.0}) is None
 
 
 # Who does the work
@@ -180,6 +240,6 @@ def test_a_task_that_kills_or_hangs_its_process_costs_itself() -> None:
     assert sum(counted) == 5
     assert [found.notes[0], found.notes[4], found.total] == ["note", "note", 4.0]
     broken = {note.path: note.reason for note in found.notes if isinstance(note, Broken)}
-    assert "ended its process" in broken["dead.mcap"]
+    assert "ended its process, twice, with status 3" in broken["dead.mcap"]
     assert "took longer than 4 s" in broken["slow.mcap"]
     assert "ValueError" in broken["wrong.mcap"]

@@ -13,9 +13,9 @@ from typing import ClassVar
 import fsspec
 import pytest
 
-from hil.batch import remote_files
-from hil.batch.errors import UnavailableError
-from hil.batch.remote_files import is_url, listed, local_copy
+from hil.batch import remote
+from hil.batch.remote import archives_below, is_url, local_file
+from hil.batch.types import UnavailableError
 from hil.errors import InputError
 from hil.version import install_command
 from tests.hil.web_folder import served
@@ -26,7 +26,7 @@ ARCHIVES = ["a/first.mcap", "b/c/second.mcap"]
 
 @pytest.fixture(autouse=True)
 def _patient_for_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_files, "_PAUSES", (0.0, 0.0))
+    monkeypatch.setattr(remote, "_PAUSES", (0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def root(request: pytest.FixtureRequest, folder: Path) -> str:
 
 
 def test_every_archive_below_an_address_is_found_in_order(root: str) -> None:
-    found = [file.url for file in listed(root)]
+    found = [url for url, _ in archives_below(root)]
     assert len(found) == len(ARCHIVES)
     for url, name in zip(found, ARCHIVES, strict=True):
         assert is_url(url)
@@ -69,14 +69,13 @@ def test_every_archive_below_an_address_is_found_in_order(root: str) -> None:
 
 
 def test_an_archive_is_found_by_its_own_address(root: str) -> None:
-    (found,) = listed(f"{root}/{ARCHIVES[0]}")
-    assert found.url.endswith(ARCHIVES[0])
-    assert found.size in (None, len(CONTENT[ARCHIVES[0]]))
+    ((url, _),) = archives_below(f"{root}/{ARCHIVES[0]}")
+    assert url.endswith(ARCHIVES[0])
 
 
 def test_what_is_found_is_fetched_to_the_byte_and_removed(root: str) -> None:
-    for file, name in zip(listed(root), ARCHIVES, strict=True):
-        with local_copy(file.url) as path:
+    for (url, _), name in zip(archives_below(root), ARCHIVES, strict=True):
+        with local_file(url) as path:
             assert path.name == Path(name).name
             assert path.read_bytes() == CONTENT[name]
         assert not path.parent.exists()
@@ -86,11 +85,11 @@ def test_a_version_is_that_of_the_content_or_none(
     memory: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address = f"{memory}/{ARCHIVES[0]}"
-    assert listed(address)[0].version == ""
+    assert archives_below(address)[0][1] == ""
     store = fsspec.get_filesystem_class("memory")
     plain = store.info
     monkeypatch.setattr(store, "info", lambda *path: plain(*path) | {"ETag": '"5f3"'})
-    assert listed(address)[0].version == '"5f3"'
+    assert archives_below(address)[0][1] == '"5f3"'
 
 
 @pytest.mark.parametrize(
@@ -103,8 +102,8 @@ def test_a_version_is_that_of_the_content_or_none(
 )
 def test_what_cannot_be_read_is_one_sentence_with_the_address(address: str, message: str) -> None:
     with pytest.raises(InputError, match=f"{address}.*{message}"):
-        listed(address)
-    with pytest.raises(InputError, match=f"{address}.*{message}"), local_copy(address):
+        archives_below(address)
+    with pytest.raises(InputError, match=f"{address}.*{message}"), local_file(address):
         pass
 
 
@@ -139,14 +138,14 @@ def busy(folder: Path) -> Iterator[str]:
 
 def test_a_server_that_is_busy_is_asked_again(busy: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_Busy, "refusals", [503, 429])
-    with local_copy(f"{busy}/{ARCHIVES[0]}") as path:
+    with local_file(f"{busy}/{ARCHIVES[0]}") as path:
         assert path.read_bytes() == CONTENT[ARCHIVES[0]]
     assert len(_Busy.asked) == 3
 
 
 def test_a_server_that_stays_busy_is_given_up(busy: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_Busy, "refusals", [503] * 10)
-    with pytest.raises(UnavailableError, match="503"), local_copy(f"{busy}/{ARCHIVES[0]}"):
+    with pytest.raises(UnavailableError, match="503"), local_file(f"{busy}/{ARCHIVES[0]}"):
         pass
     assert len(_Busy.asked) == 3
 
@@ -155,17 +154,17 @@ def test_what_a_server_does_not_give_is_asked_for_once(
     busy: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_Busy, "refusals", [403])
-    with pytest.raises(UnavailableError, match="403"), local_copy(f"{busy}/{ARCHIVES[0]}"):
+    with pytest.raises(UnavailableError, match="403"), local_file(f"{busy}/{ARCHIVES[0]}"):
         pass
-    with pytest.raises(UnavailableError, match="not there"), local_copy(f"{busy}/absent.mcap"):
+    with pytest.raises(UnavailableError, match="not there"), local_file(f"{busy}/absent.mcap"):
         pass
     assert len(_Busy.asked) == 2
 
 
 def test_without_fsspec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_files, "find_spec", lambda _: None)
+    monkeypatch.setattr(remote, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
-        listed("memory://store")
+        archives_below("memory://store")
 
 
 def test_a_path_is_no_address() -> None:

@@ -39,7 +39,7 @@ def result() -> BatchResult:
         std=undetermined,
         undetermined=(one.names[3],),
         when="",
-        doubts=("stood still at first", "two gaps"),
+        warnings=("stood still at first", "two gaps"),
     )
     pooled = replace(one, level="pooled", campaign="", unseen_rms=0.1 * one.torque_rms)
     return BatchResult(
@@ -149,7 +149,7 @@ def test_parquet_has_the_same_rows_with_types(folder: Path) -> None:
         typed = read.to_pylist()
         assert len(plain) == len(typed)
         for text, row in zip(plain, typed, strict=True):
-            assert all(same(text[name], row[name]) for name in one.plain_columns), text
+            assert all(same(text[name], row[name]) for name in one.csv_columns), text
 
 
 def same(text: str, value: object) -> bool:

@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 
 from benchmarks import archive_files
 from hil.archive import ArchiveWriter
-from hil.batch.estimates import Doubts
+from hil.batch.estimates import WarningCounts
 from hil.batch.run import Plan, reidentify
-from hil.batch.trend import Trends
 from hil.batch.types import ArchiveRef, BatchResult, Broken, Summary
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli.reidentify_words import alarm_lines, skipped_line
+from hil.compare.trend import Trends
 from hil.identify.options import FIXED
 from hil.progress import Silent
 
@@ -103,7 +103,7 @@ def test_one_folder_in_which_a_payload_is_stated_halfway_is_two_campaigns(
     assert stated == {None, 3.0}
     (pooled,) = found.pooled
     assert (pooled.repetitions, pooled.setup, pooled.payload) == (2, "", None)
-    assert "cells state different things" in pooled.doubts[0]
+    assert "cells state different things" in pooled.warnings[0]
     command = ["reidentify", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
     ran = CliRunner().invoke(app, command)
     (arm,) = json.loads(ran.stdout)["arms"].values()
@@ -120,19 +120,19 @@ def test_what_is_to_be_looked_into_is_told_even_quietly() -> None:
 
 def summary_of(name: str, *doubts: str) -> Summary:
     ref = ArchiveRef(f"/line/c1/archives/{name}", "", "excitation", "", "/line/c1", 0, "", "")
-    return Summary(ref, None, {}, 1.0, doubts)  # type: ignore[arg-type]
+    return Summary(ref, None, {}, doubts)  # type: ignore[arg-type]
 
 
 def test_a_doubt_is_told_once_with_what_it_concerns() -> None:
-    doubts = Doubts()
+    doubts = WarningCounts()
     for name in ("a", "b", "c"):
-        doubts.note(summary_of(name, "of all"))
+        doubts.count(summary_of(name, "of all"))
     assert doubts.lines() == ("of all",)
-    others = Doubts()
-    others.note(summary_of("d", "of all", "of one"))
-    others.note(summary_of("e", "of all", "of two"))
+    others = WarningCounts()
+    others.count(summary_of("d", "of all", "of one"))
+    others.count(summary_of("e", "of all", "of two"))
     doubts.add(others)
-    doubts.note(summary_of("f", "of all", "of two"))
+    doubts.count(summary_of("f", "of all", "of two"))
     assert doubts.lines() == (
         "of all",
         "2 of 6 archives, such as c1/e: of two",
@@ -141,11 +141,11 @@ def test_a_doubt_is_told_once_with_what_it_concerns() -> None:
 
 
 def test_very_many_different_doubts_are_counted() -> None:
-    doubts = Doubts()
+    doubts = WarningCounts()
     for k in range(100):
-        doubts.note(summary_of(f"{k}", f"the clock falls back {k} times"))
+        doubts.count(summary_of(f"{k}", f"the clock falls back {k} times"))
     assert len(doubts.lines()) < 20
-    assert "more doubts stand with the repetitions" in doubts.lines()[-1]
+    assert "more warnings stand with the repetitions" in doubts.lines()[-1]
 
 
 def test_what_is_left_alone_is_counted_by_reason() -> None:

@@ -18,18 +18,34 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kendalltau
 
-from hil.batch import payload_change
-from hil.batch.axis_figures import friction_of, friction_weights
-from hil.batch.chart import FEWEST, chart, drift, limits, qn_scale
-from hil.batch.trend import FALSE_ALARMS, ArmTrend, Trends, Watched, arm_trend
-from hil.batch.trend_words import findings, shifts, summary
 from hil.batch.types import Broken
+from hil.compare import payload
+from hil.compare.findings import findings, shifts, summary
+from hil.compare.trend import (
+    FALSE_ALARMS,
+    FEWEST,
+    ArmTrend,
+    Levels,
+    Limits,
+    Trends,
+    arm_trend,
+    chart,
+    drift,
+    friction_of,
+    friction_weights,
+    qn_scale,
+)
 from hil.report.trend import render_trend_report, write_trend_report
 from identification.model.payload import Payload
 
 from .arm_histories import FRICTION, Condition, Load, history, model, motion, steady, trend_of
 
 # --- the chart ---------------------------------------------------------------------------------
+
+
+def limits(earlier: np.ndarray, stds: np.ndarray, share: float = 0.01) -> Limits | None:
+    """Of one more value after a history of one level."""
+    return Levels(earlier, stds, share, [list(range(len(earlier)))]).limits(0, 0.0)
 
 
 def judged(values: list[float], std: float = 0.0, **options: float) -> tuple[bool, ...]:
@@ -51,7 +67,7 @@ def test_of_values_that_do_not_change_no_more_than_the_share_are_said_to(
     raw = distance[:, half * (half - 1) // 2 - 1]
     factor = qn_scale(values[0]) / raw[0]
     assert qn_scale(values[1]) == pytest.approx(factor * raw[1])
-    one = limits(values[0], np.zeros(count), 0.0, share)
+    one = limits(values[0], np.zeros(count), share)
     assert one is not None
     reach = (one.high - one.centre) / qn_scale(values[0])
     new = random.standard_normal(runs)
@@ -72,8 +88,8 @@ def test_qn_is_a_standard_deviation_that_half_the_values_cannot_spoil() -> None:
 @given(st.floats(-5.0, 5.0), st.floats(0.1, 10.0))
 def test_limits_move_and_stretch_with_the_values(shift: float, stretch: float) -> None:
     values = np.array([0.3, -0.2, 0.9, 0.1, -1.1, 0.4, 0.0])
-    plain = limits(values, np.zeros(7), 0.0, 0.01)
-    moved = limits(shift + stretch * values, np.zeros(7), 0.0, 0.01)
+    plain = limits(values, np.zeros(7))
+    moved = limits(shift + stretch * values, np.zeros(7))
     assert plain is not None
     assert moved is not None
     assert moved.low == pytest.approx(shift + stretch * plain.low, abs=1e-9)
@@ -81,7 +97,7 @@ def test_limits_move_and_stretch_with_the_values(shift: float, stretch: float) -
 
 
 def test_nothing_is_judged_by_too_short_a_history() -> None:
-    assert limits(np.zeros(FEWEST - 1), np.zeros(FEWEST - 1), 0.0, 0.01) is None
+    assert limits(np.zeros(FEWEST - 1), np.zeros(FEWEST - 1)) is None
     assert judged([1.0] * FEWEST + [99.0]) == (False,) * FEWEST + (True,)
 
 
@@ -95,9 +111,7 @@ SCATTER = [1.0, 1.1, 0.9, 1.05, 0.95, 1.02, 1.0]
 
 def shifted(values: list[float], **options: float) -> list[tuple[str, int, int]]:
     found = chart(np.array(values), np.zeros(len(values)), 0.01, **options)
-    stds = np.zeros(len(values))
-    watched = Watched(np.array(values), stds, found.limits, found.departs, found.levels)
-    return [(one.kind, one.first, one.last) for one in shifts(watched)]
+    return [(one.kind, one.first, one.last) for one in shifts(found)]
 
 
 def test_values_that_departed_are_no_history() -> None:
@@ -288,7 +302,7 @@ def test_inertia_of_another_link_is_no_payload() -> None:
 
 def test_the_body_is_read_back_from_the_parameters_it_changes() -> None:
     arm = model()
-    onto = payload_change.projection(
+    onto = payload.projection(
         arm, np.ones(arm.n_parameters, bool), history(steady, 1, seed=1)[0].information, 1000
     )
     assert onto is not None
@@ -305,7 +319,7 @@ def test_the_body_is_read_back_from_the_parameters_it_changes() -> None:
 def test_of_unchanged_arms_the_joint_test_finds_a_change_as_rarely_as_it_says() -> None:
     """Parameters drawn from their own covariance: T² must be F distributed, or smaller."""
     one = history(steady, 1, seed=1)[0]
-    onto = payload_change.projection(
+    onto = payload.projection(
         model(), np.isfinite(one.std), one.information, int(one.samples.sum())
     )
     assert onto is not None
@@ -321,8 +335,8 @@ def test_of_unchanged_arms_the_joint_test_finds_a_change_as_rarely_as_it_says() 
             scores = random.standard_normal((blocks, len(root))) @ root.T
             values = root @ random.standard_normal(len(root))
             covariance = scores.T @ scores / blocks
-            states.append(payload_change.state(onto, values, covariance, blocks))
-        change = payload_change.compare(onto, *states)
+            states.append(payload.state(onto, values, covariance, blocks))
+        change = payload.compare(onto, *states)
         assert change is not None
         p_values.append(change.p_value)
     assert np.mean(np.array(p_values) < 0.01) <= 0.01 + 3.0 * math.sqrt(0.01 / 1500)

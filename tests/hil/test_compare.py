@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from hil.batch.local import LocalWorkers
 from hil.batch.types import Arm, LevelEstimate
+from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign, CampaignPlan
 from hil.campaign.quick_design import design
 from hil.cell import Cell
@@ -23,7 +23,7 @@ from hil.compare import Comparison, compare_campaigns, gather
 from hil.compare.gather import Gathered
 from hil.compare.record import to_dict
 from hil.compare.spread import difference, effective_count, holm, known
-from hil.compare.words import names, told, verdict
+from hil.compare.words import findings, names, verdict
 from hil.errors import InputError
 from hil.identify import identify_campaign
 from hil.progress import Silent
@@ -80,7 +80,7 @@ def test_planted_friction_is_found_on_its_axis_and_nowhere_else(comparison: Comp
     assert change == pytest.approx(PLANTED - 1.0, abs=0.02)
     assert not comparison.load_changed
     assert verdict(comparison) == "Changed: friction of shoulder"
-    first = told(comparison)[0].words
+    first = findings(comparison)[0].words
     assert "shoulder" in first and "30 % higher in june than in march" in first
 
 
@@ -133,7 +133,7 @@ def test_one_campaign_or_two_arms_are_refused_before_anything_is_estimated(
     def estimated(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("hil.batch.run.Work", estimated)
+    monkeypatch.setattr("hil.batch.run._Batch", estimated)
     for pair in ("march", "march"), ("march", "other"):
         with pytest.raises(InputError):
             compared(*(folders[name] for name in pair))
@@ -187,11 +187,11 @@ def test_a_change_too_small_to_matter_is_told_as_a_difference_and_not_as_no_chan
     slight = [axis for axis in found.axes if axis.slight[1]]
     assert all(axis.p_values[1] < 0.005 and axis.relative(1)[0] < 0.05 for axis in slight)
     assert verdict(found).startswith("No change of 5 % or more; friction of ")
-    first = told(found)[0].words
-    assert "less than the 5 % that is told as a change" in first
+    first = findings(found)[0].words
+    assert "less than the 5 % that count as a change" in first
     (unchanged,) = (
         one.words
-        for one in told(found)
+        for one in findings(found)
         if one.words.startswith("Friction of") and "not changed" in one.words
     )
     for axis in slight:
@@ -259,7 +259,7 @@ def test_what_cannot_be_known_is_not_judged() -> None:
     levels = (found.campaigns[0], unknown)
     again = compare_campaigns(Gathered(arm, levels, ((levels[0],), (levels[1],)), True, ()))
     assert not again.changed
-    assert any("is not determined" in one.words for one in told(again))
+    assert any("is not determined" in one.words for one in findings(again))
     assert any("one repetition" in doubt for doubt in again.doubts)
     Page(render_comparison(again))
 

@@ -10,7 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planner import PlannerCrashed, WorkerProcess, chunks_of, map_in_children
+from planner import (
+    PlannerCrashed,
+    WorkerProcess,
+    chunks_of,
+    map_in_children,
+    stream_in_children,
+)
 
 
 @pytest.fixture
@@ -90,3 +96,27 @@ def test_what_is_done_is_told_as_it_comes():
     with WorkerProcess() as child:
         map_in_children([child], list, chunks_of(7, 3), lambda chunk: (chunk,), done=told.append)
     assert told == [3, 3, 1]
+
+
+class TestStreamInChildren:
+    def test_asks_for_a_chunk_when_a_child_is_free(self):
+        asked = []
+
+        def chunks():
+            for index in range(50):
+                asked.append(index)
+                yield [index]
+
+        with WorkerProcess() as child:
+            results = stream_in_children([child], list, chunks(), lambda chunk: (chunk,))
+            assert next(results) == (0, 0)
+            assert asked == [0, 1]
+            assert sorted(results) == [(index, index) for index in range(1, 50)]
+
+    def test_a_break_costs_no_child_that_is_idle(self):
+        with WorkerProcess() as one, WorkerProcess() as other:
+            results = stream_in_children([one, other], list, [[0]], lambda chunk: (chunk,))
+            assert next(results) == (0, 0)
+            pids = one.pid, other.pid
+            results.close()
+            assert (one.pid, other.pid) == pids

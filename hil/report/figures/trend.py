@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from hil.batch.trend import ArmTrend, AxisTrend, ParameterTrend, Watched
+from hil.compare.trend import ArmTrend, AxisTrend, ParameterTrend, Watched
 from hil.report import numbers
 from hil.report.figures.canvas import TICK_SIZE, blank, headed, place, ruled
 from hil.report.figures.palette import BAND, FIRST, MUTED, OUTSIDE_3, SECOND
@@ -154,7 +154,7 @@ def _band(axes: Axes, arm: ArmTrend, watched: Watched, low: float, high: float) 
 
 def _slope(axes: Axes, arm: ArmTrend, axis: AxisTrend) -> None:
     assert axis.drift is not None
-    known = np.flatnonzero(axis.friction.settled)
+    known = np.flatnonzero(axis.friction.at_last_level)
     middle = float(np.median(arm.time[known]))
     centre = float(np.median(axis.friction.values[known]))
     ends = arm.time[known[[0, -1]]]

@@ -1,4 +1,4 @@
-"""Whether the arm carries something else than before: one test on all it would change.
+"""What an arm carries from campaign to campaign: one test on all that a payload would change.
 
 A body at the last link adds its ten inertial parameters to that link's, and through the grouping
 to base parameters of links before it: they move together, in ten directions at most of the base
@@ -11,31 +11,44 @@ campaigns, so x of one less x of another is what was put on in between. Their di
 jointly by Hotelling's T² (1931), the chi-square test for a covariance that was estimated from a
 finite number of blocks. What campaigns differ by anyhow is part of the measure: T² is divided by
 the median that the arm's own changes of campaign have, where there are enough of them.
+
+A payload that a cell states is known, and its torque is no part of the parameters. Parameters that
+change although nothing else was stated are a discovered change. Where the statement changes, two
+things are tested: the parameters as they are, which stay where they were if the arm now carries
+what is stated, and the parameters with the stated body put back, which stay where they were if it
+carried the same before and only the statement is new.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import pinvh
+from scipy.optimize import brentq
 from scipy.stats import f as fisher
+from scipy.stats import t as student
 
+from hil.batch.types import LevelEstimate
 from identification import RobotModel
+from identification.model.payload import Payload
 from identification.model.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 
-_MASS_PLACE: Final = LINK_SYMBOLS.index("m")
-_MOMENT_PLACES: Final = [LINK_SYMBOLS.index(f"mc{axis}") for axis in "xyz"]
-
+LEAST_EFFECT: Final = 0.10
+"""A change of payload counts if its RMS torque is at least this share of the torque residual."""
 PAYLOAD_LIKE: Final = 0.5
 """Share of a change of the inertial parameters that a payload has to explain to be one."""
 
+Verdict = Literal["agrees", "statement only", "either", "differs", "untested"]
+
+_MASS_PLACE: Final = LINK_SYMBOLS.index("m")
+_MOMENT_PLACES: Final = [LINK_SYMBOLS.index(f"mc{axis}") for axis in "xyz"]
 # Directions in which a body changes less than this share of the strongest are not seen.
 _SEEN: Final = 1e-4
 _BLIND: Final = 1e-3
@@ -45,6 +58,7 @@ _MASS, _MOMENT, _INERTIA = 1.0, 0.3, 0.1
 _FEWEST_CHANGES: Final = 4
 # A covariance of fewer blocks than coordinates cannot be tested.
 _FEWEST_SPARE: Final = 2
+_NORMAL: Final = float(student.ppf(0.975, 1e6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +113,6 @@ class Change:
     Attributes:
         statistic: T² over its degrees of freedom, F distributed if campaigns differed by no more
             than their covariance says.
-        scatter: what `statistic` was divided by, at least 1.
         p_value: of nothing having changed.
         share: of the change of all inertial parameters that a payload explains.
         effect: RMS torque of the change, in standard deviations of the torque residual.
@@ -110,7 +123,6 @@ class Change:
     """
 
     statistic: float
-    scatter: float
     p_value: float
     share: float
     effect: float
@@ -198,7 +210,6 @@ def compare(onto: Projection, before: State, after: State, scatter: float = 1.0)
     std = np.sqrt(scatter * np.einsum("ir,rs,is->i", onto.body, covariance, onto.body))
     return Change(
         statistic=statistic,
-        scatter=scatter,
         p_value=float(fisher.sf(statistic / scatter, onto.rank, spare)),
         share=explained / whole if whole > 0.0 else 0.0,
         effect=math.sqrt(explained / max(1, onto.rows)),
@@ -222,6 +233,166 @@ def own_scatter(onto: Projection, pairs: Sequence[tuple[State, State]]) -> float
             spare = min(one.freedom, other.freedom) - onto.rank + 1
             ratios.append(change.statistic / float(fisher.median(onto.rank, spare)))
     return max(1.0, float(np.median(ratios))) if len(ratios) >= _FEWEST_CHANGES else 1.0
+
+
+# From campaign to campaign
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A campaign that states another payload than the one before.
+
+    Attributes:
+        before: what was stated before; None for nothing.
+        after: what is stated now.
+        verdict: what the torques say: "agrees", the arm carries what is stated as it did before;
+            "statement only", it carries the same as before; "either", both are possible; "differs",
+            neither is; "untested".
+    """
+
+    before: Payload | None
+    after: Payload | None
+    verdict: Verdict
+
+
+@dataclass(frozen=True, eq=False)
+class PayloadTrend:
+    """What the last link carries beside what it carried in the first campaign.
+
+    Attributes:
+        changes: of the parameters of each campaign against those before it since the last change;
+            None of the first.
+        changed: which campaigns differ in what the last link carries, beside what is stated.
+        other: which differ in their inertial parameters, but not as a payload would.
+        statements: of the campaigns that state another payload than the one before.
+        mass: on top of the first campaign's, stated or not [kg] (c,); NaN where it cannot be seen.
+        mass_std: (c,).
+        untested: why there is no test; "" if there is.
+    """
+
+    changes: tuple[Change | None, ...]
+    changed: tuple[bool, ...]
+    other: tuple[bool, ...]
+    statements: tuple[Statement | None, ...]
+    mass: Array
+    mass_std: Array
+    untested: str = ""
+
+
+def payload_trend(
+    model: RobotModel, campaigns: Sequence[LevelEstimate], share: float
+) -> PayloadTrend:
+    """Find what changed in what the arm carries.
+
+    Args:
+        model: the robot.
+        campaigns: in order of time.
+        share: of campaigns said to differ if nothing has changed.
+    """
+    onto = _projection(model, campaigns)
+    if isinstance(onto, str):
+        return _untested(campaigns, onto)
+    bare = [
+        state(
+            onto, one.values, np.nan_to_num(np.asarray(one.covariance), posinf=0.0), freedom_of(one)
+        )
+        for one in campaigns
+    ]
+    stated = [_stated(model, one.payload)[onto.places] for one in campaigns]
+    laden = [replace(b, values=b.values + body) for b, body in zip(bare, stated, strict=True)]
+    alike = [
+        (bare[k - 1], bare[k])
+        for k in range(1, len(bare))
+        if campaigns[k - 1].payload == campaigns[k].payload
+    ]
+    scatter = own_scatter(onto, alike)
+
+    def between(before: Sequence[State], after: State) -> Change | None:
+        return compare(onto, pooled(before), after, scatter)
+
+    def different(change: Change | None) -> bool:
+        return change is not None and change.p_value < share and change.effect >= LEAST_EFFECT
+
+    changes: list[Change | None] = [None]
+    statements: list[Statement | None] = [None]
+    changed, other = [False], [False]
+    first = 0  # campaign since which nothing has changed
+    for k in range(1, len(campaigns)):
+        change = between(bare[first:k], bare[k])
+        differs, like = different(change), change is not None and change.like_a_payload
+        before, after = campaigns[k - 1].payload, campaigns[k].payload
+        statement = None
+        if before != after:
+            # As if what was stated before were stated now.
+            put_back = replace(bare[k], values=bare[k].values + stated[k] - stated[k - 1])
+            restated = not different(between(bare[first:k], put_back))
+            verdict = _verdict(change, different=differs, restated=restated)
+            statement = Statement(before, after, verdict)
+        found = differs and (statement is None or statement.verdict == "differs")
+        changes.append(change)
+        changed.append(found and like)
+        other.append(found and not like)
+        statements.append(statement)
+        first = k if differs else first
+    if len(changes) > 1 and not any(changes):
+        return _untested(campaigns, "the campaigns are too short to be compared jointly")
+    beside = [compare(onto, laden[0], one, scatter) for one in laden[1:]]
+    return PayloadTrend(
+        changes=tuple(changes),
+        changed=tuple(changed),
+        other=tuple(other),
+        statements=tuple(statements),
+        mass=np.array([0.0, *(np.nan if one is None else one.mass for one in beside)]),
+        mass_std=np.array([0.0, *(np.nan if one is None else one.mass_std for one in beside)]),
+    )
+
+
+def _verdict(change: Change | None, *, different: bool, restated: bool) -> Verdict:
+    if change is None:
+        return "untested"
+    if not different:
+        return "either" if restated else "agrees"
+    return "statement only" if restated else "differs"
+
+
+def _stated(model: RobotModel, payload: Payload | None) -> Array:
+    """What a payload adds to the base parameters (b,)."""
+    if payload is None:
+        return np.zeros(model.base.rank)
+    joint, body = payload.carried_by(model.chain)
+    return np.asarray(model.base.grouping[:, model.layout.links[joint]] @ body)
+
+
+def _projection(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Projection | str:
+    """The projection onto a payload, or why there is none."""
+    if len(campaigns) < 2:
+        return "there is one campaign and nothing to compare it with"
+    information = [one.information for one in campaigns if one.information is not None]
+    if len(information) < len(campaigns) or any(one.covariance is None for one in campaigns):
+        return "the estimator gives no information matrix to compare with"
+    known = np.all([np.isfinite(one.std) for one in campaigns], axis=0)
+    rows = sum(int(one.samples.sum()) for one in campaigns)
+    onto = projection(model, known, np.sum(information, axis=0), rows)
+    return "nothing that is known of this arm depends on what it carries" if onto is None else onto
+
+
+def _untested(campaigns: Sequence[LevelEstimate], why: str) -> PayloadTrend:
+    count = len(campaigns)
+    no, unknown = (False,) * count, np.full(count, np.nan)
+    stated = [one.payload for one in campaigns]
+    statements = [
+        None if k == 0 or stated[k] == stated[k - 1] else Statement(stated[k - 1], now, "untested")
+        for k, now in enumerate(stated)
+    ]
+    return PayloadTrend((None,) * count, no, no, tuple(statements), unknown, unknown, why)
+
+
+def freedom_of(level: LevelEstimate) -> float:
+    """Degrees of freedom of the covariance, from the Student factor of its intervals."""
+    factor = level.interval_factor
+    if factor <= _NORMAL:
+        return 1e6
+    return float(brentq(lambda freedom: student.ppf(0.975, freedom) - factor, 0.5, 1.1e6))
 
 
 def _usual(name: str) -> float:

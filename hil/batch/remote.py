@@ -1,4 +1,4 @@
-"""Archives that lie in an object store or behind a web server, through fsspec.
+"""Archives in an object store or behind a web server, through fsspec.
 
 Any address fsspec knows is good (``s3://``, ``gs://``, ``http://``, ``file://``, ``memory://``...);
 some need a package of their own, which the error names. fsspec is imported when such an address is
@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, TypeVar
 
 from hil.errors import InputError
 from hil.version import install_command
 
-from .errors import UnavailableError
+from .types import UnavailableError
 
 T = TypeVar("T")
 
@@ -33,85 +33,63 @@ _TRY_LATER: Final = (408, 425, 429)
 """Of HTTP's 4xx those that ask for patience."""
 
 
-class RemoteFile(NamedTuple):
-    """An archive in a store.
-
-    Attributes:
-        url: address.
-        size: bytes; None where the store does not say.
-        version: changes when the object does; "" where the store says nothing of the kind, and
-            only its bytes tell.
-    """
-
-    url: str
-    size: int | None
-    version: str
-
-
 def is_url(text: str) -> bool:
     """Whether a location is an address and not a path."""
     return "://" in text
 
 
-def listed(url: str) -> list[RemoteFile]:
+def archives_below(url: str) -> list[tuple[str, str]]:
     """Every archive at or below an address, in the order of their addresses.
 
     Args:
         url: of an archive, or of a folder (of a web server: one that lists its folders as links).
 
+    Returns:
+        Address and version of each. The version changes when the object does; it is "" where the
+        store says nothing of the kind, and only its bytes tell.
+
     Raises:
         InputError: a package for the address is missing.
         UnavailableError: it cannot be read.
     """
-    return _asked(url, lambda: _listed(url))
+
+    def found(store: Any, root: str) -> list[tuple[str, str]]:
+        alone = root.endswith(_SUFFIX)
+        infos = {root: store.info(root)} if alone else store.find(root, detail=True)
+        return sorted(
+            (str(store.unstrip_protocol(path)), _version(info))
+            for path, info in infos.items()
+            if path.endswith(_SUFFIX)
+        )
+
+    return _asked(url, found)
 
 
 @contextmanager
-def local_copy(url: str) -> Iterator[Path]:
-    """A copy of a remote file under its own name, for as long as it is needed.
+def local_file(location: str) -> Iterator[Path]:
+    """The file at a path; a copy of a remote one under its own name, for as long as it is needed.
 
-    It lies in the folder for temporary files (``TMPDIR``); nothing of it is held in memory.
+    The copy lies in the folder for temporary files (``TMPDIR``); nothing of it is held in memory.
 
     Raises:
         InputError: a package for the address is missing.
         UnavailableError: it cannot be read.
     """
+    if not is_url(location):
+        yield Path(location)
+        return
     with tempfile.TemporaryDirectory(prefix="hil-") as folder:
-        path = Path(folder) / url.rstrip("/").rsplit("/", 1)[-1]
-        _asked(url, lambda: _copy(url, path))
+        path = Path(folder) / location.rstrip("/").rsplit("/", 1)[-1]
+        _asked(location, lambda store, place: store.get_file(place, str(path)))
         yield path
-
-
-def _listed(url: str) -> list[RemoteFile]:
-    store, root = _store(url)
-    found = {root: store.info(root)} if root.endswith(_SUFFIX) else store.find(root, detail=True)
-    files = [
-        RemoteFile(str(store.unstrip_protocol(path)), info.get("size"), _version(info))
-        for path, info in found.items()
-        if path.endswith(_SUFFIX)
-    ]
-    return sorted(files)
-
-
-def _copy(url: str, path: Path) -> None:
-    store, place = _store(url)
-    store.get_file(place, str(path))
-
-
-def _store(url: str) -> tuple[Any, str]:
-    """The file system of an address, and the place in it."""
-    from fsspec.core import url_to_fs
-
-    store, place = url_to_fs(url)
-    return store, str(place)
 
 
 def _version(info: dict[str, Any]) -> str:
     return next((str(info[name]) for name in _VERSIONS if info.get(name)), "")
 
 
-def _asked(url: str, question: Callable[[], T]) -> T:
-    """Ask a store, and again if it is only indisposed; what it has against that is one sentence."""
+def _asked(url: str, question: Callable[[Any, str], T]) -> T:
+    """Ask the file system of an address about the place in it; again if that fails for a while."""
     if find_spec("fsspec") is None:
         raise InputError(
             None,
@@ -119,17 +97,17 @@ def _asked(url: str, question: Callable[[], T]) -> T:
             field=url,
             remedy=f"install it with: {install_command('cluster')}",
         )
-    for pause in _PAUSES:
+    from fsspec.core import url_to_fs
+
+    for pause in (*_PAUSES, None):
         try:
-            return question()
+            store, place = url_to_fs(url)
+            return question(store, str(place))
         except Exception as error:  # each store has errors of its own
-            if _is_final(error):
+            if pause is None or _is_final(error):
                 raise _refusal(url, error) from error
             time.sleep(pause)
-    try:
-        return question()
-    except Exception as error:
-        raise _refusal(url, error) from error
+    raise AssertionError
 
 
 def _is_final(error: Exception) -> bool:

@@ -1,0 +1,517 @@
+"""What became of an arm: friction, torque error, parameters and payload from campaign to campaign.
+
+A robust control chart asks of each figure of an axis whether it could belong to the values before
+it. Location is their median and scale their Qn (Rousseeuw and Croux 1993), so that an odd value in
+the history neither moves the centre nor widens the limits. Values that departed are no history for
+later ones, unless `FEWEST` of them in a row stay on one side: they are a new level, by which later
+ones are judged. A value that belongs to an earlier level has returned to it. Scatter is that about
+all levels.
+
+The limits are Student's: Qn of n normal values is as uncertain as a standard deviation of about
+0.6 (n - 1) + 0.5 values, found by simulation (n = 5 to 30, tail 1e-2 and 1e-3, on the safe side).
+
+Drift is Kendall's rank correlation with time (Mann 1945), exact for few values, with the slope of
+Theil and Sen (Sen 1968). What counts as a change is in `docs/batch.md`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import kendalltau, theilslopes
+from scipy.stats import t as student
+
+from hil.batch.types import BatchResult, Broken, LevelEstimate
+from hil.timestamps import instant
+from identification import RobotModel
+
+from .payload import PayloadTrend, payload_trend
+
+Array = NDArray[np.float64]
+
+FEWEST: Final = 5
+"""Earlier values without which nothing is judged, and values in a row that make a new level."""
+FALSE_ALARMS: Final = 0.01
+"""Share of campaigns of an unchanged arm in which any one of three rules finds a change: friction
+of an axis, torque error of an axis, payload. Each has a third, shared equally among the axes.
+The test for drift, which is made once for the whole history, has as much, shared likewise."""
+LEAST_FRICTION: Final = 0.05
+"""A change of friction by less than this share is not reported, however certain."""
+LEAST_ERROR: Final = 0.10
+"""The same of the torque error."""
+
+_RULES: Final = 3
+_DAY: Final = 86400.0
+_QN_NORMAL: Final = 2.2219
+_CONFIDENCE: Final = 0.95  # of the interval of a drift
+# Speed [rad/s, m/s] where the data cannot say how fast an axis went: it has no viscous friction.
+_ANY_SPEED: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where a value would be, judged by those before it.
+
+    Attributes:
+        centre: median of the earlier values.
+        low: lower limit, -inf or 0 where only a rise counts.
+        high: upper limit.
+        history: number of earlier values used.
+    """
+
+    centre: float
+    low: float
+    high: float
+    history: int
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """One figure over c campaigns, judged campaign by campaign.
+
+    Attributes:
+        values: (c,); NaN where there is none.
+        stds: (c,); zero where only the scatter of the history is known.
+        limits: by the level that the value belongs to, or was expected at; None before there are
+            enough values.
+        departs: which values belong to no level that was known then, by enough to matter.
+        levels: number of the level that a value belongs to, from 0; -1 for one that is not known,
+            or departed and made no new level.
+    """
+
+    values: Array
+    stds: Array
+    limits: tuple[Limits | None, ...]
+    departs: tuple[bool, ...]
+    levels: tuple[int, ...]
+
+    @property
+    def at_last_level(self) -> NDArray[np.bool_]:
+        """Campaigns at the level that was reached last (c,)."""
+        known = [level for level in self.levels if level >= 0]
+        return np.asarray(np.array(self.levels) == (known[-1] if known else 0))
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A slope in time.
+
+    Attributes:
+        slope: per unit of time.
+        low: lower end of its 95 % interval.
+        high: upper end.
+        p_value: of no drift, two-sided.
+        span: time from the first value to the last.
+    """
+
+    slope: float
+    low: float
+    high: float
+    p_value: float
+    span: float
+
+
+@dataclass(frozen=True, eq=False)
+class AxisTrend:
+    """An axis.
+
+    Attributes:
+        joint: its name.
+        unit: of friction and torque error.
+        speed: at which friction is compared; NaN if it has none that depends on speed.
+        speed_unit: its unit.
+        friction: mean of both directions.
+        error: standard deviation of what the model leaves of the torque.
+        drift: of the friction at the level reached last [unit per day, or per campaign]; None if
+            there are too few campaigns.
+        drifts: whether that is more than chance, and enough to matter.
+    """
+
+    joint: str
+    unit: str
+    speed: float
+    speed_unit: str
+    friction: Watched
+    error: Watched
+    drift: Drift | None
+    drifts: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterTrend:
+    """A parameter over c campaigns.
+
+    Attributes:
+        values: (c,).
+        half: half of the 95 % interval (c,); infinite where the data do not determine it.
+    """
+
+    name: str
+    unit: str
+    is_friction: bool
+    values: Array
+    half: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ArmTrend:
+    """An arm over c campaigns.
+
+    Attributes:
+        name: of the arm.
+        campaigns: folders, in order of time.
+        when: of each, ISO 8601, "" where unknown.
+        time: (c,) [days since the first]; number of the campaign where no time is known.
+        dated: whether times are known. If not, campaigns are in the order of their names.
+        labels: see `campaign_names`.
+        names: the same with their days, if known.
+        undated: folders of further campaigns, without a time, that are no part of the history.
+        warnings: what a reader must know of the archives.
+    """
+
+    name: str
+    campaigns: tuple[str, ...]
+    when: tuple[str, ...]
+    time: Array
+    dated: bool
+    axes: tuple[AxisTrend, ...]
+    parameters: tuple[ParameterTrend, ...]
+    payload: PayloadTrend
+    labels: tuple[str, ...]
+    names: tuple[str, ...]
+    undated: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Trends:
+    """All arms of a batch by name, what was not used for it, and how many archives were fitted."""
+
+    arms: tuple[ArmTrend, ...]
+    broken: tuple[Broken, ...]
+    estimator: str
+    archives: int
+    skipped: tuple[Broken, ...] = ()
+
+
+def trends(result: BatchResult) -> Trends:
+    """Find what changed on every arm of a batch."""
+    found = []
+    for digest, arm in sorted(result.arms.items(), key=lambda item: item[1].name):
+        campaigns = [one for one in result.campaigns if one.arm == digest]
+        if campaigns:
+            own = [text for one in result.pooled if one.arm == digest for text in one.warnings]
+            trend = arm_trend(arm.name, arm.cell.model, campaigns)
+            found.append(replace(trend, warnings=tuple(dict.fromkeys(own))))
+    return Trends(
+        tuple(found), result.broken, result.estimator, len(result.repetitions), result.skipped
+    )
+
+
+def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) -> ArmTrend:
+    """Find what changed on one arm from campaign to campaign, in any order.
+
+    Campaigns without a time of recording are left out if others have one, since nobody knows where
+    they belong. If none has, all are taken in the order of their folders' names.
+    """
+    known = [(at.timestamp(), one) for one in campaigns if (at := instant(one.when)) is not None]
+    if known:
+        known.sort(key=lambda pair: (pair[0], pair[1].campaign))
+        ordered = [one for _, one in known]
+        time = (np.array([at for at, _ in known]) - known[0][0]) / _DAY
+    else:
+        ordered = sorted(campaigns, key=lambda one: _natural(one.campaign))
+        time = np.arange(1.0, len(ordered) + 1.0)
+    within = {id(one) for one in ordered}
+    return ArmTrend(
+        name=name,
+        campaigns=tuple(one.campaign for one in ordered),
+        when=tuple(one.when for one in ordered),
+        time=time,
+        dated=bool(known),
+        axes=_axes(model, ordered, time),
+        parameters=tuple(
+            ParameterTrend(
+                name=model.parameter_names[k],
+                unit=model.units[k],
+                is_friction=k >= model.base.rank,
+                values=np.array([one.values[k] for one in ordered]),
+                half=np.array([one.interval_factor * one.std[k] for one in ordered]),
+            )
+            for k in range(model.n_parameters)
+        ),
+        payload=payload_trend(model, ordered, FALSE_ALARMS / _RULES),
+        labels=tuple(campaign_names(ordered)),
+        names=tuple(campaign_names(ordered, days=bool(known))),
+        undated=tuple(one.campaign for one in campaigns if id(one) not in within),
+    )
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Names in the order that people count in: the ninth before the tenth."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
+
+
+def campaign_names(campaigns: Sequence[LevelEstimate], *, days: bool = False) -> list[str]:
+    """Campaigns as people call them: the last part of the folder, and if wanted the day.
+
+    Where a folder holds several campaigns also what their cells state.
+    """
+    folders = [one.campaign for one in campaigns]
+    names = []
+    for k, name in enumerate(short_names(folders)):
+        name = name or f"campaign {k + 1}"
+        if folders.count(folders[k]) > 1:
+            name += f", {campaigns[k].setup or 'nothing stated'}"
+        names.append(f"{name} ({campaigns[k].when[:10]})" if days else name)
+    return names
+
+
+def short_names(folders: Sequence[str]) -> list[str]:
+    """The end of each folder's path that no other one of them ends with: mostly its last part."""
+    paths = [folder.rstrip("/") for folder in folders]
+    return [_short(path, [f"/{other}" for other in paths if other != path]) for path in paths]
+
+
+def _short(path: str, others: Sequence[str]) -> str:
+    parts = path.split("/")
+    ends = ("/".join(parts[-count:]) for count in range(1, len(parts)))
+    return next((end for end in ends if not any(o.endswith(f"/{end}") for o in others)), path)
+
+
+# Friction and torque error of the axes
+
+
+def friction_weights(model: RobotModel, speed: Array) -> Array:
+    """Weights G (n, p): ``G @ values`` is the friction of each axis at a speed [N·m, N].
+
+    The mean of forwards and backwards, so that an offset and a difference by direction are no
+    part of it. Where coupled motors have friction, that of the axis' own motor counts as well.
+
+    Args:
+        model: the robot.
+        speed: of each axis (n,) [rad/s, m/s], above zero; NaN for half a radian or metre a second.
+    """
+    weights = np.zeros((model.n_joints, model.n_parameters))
+    for k, term in enumerate(model.friction.terms):
+        own = float(speed[term.owner])
+        at = own if math.isfinite(own) and own > 0.0 else _ANY_SPEED
+        forwards, backwards = term.term.column(np.array([at, -at]), np.array([1.0, -1.0]))
+        weights[term.owner, model.base.rank + k] = 0.5 * (forwards - backwards)
+    return weights
+
+
+def friction_of(values: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:
+    """Friction of each axis and its standard deviation, each (n,) [N·m, N].
+
+    NaN for an axis without friction, or with a coefficient that the data do not determine.
+
+    Args:
+        values: parameters (p,).
+        covariance: (p, p), infinite variances of what is undetermined.
+        weights: (n, p), see :func:`friction_weights`.
+    """
+    known = np.isfinite(np.diag(covariance))
+    finite = np.where(np.isfinite(covariance), covariance, 0.0)
+    variance = np.einsum("ji,ik,jk->j", weights, finite, weights)
+    whole = weights.any(axis=1) & ~weights[:, ~known].any(axis=1)
+    value = np.where(whole, weights @ values, np.nan)
+    return value, np.where(whole, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+
+
+def friction_in(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
+    """Friction of each axis by one estimate, see :func:`friction_of`."""
+    covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
+    return friction_of(level.values, covariance, weights)
+
+
+def typical_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Array:
+    """One speed for each axis (n,), the median of what the campaigns had; NaN if none has one."""
+    speeds = [one.speed_rms for one in campaigns if one.speed_rms is not None]
+    columns = [[row[j] for row in speeds if np.isfinite(row[j])] for j in range(model.n_joints)]
+    return np.array([np.median(own) if own else np.nan for own in columns])
+
+
+def _axes(
+    model: RobotModel, campaigns: Sequence[LevelEstimate], time: Array
+) -> tuple[AxisTrend, ...]:
+    speed = typical_speed(model, campaigns)
+    weights = friction_weights(model, speed)
+    each = [friction_in(one, weights) for one in campaigns]
+    friction, stds = (np.array(columns) for columns in zip(*each, strict=True))
+    error = np.array([one.noise_std for one in campaigns])
+    share = FALSE_ALARMS / _RULES / model.n_joints
+    found = []
+    for j, joint in enumerate(model.joint_names):
+        turns = bool(model.chain.revolute[j])
+        known = np.abs(friction[np.isfinite(friction[:, j]), j])
+        least = LEAST_FRICTION * (float(np.median(known)) if len(known) else 0.0)
+        watched = chart(friction[:, j], stds[:, j], share, least=least)
+        # At one level: a step is no drift.
+        slope = drift(time, np.where(watched.at_last_level, watched.values, np.nan))
+        found.append(
+            AxisTrend(
+                joint=joint,
+                unit="N·m" if turns else "N",
+                speed=float(speed[j]),
+                speed_unit="rad/s" if turns else "m/s",
+                friction=watched,
+                error=_error(error[:, j], share),
+                drift=slope,
+                drifts=slope is not None
+                and slope.p_value < FALSE_ALARMS / model.n_joints
+                and abs(slope.slope) * slope.span >= least,
+            )
+        )
+    return tuple(found)
+
+
+def _error(values: Array, share: float) -> Watched:
+    """A larger torque error is a fault, and a smaller one is none.
+
+    In logarithms: residuals scatter by a share of their size.
+    """
+    with np.errstate(divide="ignore"):
+        logarithm = np.where(values > 0.0, np.log(values), np.nan)
+    least = float(np.log1p(LEAST_ERROR))
+    judged = chart(logarithm, np.zeros(len(values)), share, least=least, rise_only=True)
+    limits = tuple(
+        band and replace(band, centre=math.exp(band.centre), low=0.0, high=math.exp(band.high))
+        for band in judged.limits
+    )
+    return replace(judged, values=values, limits=limits)
+
+
+# The chart
+
+
+def chart(
+    values: Array,
+    stds: Array,
+    share: float,
+    *,
+    least: float = 0.0,
+    rise_only: bool = False,
+) -> Watched:
+    """Judge each value by those before it that did not depart themselves.
+
+    Args:
+        values: in order of time (n,); NaN where there is none.
+        stds: standard deviations that they came with (n,).
+        share: of values beyond the limits if nothing has changed.
+        least: smallest departure from the centre that matters.
+        rise_only: whether only values above the history count.
+    """
+    known = Levels(values, stds, 2.0 * share if rise_only else share, [[]])
+    now, away = 0, list[int]()
+    found: list[Limits | None] = []
+    departs, levels = [False] * len(values), [-1] * len(values)
+    for k, value in enumerate(values):
+        expected = known.limits(now, float(stds[k]))
+        if not math.isfinite(value):
+            found.append(expected)
+            continue
+        home = known.home(k, now, least, rise_only=rise_only)
+        if home is not None:
+            now, levels[k], away = home, home, []
+            found.append(known.limits(home, float(stds[k])))
+            known.members[home].append(k)
+            continue
+        assert expected is not None
+        found.append(expected)
+        departs[k] = True
+        if away and (value > expected.centre) != (values[away[-1]] > expected.centre):
+            away = []
+        away.append(k)
+        if len(away) == FEWEST:
+            now = len(known.members)
+            known.members.append(away)
+            for one in away:
+                levels[one] = now
+            away = []
+    if rise_only:
+        found = [band and replace(band, low=-math.inf) for band in found]
+    return Watched(values, stds, tuple(found), tuple(departs), tuple(levels))
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Levels of a history, which scatter alike.
+
+    Attributes:
+        values: (n,).
+        stds: standard deviations that they came with (n,); zero where unknown.
+        share: of values beyond the limits if nothing has changed.
+        members: places of the values of each level.
+    """
+
+    values: Array
+    stds: Array
+    share: float
+    members: list[list[int]]
+
+    def limits(self, level: int, std: float) -> Limits | None:
+        """Where a value with a standard deviation would be if it belonged to a level."""
+        own = self.members[level]
+        if len(own) < FEWEST:
+            return None
+        centre = float(np.median(self.values[own]))
+        every = np.concatenate(self.members)
+        residuals = np.concatenate(
+            [self.values[one] - np.median(self.values[one]) for one in self.members]
+        )
+        # Each level has taken its own median from its residuals.
+        spare = len(every) - len(self.members)
+        scatter = qn_scale(residuals) * math.sqrt((len(every) - 1) / spare)
+        typical = float(np.median(self.stds[every]))
+        # Few values may lie close together by chance, but not closer than each is known.
+        scale = max(scatter, typical)
+        # A campaign of fewer repetitions than usual is known less well than the history scatters.
+        one = scale**2 + max(0.0, std**2 - typical**2)
+        spread = math.sqrt(one + scale**2 * math.pi / (2.0 * len(own)))
+        reach = float(student.isf(self.share / 2.0, 0.6 * spare - 0.5)) * spread
+        return Limits(centre, centre - reach, centre + reach, len(own))
+
+    def home(self, k: int, now: int, least: float, *, rise_only: bool) -> int | None:
+        """The level that a value belongs to: the present one rather than those before it."""
+        value, std = float(self.values[k]), float(self.stds[k])
+        for level in (now, *(one for one in reversed(range(len(self.members))) if one != now)):
+            band = self.limits(level, std)
+            if band is None or band.low <= value <= band.high or abs(value - band.centre) < least:
+                return level
+        below = value < float(np.median(self.values[self.members[now]]))
+        return now if rise_only and below else None
+
+
+def qn_scale(values: Array) -> float:
+    """Qn, a robust standard deviation: a low quantile of all distances between two values.
+
+    Half of the values (n,) may be anything.
+    """
+    n = len(values)
+    if n < 2:
+        return 0.0
+    first, second = np.triu_indices(n, 1)
+    half = n // 2 + 1
+    place = half * (half - 1) // 2 - 1
+    distance = np.partition(np.abs(values[first] - values[second]), place)[place]
+    correction = n / (n + (1.4 if n % 2 else 3.8))
+    return float(_QN_NORMAL * correction * distance)
+
+
+def drift(time: Array, values: Array) -> Drift | None:
+    """Slope of values (n,) in time (n,), None for fewer than `FEWEST` or one instant."""
+    known = np.isfinite(values)
+    at, own = time[known], values[known]
+    if len(own) < FEWEST or np.ptp(at) == 0.0 or np.ptp(own) == 0.0:
+        return None
+    slope, _, low, high = theilslopes(own, at, _CONFIDENCE)
+    p_value = float(kendalltau(at, own).pvalue)
+    return Drift(float(slope), float(low), float(high), p_value, float(np.ptp(at)))

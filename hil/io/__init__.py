@@ -1,0 +1,1 @@
+"""Files and folders: digests, locks, atomic writes."""
