@@ -14,7 +14,7 @@ from hil.cell import Cell
 from hil.identify.cad_prior import cad_prior, required
 from hil.identify.settings import Settings
 from identification import IdentificationError
-from identification.estimators.consistent import consistent_estimate
+from identification.estimators.consistent import SolverError, consistent_estimate
 from identification.estimators.delay_compensation import with_uncertain_delay
 from identification.estimators.least_squares import Weighting, fit_least_squares
 from identification.estimators.prior import fit_with_prior, with_prior
@@ -70,7 +70,7 @@ class Estimator:
         """What estimates from a sum and its archives are shrunk towards (p,); None for nothing.
 
         Raises:
-            IdentificationError: there is not one usable row, or no consistent solution.
+            IdentificationError: there is not one usable row.
         """
         total = phase.total
         if not total.samples.any():
@@ -78,7 +78,10 @@ class Estimator:
         if self._shrinkage.strength == 0.0:
             return None
         weight = self._shrinkage.prior_weight
-        return consistent_centre(self.model, total, self.weights(total), weight).estimate.values
+        try:
+            return consistent_centre(self.model, total, self.weights(total), weight).estimate.values
+        except SolverError:
+            return None  # least squares, as `hil identify` does it
 
     def of_archive(self, summary: Summary, centre: Array | None) -> Estimate:
         """The estimate from one archive alone, shrunk towards the centre of all.

@@ -13,7 +13,7 @@ import numpy as np
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
-from identification.estimators.consistent import consistent_estimate
+from identification.estimators.consistent import SolverError, consistent_estimate
 from identification.estimators.delay_compensation import rate_products, with_uncertain_delay
 from identification.estimators.least_squares import Weighting, fit_least_squares
 from identification.estimators.losses import Huber, Loss, Tukey
@@ -152,9 +152,13 @@ def _automatic(case: _Case) -> _Found:
     if case.shrinkage.strength == 0.0:
         return _least_squares("weighted")(case)
     total = total_phase(case.model, case.fitted).total
-    centre = consistent_centre(
-        case.model, total, joint_weights(total), case.shrinkage.prior_weight
-    ).estimate.values
+    try:
+        centre = consistent_centre(
+            case.model, total, joint_weights(total), case.shrinkage.prior_weight
+        ).estimate.values
+    except SolverError as error:
+        found, doubts = _least_squares("weighted")(case)
+        return found, [*doubts, f"least squares is reported, for {error}"]
 
     def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
         return fit_shrunk(case.model, some, case.shrinkage, centre=centre, phase=phase)

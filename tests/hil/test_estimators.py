@@ -27,7 +27,9 @@ from hil.identify.summary import uncertainty_result
 from hil.progress import Silent
 from hil.results import SCHEMA_VERSION, Results
 from hil.simulation import planted_values
+from identification.estimators.consistent import SolverError
 from identification.estimators.prior import GaussianPrior
+from identification.estimators.shrinkage import Shrinkage
 
 
 def archives(campaign: Campaign) -> list[Path]:
@@ -261,3 +263,23 @@ def test_results_of_another_version_are_refused_with_what_to_do(tmp_path: Path) 
     path.write_text(json.dumps({"schema_version": SCHEMA_VERSION, "name": 3}))
     with pytest.raises(InputError, match="name: input should be a valid string; found '3'"):
         Results.load(path)
+
+
+class TestAutomaticEstimator:
+    def test_without_a_consistent_solution_it_is_least_squares(
+        self,
+        prepared: Prepared,
+        estimations: dict[Estimator, Estimation],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """Data that no machine fits are estimated all the same, and the reason stands beside it."""
+
+        def none(*_: object) -> None:
+            raise SolverError("no solution was found", status="inaccurate")
+
+        monkeypatch.setattr("hil.identify.estimating.consistent_centre", none)
+        settings = replace(prepared.settings, shrinkage=Shrinkage(0.1))
+        found = estimate_with(replace(prepared, settings=settings), Options(), Silent())
+        expected = estimations["wls"].result.pooled.values
+        np.testing.assert_array_equal(found.result.pooled.values, expected)
+        assert any("least squares is reported" in one for one in found.doubts)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers import DriveTrain, InitPacket
-from drivers.init_check import Announced, AnnouncedLimits, compare, shown
+from drivers.init_check import AnnouncedLimits, InitCheck, compare, shown
 from tests.drivers.rig import PERIOD, drive_train
 
 COUPLING = (0.02, 0.003, 0.04)
@@ -27,7 +27,7 @@ def arm(n: int) -> DriveTrain:
     )
 
 
-def adopted(ours: DriveTrain, **changes) -> Announced:
+def adopted(ours: DriveTrain, **changes) -> InitCheck:
     """The controller's values, accepted."""
     n = ours.n_joints
     told = {
