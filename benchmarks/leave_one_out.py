@@ -1,6 +1,6 @@
 """What the defaults of the automatic settings are worth on a robot that they were not chosen on.
 
-Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--json]``, with FOLDER as in
+Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...] [--json]``, with FOLDER as in
 `benchmarks.board`.
 
 Each default of :mod:`identification.selection.inner_prediction` is varied alone. For each robot,
@@ -79,8 +79,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--json", action="store_true", help="end with one line of JSON")
+    parser.add_argument("--only", nargs="+", default=known(), help="some of the recordings")
     options = parser.parse_args()
-    robots = {name: ratios(name, options.data) for name in known()}
+    robots = {name: ratios(name, options.data) for name in options.only}
     mean = {PRESENT: _geometric([one[PRESENT, ""] for one in robots.values()])}
     table = {default: chosen_without(robots, default) for default in ALTERNATIVES}
     print(f"{PRESENT}: {mean[PRESENT]:.3f} times the error of the plain fit (geometric mean)")

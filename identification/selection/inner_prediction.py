@@ -307,11 +307,15 @@ class _Trial:
         self,
         name: str,
         candidates: Sequence[Settings],
-        share: float = WORTHWHILE,
+        share: float | None = None,
         *,
         by_joint: bool = False,
     ) -> _Decision:
-        """Take the first candidate, or the best one if it predicts better by that share."""
+        """Take the first candidate, or the best one if it predicts better by that share.
+
+        By `WORTHWHILE` without one.
+        """
+        share = WORTHWHILE if share is None else share
         each = [self.errors(one) for one in candidates]
         errors = [one.by_joint if by_joint else one.overall for one in each]
         best = int(np.nanargmin(errors)) if np.any(np.isfinite(errors)) else 0
