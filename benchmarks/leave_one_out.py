@@ -1,7 +1,7 @@
 """What the defaults of the automatic settings are worth on a robot that they were not chosen on.
 
-Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...] [--json]``, with FOLDER as in
-`benchmarks.board`.
+Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...] [--json]``, with
+FOLDER as in `benchmarks.board`.
 
 Each default of :mod:`identification.selection.inner_prediction` is varied alone. For each robot,
 the value with the least geometric mean of held-out errors over all *other* robots is taken and
