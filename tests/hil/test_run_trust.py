@@ -491,7 +491,8 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
         campaign.run(operator=Person(slow_second), unrehearsed=True)
     monkeypatch.undo()
     slowed = campaign.folder.archives / "excitation_001_a1.mcap"
-    assert (open_archive(slowed, fields=()).outcome or {})["outcome"] == "completed"
+    outcome = open_archive(slowed, fields=()).outcome
+    assert outcome is not None and outcome.outcome == "completed"
     found = discover([str(campaign.folder.root)], Where(str(tmp_path / "cache")), Here())
     assert slowed.as_posix() not in {ref.location for ref in found.refs}
     (told,) = (one for one in found.skipped if one.path == slowed.as_posix())
@@ -540,7 +541,7 @@ def test_a_first_repetition_that_was_touched_does_not_spoil_all_others(make: Mak
     good = [path.name for path in campaign.folder.completed("excitation")]
     assert good == ["excitation_000_a2.mcap", "excitation_001_a3.mcap", "excitation_002_a1.mcap"]
     touched = open_archive(campaign.folder.archives / "excitation_000_a1.mcap")
-    assert (touched.outcome or {})["outcome"] == "rejected"
+    assert touched.outcome is not None and touched.outcome.outcome == "rejected"
     assert not campaign.folder.damaged()
 
 
