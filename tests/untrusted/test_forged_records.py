@@ -6,7 +6,7 @@ import json
 import zlib
 from io import BytesIO
 from pathlib import Path
-from types import SimpleNamespace
+from types import MethodType, SimpleNamespace
 from typing import cast
 
 import pytest
@@ -34,7 +34,9 @@ def test_a_study_reads_its_archives_again_where_a_record_does_not_fit(tmp_path: 
 def test_a_plan_whose_moves_are_none_is_told_with_its_archive(tmp_path: Path) -> None:
     path = tmp_path / "validation_000_a1.mcap"
     plan = json.dumps({"moves": [{"target": "x"}]}).encode()
-    archive = cast("Archive", SimpleNamespace(path=path, attachments={"plan.json": plan}))
+    forged = SimpleNamespace(path=path, attachments={"plan.json": plan})
+    forged.table = MethodType(Archive.table, forged)
+    archive = cast("Archive", forged)
     with pytest.raises(ArchiveError, match="its plan cannot be read") as told:
         class_in(archive)
     assert str(path) in str(told.value)
