@@ -241,7 +241,7 @@ class Session:
         self._machine.resume()
 
     def discarded(self, kind: str, count: int) -> None:
-        """The link dropped `count` packets before the session saw them: counted and told."""
+        """The link dropped `count` packets before the session saw them: counted and reported."""
         self._tally.discarded(kind, count)
 
     def stop(self, reason: str = "a stop was asked for") -> None:

@@ -46,7 +46,7 @@ class HoldRefused:
 
 @dataclass(frozen=True)
 class ResumeRefused:
-    """The motion cannot be gone on with, for the reason given."""
+    """The motion cannot be resumed, for the reason given."""
 
     reason: str
 

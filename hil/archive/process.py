@@ -54,7 +54,7 @@ from hil.errors import ArchiveError, InputError
 Records = NDArray[np.void]
 
 RECENT: Final = 5000
-"""Cycles kept."""
+"""Cycles held back for what came before an event."""
 _PACKETS_PER_CYCLE = 2
 
 
@@ -77,14 +77,14 @@ class Recent:
     def keep(
         self, records: Records, events: Sequence[ExchangeEvent], packets: Records | None = None
     ) -> None:
-        """Take in what has come; `packets` None where they are not kept."""
+        """Take in what has come; `packets` None where they are not recorded."""
         _keep_newest(self._records, records, RECENT)
         self._events = [*self._events, *events][-RECENT:]
         if packets is not None:
             _keep_newest(self._packets, packets, _PACKETS_PER_CYCLE * RECENT)
 
     def taken(self) -> Session:
-        """What belongs to the session that began last; nothing is kept of it here."""
+        """What belongs to the session that began last; none of it is stored here."""
         records, events, packets = self._records, self._events, self._packets
         self._records, self._events, self._packets = [], [], []
         inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
@@ -170,7 +170,7 @@ class ArchiveProcess:
         ring, events, control: the exchange's memory.
         commands: to the supervisor.
         exchange: descriptor of the exchange process (a pidfd), which tells its death.
-        packets: the raw packets' memory, None where they are not kept.
+        packets: the raw packets' memory, None where they are not recorded.
     """
 
     def __init__(

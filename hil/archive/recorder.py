@@ -60,7 +60,7 @@ def describe(event: ExchangeEvent) -> str:
         case OverrideChanged():
             return f"override {100.0 * event.fraction:.4g} % in cycle {event.cycle}"
         case HoldChanged():
-            return f"{'held' if event.held else 'gone on with'} in cycle {event.cycle}"
+            return f"{'held' if event.held else 'resumed'} at cycle {event.cycle}"
         case MotionEnded():
             return f"{event.outcome} in cycle {event.cycle}: {event.reason}"
         case PacketRejected(kind="answered late"):
@@ -92,7 +92,7 @@ def describe(event: ExchangeEvent) -> str:
         case HoldRefused():
             return f"nothing is held: {event.reason}"
         case ResumeRefused():
-            return f"the motion cannot be gone on with: {event.reason}"
+            return f"the motion cannot be resumed: {event.reason}"
         case EventsLost():
             return f"{event.count} events were overwritten before they could be archived"
 

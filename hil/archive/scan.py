@@ -12,6 +12,7 @@ Where two chunks claim the same cycles, nobody knows which is strange, and neith
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import BinaryIO, Self
@@ -162,7 +163,7 @@ class Order:
         raise Contested(size, reason, self._newest)
 
 
-class Scan:
+class Scan(ABC):
     """What has been verified of an archive so far.
 
     Args:
@@ -209,9 +210,9 @@ class Scan:
         elif record.opcode in (container.SCHEMA, container.CHANNEL):
             self.parser.known.take(record)
 
+    @abstractmethod
     def take_chunk(self, record: Record) -> None:
         """Take a chunk."""
-        raise NotImplementedError
 
     def take_attachment(self, record: Record) -> None:
         """Take an attachment."""

@@ -33,7 +33,7 @@ class Open:
         drive_train: in force on the link.
         from_now: leave out what came before; otherwise begin with the session's oldest record
             that is still there.
-        until_ended: close it when the motion has ended; otherwise only when told to.
+        until_ended: close it when the motion has ended; otherwise only on `Close`.
     """
 
     job: int
