@@ -243,13 +243,12 @@ class Guard:
     ) -> None:
         """The first packet after a long gap, before an axis goes on from the set-point sent last.
 
-        A velocity may be off by half the step sent last, or by what counts as standstill. The
-        target's is always held against that; the arm's lags behind, so only where it stands.
+        A velocity may be off by half the step sent last, or by what counts as standstill.
 
         Args:
             target: (n,) D1, motor revolutions.
             velocity: (2, n) D2 and D4, motor revolutions per cycle.
-            commanded: (n,) D1 of the answer sent last, motor revolutions.
+            commanded: (n,) where the target should be, motor revolutions.
             step: (n,) D2 of the answer sent last, motor revolutions per cycle.
             cycle: for the error.
             where: (n,) which joints.
@@ -259,11 +258,28 @@ class Guard:
         """
         bound = FIRST_FRACTION * self._threshold
         require(where, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
-        standstill = self.limits.standstill
-        bound = np.maximum(0.5 * np.abs(step), standstill)
-        moving = np.abs(velocity[1]) > standstill
-        for joints, found in ((where, velocity[0]), (where & ~moving, velocity[1])):
-            require(joints, np.abs(found - step), bound, MotionHeld, cycle)
+        require(where, np.abs(velocity[0] - step), self._off(step), MotionHeld, cycle)
+        self.check_moving(velocity[1], step, cycle, where)
+
+    def check_moving(
+        self, velocity: Array, step: Array, cycle: int, where: NDArray[np.bool_]
+    ) -> None:
+        """No arm stands where it should move. One that moves may lag behind by any amount.
+
+        Args:
+            velocity: (n,) D4, motor revolutions per cycle.
+            step: (n,) D2 of the answer sent last, motor revolutions per cycle.
+            cycle: for the error.
+            where: (n,) which joints.
+
+        Raises:
+            NotFinite, MotionHeld: it stands, so that the next set-point would be a jump.
+        """
+        stands = where & ~(np.abs(velocity) > self.limits.standstill)
+        require(stands, np.abs(velocity - step), self._off(step), MotionHeld, cycle)
+
+    def _off(self, step: Array) -> Array:
+        return np.maximum(0.5 * np.abs(step), self.limits.standstill)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """The next set-point; if it passes, it counts as sent.

@@ -11,15 +11,17 @@ the last carried on by as many steps as packets were missed, and within 25 % of 
 one than the last is an answer lost, which is counted and reported; more than `max_gap` of them in
 100 cycles bring a motion to rest on its path.
 
-Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave
-open mode, move the arm and come back; one set-point further at full speed would then be a jump.
-Hence, after a gap longer than `max_gap`, open mode goes on only if
-D1 is within those 10 % of the set-point sent last, and its velocity (D2) within half the velocity
-sent last or what counts as standstill; an arm that itself stands (D4) is held against the latter
-too. Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such
-a gap unless they were zero. A link may say how old each value is: one that is needed for such a
-decision, for the first set-point, or to be given back to an open axis, and was not sent in this
-very packet counts as unknown and refuses.
+Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave open
+mode, move the arm and come back; one set-point further at full speed would then be a jump. Hence,
+after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the set-
+point sent last, or of that carried on by the steps that were missed, and its velocity (D2) within
+half the velocity sent last or what counts as standstill; an arm that itself stands (D4) is held
+against the latter too, also where packets came late by the clock although none is missing. A motion
+whose target was carried on skips the set-points that were missed, and is then stopped on its path.
+Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such a gap
+unless they were zero. A link may say how old each value is: one that is needed for such a decision,
+for the first set-point, or to be given back to an open axis, and was not sent in this very packet
+counts as unknown and refuses.
 
 After the motion the end is held for `settle_cycles`; the next answer asks for the end of open mode
 (status byte 1), and asks again every `EXIT_RETRY_CYCLES` in case that answer was lost; after
@@ -270,23 +272,34 @@ class ReplyPolicy:
         ring.age[row] = 0 if ages is None else ages[self.wire.joint_slots].max(axis=0)
         self.wire.read(words.view(np.float32), ring.measured[row], ages)
 
-    def note_gap(self, unanswered: int, machine: Machine, reading: Reading) -> None:
-        """So many packets before this one were not answered.
+    def note_gap(
+        self, unanswered: int, paused: bool, machine: Machine, reading: Reading, commanded: Array
+    ) -> None:
+        """So many packets before this one were not answered, or it came late by the clock.
 
         After a long gap open mode goes on only where the controller carried it on, moving, at
-        rest or on the way out: meanwhile it may have left, moved the arm, come back.
+        rest or on the way out: meanwhile it may have left, moved the arm, come back. After a pause
+        the arm must not stand where it should move.
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: it did not.
+            RefusalError: the motion cannot skip what was missed.
         """
-        if self._open_mode is None:
+        open_mode = self._open_mode
+        if open_mode is None:
             return
-        self._open_mode.missed = unanswered
-        if unanswered <= self._max_gap:
-            return
+        open_mode.missed = unanswered
         in_open = machine.state in (State.OPEN, State.EXITING) and machine.in_interval
-        if in_open and not machine.entering:
-            self._open_mode.require_carried_on(reading, machine.cycle)
+        if not in_open or machine.entering:
+            return
+        if unanswered > self._max_gap:
+            execution = machine.execution
+            moving = machine.state is State.OPEN and execution is not None and execution.started
+            open_mode.require_carried_on(
+                execution if moving else None, reading, commanded, machine.cycle
+            )
+        elif paused:
+            open_mode.require_moving(reading, machine.cycle)
 
     def refusal(self, offending: int | None, reading: Reading, words: Words) -> bytes:
         """Fill the frame with 508 for the offending joint, or with 505 for all.

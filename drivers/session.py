@@ -30,7 +30,9 @@ controller has to report closed axes first, and a new motion has to be requested
 Every fresh, well-formed packet gets exactly one answer, a duplicate (the same bytes) the same
 bytes again; stale and malformed ones get none and are counted. Motion advances one period per
 answered packet, whatever was missed; more than `max_gap` missed in a row, stale ones among them,
-bring it to rest on its path, if the controller carried it on. What is watched meanwhile, and when
+bring it to rest on its path, if the controller carried it on. A packet that comes `PAUSE_CYCLES`
+later by the clock than its number accounts for gets a further set-point only if the arm does not
+stand where it should move. What is watched meanwhile, and when
 open mode is left, stands at the head of `drivers.reply_policy`.
 
 In every state an axis that is open with its drive on, of whichever arm, is answered by its target
@@ -81,6 +83,8 @@ MAX_GAP: Final = 100
 """Largest `max_gap`."""
 SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
 """Open modes a motion can run in."""
+PAUSE_CYCLES: Final = 2.0
+"""Cycles that a packet may come later, by the clock, than its number and `max_gap` account for."""
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
 
 
@@ -156,6 +160,7 @@ class Session:
         self._policy: ReplyPolicy | None = None
         self._cold_start = False
         self._heard_at: float | None = None
+        self._arrived_at = -math.inf
         self._last_packet = b""
         self._last_reply = b""
         self._unanswered = 0
@@ -350,6 +355,7 @@ class Session:
             return None
         missed = self._sequence.accept(number)
         machine.cycle = self._sequence.cycle
+        late = (now - self._arrived_at) / self._guard.period - max(missed, self._max_gap)
         words = words_of(decoded)
         # After a corrupted number the controller's own look stale for a while.
         unanswered, self._unanswered = missed + self._unanswered, 0
@@ -368,8 +374,8 @@ class Session:
             machine.take(reading.input)
             if machine.state is State.FAULTED and before is not State.FAULTED:
                 refusal = ModeRefused(*reading.faulty, machine.cycle)
-            policy.note_gap(unanswered, machine, reading)
             measured, commanded = ring.measured[row], ring.commanded[row]
+            policy.note_gap(unanswered, late > PAUSE_CYCLES, machine, reading, commanded)
             status = policy.answer(machine, reading, words, measured, commanded)
         except BaseException as error:
             # Whatever it was, the controller is told to stop, by the answer that is due now.
@@ -390,6 +396,7 @@ class Session:
         self.counters.answered += 1
         self._last_packet = packet
         self._last_reply = reply
+        self._arrived_at = now
         self._heard(now)
         return reply
 

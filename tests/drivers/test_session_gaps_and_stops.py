@@ -16,18 +16,32 @@ from drivers import (
     RefusalError,
     State,
 )
+from drivers.open_mode import MOST_SKIPPED
 from tests.drivers.rig import (
     PERIOD,
     START,
     Cruise,
+    N,
     Rig,
     assert_refused,
+    limits,
     moving,
     smooth_move,
     still,
 )
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
+
+
+def moving_at(share):
+    """An arm whose first joint moves at a share of full speed."""
+    wide = limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0))
+    rig = Rig(guard_limits=wide)
+    source = type("Faster", (Cruise,), {"SPEED": share * wide.velocity[0], "RAMP": 1.0})()
+    rig.session.request(source)
+    rig.open()
+    rig.cycle(1200)
+    return rig, source
 
 
 class TestGaps:
@@ -138,7 +152,8 @@ class TestLongGaps:
     @pytest.mark.parametrize("sign", [-1, 1])
     def test_one_whose_target_went_elsewhere_is_not_one_that_stands(self, sign):
         def change(d):
-            d[0, [0, 2]] += sign * 0.201
+            carried_on = 3 * d[0, 1] if sign > 0 else 0.0
+            d[0, [0, 2]] += sign * 0.201 + carried_on
 
         rig, _, answer = self.after_gap(3, change)
         error = self.refused(answer, rig, MotionNotCarriedOn)
@@ -152,6 +167,28 @@ class TestLongGaps:
         rig, source, _ = self.after_gap(3, change)
         assert rig.state is State.OPEN
         assert source.stops == 1
+
+    @pytest.mark.parametrize("missed", [3, 5, 20])
+    @pytest.mark.parametrize("share", [0.25, 0.5, 0.8, 1.0])
+    def test_it_goes_on_from_there_at_any_speed(self, share, missed):
+        """The set-points that the controller made itself are skipped: the next one is a step on."""
+        rig, source = moving_at(share)
+        target, step = rig.axes["d"][0, [0, 1]]
+        rig.axes["d"][0, [0, 2]] += missed * step
+        rig.miss(missed)
+        answer = rig.cycle()
+        assert rig.state is State.OPEN
+        assert source.stops == 1
+        assert answer.axes["d"][0, 0] - target == pytest.approx((missed + 1) * step, rel=0.05)
+        rig.run()
+        assert rig.ended.outcome == "stopped"
+
+    def test_a_target_carried_on_for_too_long_is_elsewhere(self):
+        """A motion skips no more than `MOST_SKIPPED` set-points in one cycle."""
+        rig, _ = moving_at(1.0)
+        rig.axes["d"][0, [0, 2]] += (MOST_SKIPPED + 1) * rig.axes["d"][0, 1]
+        rig.miss(MOST_SKIPPED + 1)
+        assert_refused(rig, rig.cycle(), MotionNotCarriedOn)
 
     def test_a_short_gap_is_bridged_even_so(self):
         rig, source, _ = self.after_gap(2, self.held)
@@ -169,6 +206,35 @@ class TestLongGaps:
         rig.cycle(3)
         rig.miss(30)
         rig.cycle()
+        assert rig.state is State.OPEN
+
+
+class TestPauses:
+    """The controller's numbers go on without a gap, but its packets come late by the clock."""
+
+    @pytest.mark.parametrize("share", [0.25, 1.0])
+    @pytest.mark.parametrize("pause", [0.02, 0.9])
+    def test_an_arm_that_came_to_rest_is_not_driven_on(self, share, pause):
+        """From rest to a full step in one cycle is a jump, however the numbers look."""
+        rig, _ = moving_at(share)
+        rig.now += pause
+        rig.axes["d"][:, 3] = 0.0
+        assert_refused(rig, rig.cycle(), MotionHeld)
+
+    def test_an_arm_that_still_moves_is_driven_on(self):
+        """A loaded computer looks like that: its cycle was stretched, nothing else."""
+        rig, source = moving_at(1.0)
+        rig.now += 0.9
+        rig.axes["d"][:, 3] *= 0.3
+        rig.cycle(20)
+        assert (rig.state, source.stops) == (State.OPEN, 0)
+
+    def test_an_arm_that_is_only_held_stays_held(self):
+        rig = Rig()
+        rig.open()
+        rig.cycle(3)
+        rig.now += 0.9
+        rig.cycle(3)
         assert rig.state is State.OPEN
 
 

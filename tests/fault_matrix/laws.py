@@ -95,7 +95,17 @@ def broken_in_records(records: NDArray[np.void], still: slice | None) -> Iterato
     if still is not None and np.any(np.nan_to_num(records["commanded_velocity"][still])):
         yield "set-points that move after the motion was lost or refused"
     for first, last in _stretches(sent & (records["state"] != State.OPENING)):
-        yield from _broken_bounds(records["commanded_position"][first:last])
+        yield from _broken_bounds(_at_each_cycle(records[first:last]))
+
+
+def _at_each_cycle(records: NDArray[np.void]) -> Array:
+    """Set-points, and on a straight line what a controller made of a gap too long to be bridged."""
+    gap = np.where(records["gap"] > MAX_GAP, records["gap"], 0)
+    cycle = np.arange(len(records)) + np.cumsum(gap) - gap[0]
+    every = np.arange(cycle[-1] + 1)
+    return np.column_stack(
+        [np.interp(every, cycle, one) for one in records["commanded_position"].T]
+    )
 
 
 def _broken_bounds(q: Array) -> Iterator[str]:
