@@ -58,7 +58,8 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": None, "stribeck": 0.1},
 )
 # A candidate replaces the simpler one before it only if it predicts better by this share; a
-# low-pass of the torque, which can stand in for much else, by more.
+# low-pass of the torque, which can stand in for much else, by more. Of estimators and rows none is
+# simpler, and the best is taken.
 WORTHWHILE: Final = 0.01
 LOW_PASS_WORTHWHILE: Final = 0.05
 TERM_WORTHWHILE: Final = 0.02
@@ -280,7 +281,7 @@ def choose_settings(
         trial.renew_centres()
         weights = PRIOR_WEIGHTS if now.shrinkage.strength > 0.0 else (now.shrinkage.prior_weight,)
         candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
-        found = trial.decide("estimator", candidates)
+        found = trial.decide("estimator", candidates, 0.0)
         now, choices = found.settings, [*choices, found.choice]
     if not math.isfinite(trial.errors(now).overall):
         return start, ()
@@ -396,13 +397,13 @@ def _sweep(
     trial: _Trial, now: Settings, questions: Collection[Question]
 ) -> tuple[Settings, list[Choice]]:
     """Decide what depends on one another in turn, until nothing changes."""
-    asked = [(name, vary) for question, name, vary in _SWEPT if question in questions]
+    asked = [one for one in _SWEPT if one.question in questions]
     choices: list[Choice] = []
     for _ in range(_MOST_SWEEPS):
         before = now
         choices = []
-        for name, vary in asked:
-            found = trial.decide(name, vary(now))
+        for one in asked:
+            found = trial.decide(one.name, one.vary(now), one.share)
             now, choices = found.settings, [*choices, found.choice]
         if now.key == before.key:
             break
@@ -427,11 +428,27 @@ def _presliding(now: Settings) -> list[Settings]:
     ]
 
 
-_SWEPT: Final[tuple[tuple[Question, str, Callable[[Settings], list[Settings]]], ...]] = (
-    ("bandwidth", "bandwidth of the motion", _bandwidths),
-    ("velocity", "velocity", _velocities),
-    ("presliding", "presliding displacement", _presliding),
-    ("rows", "rows that are left out", _rows),
+class _Swept(NamedTuple):
+    """A question that is decided again and again.
+
+    Attributes:
+        question: which.
+        name: of the choice.
+        vary: settings with each candidate.
+        share: by which one has to predict better than the first, see `_Trial.decide`.
+    """
+
+    question: Question
+    name: str
+    vary: Callable[[Settings], list[Settings]]
+    share: float | None = None
+
+
+_SWEPT: Final = (
+    _Swept("bandwidth", "bandwidth of the motion", _bandwidths),
+    _Swept("velocity", "velocity", _velocities),
+    _Swept("presliding", "presliding displacement", _presliding),
+    _Swept("rows", "rows that are left out", _rows, share=0.0),
 )
 
 
