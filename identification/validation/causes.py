@@ -47,6 +47,9 @@ SIGMAS: Final = 3.0
 LEAST_GAIN: Final = 0.1
 # What is as good as that with fewer coefficients is taken in its place.
 _ALIKE: Final = 1.05
+# Share of its torque that each joint of a mended sign or order may be mispredicted by: where more
+# is left, the sign explains less than what remains unexplained.
+_EXPLAINED: Final = 0.5
 _MOST_CAUSES: Final = 4
 # Rows of all recordings together, and blocks of time: a fault of a whole recording shows in few.
 _MOST_ROWS: Final = 3000
@@ -165,16 +168,25 @@ def find_causes(
 
 
 class _Trial(NamedTuple):
-    """A fault mended, the upper end of its ratio, and how many coefficients it has."""
+    """A fault mended.
+
+    Attributes:
+        cause: the fault.
+        highest: upper end of its ratio.
+        coefficients: how many it has.
+        left: error that remains on the worst of its joints, as a share of their torque.
+    """
 
     cause: Cause
     highest: float
     coefficients: int
+    left: float
 
     @property
     def better(self) -> bool:
         """Whether the fault mended predicts better, beyond chance."""
-        return self.cause.ratio < 1.0 - LEAST_GAIN and self.highest < 1.0
+        explained = not self.cause.fault.discrete or self.left < _EXPLAINED
+        return explained and self.cause.ratio < 1.0 - LEAST_GAIN and self.highest < 1.0
 
     def rivalled_by(self, other: _Trial) -> bool:
         """Whether another order, or an order in place of a sign, explains nearly as much.
@@ -251,7 +263,10 @@ class _State:
             score = _score(seen, p, np.concatenate([own, before], axis=3), measured)
             ratio, highest = score.against(usual)
             size, std = _size(fault, score, tables, own)
-            trials.append(_Trial(Cause(fault, ratio, size, std), highest, own.shape[3]))
+            torque = np.einsum("jq,bjqr,jr->j", measured, seen.gram, measured)
+            left = np.sqrt(score.squares.sum(axis=0) / np.maximum(torque, np.finfo(float).tiny))
+            worst = float(left[list(fault.joints)].max(initial=0.0))
+            trials.append(_Trial(Cause(fault, ratio, size, std), highest, own.shape[3], worst))
         return trials
 
     def _tables_of(self, fault: Fault) -> _Tables:

@@ -12,6 +12,7 @@ from identification.validation.causes import Cause, Kind
 from identification.validation.evidence import Evidence
 from identification.validation.findings.finding import Finding, listed
 from identification.validation.prediction import FRICTION_CHANGE
+from identification.validation.residual_checks import Outliers
 from identification.validation.thresholds import Thresholds
 
 Array = NDArray[np.float64]
@@ -198,14 +199,7 @@ def outliers(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Ite
     checks = evidence.residuals
     if checks is None or checks.outliers is None:
         return
-    found = checks.outliers
-    joints = [
-        j
-        for j in range(len(names))
-        if found.share[j] > 0.0
-        and found.share[j] < limit.outliers
-        and found.power[j] > limit.outlying_power
-    ]
+    found, joints = checks.outliers, _spiked(checks.outliers, limit)
     if not joints:
         return
     most = max(joints, key=lambda j: float(found.share[j]))
@@ -229,10 +223,16 @@ def spoilt_by_outliers(evidence: Evidence, limit: Thresholds) -> bool:
     if checks is None or checks.outliers is None:
         return False
     found, error = checks.outliers, evidence.held_out
-    few = found.share < limit.outliers
+    few = np.isin(np.arange(len(found.share)), _spiked(found, limit))
     axis = (error.relative > limit.axis) & (found.without.relative <= limit.axis)
     overall = error.overall > limit.overall >= found.without.overall
-    return bool(np.any(axis & few)) or (overall and bool(few.all()))
+    return bool(np.any(axis & few)) or (overall and bool(few.any()))
+
+
+def _spiked(found: Outliers, limit: Thresholds) -> list[int]:
+    """Joints of which few samples make most of the error."""
+    most = (found.power > limit.outlying_power) & (found.share < limit.outliers)
+    return [int(joint) for joint in np.flatnonzero(most & (found.share > 0.0))]
 
 
 def friction_change(
