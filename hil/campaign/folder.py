@@ -184,6 +184,22 @@ class CampaignFolder:
         """SHA-256 over cell, URDF, plan and collision meshes as they lie there."""
         return combined(self._inputs())
 
+    @property
+    def motion_hash(self) -> str:
+        """The same but for the number of repetitions: of what moves the arm, however often.
+
+        Raises:
+            CampaignFolderError: one of them cannot be read.
+        """
+        contents = self._contents()
+        sums = self._checksums(contents)
+        try:
+            cell = toml_of(as_text(contents[self.cell.name]))
+        except (KeyError, ValueError):
+            return combined(sums)  # no cell that anything could be run with
+        cell.get("campaign", {}).pop("repetitions", None)
+        return combined(sums | {self.cell.name: json_digest(cell)})
+
     def hash_of(self, cell: Cell, plan: CampaignPlan) -> str:
         """The hash of a cell and a plan in memory, which must be those that lie in the folder.
 

@@ -44,7 +44,7 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
     rehearse = f"run `hil rehearse {folder.root}`"
     if found is None:
         raise NotRehearsedError(folder.root, "was not rehearsed", rehearse)
-    if found.plan_hash != (folder.plan_hash if plan_hash is None else plan_hash):
+    if not found.covers(folder, folder.plan_hash if plan_hash is None else plan_hash):
         what = "was rehearsed with another cell, URDF or plan than it has now"
         raise NotRehearsedError(folder.root, what, f"{rehearse} again")
     if not found.passed:

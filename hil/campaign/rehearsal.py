@@ -65,6 +65,8 @@ class Rehearsal(Frozen):
     software: dict[str, str]
     failed_seeds: tuple[int, ...] = ()
     """With which exactly this plan failed before."""
+    motion_hash: str = ""
+    """As `plan_hash`, whatever the number of repetitions; empty in files of older versions."""
 
     @model_validator(mode="after")
     def _judged_by_its_criteria(self) -> Self:
@@ -102,6 +104,20 @@ class Rehearsal(Frozen):
         """
         write_or_tell(path, self.model_dump_json(indent=1) + "\n")
 
+    def covers(self, folder: CampaignFolder, plan_hash: str) -> bool:
+        """Whether it is the rehearsal of a plan, or of the same motions repeated as often or not.
+
+        Args:
+            folder: of the campaign.
+            plan_hash: of the plan; a folder that was changed since has another.
+
+        Raises:
+            CampaignFolderError: cell, URDF or plan cannot be read.
+        """
+        if self.plan_hash == plan_hash:
+            return True
+        return folder.plan_hash == plan_hash and folder.motion_hash == self.motion_hash
+
     @property
     def failures(self) -> tuple[str, ...]:
         """What did not pass, in sentences."""
@@ -109,7 +125,10 @@ class Rehearsal(Frozen):
 
     def after(self, before: Rehearsal | None) -> Rehearsal:
         """This one, with what the same plan failed with before: another seed does not undo it."""
-        if before is None or before.plan_hash != self.plan_hash:
+        same = before is not None and (
+            before.plan_hash == self.plan_hash or before.motion_hash == self.motion_hash
+        )
+        if before is None or not same:
             return self
         failed = {*before.failed_seeds} | (set() if before.passed else {before.seed})
         return self.model_copy(update={"failed_seeds": tuple(sorted(failed - {self.seed}))})

@@ -261,7 +261,7 @@ def rehearse(
         before = None
         with suppress(HilError):  # what cannot be read is made anew
             before = Rehearsal.load(folder)
-        same = before is not None and (before.plan_hash, before.seed) == (plan_hash, seed)
+        same = before is not None and before.covers(folder, plan_hash) and before.seed == seed
         if before is not None and same and before.passed and not again:
             reporter.say("exactly this plan was rehearsed already and passed")
             return before
@@ -311,6 +311,7 @@ def _rehearsed(
     names = {one.name for one in criteria}
     return Rehearsal(
         plan_hash=plan_hash,
+        motion_hash=campaign.folder.motion_hash,
         seed=seed,
         passed=names == {*CRITERIA} and all(one.passed for one in criteria),
         criteria=criteria,

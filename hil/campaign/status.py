@@ -151,7 +151,7 @@ def _rehearsal(campaign: Campaign) -> _Found:
         return _LEFT_OUT
     if found is None:
         return _Found(False, "not rehearsed on the simulated arm yet", command)
-    if found.plan_hash != folder.plan_hash:
+    if not found.covers(folder, folder.plan_hash):
         sentence = "rehearsed with another cell, URDF or plan than it has now"
         return _Found(False, sentence, command)
     if not found.passed:

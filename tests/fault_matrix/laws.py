@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from drivers import Counters, CyclicPacket, State
 from drivers.packets import DRIVE_ON, Mode, cyclic_length, is_init, next_number, packet_number
@@ -99,13 +100,13 @@ def broken_in_records(records: NDArray[np.void], still: slice | None) -> Iterato
 
 
 def _at_each_cycle(records: NDArray[np.void]) -> Array:
-    """Set-points, and on a straight line what a controller made of a gap too long to be bridged."""
+    """Set-points, and on a smooth curve those of a gap too long to be bridged."""
     gap = np.where(records["gap"] > MAX_GAP, records["gap"], 0)
     cycle = np.arange(len(records)) + np.cumsum(gap) - gap[0]
-    every = np.arange(cycle[-1] + 1)
-    return np.column_stack(
-        [np.interp(every, cycle, one) for one in records["commanded_position"].T]
-    )
+    positions = records["commanded_position"]
+    if not gap.any():
+        return np.asarray(positions)
+    return np.asarray(CubicSpline(cycle, positions)(np.arange(cycle[-1] + 1)))
 
 
 def _broken_bounds(q: Array) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -75,6 +76,27 @@ def test_a_good_plan_on_a_right_cell_passes_every_criterion(designed: Campaign) 
         "current (with what the model leaves out)",
     ]
     require_rehearsed(designed.folder)
+
+
+def test_another_number_of_repetitions_of_the_same_motions_needs_no_rehearsal(
+    tmp_path: Path, designed: Campaign
+) -> None:
+    folder = CampaignFolder(tmp_path / "campaign")
+    shutil.copytree(designed.folder.root, folder.root)
+    text = folder.cell.read_text()
+    number = designed.cell.campaign.repetitions
+    assert f"repetitions = {number}" in text
+    folder.cell.write_text(text.replace(f"repetitions = {number}", "repetitions = 30"))
+    require_rehearsed(folder)
+
+
+def test_any_other_change_of_the_cell_does(tmp_path: Path, designed: Campaign) -> None:
+    folder = CampaignFolder(tmp_path / "campaign")
+    shutil.copytree(designed.folder.root, folder.root)
+    text = folder.cell.read_text()
+    folder.cell.write_text(text.replace("gear_ratio = [100.0", "gear_ratio = [101.0", 1))
+    with pytest.raises(NotRehearsedError, match="another cell, URDF or plan"):
+        require_rehearsed(folder)
 
 
 def test_exactly_the_plan_is_run_noisy_and_with_a_faulty_link(designed: Campaign) -> None:
