@@ -26,7 +26,6 @@ from identification.excitation import (
     sampled,
     search,
 )
-from identification.excitation.collision.built_in import told
 
 from .advice import exhausted, forbidden, no_excitation
 from .folder import DesignFolder, require_same
@@ -148,7 +147,7 @@ def _searched(
     stop: Callable[[], bool],
 ) -> Design:
     settings, checker = search_settings(asked), problem.constraints.checker
-    not_checked = None if checker is None else told(checker.built_in)
+    not_checked = None if checker is None else checker.exceptions
     if not_checked is not None:
         reporter.say(not_checked)
     with ExitStack() as stack:

@@ -227,6 +227,13 @@ def obstacles(workspace: Workspace) -> list[Body]:
     return bodies
 
 
+def withdrawn(plane: Body, distance: float) -> Body:
+    """Return a floor or wall that stands back by a distance [m]."""
+    assert plane.normal is not None
+    offset = float(plane.normal @ plane.hull.centre) - distance
+    return _plane(plane.name, plane.normal, offset)
+
+
 def _plane(name: str, normal: Array, offset: float) -> Body:
     length = float(np.linalg.norm(normal))
     normal = normal / length

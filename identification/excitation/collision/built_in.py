@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 NEAR: Final = 0.05
 # A foot's distance from what it stands in changes by this [m] at most.
 STILL: Final = 0.002
+# A link that never keeps the margin keeps the farthest distance that was tried, less this [m].
+SLACK: Final = 0.005
 _N_POSTURES = 200
 _SEED = 20140901
 # Ranges below this [rad, m] are taken for ranges that nobody gave.
@@ -81,6 +83,20 @@ def always_close(pairs: Pairs, pair: int, margin: float) -> tuple[float, float] 
     return nearest, farthest
 
 
+def never_clear(pairs: Pairs, pair: int, margin: float) -> tuple[float, float] | None:
+    """Return nearest and farthest distance [m] of a link that never keeps the margin of a plane.
+
+    It is one of the two links next to the mounting, such as an upper arm whose shoulder turns
+    close above the floor; in some postures it does not touch.
+    """
+    near = min(margin, NEAR)
+    if pairs.joints_between(pair) > 2 or not np.all(pairs.lower_bounds(pair) < near):
+        return None
+    distances = pairs.distances(pair)
+    nearest, farthest = float(distances.min()), float(distances.max())
+    return (nearest, farthest) if SLACK < farthest < near else None
+
+
 def random_postures(model: pin.Model, limits: JointLimits | None) -> Array:
     """Return postures within limits, half a turn to either side where there are none (k, n).
 
@@ -98,12 +114,21 @@ def random_postures(model: pin.Model, limits: JointLimits | None) -> Array:
     return postures
 
 
-def told(built_in: Sequence[BuiltIn]) -> str | None:
-    """Return the sentence that says what is not checked, None where everything is."""
-    if not built_in:
-        return None
-    pairs = "; ".join(map(str, built_in))
-    return f"not checked for collisions, always too close by the way the arm is built: {pairs}"
+def exceptions(built_in: Sequence[BuiltIn], narrowed: Sequence[BuiltIn]) -> str | None:
+    """Return the sentence that says what is not checked, or with less than the margin."""
+    sentences = []
+    if built_in:
+        pairs = "; ".join(map(str, built_in))
+        sentences.append(
+            f"not checked for collisions, always too close by the way the arm is built: {pairs}"
+        )
+    if narrowed:
+        pairs = "; ".join(map(str, narrowed))
+        sentences.append(
+            f"checked with the largest distance that the mounting leaves instead of the margin:"
+            f" {pairs}"
+        )
+    return "; ".join(sentences) or None
 
 
 def _described(model: pin.Model) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.collision.built_in import BuiltIn
+from identification.excitation.collision.built_in import BuiltIn, exceptions
 from identification.excitation.collision.gaps import touch_between
 from identification.excitation.collision.near import Near, Touch, bulges_of, what_is_near
 from identification.excitation.collision.poses import joint_poses
@@ -77,8 +77,10 @@ class CollisionChecker:
     it stands among. Two shapes of the arm, two joints apart at most, that are too close in every
     one of 200 random postures, and closer than 5 cm, are taken to be built that way (a wrist) and
     left out too, as is a shape of the first link that is as close to an obstacle in all of them
-    (a foot that turns in the floor). `built_in` lists both. Every other pair is checked, even if
-    it always touches.
+    (a foot that turns in the floor). `built_in` lists both. One of the two links next to the
+    mounting that never keeps the margin of a floor or wall, but does not always touch it, keeps
+    the largest distance that it can have; `exceptions` says of both. Every other pair is checked,
+    even if it always touches.
 
     Args:
         urdf: text of the robot description; meshes are replaced by their convex hulls.
@@ -117,6 +119,11 @@ class CollisionChecker:
     def built_in(self) -> tuple[BuiltIn, ...]:
         """Shapes that are not checked against each other, always too close as the arm is built."""
         return self._scene.built_in
+
+    @property
+    def exceptions(self) -> str | None:
+        """What is not checked, or with less than the margin, in a sentence; None for nothing."""
+        return exceptions(self._scene.built_in, self._scene.narrowed)
 
     def spread(self, first: str, second: str) -> tuple[float, float]:
         """Return the least and largest distance [m] of a pair (see `pairs`) in random postures.

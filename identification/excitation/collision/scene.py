@@ -12,8 +12,14 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.excitation.collision.bodies import link_bodies, obstacles
-from identification.excitation.collision.built_in import BuiltIn, always_close, random_postures
+from identification.excitation.collision.bodies import link_bodies, obstacles, withdrawn
+from identification.excitation.collision.built_in import (
+    SLACK,
+    BuiltIn,
+    always_close,
+    never_clear,
+    random_postures,
+)
 from identification.excitation.collision.curvature import Curvature, carrier
 from identification.excitation.collision.poses import (
     Bodies,
@@ -58,6 +64,7 @@ class Scene:
         carrier: (p,) the last joint that moves both bodies of a pair, -1 for the base.
         from_base, from_carrier: how far pairs leave straight lines, seen from there.
         built_in: shapes that are no pair, because they are always too close.
+        narrowed: links and planes that keep less than the margin, because they never can.
 
     Args:
         urdf: of the arm.
@@ -94,7 +101,7 @@ class Scene:
         ]
         self.separation = Separation(self._bodies, pairs)
         self._tried = random_postures(model, limits)
-        self.built_in = self._leave_out(self._tried)
+        self.built_in, self.narrowed = self._leave_out(self._tried)
         first, second = self.separation.first, self.separation.second
         joints = [body.joint for body in self._bodies]
         self.carrier: Indices = np.array(
@@ -161,21 +168,33 @@ class Scene:
         a, b = self.indices(pair)
         return self._bodies[a].name, self._bodies[b].name
 
-    def _leave_out(self, postures: Array) -> tuple[BuiltIn, ...]:
-        """Leave out the pairs that are built in, as these postures (k, n) show, and return them."""
+    def _leave_out(self, postures: Array) -> tuple[tuple[BuiltIn, ...], tuple[BuiltIn, ...]]:
+        """Leave out the pairs that are built in, as these postures (k, n) show.
+
+        A plane stands back for a link that can never keep the margin of it.
+
+        Returns:
+            What is left out, and those links.
+        """
         tried = _Tried(self, self.path(postures))
-        kept: list[tuple[int, int]] = []
-        left_out: list[BuiltIn] = []
+        checked: list[tuple[int, int]] = []
+        left_out, narrowed = list[BuiltIn](), list[BuiltIn]()
         for pair in range(len(self.separation.first)):
             a, b = self.indices(pair)
-            always = always_close(tried, pair, self.margin)
-            if always is None:
-                kept.append((a, b))
-            else:
-                names = self._bodies[a].shape_name, self._bodies[b].shape_name
+            names = self._bodies[a].shape_name, self._bodies[b].shape_name
+            plane = self._bodies[b].normal is not None
+            if (always := always_close(tried, pair, self.margin)) is not None:
                 left_out.append(BuiltIn(*names, *always))
-        self.separation = Separation(self._bodies, kept)
-        return tuple(left_out)
+                continue
+            if plane and (range_ := never_clear(tried, pair, self.margin)) is not None:
+                narrowed.append(BuiltIn(*names, *range_))
+                self._bodies.append(
+                    withdrawn(self._bodies[b], self.margin - narrowed[-1].farthest + SLACK)
+                )
+                b = len(self._bodies) - 1
+            checked.append((a, b))
+        self.separation = Separation(self._bodies, checked)
+        return tuple(left_out), tuple(narrowed)
 
     def spread(self, first: str, second: str) -> tuple[float, float]:
         """Return the least and largest distance of two bodies in random postures [m].
