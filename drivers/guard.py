@@ -243,7 +243,8 @@ class Guard:
     ) -> None:
         """The first packet after a long gap, before an axis goes on from the set-point sent last.
 
-        A velocity may be off by half the step sent last, or by what counts as standstill.
+        A velocity may be off by half the step sent last, or by what counts as standstill. The
+        target's is always held against that; the arm's lags behind, so only where it stands.
 
         Args:
             target: (n,) D1, motor revolutions.
@@ -258,28 +259,36 @@ class Guard:
         """
         bound = FIRST_FRACTION * self._threshold
         require(where, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
-        require(where, np.abs(velocity[0] - step), self._off(step), MotionHeld, cycle)
-        self.check_moving(velocity[1], step, cycle, where)
+        stands = where & ~(np.abs(velocity[1]) > self.limits.standstill)
+        self._require_step(velocity[0], step, where, cycle)
+        self._require_step(velocity[1], step, stands, cycle)
 
     def check_moving(
-        self, velocity: Array, step: Array, cycle: int, where: NDArray[np.bool_]
+        self, before: Array, velocity: Array, step: Array, cycle: int, where: NDArray[np.bool_]
     ) -> None:
-        """No arm stands where it should move. One that moves may lag behind by any amount.
+        """An arm that moved before a pause by the clock did not come to rest in it.
+
+        Single joints stand at each reversal, and all of them lag behind at the start of a motion.
 
         Args:
-            velocity: (n,) D4, motor revolutions per cycle.
-            step: (n,) D2 of the answer sent last, motor revolutions per cycle.
+            before: (n,) D4 of the packet before, motor revolutions per cycle.
+            velocity: (n,) D4.
+            step: (n,) D2 of the answer sent last.
             cycle: for the error.
             where: (n,) which joints.
 
         Raises:
-            NotFinite, MotionHeld: it stands, so that the next set-point would be a jump.
+            NotFinite, MotionHeld: it did, so that the next set-point would be a jump.
         """
-        stands = where & ~(np.abs(velocity) > self.limits.standstill)
-        require(stands, np.abs(velocity - step), self._off(step), MotionHeld, cycle)
+        standstill = self.limits.standstill
+        if np.any(np.abs(before) > standstill) and not np.any(np.abs(velocity) > standstill):
+            self._require_step(velocity, step, where, cycle)
 
-    def _off(self, step: Array) -> Array:
-        return np.maximum(0.5 * np.abs(step), self.limits.standstill)
+    def _require_step(
+        self, velocity: Array, step: Array, where: NDArray[np.bool_], cycle: int
+    ) -> None:
+        bound = np.maximum(0.5 * np.abs(step), self.limits.standstill)
+        require(where, np.abs(velocity - step), bound, MotionHeld, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """The next set-point; if it passes, it counts as sent.

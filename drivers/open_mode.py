@@ -108,7 +108,7 @@ class OpenMode(ABC):
 
     @abstractmethod
     def require_moving(self, reading: Reading, cycle: int) -> None:
-        """The packet read last came late by the clock: no arm stands where it should move.
+        """The packet read last came late by the clock: the arm did not come to rest meanwhile.
 
         Raises:
             NotFinite, MotionHeld: going on would be a jump.
@@ -157,6 +157,7 @@ class PositionMode(OpenMode):
         self._taken = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
+        self._velocity = np.zeros(len(self._still))
         self._kept = np.ones(len(self._still), dtype=np.bool_)
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
@@ -196,6 +197,7 @@ class PositionMode(OpenMode):
         raw = self._wire.raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
         self._check_taken(cycle)
+        self._velocity[...] = raw[ACTUAL_VELOCITY]
         if execution is None:
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
@@ -266,7 +268,8 @@ class PositionMode(OpenMode):
         """Velocity of the arm against the step sent last."""
         where = self._kept & reading.ready
         self._require_fresh((ACTUAL_VELOCITY,), MotionUnknown, cycle, where)
-        self._guard.check_moving(self._wire.raw[ACTUAL_VELOCITY], self._step, cycle, where)
+        velocity = self._wire.raw[ACTUAL_VELOCITY]
+        self._guard.check_moving(self._velocity, velocity, self._step, cycle, where)
 
     def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
         """Axes open all the time keep the last set-point; those open again, their target."""

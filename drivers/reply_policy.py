@@ -13,15 +13,15 @@ one than the last is an answer lost, which is counted and reported; more than `m
 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave open
 mode, move the arm and come back; one set-point further at full speed would then be a jump. Hence,
-after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the set-
-point sent last, or of that carried on by the steps that were missed, and its velocity (D2) within
-half the velocity sent last or what counts as standstill; an arm that itself stands (D4) is held
-against the latter too, also where packets came late by the clock although none is missing. A motion
-whose target was carried on skips the set-points that were missed, and is then stopped on its path.
-Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such a gap
-unless they were zero. A link may say how old each value is: one that is needed for such a decision,
-for the first set-point, or to be given back to an open axis, and was not sent in this very packet
-counts as unknown and refuses.
+after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the
+set-point sent last, or of that carried on by the steps that were missed, and its velocity (D2)
+within half the velocity sent last or what counts as standstill; an arm that itself stands (D4) is
+held against the latter too, and an arm as a whole, where packets came late by the clock although
+none is missing. A motion whose target was carried on skips the set-points that were missed, and is
+then stopped on its path. Corrections of targets that the controller generates (modes 2, 7, 8, 9)
+are refused after such a gap unless they were zero. A link may say how old each value is: one that
+is needed for such a decision, for the first set-point, or to be given back to an open axis, and was
+not sent in this very packet counts as unknown and refuses.
 
 After the motion the end is held for `settle_cycles`; the next answer asks for the end of open mode
 (status byte 1), and asks again every `EXIT_RETRY_CYCLES` in case that answer was lost; after
@@ -279,7 +279,7 @@ class ReplyPolicy:
 
         After a long gap open mode goes on only where the controller carried it on, moving, at
         rest or on the way out: meanwhile it may have left, moved the arm, come back. After a pause
-        the arm must not stand where it should move.
+        an arm that moved must not have come to rest.
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: it did not.

@@ -221,6 +221,18 @@ class TestPauses:
         rig.axes["d"][:, 3] = 0.0
         assert_refused(rig, rig.cycle(), MotionHeld)
 
+    def test_an_arm_that_lags_behind_at_the_start_is_driven_on(self):
+        """It did not move before the pause either."""
+        rig = Rig()
+        rig.session.request(Cruise())
+        rig.open()
+        while abs(rig.axes["d"][0, 1]) < 2e-3:
+            rig.cycle()
+            rig.axes["d"][:, 3] = 0.0
+        rig.now += 0.05
+        rig.cycle()
+        assert rig.state is State.OPEN
+
     def test_an_arm_that_still_moves_is_driven_on(self):
         """A loaded computer looks like that: its cycle was stretched, nothing else."""
         rig, source = moving_at(1.0)

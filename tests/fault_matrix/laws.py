@@ -100,13 +100,17 @@ def broken_in_records(records: NDArray[np.void], still: slice | None) -> Iterato
 
 
 def _at_each_cycle(records: NDArray[np.void]) -> Array:
-    """Set-points, and on a smooth curve those of a gap too long to be bridged."""
-    gap = np.where(records["gap"] > MAX_GAP, records["gap"], 0)
-    cycle = np.arange(len(records)) + np.cumsum(gap) - gap[0]
-    positions = records["commanded_position"]
-    if not gap.any():
-        return np.asarray(positions)
-    return np.asarray(CubicSpline(cycle, positions)(np.arange(cycle[-1] + 1)))
+    """Set-points, and on a smooth curve those that a motion skipped after a long gap."""
+    q = records["commanded_position"]
+    step = np.linalg.norm(np.diff(q, axis=0, prepend=q[:1]), axis=1)
+    before = np.roll(step, 1)
+    skipped = np.round(np.divide(step, before, out=np.ones_like(step), where=before > 0.0)) - 1
+    skipped = np.where(records["gap"] > MAX_GAP, np.minimum(skipped, records["gap"]), 0)
+    skipped[0] = 0
+    if not skipped.any():
+        return np.asarray(q)
+    cycle = np.arange(len(q)) + np.cumsum(np.maximum(skipped, 0))
+    return np.asarray(CubicSpline(cycle, q)(np.arange(cycle[-1] + 1)))
 
 
 def _broken_bounds(q: Array) -> Iterator[str]:
