@@ -80,6 +80,11 @@ class ArmWire:
         difference: Array = np.dot(dq, self._to_motor)
         return difference
 
+    def joint_difference(self, motor: Array) -> Array:
+        """Differences of motor revolutions (n,) to those of joint positions (n,) rad."""
+        difference: Array = np.dot(motor, self._to_joint)
+        return difference
+
     def joint_rounding(self, motor: Array) -> Array:
         """What float32 may make, in rad, of a step between two targets (n,) like these."""
         rounding: Array = np.spacing(np.abs(motor).astype(np.float32)) @ np.abs(self._to_joint)

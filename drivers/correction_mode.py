@@ -107,7 +107,7 @@ class CorrectionMode(OpenMode):
         """A correction that was not zero may have been kept or dropped: nothing tells."""
         self._corrections.check_after_gap(cycle)
 
-    def require_moving(self, reading: Reading, cycle: int) -> None:
+    def require_no_pause(self, reading: Reading, cycle: int) -> None:
         """The controller generates the motion: what it should be is not known here."""
 
     def leaving(

@@ -30,6 +30,7 @@
             │   └── FirstSetPointUnknown  what it is judged by is not of this cycle
             └── MotionNotCarriedOn the target received is none of the set-points sent last
                 ├── MotionHeld     or has been brought to rest
+                ├── MotionPaused   or its arm has, in a pause by the clock
                 │   └── MotionUnknown     or what it is judged by is not of this cycle
                 └── CorrectionNotCarriedOn  or nothing tells whether a correction was kept
 
@@ -366,6 +367,13 @@ class MotionHeld(MotionNotCarriedOn):
 
     check = "difference, after a gap, between received velocity and the one sent last"
     unit = "motor revolutions per cycle"
+
+
+class MotionPaused(MotionNotCarriedOn):
+    """After a pause by the clock the arm moves otherwise than the set-points sent last."""
+
+    check = "difference, after a pause, between the velocity received and the one sent last"
+    unit = "rad/s"
 
 
 class MotionUnknown(MotionHeld):

@@ -29,6 +29,7 @@ from drivers.errors import (
     JerkLimit,
     MotionHeld,
     MotionNotCarriedOn,
+    MotionPaused,
     NotAtStandstill,
     PositionLimit,
     VelocityLimit,
@@ -45,7 +46,9 @@ RELATIVE_TOLERANCE: Final = 1e-6
 FIRST_FRACTION: Final = 0.1
 """Share of the following-error threshold allowed between target and arm at the first set-point,
 and between the target and the set-points sent last from then on."""
-
+LAG: Final = 0.05
+"""s that the velocity of an arm may lag behind that of its set-points: position loops of robots
+have a gain of 20 to 50 /s."""
 
 # Rows of the matrix of checked quantities, in the order in which a violation is reported.
 _SET_POINT_CHECKS: Final[tuple[type[GuardError], ...]] = (
@@ -259,36 +262,36 @@ class Guard:
         """
         bound = FIRST_FRACTION * self._threshold
         require(where, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
-        stands = where & ~(np.abs(velocity[1]) > self.limits.standstill)
-        self._require_step(velocity[0], step, where, cycle)
-        self._require_step(velocity[1], step, stands, cycle)
+        standstill = self.limits.standstill
+        bound = np.maximum(0.5 * np.abs(step), standstill)
+        moving = np.abs(velocity[1]) > standstill
+        for joints, found in ((where, velocity[0]), (where & ~moving, velocity[1])):
+            require(joints, np.abs(found - step), bound, MotionHeld, cycle)
 
-    def check_moving(
-        self, before: Array, velocity: Array, step: Array, cycle: int, where: NDArray[np.bool_]
-    ) -> None:
-        """An arm that moved before a pause by the clock did not come to rest in it.
+    def check_after_pause(self, velocity: Array, cycle: int, where: NDArray[np.bool_]) -> None:
+        """A packet came late by the clock: the arm moves as the set-points sent last.
 
-        Single joints stand at each reversal, and all of them lag behind at the start of a motion.
+        A servo lags behind; what it gains in `LAG` at the acceleration allowed is no pause.
 
         Args:
-            before: (n,) D4 of the packet before, motor revolutions per cycle.
-            velocity: (n,) D4.
-            step: (n,) D2 of the answer sent last.
+            velocity: (n,) of the arm, rad/s.
             cycle: for the error.
             where: (n,) which joints.
 
         Raises:
-            NotFinite, MotionHeld: it did, so that the next set-point would be a jump.
+            NotFinite, MotionPaused: it does not, so that the next set-point would be a jump.
         """
-        standstill = self.limits.standstill
-        if np.any(np.abs(before) > standstill) and not np.any(np.abs(velocity) > standstill):
-            self._require_step(velocity, step, where, cycle)
+        sent = (self._history[3] - self._history[2]) / self.period
+        factor, _ = self.limits.factors(self._in_force.rank)
+        bound = LAG * factor * self.limits.acceleration
+        require(where, np.abs(velocity - sent), bound, MotionPaused, cycle)
 
-    def _require_step(
-        self, velocity: Array, step: Array, where: NDArray[np.bool_], cycle: int
-    ) -> None:
-        bound = np.maximum(0.5 * np.abs(step), self.limits.standstill)
-        require(where, np.abs(velocity - step), bound, MotionHeld, cycle)
+    def move_history(self, way: Array) -> None:
+        """The controller stands this way (n,) rad from the set-point sent last, and goes on there.
+
+        What it held meanwhile is no motion of ours: rates are those of the steps before.
+        """
+        self._history[:4] += way
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """The next set-point; if it passes, it counts as sent.

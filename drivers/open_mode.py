@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.arm_wire import ArmWire
+from drivers.catch_up import CatchUp
 from drivers.checks import require
 from drivers.correction_guard import CorrectionGuard
 from drivers.errors import FirstSetPointUnknown, GuardError, MotionUnknown
 from drivers.execution import Execution, MotionExecution
 from drivers.guard import Guard
+from drivers.guard_limits import RANK
 from drivers.packets import Mode
 from drivers.reading import Reading
 from drivers.replies import D1, D2, D4, D5, ReplyFrame
@@ -74,6 +76,11 @@ class OpenMode(ABC):
         raw = self._wire.raw
         self._guard.check_hold(raw[TARGET], raw[ACTUAL], where, cycle)
 
+    @property
+    def behind(self) -> bool:
+        """Whether the motion still has to catch up with its path."""
+        return False
+
     @abstractmethod
     def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
         """The last wanted axis opened in this packet: the first answer in open mode.
@@ -107,11 +114,11 @@ class OpenMode(ABC):
         """
 
     @abstractmethod
-    def require_moving(self, reading: Reading, cycle: int) -> None:
-        """The packet read last came late by the clock: the arm did not come to rest meanwhile.
+    def require_no_pause(self, reading: Reading, cycle: int) -> None:
+        """The packet read last came late by the clock: the arm moves as it should, all the same.
 
         Raises:
-            NotFinite, MotionHeld: going on would be a jump.
+            NotFinite, MotionPaused: going on would be a jump.
         """
 
     @abstractmethod
@@ -157,8 +164,8 @@ class PositionMode(OpenMode):
         self._taken = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
-        self._velocity = np.zeros(len(self._still))
         self._kept = np.ones(len(self._still), dtype=np.bool_)
+        self._behind = CatchUp(guard.limits.velocity, guard.period)
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
         )
@@ -176,9 +183,15 @@ class PositionMode(OpenMode):
         self.held = position
         self._sent = target
         self._taken.begin(target)
+        self._behind.begin()
         self.lost = 0
         self._kept[...] = True
         self._rest(commanded)
+
+    @property
+    def behind(self) -> bool:
+        """Whether answers were lost and the way of them is not made up yet."""
+        return self._behind.active
 
     def require_start(self, cycle: int) -> None:
         """The arm has to stand at the set-point that was held, too."""
@@ -197,17 +210,24 @@ class PositionMode(OpenMode):
         raw = self._wire.raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
         self._check_taken(cycle)
-        self._velocity[...] = raw[ACTUAL_VELOCITY]
         if execution is None:
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
             return
+        if self.lost:
+            behind = self._wire.joint_difference(self._taken.lost)
+            self._behind.add(behind)
+            self._guard.move_history(-behind)
         self._go_on(execution, commanded, cycle)
 
     def _go_on(self, execution: Execution, commanded: Array, cycle: int) -> None:
         """Write the motion's next set-point."""
         assert isinstance(execution, MotionExecution)
         position, velocity, bounds = execution.advance(cycle)
+        if self._behind.active:
+            behind, rate = self._behind.advance()
+            position, velocity = position - behind, velocity - rate
+            bounds = max(bounds, "override", key=RANK.__getitem__)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
         self._step = step = motor - self._sent
@@ -264,12 +284,12 @@ class PositionMode(OpenMode):
             for _ in range(self.missed):
                 self._go_on(execution, commanded, cycle)
 
-    def require_moving(self, reading: Reading, cycle: int) -> None:
-        """Velocity of the arm against the step sent last."""
+    def require_no_pause(self, reading: Reading, cycle: int) -> None:
+        """Velocity of the arm against that of the set-points sent last."""
         where = self._kept & reading.ready
         self._require_fresh((ACTUAL_VELOCITY,), MotionUnknown, cycle, where)
-        velocity = self._wire.raw[ACTUAL_VELOCITY]
-        self._guard.check_moving(self._velocity, velocity, self._step, cycle, where)
+        velocity = self._wire.joint_difference(self._wire.raw[ACTUAL_VELOCITY])
+        self._guard.check_after_pause(velocity / self._guard.period, cycle, where)
 
     def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
         """Axes open all the time keep the last set-point; those open again, their target."""

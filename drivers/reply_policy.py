@@ -3,25 +3,27 @@
 In open mode the first set-point is the target received in the packet in which the last wanted axis
 opened, at zero velocity, held against actual position and standstill. D2 is the step of the motor
 from one sent set-point to the next, formed in float64; which of D1..D5 an open mode has is the
-table `drivers.packets.MODE_FIELDS`. A motion requested while the axes are open already begins
-under the same conditions, from the set-point held. While axes are open, moving or not, following
-error and current are watched, and that the controller takes the set-points: the target received
-(D1) is within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent, or of
-the last carried on by as many steps as packets were missed, and within 25 % of the last. An older
-one than the last is an answer lost, which is counted and reported; more than `max_gap` of them in
-100 cycles bring a motion to rest on its path.
+table `drivers.packets.MODE_FIELDS`. A motion requested while the axes are open already begins under
+the same conditions, from the set-point held. While axes are open, moving or not, following error
+and current are watched, and that the controller takes the set-points: the target received (D1) is
+within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent, or of the last
+carried on by as many steps as packets were missed, and within 25 % of the last. An older one than
+the last is an answer lost, which is counted and reported; the motion goes on from the target that
+the controller holds and catches up little by little (:mod:`drivers.catch_up`); more than `max_gap`
+of them in 100 cycles bring a motion to rest on its path.
 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave open
 mode, move the arm and come back; one set-point further at full speed would then be a jump. Hence,
 after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the
 set-point sent last, or of that carried on by the steps that were missed, and its velocity (D2)
 within half the velocity sent last or what counts as standstill; an arm that itself stands (D4) is
-held against the latter too, and an arm as a whole, where packets came late by the clock although
-none is missing. A motion whose target was carried on skips the set-points that were missed, and is
-then stopped on its path. Corrections of targets that the controller generates (modes 2, 7, 8, 9)
-are refused after such a gap unless they were zero. A link may say how old each value is: one that
-is needed for such a decision, for the first set-point, or to be given back to an open axis, and was
-not sent in this very packet counts as unknown and refuses.
+held against the latter too. Where packets came late by the clock although none is missing, the
+velocity of the arm (D4) is held against that sent last. A motion whose target was carried on skips
+the set-points that were missed, and is then stopped on its path. Corrections of targets that the
+controller generates (modes 2, 7, 8, 9) are refused after such a gap unless they were zero. A link
+may say how old each value is: one that is needed for such a decision, for the first set-point, or
+to be given back to an open axis, and was not sent in this very packet counts as unknown and
+refuses.
 
 After the motion the end is held for `settle_cycles`; the next answer asks for the end of open mode
 (status byte 1), and asks again every `EXIT_RETRY_CYCLES` in case that answer was lost; after
@@ -246,7 +248,7 @@ class ReplyPolicy:
             return machine.stop_reason is not None
         if not moving:
             machine.begin_motion(open_mode.held)
-        execution.leaving = execution.settled
+        execution.leaving = execution.settled and not open_mode.behind
         return execution.leaving
 
     def record(
@@ -279,10 +281,10 @@ class ReplyPolicy:
 
         After a long gap open mode goes on only where the controller carried it on, moving, at
         rest or on the way out: meanwhile it may have left, moved the arm, come back. After a pause
-        an arm that moved must not have come to rest.
+        the arm has to move as it was commanded to.
 
         Raises:
-            NotFinite, MotionNotCarriedOn, MotionHeld: it did not.
+            NotFinite, MotionNotCarriedOn, MotionHeld, MotionPaused: it did not.
             RefusalError: the motion cannot skip what was missed.
         """
         open_mode = self._open_mode
@@ -299,7 +301,7 @@ class ReplyPolicy:
                 execution if moving else None, reading, commanded, machine.cycle
             )
         elif paused:
-            open_mode.require_moving(reading, machine.cycle)
+            open_mode.require_no_pause(reading, machine.cycle)
 
     def refusal(self, offending: int | None, reading: Reading, words: Words) -> bytes:
         """Fill the frame with 508 for the offending joint, or with 505 for all.
