@@ -519,14 +519,13 @@ def _body_estimate(model: RobotModel, runs: Sequence[Run]) -> _BodyEstimate:
     fit = _fit(model, runs, carried, [shape])
     determined = fit.determined(fit.bodies[0])
     if len(determined) < _BODY:
-        shape = np.linalg.pinv(determined)
-        fit = _fit(model, runs, carried, [shape])
+        fit = _fit(model, runs, carried, [np.linalg.pinv(determined)])
+    else:
+        determined = shape
     part = fit.bodies[0]
-    # In the units of the fit's own columns, in which the covariance is well conditioned.
-    rows = determined if len(determined) < _BODY else np.eye(_BODY)
     return _BodyEstimate(
-        values=shape @ fit.values[part],
-        determined=rows,
+        values=np.linalg.pinv(determined) @ fit.values[part],
+        determined=determined,
         spread=fit.clustered.covariance[np.ix_(part, part)],
         factor=fit.clustered.interval_factor,
         blocks=fit.clustered.blocks,
