@@ -18,7 +18,7 @@ import pinocchio as pin
 import scipy
 from numpy.typing import NDArray
 
-from identification.estimators.payload import NAMES, PayloadEstimate, Run, identify_payload
+from identification.estimators.payload import NAMES, Run, figures_of, identify_payload
 from identification.model.friction import FrictionLaw
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
@@ -75,11 +75,9 @@ def load_of(seed: int) -> Body:
     return Body(mass, centre, turned @ tensor @ turned.T)
 
 
-def weighed(seed: int, *, drift: float = DRIFT, repetitions: int = 1) -> PayloadEstimate:
-    """The estimate of the load of a seed."""
-    model = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(third=None, offset=True))
-    runs = runs_of(seed, model, drift=drift, repetitions=repetitions)
-    return identify_payload(model, runs)
+def arm_model() -> RobotModel:
+    """The arm as it is fitted."""
+    return RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(third=None, offset=True))
 
 
 def runs_of(
@@ -88,22 +86,21 @@ def runs_of(
     *,
     loads: tuple[Body | None, ...] | None = None,
     drift: float = DRIFT,
-    repetitions: int = 1,
+    pace: float = 1.0,
 ) -> list[Run]:
     """Recordings, reduced.
 
     Args:
         seed: of load, motion, drift and noise.
         model: to reduce them with.
-        loads: what is carried in each recording; by default that of the seed in every second.
-        drift: of the friction.
-        repetitions: pairs of recordings, without `loads`.
+        loads: what is carried in each recording; by default nothing and then that of the seed.
+        drift: of the friction, its standard deviation.
+        pace: of the motion.
     """
-    if loads is None:
-        loads = (None, load_of(seed)) * repetitions
+    loads = (None, load_of(seed)) if loads is None else loads
     rng = np.random.default_rng([seed, 2])
     time = np.arange(round(_DURATION * _RATE)) / _RATE
-    q, qd, qdd = _motion(rng, time)
+    q, qd, qdd = _motion(rng, time, pace)
     runs = []
     for k, load in enumerate(loads):
         arm = pin.buildModelFromXML(urdf_text())
@@ -126,18 +123,13 @@ def runs_of(
     return runs
 
 
-def true_figures(load: Body) -> Array:
-    """Mass, centre, tensor about it (10,), as `NAMES`."""
-    tensor = load.inertia[np.triu_indices(3)]
-    return np.concatenate([[load.mass], load.centre, tensor])
-
-
 def coverage(seeds: range) -> Coverage:
     """Weigh the load of every seed."""
     inside, moments, errors, halves = [], [], [], []
+    model = arm_model()
     for seed in seeds:
-        load, found = load_of(seed), weighed(seed)
-        truth, intervals = true_figures(load), found.intervals
+        load, found = load_of(seed), identify_payload(model, runs_of(seed, model))
+        truth, intervals = figures_of(load), found.intervals
         inside.append((intervals[:, 0] <= truth) & (truth <= intervals[:, 1]))
         halves.append((intervals[:, 1] - intervals[:, 0]) / 2.0)
         moment = load.mass * float(np.linalg.norm(load.centre))
@@ -156,13 +148,13 @@ def coverage(seeds: range) -> Coverage:
     )
 
 
-def _motion(rng: np.random.Generator, time: Array) -> tuple[Array, Array, Array]:
+def _motion(rng: np.random.Generator, time: Array, pace: float) -> tuple[Array, Array, Array]:
     """Five sines a joint between 0.1 and 1 Hz, up to 60 % of the largest speeds."""
-    rate = 2.0 * np.pi * rng.uniform(0.1, 1.0, (5, 6))
+    rate = 2.0 * np.pi * pace * rng.uniform(0.1, 1.0, (5, 6))
     size, phase = rng.standard_normal((5, 6)) / rate, rng.uniform(0.0, 2.0 * np.pi, (5, 6))
     angle = rate * time[:, None, None] + phase
     wave, slope = size * np.sin(angle), size * rate * np.cos(angle)
-    fastest = np.abs(slope.sum(axis=1)).max(axis=0) / (0.6 * _SPEED)
+    fastest = np.abs(slope.sum(axis=1)).max(axis=0) / (0.6 * pace * _SPEED)
     shrink = 1.0 / np.maximum(fastest, np.abs(wave.sum(axis=1)).max(axis=0) / _ROOM)
     bend = -(wave * rate**2).sum(axis=1)
     return _CENTRE + shrink * wave.sum(axis=1), shrink * slope.sum(axis=1), shrink * bend

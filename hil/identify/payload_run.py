@@ -20,6 +20,7 @@ from identification.estimators.payload import (
     Difference,
     PayloadEstimate,
     Run,
+    figures_of,
     find_difference,
     identify_payload,
 )
@@ -68,8 +69,7 @@ class PayloadFound:
         Raises:
             InputError: there is no payload.
         """
-        body = self._body
-        return np.concatenate([[body.mass], body.centre, body.inertia[np.triu_indices(3)]])
+        return figures_of(self._body)
 
     @property
     def _body(self) -> Body:

@@ -71,6 +71,7 @@ _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
 _ROUNDS: Final = 4  # of weights and friction
 _LEAST_NOISE: Final = 1e-6  # share of a torque's length: rounding of the Gram matrix
 _PARTICIPATION: Final = 1e-3
+_ROUNDING: Final = 1e-9
 _DENSITY: Final = 1000.0  # kg/m³, of the ball whose size says what is small
 # Two recordings carry different bodies: probability that chance does it, and share of the torque.
 _CHANCE: Final = 1e-4
@@ -79,6 +80,12 @@ _OFF_DIAGONAL: Final = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
 
 NAMES: Final = ("mass", "cx", "cy", "cz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """Figures of a body in this order: mass, centre of mass, tensor about it."""
+
+
+def figures_of(carried: Body) -> Array:
+    """Figures of a body (10,), as `NAMES`."""
+    tensor = carried.inertia[np.triu_indices(3)]
+    return np.concatenate([[carried.mass], carried.centre, tensor])
 
 
 class PayloadError(IdentificationError):
@@ -170,7 +177,8 @@ class PayloadEstimate:
         interval_factor: standard deviations in half a 95 % interval.
         body: the possible body closest to them; None where the mass is not significantly above
             zero.
-        intervals: 95 %, of the figures `NAMES` (10, 2); infinite where not determined.
+        intervals: 95 %, of the figures `NAMES` (10, 2), with those of `body` inside; infinite where
+            not determined.
         moment: mass times distance of the centre from the frame's origin [kg m], and its interval.
         undetermined: names of what the motion does not determine: of `body` the reference body's.
         contradicted: whether no possible body fits the recordings to their noise.
@@ -235,11 +243,15 @@ def identify_payload(
     intervals[1:4] = found.centre_intervals
     to_centre = _moved(np.eye(3), -values[6:9] / mass)[_INERTIA]
     middle, halves = to_centre @ values, factor * found.std(to_centre)
-    intervals[4:] = np.column_stack([middle - halves, middle + halves])
+    lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
+    intervals[4:] = np.column_stack([middle - halves - lower, middle + halves + upper])
     intervals[_DIAGONAL] = np.maximum(intervals[_DIAGONAL], 0.0)
     widest = np.repeat([np.inf, size.length, size.inertia], [1, 3, 6])
     wide = (intervals[:, 1] - intervals[:, 0]) / 2.0 > widest
     possible, misfit = _closest_body(found, size)
+    figures = figures_of(possible)[:, None]
+    intervals[:, :1] = np.minimum(intervals[:, :1], figures)
+    intervals[:, 1:] = np.maximum(intervals[:, 1:], figures)
     chance = _chance(misfit, len(found.determined), found.blocks - len(found.determined))
     return replace(
         estimate,
@@ -310,6 +322,7 @@ class _Fit(NamedTuple):
         basis = self.root * scale[:, None]
         basis = basis[part] / np.linalg.norm(basis, axis=0)
         lost, axes = np.linalg.eigh(np.eye(len(part)) - basis @ basis.T)
+        axes = np.where(np.abs(axes) < _ROUNDING, 0.0, axes)
         return np.asarray(axes[:, lost < _PARTICIPATION**2].T * scale[part])
 
 
@@ -531,6 +544,15 @@ def _body_estimate(model: RobotModel, runs: Sequence[Run]) -> _BodyEstimate:
         blocks=fit.clustered.blocks,
         words=fit.clustered.words,
     )
+
+
+def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
+    """By how much a tensor may be smaller and larger (6,), (6,): its centre is as far off (3,)."""
+    with np.errstate(invalid="ignore"):
+        products = mass * np.nan_to_num(np.outer(reach, reach), nan=np.inf, posinf=np.inf)
+    xx, xy, xz, yy, yz, zz = products[np.triu_indices(3)]
+    off_diagonal = np.array([0.0, xy, xz, 0.0, yz, 0.0])
+    return off_diagonal + np.array([yy + zz, 0.0, 0.0, xx + zz, 0.0, xx + yy]), off_diagonal
 
 
 class _Reference(NamedTuple):
