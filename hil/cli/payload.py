@@ -13,6 +13,7 @@ from hil.cli.identify_options import LONGEST_DELAY
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
 from hil.files import write_or_tell
+from hil.identify.options import Options
 from hil.identify.payload_run import PayloadFound, find_payload
 from hil.progress import reporter as make_reporter
 
@@ -87,7 +88,8 @@ def payload(
         )
     box, wanted = _box(shape), _wanted(check or [])
     reporter = make_reporter(quiet=quiet or json)
-    found = find_payload(bare, loaded or [], reporter, frame=frame, box=box, delay=delay)
+    options = Options(estimator="wls", delay=delay)
+    found = find_payload(bare, loaded or [], reporter, frame=frame, box=box, options=options)
     outside = found.outside(wanted)
     text = json_module.dumps(
         found.as_json() | {"checked": wanted, "outside": outside}, indent=1, ensure_ascii=False

@@ -239,7 +239,7 @@ def find_payload(
     *,
     frame: str | None = None,
     box: tuple[float, float, float] | None = None,
-    delay: float | None = None,
+    options: Options = Options(estimator="wls"),
 ) -> PayloadFound:
     """Weigh what the arm carries in some recordings and not in others.
 
@@ -253,7 +253,7 @@ def find_payload(
         frame: link of the URDF in whose frame it is; by default `tool0` or `flange` where one is
             fixed to the last joint, else the link of that joint.
         box: edges [m] of the reference body along the frame's axes; None for a point.
-        delay: of the torque behind the position [s]; None: the cell's, or what is found.
+        options: how recordings become samples.
 
     Raises:
         InputError: archives cannot be used, are of two arms or carry two payloads.
@@ -280,7 +280,6 @@ def find_payload(
         training, _ = aligned(training)
     first, last = training[: len(found[False].training)], training[len(found[False].training) :]
     sources = replace(found[False], cell=cell, training=first, held_out=first)
-    options = Options(estimator="wls", in_sample=True, delay=delay)
     prepared = prepare_sources(sources, options, reporter)
     cell, settings = prepared.sources.cell, prepared.settings
     frame = frame or flange_of(cell.model)

@@ -280,17 +280,16 @@ def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None
     if not others:
         return None
     carried = [[run.loaded for run in runs], *([run is other for run in runs] for other in others)]
-    shapes = [np.eye(_BODY), *([np.eye(_BODY)[:, _WEIGHT]] * len(others))]
-    fit = _fit(model, runs, carried, shapes)
+    fit = _fit(model, runs, carried, [np.eye(_BODY)] * len(carried))
     found: list[tuple[float, Difference]] = []
     for other, part in zip(others, fit.bodies[1:], strict=True):
         reference = first[other.loaded]
         assert reference is not None
-        delta, own = fit.values[part], fit.clustered.covariance[np.ix_(part, part)]
-        if not np.isfinite(own).all():
-            continue
-        squares = float(delta @ np.linalg.pinv(own) @ delta)
-        chance = _chance(squares, len(part), fit.clustered.blocks - len(part))
+        weight = part[_WEIGHT]
+        delta, own = fit.values[weight], fit.clustered.covariance[np.ix_(weight, weight)]
+        known = np.flatnonzero(np.isfinite(np.diag(own)))
+        squares = float(delta[known] @ np.linalg.pinv(own[np.ix_(known, known)]) @ delta[known])
+        chance = _chance(squares, len(known), fit.clustered.blocks - len(known))
         share = _torque_share(model, other, delta, fit.values[fit.bodies[0]][_WEIGHT], fit.weights)
         if chance < _CHANCE / len(others) and share > _DIFFERENT:
             found.append((squares, Difference(other, reference, float(delta[-1]))))
@@ -528,13 +527,13 @@ class _BodyEstimate(NamedTuple):
 
 def _body_estimate(model: RobotModel, runs: Sequence[Run]) -> _BodyEstimate:
     """The body of the loaded runs; where the motion leaves a choice, of least parameters."""
-    carried, shape = [[run.loaded for run in runs]], np.eye(_BODY)
-    fit = _fit(model, runs, carried, [shape])
-    determined = fit.determined(fit.bodies[0])
+    carried = [[run.loaded for run in runs]]
+    fit = _fit(model, runs, carried, [np.eye(_BODY)])
+    determined: Array = fit.determined(fit.bodies[0])
     if len(determined) < _BODY:
-        fit = _fit(model, runs, carried, [np.linalg.pinv(determined)])
+        fit = _fit(model, runs, carried, [np.asarray(np.linalg.pinv(determined))])
     else:
-        determined = shape
+        determined = np.eye(_BODY)
     part = fit.bodies[0]
     return _BodyEstimate(
         values=np.linalg.pinv(determined) @ fit.values[part],
