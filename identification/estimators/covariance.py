@@ -102,11 +102,15 @@ def block_covariance(
         part = slice(start, start + _AT_ONCE)
         information = longer.blocks(part).weighted(weights)[:, :-1, :-1]
         shares[part] = _shares(information, root, root)
-    return _sandwich(shares, scores, solution, prior, length)
+    return _sandwich(shares, scores, solution, prior, length * FINE_BLOCK)
 
 
 def cluster_covariance(
-    information: Array, scores: Array, solution: Solution, prior: Array | None = None
+    information: Array,
+    scores: Array,
+    solution: Solution,
+    prior: Array | None = None,
+    block: float = FINE_BLOCK,
 ) -> Clustered:
     """Cluster-robust covariance of an estimate whose fine blocks are given.
 
@@ -115,18 +119,19 @@ def cluster_covariance(
         scores: what the blocks' residuals pull with (B, p).
         solution: of the sum of the information, with the prior's.
         prior: see :func:`block_covariance`.
+        block: length of each [s].
     """
     used = scores.any(axis=1)
     information, scores = information[used], scores[used]
     length = block_length(scores)
     shares = _shares(merged(information, length), solution.root, solution.root)
-    return _sandwich(shares, merged(scores, length), solution, prior, length)
+    return _sandwich(shares, merged(scores, length), solution, prior, length * block)
 
 
 def _sandwich(
-    shares: Array, scores: Array, solution: Solution, prior: Array | None, length: int
+    shares: Array, scores: Array, solution: Solution, prior: Array | None, duration: float
 ) -> Clustered:
-    """Covariance from blocks of some length: shares of the information (B, k, k), scores (B, p)."""
+    """Covariance from blocks of some seconds: shares of information (B, k, k), scores (B, p)."""
     corrected = leverage_corrected(shares, scores @ solution.root)
     moved = corrected @ solution.root.T
     covariance = np.asarray(moved.T @ moved)
@@ -140,7 +145,7 @@ def _sandwich(
         determined=solution.determined,
         design_effect=effect,
         interval_factor=float(student_limit(0.025, max(1, count - 1))),
-        words=f"cluster-robust covariance over {count} blocks of {length * FINE_BLOCK:g} s",
+        words=f"cluster-robust covariance over {count} blocks of {duration:g} s",
         blocks=count,
     )
 

@@ -38,6 +38,7 @@ from identification.factor.factor import (
     solve,
 )
 from identification.factor.phases import (
+    FINE_BLOCK,
     PhaseFactor,
     add_grams,
     counted,
@@ -69,6 +70,7 @@ _WEIGHT: Final = np.arange(6, _BODY)  # mass and first moment
 _INERTIA: Final = np.arange(6)
 _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
 _ROUNDS: Final = 4  # of weights and friction
+_MOST_BLOCKS: Final = 500
 _LEAST_NOISE: Final = 1e-6  # share of a torque's length: rounding of the Gram matrix
 _PARTICIPATION: Final = 1e-3
 _ROUNDING: Final = 1e-9
@@ -213,19 +215,19 @@ def identify_payload(
     """
     found = _body_estimate(model, runs)
     values, factor = found.values, found.factor
-    mass, half = values[9], factor * found.std(np.eye(_BODY)[[9]])[0]
-    if not np.isfinite(half):
+    mass, low, high = found.mass
+    if not np.isfinite(high):
         raise PayloadError(
             "the motion does not determine the mass: it is seen only together with other"
             " parameters; record one in which more axes turn, the wrist in many poses"
         )
-    if mass + half < 0.0:
+    if high < 0.0:
         raise PayloadError(
             f"the bare recordings carry {-mass:.3g} kg more than the loaded ones: they may have"
             " been exchanged"
         )
     intervals = np.tile([-np.inf, np.inf], (_BODY, 1))
-    intervals[0] = max(0.0, mass - half), mass + half
+    intervals[0] = max(0.0, low), high
     estimate = PayloadEstimate(
         parameters=values,
         covariance=found.marked_covariance,
@@ -237,7 +239,7 @@ def identify_payload(
         contradicted=False,
         method=found.words,
     )
-    if mass <= half:
+    if low <= 0.0:
         return estimate
     size = _reference(mass, box)
     intervals[1:4] = found.centre_intervals
@@ -259,6 +261,22 @@ def identify_payload(
         undetermined=tuple(name for name, is_wide in zip(NAMES, wide, strict=True) if is_wide),
         contradicted=chance < _CHANCE,
     )
+
+
+def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, float, float]:
+    """By how much more the loaded recordings carry [kg], and its 95 % interval.
+
+    Infinite ends where the motion does not determine it.
+
+    Args:
+        model: the arm without payload.
+        runs: bare and loaded.
+
+    Raises:
+        PayloadError: there is no bare or no loaded recording.
+        IdentificationError: there is not one usable row.
+    """
+    return _body_estimate(model, runs).mass
 
 
 def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None:
@@ -363,7 +381,8 @@ def _fit(
         values = solve(_normal(layout.total(problem, weights)[0], prior)).values
         weights = _weights(problem, values, rows)
         friction = np.where(model.friction_columns, values[:p], 0.0)
-    problem = layout.rows(model, [run.phase for run in runs], friction)
+    length = max(1, -(-max(len(run.phase) for run in runs) // _MOST_BLOCKS))
+    problem = layout.rows(model, [run.phase.merged(length) for run in runs], friction)
     # Priors are physical and count as they are; data whose noise is coloured count for less.
     effect = 1.0
     for _ in range(2):
@@ -373,7 +392,9 @@ def _fit(
         equations = _normal(blocks.sum(axis=0), prior)
         solution = solve(equations)
         scores = blocks[:, :-1] @ np.append(-solution.values, 1.0)
-        clustered = cluster_covariance(blocks[:, :-1, :-1], scores, solution, prior)
+        clustered = cluster_covariance(
+            blocks[:, :-1, :-1], scores, solution, prior, length * FINE_BLOCK
+        )
         effect *= max(1.0, clustered.design_effect)
     scale = np.sqrt(np.diag(equations.A))
     return _Fit(solution.values, bodies, solution.root, scale, clustered, weights)
@@ -501,6 +522,12 @@ class _BodyEstimate(NamedTuple):
         covariance = self.covariance(np.eye(_BODY))
         mark_undetermined(covariance, np.isfinite(self.std(np.eye(_BODY))))
         return covariance
+
+    @property
+    def mass(self) -> tuple[float, float, float]:
+        """Mass and its interval [kg], infinite if not determined; below zero for less."""
+        value, half = float(self.values[9]), self.factor * float(self.std(np.eye(_BODY)[[9]])[0])
+        return value, value - half, value + half
 
     @property
     def moment(self) -> tuple[float, float, float]:
