@@ -24,6 +24,7 @@ from hil.progress import Silent
 from hil.simulation import simulated_controller, simulated_provenance
 from identification import FrictionLaw, IdentificationError
 from identification.model.kinematics import pinocchio_model
+from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
 from tests.hil.fast_cell import fast_cell
 from tests.hil.simulated_logs import Simulated, simulate
@@ -97,10 +98,12 @@ class TestPage:
         for name, source in (("bare", "empty.mcap"), ("gripper", "full.mcap")):
             (folder / name).mkdir()
             (folder / name / source).write_bytes((folder / source).read_bytes())
-        typed = commands(ROOT / "docs" / "payload.md")
-        assert len(typed) >= 3
-        for program, *words in typed:
+        for file in ("cell.toml", "robot.urdf"):
+            (folder / file).write_bytes((ROOT / "examples" / "two_joints" / file).read_bytes())
+        (folder / "quick.toml").write_text(QUICK)
+        for program, *words in commands(ROOT / "docs" / "payload.md"):
             assert program == "hil"
+            words += ("--settings", "quick.toml") if words[0] == "design" else ()
             result = CliRunner().invoke(app, words)
             assert result.exit_code == 0, (shlex.join(words), result.output, result.exception)
         model = pinocchio_model((folder / "gripper.urdf").read_text())
