@@ -111,6 +111,7 @@ def cluster_covariance(
     solution: Solution,
     prior: Array | None = None,
     block: float = FINE_BLOCK,
+    stretch: int = 1,
 ) -> Clustered:
     """Cluster-robust covariance of an estimate whose fine blocks are given.
 
@@ -120,10 +121,12 @@ def cluster_covariance(
         solution: of the sum of the information, with the prior's.
         prior: see :func:`block_covariance`.
         block: length of each [s].
+        stretch: by how much blocks are longer than scores ask for, as far as enough are left.
     """
     used = scores.any(axis=1)
     information, scores = information[used], scores[used]
     length = block_length(scores)
+    length = max(length, min(stretch * length, len(scores) // _FEWEST_BLOCKS))
     shares = _shares(merged(information, length), solution.root, solution.root)
     return _sandwich(shares, merged(scores, length), solution, prior, length * block)
 
