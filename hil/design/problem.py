@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# States in which every parameter of a load that an arm can tell apart shows, and from which share
-# of the largest on it counts as told apart.
+# States that excite every parameter of a load that an arm feels, and the share of the largest from
+# which on one is independent of the others.
 _STATES: Final = 300
 _SEED: Final = 20140901
 _INDEPENDENT: Final = 1e-6
@@ -203,11 +203,11 @@ def _objective(cell: Cell, settings: DesignSettings, known: Knowledge | None) ->
 
 
 def _payload_objective(cell: Cell, known: Knowledge | None) -> Objective:
-    """Of a body on the last link, by those of its parameters that some motion tells apart."""
+    """Of a body on the last link, by those of its parameters that some motion distinguishes."""
     if known is not None:
         raise SettingsError(
             None,
-            "takes the arm's parameters for known, to which earlier archives add nothing",
+            "assumes the arm's parameters as known: earlier archives add nothing",
             field='objective.parameters = "payload"',
             remedy="leave out --earlier",
         )

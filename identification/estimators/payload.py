@@ -9,12 +9,12 @@ offset and a scale of the friction of every joint, for friction drifts between r
 
 The friction f is that of the solution before. Weak priors (:data:`DRIFT`) keep drifts apart from
 the friction that all recordings share. The covariance is cluster-robust: blocks at equal times of
-the motion form one, so what the model gets wrong in every repetition is not taken for noise.
+the motion form one, so what the model gets wrong in every repetition does not count as noise.
 
 The body that comes out is a possible one: the closest to the estimate in the metric of its
 covariance among those with a positive semidefinite pseudo-inertia. The tensor about the centre of
-mass has a prior at that of a reference body, a point or a box, as wide as the reference is large;
-what the motion does not determine is therefore the reference's.
+mass has a prior at that of a reference body, a point or a box, as wide as the reference is large or
+as the recordings show the body to be: what the motion does not determine is the reference's.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ _STRETCH: Final = 2
 _LEAST_NOISE: Final = 1e-6  # share of a torque's length: rounding of the Gram matrix
 _PARTICIPATION: Final = 1e-3
 _ROUNDING: Final = 1e-9
+_LOST: Final = 1e12  # variance of what is not determined, times the share of it squared
 _DENSITY: Final = 1000.0  # kg/m³, of the ball whose size says what is small
 # Two recordings carry different bodies: probability that chance does it, and share of the torque.
 _CHANCE: Final = 1e-4
@@ -253,8 +254,10 @@ def identify_payload(
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([middle - halves - lower, middle + halves + upper])
     intervals[_DIAGONAL] = np.maximum(intervals[_DIAGONAL], 0.0)
-    widest = np.repeat([np.inf, size.length, size.inertia], [1, 3, 6])
-    wide = (intervals[:, 1] - intervals[:, 0]) / 2.0 > widest
+    width, usual = (intervals[:, 1] - intervals[:, 0]) / 2.0, mass * size.tensor
+    open_ended = width > np.repeat([np.inf, size.inertia], [4, 6])
+    open_ended[1:4] = np.isinf(width[1:4])
+    open_ended[4:] &= (intervals[4:, 0] <= usual) & (usual <= intervals[4:, 1])
     possible, misfit = _closest_body(found, size)
     figures = figures_of(possible)[:, None]
     intervals[:, :1] = np.minimum(intervals[:, :1], figures)
@@ -263,7 +266,7 @@ def identify_payload(
     return replace(
         estimate,
         body=possible,
-        undetermined=tuple(name for name, is_wide in zip(NAMES, wide, strict=True) if is_wide),
+        undetermined=tuple(np.array(NAMES)[open_ended].tolist()),
         contradicted=chance < _CHANCE,
     )
 
@@ -521,6 +524,15 @@ class _BodyEstimate(NamedTuple):
         known = np.linalg.norm(lost, axis=1) < _PARTICIPATION * np.linalg.norm(rows / scale, axis=1)
         return np.where(known, np.sqrt(np.diag(self.covariance(rows))), np.inf)
 
+    def principal(self, rows: Array) -> tuple[Array, Array]:
+        """Uncorrelated combinations (k, 10) of k functions, and half their intervals (k,)."""
+        scale = np.linalg.norm(self.determined, axis=0)
+        scale = np.where(scale > 0.0, scale, 1.0)
+        lost = (rows - rows @ np.linalg.pinv(self.determined) @ self.determined) / scale
+        lost /= max(float(np.linalg.norm(rows / scale)), np.finfo(np.float64).tiny)
+        variance, axes = np.linalg.eigh(self.covariance(rows) + _LOST * lost @ lost.T)
+        return axes.T @ rows, self.factor * np.sqrt(np.maximum(variance, 0.0))
+
     @property
     def marked_covariance(self) -> Array:
         """Covariance of the parameters (10, 10), with infinite variances."""
@@ -587,7 +599,7 @@ def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
 
 
 class _Reference(NamedTuple):
-    """The body that what is not determined is taken from.
+    """Where figures come from that the motion does not determine.
 
     Attributes:
         tensor: about its centre, per kg (6,).
@@ -615,7 +627,7 @@ def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, fl
 
     Args:
         found: the estimate.
-        reference: where the tensor about the centre of mass has its prior.
+        reference: at which the tensor about the centre of mass has its prior.
 
     Raises:
         PayloadError: the solver finds none.
@@ -630,7 +642,10 @@ def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, fl
     centre = values[6:9] / values[9]
     about = _moved(np.eye(3), -centre)[_INERTIA]
     about[:, 9] -= reference.tensor
-    about *= np.sqrt(_OFF_DIAGONAL)[:, None] / reference.inertia
+    about *= np.sqrt(_OFF_DIAGONAL)[:, None]
+    # As wide as the reference is large, or as the recordings show the body to be beyond chance.
+    along, half = found.principal(about)
+    about /= np.sqrt(np.max((along @ values) ** 2 - half**2, initial=reference.inertia**2))
     # In units of the reference the numbers are near one.
     mass, length = values[9], max(reference.length, float(np.linalg.norm(centre)))
     units = mass * np.repeat([length**2, length, 1.0], [6, 3, 1])
@@ -638,11 +653,10 @@ def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, fl
     entries = pseudo_inertia_map().reshape(_BODY, 16).T @ x
     matrix = cp.reshape(entries, (4, 4), order="C")
     error = cp.sum_squares((rows * units) @ x - rows @ values)
-    problem = cp.Problem(
-        cp.Minimize(error + cp.sum_squares((about * units) @ x)), [matrix >> 0.0, x[9] >= 1e-3]
-    )
+    prior = cp.sum_squares((about * units) @ x)
+    problem = cp.Problem(cp.Minimize(error + prior), [matrix >> 0.0, x[9] >= 1e-3])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate solution is told by its status
+        warnings.simplefilter("ignore")  # its status says whether a solution is inaccurate
         try:
             problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:

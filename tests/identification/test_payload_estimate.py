@@ -138,6 +138,16 @@ class TestPossibleBody:
         assert found.body is not None
         assert found.body.centre[1] == pytest.approx(0.0, abs=1e-6)
 
+    def test_a_large_body_is_not_moved_towards_a_point(self) -> None:
+        """A bar of 1 m: its inertia is many times that of the reference, and significant."""
+        bar = Payload(2.0, (0.2, 0.0, 0.1), (0.17, 0.0, 0.0, 0.17, 0.0, 0.001))
+        found = estimate([None, bar])
+        low, high = found.intervals[NAMES.index("Iyy")]
+        middle = (low + high) / 2.0
+        assert "Iyy" not in found.undetermined
+        assert found.body is not None
+        assert found.body.inertia[1, 1] == pytest.approx(middle, abs=0.05 * (high - low))
+
     def test_an_undetermined_inertia_is_that_of_a_box(self) -> None:
         """Slow motion is weight alone."""
         model, runs = recordings([None, LOAD], pace=0.1, noise=3.0 * NOISE)
