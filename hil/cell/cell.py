@@ -155,6 +155,11 @@ class Cell:
         _ = changed.model
         return changed
 
+    def without_payload(self) -> Cell:
+        """The cell without what `[robot.payload]` says that the arm carries."""
+        robot = self.file.robot.model_copy(update={"payload": None})
+        return replace(self, file=self.file.model_copy(update={"robot": robot}))
+
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Joints in the order of the URDF."""

@@ -37,6 +37,7 @@ COMMANDS = LazyCommands(
         "reidentify",
         "compare",
         "gains",
+        "payload",
         "plan",
         "plot",
         "new",

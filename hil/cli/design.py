@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -90,6 +90,14 @@ def design(
             "not for a robot.",
         ),
     ] = False,
+    purpose: Annotated[
+        Literal["arm", "payload"],
+        typer.Option(
+            "--for",
+            help="arm: all parameters of the arm. payload: what it carries, the arm known, by a "
+            "motion of at most ten seconds (`hil payload`).",
+        ),
+    ] = "arm",
     earlier: Annotated[
         list[Path] | None,
         typer.Option(
@@ -139,6 +147,7 @@ def design(
     - `hil design --show-settings front > my.toml`, then `hil design cell.toml --settings my.toml`
     - `hil design cell.toml --method b --kinematic -o runs/b`: the paper's comparison
     - `hil design cell.toml --earlier runs/demo -o runs/second`: adds to what is known
+    - `hil design cell.toml --for payload -o runs/load`: a short motion for `hil payload`
     """
     if show_settings is not None:
         typer.echo(preset_text(show_settings), nl=False)
@@ -159,7 +168,15 @@ def design(
     reporter = make_reporter(quiet=quiet or json)
     loaded, folder = Cell.load(cell), DesignFolder(output)
     require_replaceable(output)
-    asked = _settings(folder, method, settings, seed, kinematic=kinematic, resume=resume)
+    asked = _settings(
+        folder,
+        method,
+        settings,
+        seed,
+        kinematic=kinematic,
+        resume=resume,
+        payload=purpose == "payload",
+    )
     beside = references(compare or [], loaded, asked, together=bool(earlier))
     known = known_from(earlier, loaded, reporter) if earlier else None
 
@@ -246,6 +263,7 @@ def _settings(
     *,
     kinematic: bool,
     resume: bool,
+    payload: bool,
 ) -> DesignSettings:
     """Return what is asked for; of a search to be resumed, what it began with."""
     there = folder.interrupted() if resume else None
@@ -259,6 +277,8 @@ def _settings(
         asked = asked.replaced(seed=seed)
     if kinematic:
         asked = asked.kinematic()
+    if payload:
+        asked = asked.for_payload()
     if there is not None:
         require_same(asked, there, folder.settings)
     return asked

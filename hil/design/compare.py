@@ -92,8 +92,11 @@ def _require_comparable(
         )
     every = set(cell.model.parameter_names)
     asked = settings.objective.parameters
-    ours = every if asked == "all" else set(asked)
+    ours = every if isinstance(asked, str) else set(asked)
     theirs = every if result.parameters is None else set(result.parameters)
+    others = result.settings.objective.parameters
+    if "payload" in (asked, others):
+        ours, theirs = ({"payload"} if name == "payload" else every for name in (asked, others))
     if ours != theirs:
         raise InputError(
             path,

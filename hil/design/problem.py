@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
@@ -31,6 +32,12 @@ if TYPE_CHECKING:
     from .knowledge import Knowledge
 
 Array = NDArray[np.float64]
+
+# States that excite every parameter of a load that an arm feels, and the share of the largest from
+# which on one is independent of the others.
+_STATES: Final = 300
+_SEED: Final = 20140901
+_INDEPENDENT: Final = 1e-6
 
 
 def problem_of(cell: Cell, settings: DesignSettings, known: Knowledge | None = None) -> Problem:
@@ -180,6 +187,8 @@ def _listed(cell: Cell, field: str, values: list[float] | str) -> Array:
 
 
 def _objective(cell: Cell, settings: DesignSettings, known: Knowledge | None) -> Objective:
+    if settings.objective.parameters == "payload":
+        return _payload_objective(cell, known)
     parameters = _essential(cell, settings, known)
     if known is None:
         return Objective(cell.model, parameters=parameters)
@@ -191,6 +200,27 @@ def _objective(cell: Cell, settings: DesignSettings, known: Knowledge | None) ->
         earlier_samples=known.samples,
         repetitions=known.repetitions,
     )
+
+
+def _payload_objective(cell: Cell, known: Knowledge | None) -> Objective:
+    """Of a body on the last link, by those of its parameters that some motion distinguishes."""
+    if known is not None:
+        raise SettingsError(
+            None,
+            "assumes the arm's parameters as known: earlier archives add nothing",
+            field='objective.parameters = "payload"',
+            remedy="leave out --earlier",
+        )
+    model = cell.model.of_payload()
+    states = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, model.n_joints))
+    rows = model.regressor(*states).dense(model.n_parameters).reshape(-1, model.n_parameters)
+    length = np.linalg.norm(rows, axis=0)
+    _, triangle, order = scipy.linalg.qr(
+        rows / np.where(length > 0.0, length, 1.0), mode="economic", pivoting=True
+    )
+    size = np.abs(np.diag(triangle))
+    chosen = np.sort(order[: np.count_nonzero(size > _INDEPENDENT * size[0])])
+    return Objective(model, parameters=chosen)
 
 
 def _essential(

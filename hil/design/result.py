@@ -202,7 +202,7 @@ class DesignResult:
         archives: tuple[tuple[str, str], ...] = (),
     ) -> Self:
         """Return the record of a design."""
-        names = cell.model.parameter_names
+        names = objective.model.parameter_names
         chosen = objective.parameters
         front = design.front
         return cls(

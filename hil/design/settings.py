@@ -41,6 +41,10 @@ Frequencies = Annotated[list[AboveZero], Field(min_length=1)]
 _MOTIONS = ("via_points", "sines")
 RESULT_FORMAT: Final = "designed excitation"
 """What the file that a design leaves calls itself; the settings are a table in it."""
+PAYLOAD_DURATION: Final = 10.0
+"""s; a load is weighed by a short motion, since the arm carries it and people wait."""
+PAYLOAD_POINTS: Final = 5
+"""Via points that fit into it."""
 SHORTEST_RAMP: Final = 0.05
 """s; sines that grow faster are a blow to any arm, and their contacts cannot be determined."""
 
@@ -182,10 +186,10 @@ class ConstraintTable(_Table):
 class ObjectiveTable(_Table):
     """`[objective]`: which parameters count."""
 
-    parameters: Literal["all"] | list[str] = Field(
+    parameters: Literal["all", "payload"] | list[str] = Field(
         default="all",
-        description='"all", or a list of at least two names of parameters as `hil identify` '
-        "reports them",
+        description='"all"; "payload", a body on the last link with the arm known; or a list of at '
+        "least two names of parameters as `hil identify` reports them",
     )
     max_relative_std: Annotated[Number, Field(gt=0)] | None = Field(
         default=None,
@@ -260,6 +264,18 @@ class DesignSettings(_Table):
             SettingsError: names field, value and remedy.
         """
         return _validated(None, _merged(self.to_dict(), changes))
+
+    def for_payload(self) -> DesignSettings:
+        """These settings for a short motion that weighs what the arm carries."""
+        changes: dict[str, dict[str, object]] = {
+            "objective": {"parameters": "payload"},
+            "constraints": {"max_duration": min(self.constraints.max_duration, PAYLOAD_DURATION)},
+        }
+        if self.sines is not None:
+            changes["sines"] = {"length": min(self.sines.length, PAYLOAD_DURATION)}
+        if self.via_points is not None:
+            changes["via_points"] = {"n_via": min(self.via_points.n_via, PAYLOAD_POINTS)}
+        return self.replaced(**changes)
 
     def kinematic(self) -> DesignSettings:
         """These settings with nothing but joint limits and durations to keep, the path open."""

@@ -133,7 +133,7 @@ def gather_sources(
         raise InputError(
             predict[0], "cannot be held out where all is fitted", remedy="leave out --in-sample"
         )
-    _refuse_duplicates([*paths, *predict])
+    refuse_duplicates([*paths, *predict])
     archives = [open_archive(path) for path in [*paths, *predict]]
     rejected = [archive for archive in archives if _rejected(archive)]
     by_kind = _by_kind(
@@ -209,7 +209,7 @@ def all_fitted(
         len({archive.attachments.get("plan.json") for archive in archives}) == 1
     )
     if plan is None:
-        training, same_motion = _aligned(training)
+        training, same_motion = aligned(training)
     return Sources(
         cell=cell,
         header=archives[0].header,
@@ -225,7 +225,7 @@ def all_fitted(
     )
 
 
-def _aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
+def aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
     """Imported recordings with one origin if they show one motion, and whether they do."""
     offsets = offsets_of_repetitions([source.recording for source in sources])
     if offsets is None:
@@ -260,7 +260,7 @@ def _kind(archive: Archive) -> str:
     return archive.header.serves_as
 
 
-def _refuse_duplicates(paths: Sequence[Path]) -> None:
+def refuse_duplicates(paths: Sequence[Path]) -> None:
     """What is fitted must not be predicted as well."""
     seen: dict[str, Path] = {}
     for path in paths:

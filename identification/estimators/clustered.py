@@ -80,6 +80,7 @@ def clustered_covariance(
         design_effect=float((corrected**2).sum() / max(1, corrected.shape[1])),
         interval_factor=float(student_limit(0.025, max(1, count - 1))),
         words=f"cluster-robust covariance over {count} blocks of {length * FINE_BLOCK:g} s",
+        blocks=count,
     )
 
 

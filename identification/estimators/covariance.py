@@ -31,7 +31,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.factor.factor import Estimate, mark_undetermined, solve
+from identification.factor.factor import Estimate, Solution, mark_undetermined, solve
 from identification.factor.phases import FINE_BLOCK, PhaseFactor, merged
 
 Array = NDArray[np.float64]
@@ -63,6 +63,7 @@ class Clustered:
         design_effect: by how much the mean variance is that of white residuals.
         interval_factor: standard deviations in half a 95 % interval.
         words: what was done.
+        blocks: of time.
     """
 
     covariance: Array
@@ -70,6 +71,7 @@ class Clustered:
     design_effect: float
     interval_factor: float
     words: str
+    blocks: int
 
 
 def block_covariance(
@@ -100,8 +102,41 @@ def block_covariance(
         part = slice(start, start + _AT_ONCE)
         information = longer.blocks(part).weighted(weights)[:, :-1, :-1]
         shares[part] = _shares(information, root, root)
-    corrected = leverage_corrected(shares, scores @ root)
-    moved = corrected @ root.T
+    return _sandwich(shares, scores, solution, prior, length * FINE_BLOCK)
+
+
+def cluster_covariance(
+    information: Array,
+    scores: Array,
+    solution: Solution,
+    prior: Array | None = None,
+    block: float = FINE_BLOCK,
+    stretch: int = 1,
+) -> Clustered:
+    """Cluster-robust covariance of an estimate whose fine blocks are given.
+
+    Args:
+        information: of the blocks (B, p, p).
+        scores: what the blocks' residuals pull with (B, p).
+        solution: of the sum of the information, with the prior's.
+        prior: see :func:`block_covariance`.
+        block: length of each [s].
+        stretch: by how much blocks are longer than scores ask for, as far as enough are left.
+    """
+    used = scores.any(axis=1)
+    information, scores = information[used], scores[used]
+    length = block_length(scores)
+    length = max(length, min(stretch * length, len(scores) // _FEWEST_BLOCKS))
+    shares = _shares(merged(information, length), solution.root, solution.root)
+    return _sandwich(shares, merged(scores, length), solution, prior, length * block)
+
+
+def _sandwich(
+    shares: Array, scores: Array, solution: Solution, prior: Array | None, duration: float
+) -> Clustered:
+    """Covariance from blocks of some seconds: shares of information (B, k, k), scores (B, p)."""
+    corrected = leverage_corrected(shares, scores @ solution.root)
+    moved = corrected @ solution.root.T
     covariance = np.asarray(moved.T @ moved)
     effect = float((corrected**2).sum() / max(1, corrected.shape[1]))
     if prior is not None:
@@ -113,7 +148,8 @@ def block_covariance(
         determined=solution.determined,
         design_effect=effect,
         interval_factor=float(student_limit(0.025, max(1, count - 1))),
-        words=f"cluster-robust covariance over {count} blocks of {length * FINE_BLOCK:g} s",
+        words=f"cluster-robust covariance over {count} blocks of {duration:g} s",
+        blocks=count,
     )
 
 

@@ -27,9 +27,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.distributions import student_limit
 from identification.errors import IdentificationError
-from identification.estimators.covariance import block_length, spread
+from identification.estimators.covariance import cluster_covariance
 from identification.factor.factor import NormalEquations, Solution, mark_undetermined, solve
 from identification.factor.gains import GainFactor
 
@@ -124,7 +123,8 @@ def identify_gains(
         blocks = _errors_in_currents(factor.gram, factor.rows, fit)
     else:
         blocks = _currents_predicted(factor.gram, fit)
-    covariance, interval = _clustered(*blocks, fit.solution)
+    clustered = cluster_covariance(*blocks, fit.solution)
+    covariance = clustered.covariance
     reasons = _reasons(total, rows, fit, np.sqrt(np.diag(covariance)[p:]), worst_relative_std)
     known = np.array([reason is None for reason in reasons])
     gains, own = fit.unknowns[p:], covariance[p:, p:]
@@ -140,7 +140,7 @@ def identify_gains(
         parameters=fit.unknowns[:p],
         noise_std=fit.noise,
         method=method,
-        interval_factor=interval,
+        interval_factor=clustered.interval_factor,
     )
 
 
@@ -311,17 +311,6 @@ def _errors_in_currents(gram: Array, rows: NDArray[np.intp], fit: _Fit) -> tuple
         information.append(full[:-1, :-1])
         scores.append(-(full[:-1] @ np.append(fit.unknowns, 1.0)))
     return np.array(information), np.array(scores)
-
-
-def _clustered(information: Array, scores: Array, solution: Solution) -> tuple[Array, float]:
-    """Sandwich covariance over blocks of time, and the factor of half a 95 % interval."""
-    used = scores.any(axis=1)
-    information, scores = information[used], scores[used]
-    edges = np.arange(0, len(scores), block_length(scores))
-    information = np.add.reduceat(information, edges, axis=0)
-    scores = np.add.reduceat(scores, edges, axis=0)
-    moved = spread(information, scores, solution.root)
-    return np.asarray(moved.T @ moved), float(student_limit(0.025, max(1, len(scores) - 1)))
 
 
 def _loaded(gram: Array, p: int) -> bool:

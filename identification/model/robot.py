@@ -286,6 +286,21 @@ class RobotModel:
             plan=_plan(self.chain, self.gravity, self.layout, self.base.kept, friction, elements),
         )
 
+    def of_payload(self) -> RobotModel:
+        """Return the model of what the arm carries: ten parameters about the last joint's frame.
+
+        Everything else is known, and no part of the regressor.
+        """
+        n = self.n_joints
+        links: list[list[int]] = [[] for _ in range(n)]
+        links[-1] = list(range(_N_LINK))
+        return replace(
+            self,
+            parameter_names=LINK_SYMBOLS,
+            units=tuple(self.layout.units[k] for k in self.layout.links[-1]),
+            plan=RegressorPlan(self.chain, self.gravity, links, [False] * n, None),
+        )
+
     @property
     def standard_names(self) -> tuple[str, ...]:
         """Names of the s standard parameters: link by link, then coupling inertias."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate
+from identification.estimators.payload import Run, mass_difference
 from identification.estimators.repetitions import RepeatedEstimate
 from identification.excitation.criteria import (
     coupling_index,
@@ -38,6 +39,7 @@ from identification.validation.prediction import (
 )
 from identification.validation.repeatability import Repeatability, repeatability
 from identification.validation.residual_checks import ResidualChecks, check_residuals
+from identification.validation.thresholds import Thresholds
 
 Array = NDArray[np.float64]
 
@@ -51,6 +53,8 @@ class CarriedLoad:
 
     Attributes:
         mass: how much more the arm carried there [kg].
+        half_interval: of that, 95 % [kg]; infinite where nobody computed it, or nothing determines
+            it.
         explained: share of the error on unseen motion, beyond that of the fit, that it explains.
         axes: number of joints whose error is far beyond that of the fit.
     """
@@ -58,6 +62,23 @@ class CarriedLoad:
     mass: float
     explained: float
     axes: int
+    half_interval: float = np.inf
+
+
+def weigh_load(
+    model: RobotModel, training: Sequence[Samples], held_out: Sequence[Samples], found: CarriedLoad
+) -> CarriedLoad:
+    """The load with its interval: fitted again with friction that drifts between recordings."""
+    try:
+        runs = [
+            Run.of(str(k), model, samples, None, loaded=loaded)
+            for loaded, some in ((False, training), (True, held_out))
+            for k, samples in enumerate(some)
+        ]
+        mass, _, high = mass_difference(model, runs)
+    except IdentificationError:
+        return found
+    return replace(found, mass=mass, half_interval=high - mass) if np.isfinite(high) else found
 
 
 def find_load(model: RobotModel, training: StandardGram, held_out: StandardGram) -> CarriedLoad:
@@ -300,6 +321,10 @@ def gather(
     unseen = total([Factor.of(model, run) for run in held_out])
     error = over_all(prediction_error(model, values, held_out))
     grams = [StandardGram.of(model, some[:_MOST_RECORDINGS]) for some in (training, held_out)]
+    carried = find_load(model, *grams)
+    if carried.explained > Thresholds().load:
+        few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
+        carried = weigh_load(model, few, unseen_few, carried)
     steady = repeatability(model, values, training, slow) if repeated else None
     slow_errors = [slow_error(model, values, run, slow) for run in held_out if repeated]
     return Evidence(
@@ -315,7 +340,7 @@ def gather(
         disagreement=_disagreement(result) if repeated else None,
         causes=find_causes(model, training, values, names),
         gravity=find_gravity(model, *grams),
-        load=find_load(model, *grams),
+        load=carried,
         loaded=gravity_loads(model, position[:: max(1, len(position) // _POSTURES)]),
         nominal=None if nominal is None else over_all(prediction_error(model, nominal, held_out)),
         implausible=implausibilities(

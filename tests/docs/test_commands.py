@@ -24,6 +24,7 @@ TYPED_ELSEWHERE = {
     "bring-your-own-robot.md": "tests/hil/test_bring_your_own_robot.py",
     "campaign.md": "tests/hil/test_campaign_day.py",
     "first-hour.md": "tests/hil/test_first_hour.py",
+    "payload.md": "tests/hil/test_payload_command.py",
 }
 """Pages whose commands another test types, one after the other."""
 
@@ -58,6 +59,7 @@ NOT_TYPED = {
     "hil import rosbag2": "needs a recording; tests/hil/test_importers_rosbag2.py",
     "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",
     "hil gains empty.mcap": "typed in bring-your-own-robot.md",
+    "hil payload bare --loaded gripper": "typed in payload.md",
     "hil identify ur10.mcap": "needs a recording; tests/benchmarks/test_real_data.py",
     "hil reidentify /data": "needs other people's archives",
     "hil reidentify s3:": "network",

@@ -15,7 +15,9 @@ from hil.design.knowledge import Knowledge
 from hil.design.settings import SettingsError, preset_text, settings_of
 from hil.design.toml_text import Angles, from_text, to_text
 from identification.excitation import SineGenome, ViaPointGenome
+from identification.model.payload import Load, Payload
 from sim_fixtures.ns16 import CELL_PATH
+from tests.docs.typed import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -306,3 +308,45 @@ def test_seeds_and_repetitions_of_the_cell_play_no_part_in_the_problem(cell):
         replaced_value(cell.text, "campaign", "repetitions", 3), cell.urdf, cell.path
     )
     assert problem_of(other, preset("b").kinematic()).objective.repetitions == 1
+
+
+class TestPayload:
+    @pytest.mark.parametrize("method", METHODS)
+    def test_a_load_is_weighed_by_a_motion_of_ten_seconds(self, method):
+        asked = preset(method).for_payload()
+        assert asked.objective.parameters == "payload"
+        assert asked.constraints.max_duration == 10.0
+        assert asked.sines is None or asked.sines.length <= 10.0
+
+    def test_ten_parameters_of_the_load_are_judged(self, cell):
+        """All else is known: the regressor of the load alone, as its torque is computed."""
+        objective = problem_of(cell, preset("front").for_payload()).objective
+        assert objective.n_parameters == 10
+        rng = np.random.default_rng(2)
+        q, qd, qdd = rng.uniform(-1.0, 1.0, (3, 5, 6))
+        load = Payload(3.0, (0.1, -0.05, 0.2), (0.02, 0.001, 0.0, 0.03, 0.002, 0.04))
+        expected = Load(cell.model.chain, cell.model.gravity, load).torque(q, qd, qdd)
+        torque = objective.model.torque(load.parameters, q, qd, qdd)
+        np.testing.assert_allclose(torque, expected, atol=1e-9)
+
+    def test_what_no_motion_tells_apart_is_left_out(self):
+        """Two joints about y feel mass, moments in their plane and Iyy."""
+        flat = Cell.load(ROOT / "examples" / "two_joints" / "cell.toml")
+        objective = problem_of(flat, preset("front").for_payload()).objective
+        assert objective.parameters is not None
+        names = [objective.model.parameter_names[k] for k in objective.parameters]
+        assert names == ["Iyy", "mcx", "mcz", "m"]
+
+    def test_earlier_archives_add_nothing(self, cell):
+        p = cell.model.n_parameters
+        known = Knowledge(
+            names=cell.model.parameter_names,
+            values=np.ones(p),
+            std=np.ones(p),
+            joint_weights=np.ones(6),
+            gram=np.eye(p),
+            samples=1,
+            repetitions=1,
+        )
+        with pytest.raises(SettingsError, match=r"known.*leave out --earlier"):
+            problem_of(cell, preset("front").for_payload(), known)

@@ -37,6 +37,7 @@ FAILING = {
     "study": ("study", "--campaign", NOWHERE),
     "reidentify": ("reidentify", NOWHERE, "--workers", "1"),
     "gains": ("gains", NOWHERE, NOWHERE, "--mass", "1"),
+    "payload": ("payload", NOWHERE, "--loaded", NOWHERE),
     "plan": ("plan", NOWHERE, "--cell", NOWHERE),
     "record": ("record", NOWHERE),
     "simulate": ("simulate", NOWHERE),

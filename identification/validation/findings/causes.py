@@ -177,7 +177,9 @@ def load(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterato
     found = evidence.load
     if found is None or found.explained < limit.load or 2 * found.axes < len(names):
         return
-    more = f"{abs(found.mass):.2g} kg {'more' if found.mass > 0.0 else 'less'}"
+    more = f"{abs(found.mass):.3g} kg {'more' if found.mass > 0.0 else 'less'}"
+    if np.isfinite(found.half_interval):
+        more = more.replace(" kg", f" ± {found.half_interval:.2g} kg")
     yield Finding(
         "load",
         "wrong",

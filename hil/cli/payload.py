@@ -1,0 +1,144 @@
+"""`hil payload`: what the arm carries, as figures that a controller is given."""
+
+from __future__ import annotations
+
+import json as json_module
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hil.cli.identify_options import LONGEST_DELAY
+from hil.cli.verdict import NOT_GOOD
+from hil.errors import InputError
+from hil.files import write_or_tell
+from hil.identify.options import Options
+from hil.identify.payload_run import PayloadFound, find_payload
+from hil.progress import reporter as make_reporter
+
+
+def payload(
+    bare: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Archives (*.mcap) recorded without the payload, or campaign folders.",
+            show_default=False,
+            metavar="BARE...",
+        ),
+    ],
+    loaded: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--loaded",
+            help="Archive recorded with it, or campaign folder; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="Link of the URDF in whose frame the figures are. If left out: tool0 or flange "
+            "where one is fixed to the last joint, else the link of that joint.",
+            show_default=False,
+        ),
+    ] = None,
+    shape: Annotated[
+        tuple[str, float, float, float] | None,
+        typer.Option(
+            metavar="box X Y Z",
+            help="Edges in m of a uniform box along the axes of the frame: what the motion does "
+            "not determine is that of the possible body closest to it. If left out: to a point.",
+            show_default=False,
+        ),
+    ] = None,
+    check: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="A figure that is known, such as mass=4.0 (kg): exit status 5 if it lies outside "
+            "its 95 % interval. May be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    urdf: Annotated[
+        Path | None,
+        typer.Option(help="File for the payload as a link of a URDF.", show_default=False),
+    ] = None,
+    delay: Annotated[
+        float | None,
+        typer.Option(
+            help="Time in s by which torques lag positions; the cell's, or what is found, if left "
+            "out.",
+            show_default=False,
+        ),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the result.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Weigh what the arm carries: mass, centre of mass and inertia with 95 % intervals.
+
+    The difference of recordings without and with it, on one model of the arm. Prints the figures
+    as they are typed into a COMAU, UR and Franka controller. Exit status 5 if a figure of --check
+    lies outside its interval, or no possible body fits the recordings.
+    """
+    if delay is not None and not abs(delay) <= LONGEST_DELAY:
+        raise InputError(
+            None, f"{delay} is no delay", field="--delay", remedy=f"give s, at most {LONGEST_DELAY}"
+        )
+    box, wanted = _box(shape), _wanted(check or [])
+    reporter = make_reporter(quiet=quiet or json)
+    options = Options(estimator="wls", delay=delay)
+    found = find_payload(bare, loaded or [], reporter, frame=frame, box=box, options=options)
+    outside = found.outside(wanted)
+    text = json_module.dumps(
+        found.as_json() | {"checked": wanted, "outside": outside}, indent=1, ensure_ascii=False
+    )
+    lines = _lines(found, wanted, outside)
+    if urdf is not None:
+        write_or_tell(urdf, found.urdf)
+    typer.echo(text if json else "\n".join(lines))
+    if outside or found.estimate.contradicted:
+        raise typer.Exit(NOT_GOOD)
+
+
+def _lines(found: PayloadFound, wanted: dict[str, float], outside: list[str]) -> list[str]:
+    lines = [*found.sentences, ""]
+    lines += [
+        f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"
+        for name, value, low, high, unit in found.table
+    ]
+    for controller, typed in found.controllers.items():
+        lines += ["", f"{controller}:", typed]
+    lines += ["", *(f"warning: {warning}" for warning in found.warnings)]
+    lines += [f"check: {sentence}" for sentence in outside]
+    if wanted and not outside:
+        lines.append(f"check: {', '.join(wanted)} inside the 95 % interval")
+    return lines
+
+
+def _box(shape: tuple[str, float, float, float] | None) -> tuple[float, float, float] | None:
+    if shape is None:
+        return None
+    kind, x, y, z = shape
+    if kind != "box" or not all(math.isfinite(edge) and edge > 0.0 for edge in (x, y, z)):
+        raise InputError(
+            None,
+            f"{kind} {x:g} {y:g} {z:g} is no shape",
+            field="--shape",
+            remedy="give box and three edges above 0 m, such as box 0.2 0.1 0.1",
+        )
+    return x, y, z
+
+
+def _wanted(checks: list[str]) -> dict[str, float]:
+    wanted = {}
+    for text in checks:
+        name, _, figure = text.partition("=")
+        try:
+            wanted[name] = float(figure)
+        except ValueError:
+            raise InputError(
+                None, f"{text!r} is no figure", field="--check", remedy="write mass=4.0"
+            ) from None
+    return wanted

@@ -1,0 +1,396 @@
+"""What an arm carries, from archives recorded without and with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.campaign.folder import CampaignFolder
+from hil.cell import Cell
+from hil.errors import ArchiveError, InputError
+from hil.progress import Reporter
+from hil.reading import lies_there
+from identification.estimators.payload import (
+    NAMES,
+    Difference,
+    PayloadEstimate,
+    Run,
+    figures_of,
+    find_difference,
+    identify_payload,
+)
+from identification.model.pseudo_inertia import Body
+from identification.model.robot import RobotModel
+
+from .options import Options
+from .prepared import prepare_sources
+from .settings import samples_of, signals_of
+from .sources import Sources, aligned, gather_sources, refuse_duplicates
+
+Array = NDArray[np.float64]
+
+# Frames in which controllers count, as ROS-Industrial names them.
+_FLANGES: Final = ("tool0", "flange")
+_UNITS: Final = dict(zip(NAMES, ["kg", *["m"] * 3, *["kg·m²"] * 6], strict=True))
+_PRINTED_DIGITS: Final = 4
+
+
+@dataclass(frozen=True, eq=False)
+class PayloadFound:
+    """A payload, and what it was found from.
+
+    Attributes:
+        estimate: of the body.
+        frame: link of the robot description in whose frame it is.
+        box: edges of the reference body [m]; None for a point.
+        gravity: magnitude [m/s²].
+        bare: names of the archives without it.
+        loaded: names of the archives with it.
+        warnings: what a reader must know.
+    """
+
+    estimate: PayloadEstimate
+    frame: str
+    box: tuple[float, float, float] | None
+    gravity: float
+    bare: tuple[str, ...]
+    loaded: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def figures(self) -> Array:
+        """Those of the body (10,), as `NAMES`.
+
+        Raises:
+            InputError: there is no payload.
+        """
+        return figures_of(self._body)
+
+    @property
+    def _body(self) -> Body:
+        if self.estimate.body is None:
+            low, high = self.estimate.intervals[0]
+            raise InputError(
+                None,
+                f"the loaded archives show no payload: its mass is between {low:.3g} and"
+                f" {high:.3g} kg",
+                field="--loaded",
+                remedy="name recordings that were made with it",
+            )
+        return self.estimate.body
+
+    @property
+    def wrist_torque(self) -> tuple[float, float, float]:
+        """Torque of its weight about the frame's origin in the worst pose [N·m], and interval."""
+        value, low, high = (self.gravity * part for part in self.estimate.moment)
+        return value, low, high
+
+    def outside(self, wanted: Mapping[str, float]) -> list[str]:
+        """Sentences about figures that do not lie in their intervals.
+
+        Raises:
+            InputError: there is no figure of that name.
+        """
+        found = []
+        for name, value in wanted.items():
+            if name not in NAMES:
+                raise InputError(
+                    None,
+                    f"{name!r} is no figure of a payload",
+                    field="--check",
+                    remedy=f"use some of {', '.join(NAMES)}, such as mass=4.0",
+                )
+            low, high = self.estimate.intervals[NAMES.index(name)]
+            if not low <= value <= high:
+                unit = _UNITS[name]
+                found.append(
+                    f"{name} {value:g} {unit} lies outside the 95 % interval"
+                    f" {low:.{_PRINTED_DIGITS}g} to {high:.{_PRINTED_DIGITS}g} {unit}"
+                )
+        return found
+
+    @property
+    def sentences(self) -> list[str]:
+        """What was found, in words.
+
+        Raises:
+            InputError: there is no payload.
+        """
+        body, estimate = self._body, self.estimate
+        low, high = estimate.intervals[0]
+        torque = self.wrist_torque
+        centre = ", ".join(f"{1e3 * part:.1f}" for part in body.centre)
+        lines = [
+            f"The payload weighs {body.mass:.{_PRINTED_DIGITS}g} kg (95 %: {low:.4g} to"
+            f" {high:.4g} kg), its centre of mass is at {centre} mm in the frame {self.frame};"
+            f" its weight loads the flange with up to {torque[0]:.3g} N·m"
+            f" ({torque[1]:.3g} to {torque[2]:.3g})."
+        ]
+        if estimate.undetermined:
+            shape = "a point mass" if self.box is None else "the box"
+            lines.append(
+                f"The motion does not determine {', '.join(estimate.undetermined)}: they are those"
+                f" of the possible body closest to {shape}."
+            )
+        if estimate.contradicted:
+            lines.append(
+                "No possible body fits the recordings to their noise: torque constants, the"
+                " geometry of the URDF or friction that depends on the load may be the cause, and"
+                " the intervals do not contain it."
+            )
+        return lines
+
+    @property
+    def table(self) -> list[tuple[str, float, float, float, str]]:
+        """Rows of name, value, interval and unit."""
+        intervals = self.estimate.intervals.tolist()
+        return [
+            (name, value, low, high, _UNITS[name])
+            for name, value, (low, high) in zip(
+                NAMES, self.figures.tolist(), intervals, strict=True
+            )
+        ]
+
+    @property
+    def controllers(self) -> dict[str, str]:
+        """By controller, the figures as they are typed; units and frames stand in the manual."""
+        body = self._body
+        x, y, z = (f"{1e3 * part:.2f}" for part in body.centre)
+        metres = ", ".join(f"{part:.5f}" for part in body.centre)
+        xx, xy, xz, yy, yz, zz = (f"{part:.5f}" for part in self.figures[4:])
+        six = ", ".join((xx, yy, zz, xy, xz, yz))
+        columns = ", ".join((xx, xy, xz, xy, yy, yz, xz, yz, zz))
+        inertia = [
+            f"$TOOL_INERTIA[{k}] := {figure}"
+            for k, figure in enumerate((xx, yy, zz, xy, xz, yz), 1)
+        ]
+        return {
+            "COMAU": "\n".join(
+                [
+                    f"$TOOL_MASS := {body.mass:.3f}",
+                    f"$TOOL_CNTR := POS({x}, {y}, {z}, 0, 0, 0, '')",
+                    *inertia,
+                ]
+            ),
+            "UR": f"set_target_payload({body.mass:.3f}, [{metres}], [{six}])",
+            "Franka": f"robot.setLoad({body.mass:.3f}, {{{metres}}}, {{{columns}}});",
+        }
+
+    @property
+    def urdf(self) -> str:
+        """A description with the frame's link and the payload fixed to it."""
+        body = self._body
+        xyz = " ".join(repr(float(part)) for part in body.centre)
+        names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        tensor = " ".join(
+            f'{name}="{float(part)!r}"' for name, part in zip(names, self.figures[4:], strict=True)
+        )
+        return f"""<?xml version="1.0"?>
+<robot name="payload">
+  <link name="{self.frame}"/>
+  <joint name="payload_mount" type="fixed">
+    <parent link="{self.frame}"/>
+    <child link="payload"/>
+  </joint>
+  <link name="payload">
+    <inertial>
+      <origin xyz="{xyz}" rpy="0 0 0"/>
+      <mass value="{float(body.mass)!r}"/>
+      <inertia {tensor}/>
+    </inertial>
+  </link>
+</robot>
+"""
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything, for other programs; infinite ends of intervals are null."""
+        torque, estimate = self.wrist_torque, self.estimate
+        return {
+            "frame": self.frame,
+            "figures": {
+                name: {"value": value, "interval": [_finite(low), _finite(high)], "unit": unit}
+                for name, value, low, high, unit in self.table
+            },
+            "wrist_torque": {
+                "value": torque[0],
+                "interval": [_finite(torque[1]), _finite(torque[2])],
+                "unit": "N·m",
+            },
+            "undetermined": list(estimate.undetermined),
+            "contradicted": estimate.contradicted,
+            "least_squares": estimate.parameters.tolist(),
+            "method": estimate.method,
+            "controllers": self.controllers,
+            "bare": list(self.bare),
+            "loaded": list(self.loaded),
+            "warnings": list(self.warnings),
+        }
+
+
+def find_payload(
+    bare: Sequence[Path],
+    loaded: Sequence[Path],
+    reporter: Reporter,
+    *,
+    frame: str | None = None,
+    box: tuple[float, float, float] | None = None,
+    options: Options = Options(estimator="wls"),
+) -> PayloadFound:
+    """Weigh what the arm carries in some recordings and not in others.
+
+    Settings are chosen on the bare recordings. What `[robot.payload]` of a cell states is left out
+    of account: the payload is all that the loaded recordings carry and the bare ones do not.
+
+    Args:
+        bare: archives or folders of them, or campaign folders, without it.
+        loaded: the same with it.
+        reporter: of progress.
+        frame: link of the URDF in whose frame it is; by default `tool0` or `flange` where one is
+            fixed to the last joint, else the link of that joint.
+        box: edges [m] of the reference body along the frame's axes; None for a point.
+        options: how recordings become samples.
+
+    Raises:
+        InputError: archives cannot be used, are of two arms or carry two payloads.
+        IdentificationError: the recordings do not determine the mass.
+    """
+    sides = {False: list(_archives(bare)), True: list(_archives(loaded))}
+    if not sides[False] or not sides[True]:
+        raise InputError(
+            None,
+            "a payload is a difference of recordings without it and with it",
+            remedy="name both: hil payload BARE... --loaded LOADED",
+        )
+    refuse_duplicates([*sides[False], *sides[True]])
+    found = {
+        kind: gather_sources(paths, Options().split, in_sample=True)
+        for kind, paths in sides.items()
+    }
+    _refuse_other_arm(found[False].cell, found[True].cell, sides[True][0])
+    paths = {path.name: path for path in (*sides[False], *sides[True])}
+    _require_torques(found.values(), paths)
+    cell = found[False].cell.without_payload()
+    training = (*found[False].training, *found[True].training)
+    if found[False].plan is None and found[True].plan is None:
+        training, _ = aligned(training)
+    first, last = training[: len(found[False].training)], training[len(found[False].training) :]
+    sources = replace(found[False], cell=cell, training=first, held_out=first)
+    prepared = prepare_sources(sources, options, reporter)
+    cell, settings = prepared.sources.cell, prepared.settings
+    frame = frame or flange_of(cell.model)
+    runs = []
+    with reporter.task("reducing recordings", len(training)) as task:
+        for source, samples in zip(first, prepared.fitted, strict=True):
+            runs.append(Run.of(source.name, cell.model, samples, frame, loaded=False))
+            task.advance(1, source.name)
+        for source in last:
+            samples = samples_of(signals_of(source, settings), cell, settings)
+            runs.append(Run.of(source.name, cell.model, samples, frame, loaded=True))
+            task.advance(1, source.name)
+    with reporter.task("weighing", 2) as task:
+        _refuse_difference(find_difference(cell.model, runs), paths)
+        task.advance(1)
+        estimate = identify_payload(cell.model, runs, box)
+        task.advance(1)
+    warnings = (*prepared.sources.doubts, *found[True].doubts)
+    return PayloadFound(
+        estimate=estimate,
+        frame=frame,
+        box=box,
+        gravity=float(np.linalg.norm(cell.model.gravity)),
+        bare=tuple(source.name for source in first),
+        loaded=tuple(source.name for source in last),
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def flange_of(model: RobotModel) -> str:
+    """The link whose frame controllers count in: `tool0`, `flange`, or that of the last joint."""
+    last = {
+        name: pose for name, pose in model.chain.frames.items() if pose.joint == model.n_joints - 1
+    }
+    named = next((name for name in _FLANGES if name in last), None)
+    return named or min(last, key=lambda name: float(np.abs(last[name].translation).sum()))
+
+
+def _archives(paths: Sequence[Path]) -> Iterator[Path]:
+    """Archives, and those of folders."""
+    for path in paths:
+        if not path.is_dir():
+            yield path
+            continue
+        folder = CampaignFolder(path)
+        if lies_there(path / "manifest.json"):
+            kinds = ("excitation", "validation", "standstill")
+            inside = [archive for kind in kinds for archive in folder.completed(kind)]
+        else:
+            inside = sorted(path.glob("*.mcap"))
+        if not inside:
+            raise InputError(
+                path,
+                "holds no whole archive",
+                remedy="name archives (*.mcap) or the folder of a campaign that was run",
+            )
+        yield from inside
+
+
+def _refuse_other_arm(bare: Cell, loaded: Cell, path: Path) -> None:
+    """One arm with one drive train; only what it carries may differ."""
+    differing = [
+        name
+        for name, mine, other in (
+            ("robot.urdf", bare.urdf, loaded.urdf),
+            ("[robot]", bare.without_payload().file.robot, loaded.without_payload().file.robot),
+            ("[drive_train]", bare.file.drive_train, loaded.file.drive_train),
+        )
+        if mine != other
+    ]
+    if differing:
+        raise ArchiveError(
+            path,
+            f"is of another arm than {bare.path}: {' and '.join(differing)} differ",
+            field="--loaded",
+            remedy="name bare and loaded recordings of one arm",
+        )
+
+
+def _require_torques(sources: Iterable[Sources], paths: Mapping[str, Path]) -> None:
+    for side in sources:
+        for source in side.training:
+            if source.recording.torque is None:
+                raise ArchiveError(
+                    paths.get(source.name),
+                    "holds no joint torques, and a payload is weighed in their unit",
+                    field="torque",
+                    remedy="give drive.torque_constant in the column map",
+                )
+
+
+def _refuse_difference(found: Difference | None, paths: Mapping[str, Path]) -> None:
+    """All bare recordings carry the same, and all loaded ones do."""
+    if found is None:
+        return
+    run, other = found.run, found.reference
+    amount = f"{abs(found.mass):.3g} kg {'more' if found.mass > 0.0 else 'less'} than {other.name}"
+    if run.loaded:
+        raise InputError(
+            paths.get(run.name),
+            f"carries another payload: {amount}, though both are named as loaded",
+            field="--loaded",
+            remedy="weigh each payload by itself",
+        )
+    raise InputError(
+        paths.get(run.name),
+        f"was recorded with another tool mounted: it carries {amount}, though both are named as"
+        " bare",
+        remedy="name it with --loaded, or leave it out",
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

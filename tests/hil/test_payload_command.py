@@ -1,0 +1,206 @@
+"""`hil payload`: the commands of `docs/payload.md`, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from typer.testing import CliRunner
+
+from drivers.transports.simulated import SimulatedTransport
+from hil.campaign import Campaign, Stop, design
+from hil.campaign.link import Link
+from hil.cell import Cell
+from hil.cli import app
+from hil.errors import ArchiveError, InputError
+from hil.identify.options import FIXED
+from hil.identify.payload_run import PayloadFound, find_payload
+from hil.importers import ColumnMap, Robot, import_log
+from hil.progress import Silent
+from hil.simulation import simulated_controller, simulated_provenance
+from identification import FrictionLaw, IdentificationError
+from identification.model.kinematics import pinocchio_model
+from tests.docs.test_commands import QUICK
+from tests.docs.typed import ROOT, commands
+from tests.hil.fast_cell import fast_cell
+from tests.hil.simulated_logs import Simulated, simulate
+
+MASS, CENTRE = 4.0, np.array([0.0, 0.09, 0.12])
+TENSOR = np.diag([0.01, 0.02, 0.015])
+LAW = FrictionLaw(third=None, offset=True)
+
+
+def archive(path: Path, simulated: Simulated, law: FrictionLaw = LAW) -> Path:
+    table = path.with_suffix(".npz")
+    np.savez(table, q=simulated.position, tau=simulated.torque, t=simulated.time)
+    columns = {
+        "time": {"column": "t"},
+        "position": {"columns": "q"},
+        "torque": {"columns": "tau"},
+    }
+    return import_log(
+        table,
+        path,
+        robot=Robot.from_urdf(simulated.urdf, friction=law),
+        columns=ColumnMap.model_validate(columns),
+    )
+
+
+def record(folder: Path, name: str, mass: float, seed: int) -> Path:
+    time = np.arange(0.0, 12.0, 8e-3)
+    load = None if mass == 0.0 else pin.Inertia(mass, CENTRE, TENSOR * mass / MASS)
+    return archive(folder / name, simulate("ur5_robot.urdf", time, seed=seed, load=load))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("payload")
+    record(folder, "empty.mcap", 0.0, 1)
+    record(folder, "full.mcap", MASS, 2)
+    record(folder, "other.mcap", 2.0, 3)
+    return folder
+
+
+def run(folder: Path, *arguments: str) -> tuple[int, str]:
+    named = [str(folder / a) if a.endswith(".mcap") else a for a in arguments]
+    result = CliRunner().invoke(app, ["payload", *named])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout
+
+
+def weigh(folder: Path, bare: list[str], loaded: list[str]) -> PayloadFound:
+    """With settings as they are stated: nothing is chosen, which takes seconds."""
+    sides = [[folder / f"{name}.mcap" for name in names] for names in (bare, loaded)]
+    return find_payload(*sides, Silent(), options=FIXED)
+
+
+@pytest.fixture(scope="module")
+def printed(folder: Path) -> dict[str, object]:
+    status, text = run(
+        folder, "empty.mcap", "--loaded", "full.mcap", "--json", "--check", "mass=4.5"
+    )
+    assert status == 5
+    found: dict[str, object] = json.loads(text)
+    return found
+
+
+class TestPage:
+    def test_every_command_of_the_page_runs(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """docs/payload.md, in a folder with the recordings that it names."""
+        monkeypatch.chdir(folder)
+        for name, source in (("bare", "empty.mcap"), ("gripper", "full.mcap")):
+            (folder / name).mkdir()
+            (folder / name / source).write_bytes((folder / source).read_bytes())
+        for file in ("cell.toml", "robot.urdf"):
+            (folder / file).write_bytes((ROOT / "examples" / "two_joints" / file).read_bytes())
+        (folder / "quick.toml").write_text(QUICK)
+        for program, *words in commands(ROOT / "docs" / "payload.md"):
+            assert program == "hil"
+            words += ("--settings", "quick.toml") if words[0] == "design" else ()
+            result = CliRunner().invoke(app, words)
+            assert result.exit_code == 0, (shlex.join(words), result.output, result.exception)
+        model = pinocchio_model((folder / "gripper.urdf").read_text())
+        assert model.inertias[0].mass == pytest.approx(MASS, rel=0.01)
+
+
+class TestFigures:
+    def test_intervals_are_near_the_truth(self, printed: dict[str, dict[str, dict]]) -> None:
+        """Smoothing leaves a bias of some tenths of a percent."""
+        figures = printed["figures"]
+        assert figures["mass"]["value"] == pytest.approx(MASS, rel=0.01)
+        low, high = figures["mass"]["interval"]
+        assert low < figures["mass"]["value"] < high
+        assert printed["frame"] == "tool0"
+        assert np.trace(TENSOR) == pytest.approx(
+            sum(figures[name]["value"] for name in ("Ixx", "Iyy", "Izz")), rel=0.3
+        )
+
+    def test_a_check_outside_is_said(self, printed: dict[str, list[str]]) -> None:
+        (sentence,) = printed["outside"]
+        assert sentence.startswith("mass 4.5 kg lies outside the 95 % interval")
+
+    def test_each_controller_has_its_own_units(self, printed: dict[str, dict]) -> None:
+        """COMAU counts in mm; UR and Franka in m; Franka takes a whole matrix."""
+        typed, figures = printed["controllers"], printed["figures"]
+        centre = [figures[name]["value"] for name in ("cx", "cy", "cz")]
+        assert f"$TOOL_CNTR := POS({1e3 * centre[0]:.2f}, {1e3 * centre[1]:.2f}" in typed["COMAU"]
+        assert f"$TOOL_INERTIA[2] := {figures['Iyy']['value']:.5f}" in typed["COMAU"]
+        assert typed["UR"].startswith(f"set_target_payload({figures['mass']['value']:.3f}, [")
+        six = typed["UR"].split("[")[2].strip("])").split(", ")
+        assert six[:2] == [f"{figures[name]['value']:.5f}" for name in ("Ixx", "Iyy")]
+        nine = typed["Franka"].split("{")[2].strip("});").split(", ")
+        assert (len(nine), nine[1], nine[4]) == (9, nine[3], six[1])
+
+
+class TestRefusals:
+    def test_a_second_payload_is_named(self, folder: Path) -> None:
+        with pytest.raises(InputError, match=r"other\.mcap.*another payload: .* kg less"):
+            weigh(folder, ["empty"], ["full", "other"])
+
+    def test_a_bare_run_with_a_tool_is_named(self, folder: Path) -> None:
+        with pytest.raises(InputError, match=r"other\.mcap.*another tool mounted: .* kg more"):
+            weigh(folder, ["empty", "other"], ["full"])
+
+    def test_another_arm_is_named(self, folder: Path, tmp_path: Path) -> None:
+        time = np.arange(0.0, 6.0, 8e-3)
+        other = archive(tmp_path / "ur10.mcap", simulate("ur10_robot.urdf", time, seed=1))
+        with pytest.raises(ArchiveError, match=r"ur10\.mcap.*another arm .* robot\.urdf"):
+            find_payload([folder / "empty.mcap"], [other], Silent())
+
+    def test_exchanged_recordings_are_refused(self, folder: Path) -> None:
+        with pytest.raises(IdentificationError, match="exchanged"):
+            weigh(folder, ["full"], ["empty"])
+
+    def test_one_archive_on_both_sides_is_refused(self, folder: Path) -> None:
+        with pytest.raises(InputError, match="holds the same as"):
+            weigh(folder, ["empty"], ["empty"])
+
+    @pytest.mark.parametrize(
+        ("arguments", "sentence"),
+        [
+            (("empty.mcap",), "name both: hil payload BARE"),
+            (("empty.mcap", "--loaded", "full.mcap", "--check", "mass"), "'mass' is no figure"),
+            (("empty.mcap", "--shape", "ball", "1", "1", "1"), "ball 1 1 1 is no shape"),
+        ],
+    )
+    def test_what_cannot_be_used_is_named(
+        self, folder: Path, arguments: tuple[str, ...], sentence: str
+    ) -> None:
+        with pytest.raises(InputError, match=sentence):
+            run(folder, *arguments)
+
+
+class TestCampaigns:
+    def test_campaigns_of_a_simulated_cell_give_its_load(self, tmp_path: Path) -> None:
+        """Through the controller's link: the arm carries 2 kg that its cell file does not know."""
+        load = (
+            '<link name="load"><inertial><mass value="2"/><origin xyz="0.3 0 0.05"/><inertia '
+            'ixx="0.004" iyy="0.006" izz="0.005" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            '<joint name="mount" type="fixed"><parent link="fore"/><child link="load"/></joint>'
+            "</robot>"
+        )
+        cell = fast_cell(tmp_path, repetitions=2)
+        heavier = Cell.from_texts(cell.text, cell.urdf.replace("</robot>", load), cell.path)
+        plan = design(cell, Silent())
+        for seed, (name, arm) in enumerate({"bare": cell, "loaded": heavier}.items(), 1):
+            controller = simulated_controller(arm, seed=seed)
+            Campaign.create(tmp_path / name, cell, plan).run(
+                Link.over(SimulatedTransport(controller), cell, finish=controller.finish),
+                Stop(),
+                Silent(),
+                provenance=simulated_provenance(cell, False),
+                durable=False,
+                unrehearsed=True,
+            )
+        found = find_payload([tmp_path / "bare"], [tmp_path / "loaded"], Silent(), options=FIXED)
+        assert found.figures[0] == pytest.approx(2.0, rel=0.05)
+        assert found.frame == "fore"
+        assert set(found.estimate.undetermined) >= {"cy", "Ixy", "Iyz"}
+        assert not found.outside({"cx": 0.3})
