@@ -286,13 +286,6 @@ class Guard:
         bound = LAG * factor * self.limits.acceleration
         require(where, np.abs(velocity - sent), bound, MotionPaused, cycle)
 
-    def move_history(self, way: Array) -> None:
-        """The controller stands this way (n,) rad from the set-point sent last, and goes on there.
-
-        What it held meanwhile is no motion of ours: rates are those of the steps before.
-        """
-        self._history[:4] += way
-
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """The next set-point; if it passes, it counts as sent.
 

@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.arm_wire import ArmWire
-from drivers.catch_up import CatchUp
 from drivers.checks import require
 from drivers.correction_guard import CorrectionGuard
 from drivers.errors import FirstSetPointUnknown, GuardError, MotionUnknown
 from drivers.execution import Execution, MotionExecution
 from drivers.guard import Guard
-from drivers.guard_limits import RANK
 from drivers.packets import Mode
 from drivers.reading import Reading
 from drivers.replies import D1, D2, D4, D5, ReplyFrame
@@ -75,11 +73,6 @@ class OpenMode(ABC):
         self._require_fresh((TARGET,), FirstSetPointUnknown, cycle, given)
         raw = self._wire.raw
         self._guard.check_hold(raw[TARGET], raw[ACTUAL], where, cycle)
-
-    @property
-    def behind(self) -> bool:
-        """Whether the motion still has to catch up with its path."""
-        return False
 
     @abstractmethod
     def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
@@ -165,7 +158,6 @@ class PositionMode(OpenMode):
         self._sent = self._still
         self._step = self._still
         self._kept = np.ones(len(self._still), dtype=np.bool_)
-        self._behind = CatchUp(guard.limits.velocity, guard.period)
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
         )
@@ -183,15 +175,9 @@ class PositionMode(OpenMode):
         self.held = position
         self._sent = target
         self._taken.begin(target)
-        self._behind.begin()
         self.lost = 0
         self._kept[...] = True
         self._rest(commanded)
-
-    @property
-    def behind(self) -> bool:
-        """Whether answers were lost and the way of them is not made up yet."""
-        return self._behind.active
 
     def require_start(self, cycle: int) -> None:
         """The arm has to stand at the set-point that was held, too."""
@@ -214,20 +200,12 @@ class PositionMode(OpenMode):
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
             return
-        if self.lost:
-            behind = self._wire.joint_difference(self._taken.lost)
-            self._behind.add(behind)
-            self._guard.move_history(-behind)
         self._go_on(execution, commanded, cycle)
 
     def _go_on(self, execution: Execution, commanded: Array, cycle: int) -> None:
         """Write the motion's next set-point."""
         assert isinstance(execution, MotionExecution)
         position, velocity, bounds = execution.advance(cycle)
-        if self._behind.active:
-            behind, rate = self._behind.advance()
-            position, velocity = position - behind, velocity - rate
-            bounds = max(bounds, "override", key=RANK.__getitem__)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
         self._step = step = motor - self._sent

@@ -26,10 +26,6 @@ LEAP_FRACTION: Final = 0.25
 class SentSetPoints:
     """The set-points sent last, in motor revolutions.
 
-    Attributes:
-        lost: (n,) how much further the last set-points were, of which `check` said that the
-            controller did not take them.
-
     Args:
         guard: whose following-error threshold and standstill apply.
         depth: how many of them the target received may be.
@@ -45,7 +41,6 @@ class SentSetPoints:
         self._ahead = np.arange(1.0, depth)[:, None]
         self._newest = 0
         self._lag = 0
-        self.lost = np.zeros(n)
         self._every = np.ones(n, dtype=np.bool_)
 
     def begin(self, target: Array) -> None:
@@ -97,8 +92,5 @@ class SentSetPoints:
         behind = where & (late[0] > standstill)
         behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
         lag = int(late.argmin(axis=0)[behind].max(initial=0))
-        more = max(0, lag - self._lag)
-        if more:
-            self.lost = rows[self._lag] - rows[lag]
-        self._lag = lag
+        more, self._lag = max(0, lag - self._lag), lag
         return more
