@@ -36,6 +36,7 @@ COMMANDS = LazyCommands(
         "identify",
         "reidentify",
         "compare",
+        "export",
         "gains",
         "plan",
         "plot",
