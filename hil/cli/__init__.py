@@ -33,6 +33,7 @@ COMMANDS = LazyCommands(
         "rehearse",
         "status",
         "report",
+        "replay",
         "identify",
         "reidentify",
         "compare",

@@ -48,6 +48,7 @@ class Identification:
         results: as they go into `results.json`.
         series: for the figures of the report.
         unseen: the recordings that were predicted; those that were fitted where none were.
+        tested_on: what these are, in words.
     """
 
     paths: tuple[Path, ...]
@@ -59,6 +60,7 @@ class Identification:
     results: Results
     series: ReportSeries
     unseen: tuple[Samples, ...]
+    tested_on: str
 
     @property
     def estimate(self) -> RepeatedEstimate:
@@ -220,4 +222,5 @@ def _judged(
         results=results.model_copy(update={"judgement": judgement}),
         series=report_series(prepared, result),
         unseen=prepared.held_out,
+        tested_on=prepared.sources.tested_on,
     )

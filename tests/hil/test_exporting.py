@@ -143,6 +143,14 @@ class TestCommand:
         assert "not read back: MuJoCo is not installed" in result.stdout
         assert (tmp_path / "identified.xml").read_text().startswith("<mujoco")
 
+    def test_a_replay_draws_and_says_how_far_models_stray(self, log: Path, tmp_path: Path) -> None:
+        picture = tmp_path / "deep" / "replay.svg"
+        result = CliRunner().invoke(app, ["replay", str(log), "-o", str(picture), "--json"])
+        assert result.exit_code in (0, 5), result.output
+        models = json.loads(result.stdout)["models"]
+        assert max(models["identified"]["rms"]) < min(models["nominal"]["rms"])
+        assert "</svg>" in picture.read_text()
+
     def test_a_folder_without_archives_is_refused(self, tmp_path: Path) -> None:
         result = CliRunner().invoke(app, ["export", str(tmp_path), "--to", "mjcf"])
         assert str(tmp_path) in str(result.exception)

@@ -37,6 +37,7 @@ FAILING = {
     "study": ("study", "--campaign", NOWHERE),
     "reidentify": ("reidentify", NOWHERE, "--workers", "1"),
     "gains": ("gains", NOWHERE, NOWHERE, "--mass", "1"),
+    "replay": ("replay", NOWHERE),
     "export": ("export", NOWHERE, "--to", "mjcf"),
     "plan": ("plan", NOWHERE, "--cell", NOWHERE),
     "record": ("record", NOWHERE),
