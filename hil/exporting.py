@@ -170,9 +170,7 @@ def export_model(
     write_together(output.parent, {output.name: text})
     spread = None
     if ensemble:
-        variants = sample_ensemble(
-            arm.model, consistent, found.estimate.pooled.covariance, ensemble, seed
-        )
+        variants = sample_ensemble(arm.model, found.estimate.pooled, ensemble, seed)
         _write_variants(output, to, arm, variants, (*remarks, f"seed of the ensemble: {seed}"))
         spread = spread_of(arm, variants, found.estimate.pooled.covariance, motion)
     units = tuple("N·m" if turns else "N" for turns in arm.model.chain.revolute)

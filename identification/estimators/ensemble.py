@@ -1,42 +1,43 @@
-r"""Variants of a physically consistent estimate, as far apart as its covariance says.
+r"""Variants of an arm as far apart as its parameters are uncertain, every one a possible machine.
 
-Least squares knows the parameters up to :math:`\delta \sim N(0, C)`. Each draw is carried to the
-standard parameters by the smallest change of the consistent ones that makes it,
-
-.. math:: \Delta\pi_s = H^{-1} G^T (G H^{-1} G^T)^{-1} \delta
-
-with the grouping G and the Hessian H of :math:`-\log\det` of the pseudo-inertias and of the rotors'
-inertia matrix, which measures a change by what a body has, the same in all frames and units. What
-the data say nothing about stays where it is. The draws are those of the normal distribution on the
-side of the boundary where machines are possible, by elliptical slice sampling (Murray, Adams and
-MacKay 2010); a coefficient of friction that may not be negative is reflected at zero.
+Least squares knows the parameters up to :math:`\delta \sim N(0, C)`. For each variant one
+:math:`\delta` is added to the estimate, and the physically consistent parameters nearest to the sum
+are looked for, in the measure :math:`C^{-1}` and with the prior of
+:mod:`identification.estimators.consistent` (randomise, then optimise). Where everything within the
+intervals is possible the variants have the covariance C; where intervals reach beyond what is
+possible, what lies beyond is moved to its edge and the variants are closer together. What the data
+say nothing about stays at the prior.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.consistent import ConsistentEstimate
-from identification.model.friction import dissipation
-from identification.model.pseudo_inertia import margin, pseudo_inertia, pseudo_inertia_map
+from identification.estimators.consistent_program import (
+    Consistency,
+    Program,
+    SquareRoot,
+    link_parameters,
+    solve_program,
+)
+from identification.factor.factor import Estimate
+from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
 MOST: Final = 10_000
 """Variants; more would fill memories before they say more."""
-# Steps of the sampler between two variants: where nothing is cut off, two leave no correlation.
-_STEPS: Final = 20
-# Of the consistent estimate's smallest eigenvalues: nearer to the edge, rounding decides.
-_CLEAR: Final = 1e-3
-# Of the largest rotor.
-_ROUNDING: Final = 1e-12
+# Smallest eigenvalue of the covariance in units of standard deviations, over the largest: in
+# directions that are known better the measure is as if they were not, lest it be singular.
+_BEST_KNOWN: Final = 1e-8
+# So many that the prior's weight stays: the covariance holds the errors of the model already.
+_ROWS: Final = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,115 +53,51 @@ class Ensemble:
     values: Array
 
 
-def sample_ensemble(
-    model: RobotModel, consistent: ConsistentEstimate, covariance: Array, count: int, seed: int
-) -> Ensemble:
-    """Draw variants around a consistent estimate.
+def sample_ensemble(model: RobotModel, estimate: Estimate, count: int, seed: int) -> Ensemble:
+    """Draw variants of an arm.
 
     Args:
         model: the robot.
-        consistent: the estimate.
-        covariance: of the parameters (p, p); one of infinite variance stays as it is.
+        estimate: of its parameters, with their covariance.
         count: number N of variants.
         seed: of the draws; the same one gives the same variants.
 
     Raises:
         IdentificationError: the count is not between 1 and `MOST`.
+        SolverError: the solver found no possible parameters near some draw.
     """
     if not 1 <= count <= MOST:
         raise IdentificationError(f"{count} variants were asked for; ask for 1 to {MOST}")
-    centre, values = consistent.standard, consistent.estimate.values
-    root = _root(covariance)
-    lift = _lift(model, centre) @ root[: model.base.rank]
-    possible = _possible(model, centre)
+    spread, measure = _roots(estimate.covariance)
+    options = Consistency()
+    program = Program.of(model, SquareRoot(measure, measure @ estimate.values), options)
+    near, _ = solve_program(program, options, _ROWS)
     random = np.random.default_rng(seed)
-    state = np.zeros(root.shape[1])
-    standard, variants = [], []
+    standard, values = [], []
     for _ in range(count):
-        for _ in range(_STEPS):
-            state = _next_state(state, random, lambda x: possible(centre + lift @ x))
-        standard.append(centre + lift @ state)
-        variants.append(values + root @ state)
-    found, rest = np.array(standard), np.array(variants)[:, model.base.rank :]
-    friction = len(model.friction.terms)
-    rest[:, :friction] = _dissipating(model, rest[:, :friction])
-    return Ensemble(found, np.hstack([found @ model.base.grouping.T, rest]))
+        aim = estimate.values + spread @ random.standard_normal(spread.shape[1])
+        one = replace(program, rows=program.rows._replace(z=measure @ aim))
+        bodies, others = one.physical(solve_program(one, options, _ROWS, near)[0])
+        if not np.all(margin(link_parameters(model, bodies)) > 0.0):
+            raise IdentificationError("a variant was left with an impossible body")
+        standard.append(bodies)
+        values.append(np.concatenate([model.base.grouping @ bodies, others]))
+    return Ensemble(np.array(standard), np.array(values))
 
 
-def _possible(model: RobotModel, centre: Array) -> Callable[[Array], bool]:
-    """Return what says whether standard parameters (s,) are those of a machine."""
-    layout = model.layout
-    least = _CLEAR * margin(centre[layout.links])
-    rounding = -_ROUNDING * float(np.abs(layout.rotor_matrix(centre)).max(initial=0.0))
+def _roots(covariance: Array) -> tuple[Array, Array]:
+    """Return L (p, d) with ``L L'`` the covariance, and R (d, p) with ``R' R`` its inverse.
 
-    def possible(standard: Array) -> bool:
-        bodies = np.all(margin(standard[layout.links]) > least)
-        return bool(bodies and np.linalg.eigvalsh(layout.rotor_matrix(standard))[0] >= rounding)
-
-    return possible
-
-
-def _next_state(
-    state: Array, random: np.random.Generator, inside: Callable[[Array], bool]
-) -> Array:
-    """Return the next state (d,) of a standard normal distribution that is cut off."""
-    other = random.standard_normal(len(state))
-    angle = random.uniform(0.0, 2.0 * np.pi)
-    low, high = angle - 2.0 * np.pi, angle
-    while not inside(moved := np.asarray(state * np.cos(angle) + other * np.sin(angle))):
-        low, high = (angle, high) if angle < 0.0 else (low, angle)
-        angle = random.uniform(low, high)
-    return moved
-
-
-def _root(covariance: Array) -> Array:
-    """Return L (p, d) with L L' the covariance; rows of infinite variance are zero."""
+    Both are zero for parameters of infinite variance.
+    """
     known = np.isfinite(np.diag(covariance))
     own = covariance[np.ix_(known, known)]
-    scale = _units(own)
+    scale = np.sqrt(np.diag(own))
+    scale = np.where(scale > 0.0, scale, 1.0)
     eigenvalues, vectors = np.linalg.eigh(own / np.outer(scale, scale))
-    root = np.zeros((len(covariance), len(own)))
-    root[known] = scale[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
-    return root
-
-
-def _lift(model: RobotModel, centre: Array) -> Array:
-    """Return the smallest change of standard parameters per change of base parameters (s, b)."""
-    layout = model.layout
-    metric = np.zeros((layout.size, layout.size))
-    for places in layout.links:
-        curvature = _curvature(pseudo_inertia(centre[places]), pseudo_inertia_map())
-        metric[np.ix_(places, places)] = np.linalg.inv(curvature)
-    rotors = layout.rotor_matrix(centre)
-    turning = np.diag(rotors) > _ROUNDING * np.abs(rotors).max(initial=0.0)
-    if turning.any():
-        places = np.concatenate([layout.rotors, layout.couplings])
-        entries = np.array([layout.rotor_matrix(one) for one in np.eye(layout.size)[places]])
-        free = ~entries[:, ~turning].any(axis=(1, 2))  # a rotor of zero is on its bound
-        own = np.ix_(turning, turning)
-        curvature = _curvature(rotors[own], entries[free][:, *own])
-        metric[np.ix_(places[free], places[free])] = np.linalg.inv(curvature)
-    grouping = model.base.grouping
-    spread = metric @ grouping.T
-    scale = _units(grouping @ spread)
-    gain = np.linalg.pinv(grouping @ spread / np.outer(scale, scale), hermitian=True)
-    return np.asarray(spread @ (gain / np.outer(scale, scale)))
-
-
-def _curvature(matrix: Array, entries: Array) -> Array:
-    """Return the Hessian of -log det (d, d) at a matrix (k, k), for its entries (d, k, k)."""
-    turned = np.linalg.solve(matrix, entries)
-    return np.asarray(np.einsum("kab,lba->kl", turned, turned))
-
-
-def _units(matrix: Array) -> Array:
-    """Return the roots of a diagonal (d,), one for zero."""
-    diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    return np.where(diagonal > 0.0, diagonal, 1.0)
-
-
-def _dissipating(model: RobotModel, coefficients: Array) -> Array:
-    """Return friction coefficients (N, k), those that would give energy reflected at zero."""
-    combine, not_negative = dissipation(model.friction)
-    free = np.linalg.solve(combine, coefficients.T)
-    return np.asarray((combine @ np.where(not_negative[:, None], np.abs(free), free)).T)
+    sizes = np.sqrt(np.maximum(eigenvalues, 0.0))
+    least = np.sqrt(_BEST_KNOWN) * sizes.max(initial=0.0)
+    spread, measure = np.zeros((2, len(covariance), len(own)))
+    spread[known] = scale[:, None] * vectors * sizes
+    measure[known] = vectors / np.maximum(sizes, least) / scale[:, None]
+    return spread, measure.T

@@ -54,21 +54,21 @@ class TestEnsemble:
     """Variants are possible machines that spread as the covariance says."""
 
     def test_torque_spreads_as_wide_as_its_interval(self, arm: IdentifiedArm) -> None:
-        """A standard deviation from 400 variants is known to 4 %: four times that is allowed."""
-        consistent = arm.consistency.consistent
-        variants = sample_ensemble(arm.cell.model, consistent, arm.estimate.covariance, 400, 1)
-        motion = a_motion(2, 7)
+        """A standard deviation from 200 variants is known to 5 %: three times that is allowed."""
+        variants = sample_ensemble(arm.cell.model, arm.estimate, 200, 1)
+        motion, consistent = a_motion(2, 7), arm.consistency.consistent
         spread = spread_of(arm_of(arm.cell, consistent), variants, arm.estimate.covariance, motion)
-        np.testing.assert_allclose(spread.variants, spread.covariance, rtol=0.16)
-        centre = arm.cell.model.torque(consistent.estimate.values, *motion[1:])
+        np.testing.assert_allclose(spread.variants, spread.covariance, rtol=0.15)
+        centre = arm.cell.model.torque(arm.estimate.values, *motion[1:])
         mean = np.mean([arm.cell.model.torque(v, *motion[1:]) for v in variants.values], axis=0)
         assert np.all(np.abs(mean - centre).mean(axis=0) < 0.2 * spread.covariance)
 
     @pytest.mark.parametrize("factor", [1.0, 1e6])
     def test_every_variant_is_a_possible_machine(self, arm: IdentifiedArm, factor: float) -> None:
         """Also where the intervals reach far beyond what is possible."""
-        model, consistent = arm.cell.model, arm.consistency.consistent
-        variants = sample_ensemble(model, consistent, factor * arm.estimate.covariance, 50, 1)
+        model = arm.cell.model
+        wide = replace(arm.estimate, covariance=factor * arm.estimate.covariance)
+        variants = sample_ensemble(model, wide, 20, 1)
         assert np.all(margin(variants.standard[:, model.layout.links]) > 0.0)
         assert np.all(variants.standard[:, model.layout.rotors] >= 0.0)
         base = variants.standard @ model.base.grouping.T
@@ -79,37 +79,22 @@ class TestEnsemble:
                 assert row["f1"] >= 0.0
 
     def test_one_seed_is_one_ensemble(self, arm: IdentifiedArm) -> None:
-        model, consistent = arm.cell.model, arm.consistency.consistent
         one, same, other = (
-            sample_ensemble(model, consistent, arm.estimate.covariance, 5, seed).standard
-            for seed in (1, 1, 2)
+            sample_ensemble(arm.cell.model, arm.estimate, 5, seed).standard for seed in (1, 1, 2)
         )
         np.testing.assert_array_equal(one, same)
         assert not np.array_equal(one, other)
 
-    def test_a_rotor_of_zero_stays_zero(self, arm: IdentifiedArm) -> None:
-        model, found = arm.cell.model, arm.consistency.consistent
-        standard = found.standard.copy()
-        standard[model.layout.rotors[1]] = 0.0
-        variants = sample_ensemble(
-            model, replace(found, standard=standard), arm.estimate.covariance, 5, 1
-        )
-        assert not variants.standard[:, model.layout.rotors[1]].any()
-        assert variants.standard[:, model.layout.rotors[0]].std() > 0.0
-
     def test_what_is_not_determined_stays(self) -> None:
         still = identified_arm(TWO_LINK, still=(0,))
-        variants = sample_ensemble(
-            still.cell.model, still.consistency.consistent, still.estimate.covariance, 5, 1
-        )
+        variants = sample_ensemble(still.cell.model, still.estimate, 5, 1)
         place = still.cell.model.parameter_names.index("f1_1")
-        assert np.unique(variants.values[:, place]).size == 1
+        np.testing.assert_allclose(variants.values[:, place], variants.values[0, place])
 
     @pytest.mark.parametrize("count", [0, 10_001])
     def test_a_count_out_of_bounds_is_refused(self, arm: IdentifiedArm, count: int) -> None:
-        consistent = arm.consistency.consistent
         with pytest.raises(IdentificationError, match="ask for 1 to 10000"):
-            sample_ensemble(arm.cell.model, consistent, arm.estimate.covariance, count, 1)
+            sample_ensemble(arm.cell.model, arm.estimate, count, 1)
 
 
 class TestCommand:
