@@ -24,6 +24,7 @@ TYPED_ELSEWHERE = {
     "bring-your-own-robot.md": "tests/hil/test_bring_your_own_robot.py",
     "campaign.md": "tests/hil/test_campaign_day.py",
     "first-hour.md": "tests/hil/test_first_hour.py",
+    "other-robots.md": "tests/docs/test_other_robots.py",
     "simulators.md": "tests/docs/test_simulators_page.py",
 }
 """Pages whose commands another test types, one after the other."""
