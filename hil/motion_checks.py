@@ -162,7 +162,21 @@ def collision_checker(cell: Cell) -> CollisionChecker:
 
 
 def current_model(cell: Cell) -> CurrentModel:
-    """Motor currents and joint torques of a cell's arm by its nominal model, and their limits."""
+    """Motor currents and joint torques of a cell's arm by its nominal model, and their limits.
+
+    Without a drive train only torques have limits: those of `[limits] torque`.
+    """
+    n = cell.model.n_joints
+    if cell.file.drive_train is None:
+        return CurrentModel(
+            model=cell.model,
+            values=cell.nominal_values(),
+            motor_from_joint=np.eye(n),
+            torque_constant=np.ones(n),
+            current_limit=np.full(n, np.inf),
+            uncertainty=cell.nominal.uncertainty,
+            torque_limit=cell.torque_limit,
+        )
     drives = cell.drive_train
     return CurrentModel(
         model=cell.model,

@@ -37,6 +37,8 @@ LONG: Final = (
     "benchmarks",
     "docs/test_commands.py",
     "docs/test_examples.py",
+    "docs/test_other_robots.py",
+    "docs/test_simulators_page.py",
     "fuzz",
     "hil/archive/test_memory.py",
     "hil/test_any_robot.py",

@@ -14,7 +14,9 @@ from typing import Annotated, Literal
 import typer
 
 from hil.campaign.from_design import campaign_of_design, require_replaceable
+from hil.campaign.quick_design import quick_settings
 from hil.campaign.stop import Stop, stop_on_interrupt
+from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.design import DesignSettings, Method, load_settings, preset
 from hil.design.advice import NoExcitationError
@@ -66,6 +68,23 @@ def design(
         Method | None,
         typer.Option(
             help="Print the settings of a method, explained, and do nothing else.",
+            show_default=False,
+        ),
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="A short search, for a first look: method b, as many motions as `candidates` of "
+            "[campaign] says.",
+        ),
+    ] = False,
+    repetitions: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=1000,
+            help="How often the motion is run; that of [campaign] if left out.",
             show_default=False,
         ),
     ] = None,
@@ -137,9 +156,11 @@ def design(
     Leaves `excitation.toml` (motion, criteria, settings), `excitation.png` (what the robot is
     going to do), and a journal to resume from in OUTPUT, and makes OUTPUT a campaign, with copies
     of the cell file and the URDF and with validation motions: `hil rehearse OUTPUT` comes next, and
-    `hil status OUTPUT` says so. Ctrl-C (or SIGTERM) ends the search with
-    the best motion so far once the generation under way is scored: seconds, a few minutes if a
-    motion hangs. A second one leaves at once. `hil demo --excitation OUTPUT` runs the motion.
+    `hil status OUTPUT` says so. For a cell without [controller] it leaves trajectory files instead:
+    CSV, ROS 2 JointTrajectory, and for six axes URScript and a player. Ctrl-C (or SIGTERM) ends
+    the search with the best motion so far once the generation under way is scored: seconds, a few
+    minutes if a motion hangs. A second one leaves at once. `hil demo --excitation OUTPUT` runs the
+    motion.
 
     **Examples:**
 
@@ -161,18 +182,27 @@ def design(
             field="--method",
             remedy="give either --method or --settings",
         )
+    if quick and (method is not None or settings is not None):
+        raise InputError(
+            None,
+            "names a method of its own",
+            field="--quick",
+            remedy="leave out --method and --settings, or --quick",
+        )
     if resume and force:
         raise InputError(None, "--resume and --force exclude each other", remedy="give one of them")
     if view:
         _require_view()
     reporter = make_reporter(quiet=quiet or json)
-    loaded, folder = Cell.load(cell), DesignFolder(output)
+    loaded, folder = Cell.load(cell).with_campaign(repetitions=repetitions), DesignFolder(output)
     require_replaceable(output)
+    own = quick_settings(loaded) if quick else None
     asked = _settings(
         folder,
         method,
         settings,
         seed,
+        own,
         kinematic=kinematic,
         resume=resume,
         payload=purpose == "payload",
@@ -184,9 +214,9 @@ def design(
         """Say what was found, then draw it, while no other search may enter the folder."""
         words.say(reporter, done)
         words.warn_of_unchecked(done, loaded)
-        made = _campaign(folder, loaded, done)
-        words.say_campaign(reporter, folder, made)
-        summary = words.summary(done, folder) | words.campaign_summary(folder, made)
+        made, files = _campaign(folder, loaded, done)
+        words.say_campaign(reporter, folder, made, files)
+        summary = words.summary(done, folder) | words.campaign_summary(folder, made, files)
         told = words.line(done, folder)
         typer.echo(json_format.dumps(summary, allow_nan=False) if json else printable(told))
         words.draw(folder, done, loaded, beside, together=known is not None)
@@ -221,18 +251,25 @@ def design(
         _show(done, loaded)
 
 
-def _campaign(folder: DesignFolder, cell: Cell, done: Designed) -> str | None:
-    """Make the design a campaign; in words why there is none, None if there is."""
+def _campaign(
+    folder: DesignFolder, cell: Cell, done: Designed
+) -> tuple[str | None, tuple[str, ...]]:
+    """Make the design a campaign, or trajectory files where the cell names no controller.
+
+    In words why there is neither, None if there is; and the trajectory files.
+    """
     unchecked = done.result.settings.unchecked
     if not done.design.complete:
-        return "the search was stopped"
+        return "the search was stopped", ()
     if unchecked:
-        return f"{', '.join(unchecked)} were not looked at"
+        return f"{', '.join(unchecked)} were not looked at", ()
     try:
+        if cell.file.controller is None and cell.file.campaign is not None:
+            return None, write_trajectories(folder.root, cell, done.result.excitation)
         campaign_of_design(folder.root, cell, done.result.excitation)
     except (HilError, OSError) as error:  # the design is as good without one
-        return str(error)
-    return None
+        return str(error), ()
+    return None, ()
 
 
 @contextmanager
@@ -260,14 +297,17 @@ def _settings(
     method: Method | None,
     file: Path | None,
     seed: int | None,
+    own: DesignSettings | None,
     *,
     kinematic: bool,
     resume: bool,
     payload: bool,
 ) -> DesignSettings:
-    """Return what is asked for; of a search to be resumed, what it began with."""
+    """Return what is asked for, or `own`; of a search to be resumed, what it began with."""
     there = folder.interrupted() if resume else None
-    if file is not None:
+    if own is not None:
+        asked = own
+    elif file is not None:
         asked = load_settings(file)
     elif method is not None or there is None:
         asked = preset(method or "front")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Sequence
 from typing import Any
 
 from hil import lines
@@ -81,19 +82,25 @@ def summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
     }
 
 
-def say_campaign(reporter: Reporter, folder: DesignFolder, lacking: str | None) -> None:
+def say_campaign(
+    reporter: Reporter, folder: DesignFolder, lacking: str | None, files: Sequence[str]
+) -> None:
     """Say what comes next, or why the motion became no campaign."""
-    if lacking is None:
+    if files:
+        reporter.say(f"trajectory files in {folder.root}: {', '.join(files)}")
+    elif lacking is None:
         root = shlex.quote(str(folder.root))
         reporter.say(f"{folder.root} is a campaign now; next: hil rehearse {root}")
     else:
         reporter.say(f"note: no campaign was made of it: {lacking}")
 
 
-def campaign_summary(folder: DesignFolder, lacking: str | None) -> dict[str, Any]:
+def campaign_summary(
+    folder: DesignFolder, lacking: str | None, files: Sequence[str]
+) -> dict[str, Any]:
     """Return the same as data."""
-    campaign = str(folder.root) if lacking is None else None
-    return {"campaign": campaign, "no_campaign": lacking}
+    campaign = str(folder.root) if lacking is None and not files else None
+    return {"campaign": campaign, "no_campaign": lacking, "trajectories": [*files]}
 
 
 def draw(

@@ -19,12 +19,10 @@ from hil.cli.identify_options import (
     options_from,
 )
 from hil.cli.verdict import finish
-from hil.errors import InputError
 from hil.files import make_folder
-from hil.identify import identify_archives, identify_campaign
+from hil.identify import identify_sources
 from hil.outcome import write_outcome
 from hil.progress import reporter as make_reporter
-from hil.reading import lies_there
 
 
 def identify(
@@ -111,31 +109,11 @@ def identify(
         standstill=standstill,
         in_sample=in_sample,
     )
-    unseen = predict or ()
     if len(archives) == 1 and archives[0].is_dir():
         output = output or (archives[0] / "paper" if paper else archives[0])
+    if output is not None:
         make_folder(output)
-        loose = sorted(archives[0].glob("*.mcap"))
-        if not loose and not lies_there(archives[0] / "manifest.json"):
-            raise InputError(
-                archives[0],
-                "holds neither a campaign nor archives",
-                remedy="name the folder of a campaign (`hil design -o`), or archives (*.mcap)",
-            )
-        if loose and not lies_there(archives[0] / "manifest.json"):
-            # A folder of `hil record`.
-            found = identify_archives(loose, reporter, options, predict=unseen)
-        else:
-            found = identify_campaign(archives[0], reporter, options, predict=unseen)
-    else:
-        folder = next((path for path in archives if path.is_dir()), None)
-        if folder is not None:
-            raise InputError(
-                folder, "is a folder among archives", remedy="name one campaign folder, or files"
-            )
-        if output is not None:
-            make_folder(output)
-        found = identify_archives(archives, reporter, options, predict=unseen)
+    found = identify_sources(archives, reporter, options, predict=predict or ())
     results = found.results
     if output is not None:
         results = write_outcome(output, found, reporter)

@@ -21,6 +21,7 @@ from hil.new import (
     from_archive,
     from_init,
     read_init,
+    with_clear_home,
 )
 from hil.whole_number import port_number
 
@@ -85,6 +86,14 @@ def new(
             show_default=False,
         ),
     ] = None,
+    design_only: Annotated[
+        bool,
+        typer.Option(
+            "--design-only",
+            help="For an arm whose motions another controller runs: no drive train and no link in "
+            "the file, what a design needs beside the URDF assumed and named.",
+        ),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier file.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
 ) -> None:
@@ -98,11 +107,19 @@ def new(
     Denavit-Hartenberg parameters are known begins with --dh in place of --urdf.
 
     **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`,
-    `hil new --dh table.csv --convention modified -o cell.toml`
+    `hil new --dh table.csv --convention modified -o cell.toml`,
+    `hil new --design-only --urdf robot.urdf -o cell.toml`
     """
     if from_controller is not None and from_archive_file is not None:
         raise InputError(
             None, "controller and archive at once", remedy="give one of the two --from options"
+        )
+    if design_only and (from_controller is not None or from_archive_file is not None):
+        raise InputError(
+            None,
+            "excludes --from-controller and --from-archive",
+            field="--design-only",
+            remedy="leave out one of them",
         )
     _require_free(output, force=force)
     made = _described(urdf, dh, convention, _positions(fix or []))
@@ -115,7 +132,10 @@ def new(
         told = from_archive(from_archive_file, made.joint_names)
         # Limits belong together, with their frame.
         known = (known.without("limits") if "limits.frame" in told.values else known) | told
-    text, unknown = made.with_known(known).text(output)
+    made = made.with_known(known)
+    text, unknown = (made.for_design() if design_only else made).text(output)
+    if design_only and not unknown:
+        text = with_clear_home(text, made, output)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         if made.urdf is not None:
@@ -137,7 +157,10 @@ def new(
     say(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})")
     if unknown:
         say(f'still unknown, marked "?": {", ".join(unknown)}')
-        say(f"fill them in, then `hil doctor {output}`; whatever is missing is named again")
+        after = "design" if design_only else "doctor"
+        say(f"fill them in, then `hil {after} {output}`; whatever is missing is named again")
+    elif design_only:
+        say(f"read what is assumed in it; then `hil design {output}`")
 
 
 def _described(

@@ -7,9 +7,15 @@ from typing import TYPE_CHECKING, Any
 from .options import Options
 
 if TYPE_CHECKING:
-    from .run import Identification, identify_archives, identify_campaign
+    from .run import Identification, identify_archives, identify_campaign, identify_sources
 
-__all__ = ["Identification", "Options", "identify_archives", "identify_campaign"]
+__all__ = [
+    "Identification",
+    "Options",
+    "identify_archives",
+    "identify_campaign",
+    "identify_sources",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -17,7 +17,7 @@ from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import friction_in_words, friction_source
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
 from identification.export.urdf import write_urdf
-from identification.export.xml_source import Edit, XmlSource, comment_text
+from identification.export.xml_source import with_comment
 
 Array = NDArray[np.float64]
 
@@ -151,16 +151,7 @@ def _urdf(
             f"Not determined by the data, but nominal: {', '.join(estimate.undetermined)}."
         )
     lines += [f"{key}: {value}" for key, value in origin.items()]
-    return write_urdf(_with_comment(cell.urdf, lines), model, consistent.standard, friction)
-
-
-def _with_comment(urdf: str, lines: Sequence[str]) -> str:
-    """A URDF text with a comment in front of its first element."""
-    source = XmlSource(urdf)
-    text = comment_text(source.newline.join(f"  {line}" for line in lines))
-    comment = f"<!--{source.newline}{text}{source.newline}-->{source.newline}"
-    at = source.root.start
-    return source.edited([Edit(at, at, comment)])
+    return write_urdf(with_comment(cell.urdf, lines), model, consistent.standard, friction)
 
 
 def _line(text: str) -> str:

@@ -11,11 +11,13 @@ from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.progress import Reporter
+from hil.reading import lies_there
 from hil.report import ReportSeries
 from hil.results import Results
 from identification.estimators.repetitions import RepeatedEstimate
 from identification.factor.phases import PhaseFactor
 from identification.selection.essential_choice import EssentialChoice
+from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import gather
 from identification.validation.verdict import Verdict, judge
@@ -45,6 +47,8 @@ class Identification:
         verdict: on the estimate.
         results: as they go into `results.json`.
         series: for the figures of the report.
+        unseen: the recordings that were predicted; those that were fitted where none were.
+        tested_on: what these are, in words.
     """
 
     paths: tuple[Path, ...]
@@ -55,11 +59,44 @@ class Identification:
     verdict: Verdict
     results: Results
     series: ReportSeries
+    unseen: tuple[Samples, ...]
+    tested_on: str
 
     @property
     def estimate(self) -> RepeatedEstimate:
         """Pooled and per repetition."""
         return self.estimation.result
+
+
+def identify_sources(
+    paths: Sequence[Path],
+    reporter: Reporter,
+    options: Options = Options(),
+    *,
+    predict: Sequence[Path] = (),
+) -> Identification:
+    """Identify from one folder, of a campaign or of archives, or from archives.
+
+    Raises:
+        InputError: a folder holds neither, or stands among archives.
+    """
+    folder = next((path for path in paths if path.is_dir()), None)
+    if folder is None:
+        return identify_archives(paths, reporter, options, predict=predict)
+    if len(paths) > 1:
+        raise InputError(
+            folder, "is a folder among archives", remedy="name one campaign folder, or files"
+        )
+    if lies_there(folder / "manifest.json"):
+        return identify_campaign(folder, reporter, options, predict=predict)
+    loose = sorted(folder.glob("*.mcap"))  # of `hil record`
+    if not loose:
+        raise InputError(
+            folder,
+            "holds neither a campaign nor archives",
+            remedy="name the folder of a campaign (`hil design -o`), or archives (*.mcap)",
+        )
+    return identify_archives(loose, reporter, options, predict=predict)
 
 
 def identify_campaign(
@@ -184,4 +221,6 @@ def _judged(
         verdict=verdict,
         results=results.model_copy(update={"judgement": judgement}),
         series=report_series(prepared, result),
+        unseen=prepared.held_out,
+        tested_on=prepared.sources.tested_on,
     )

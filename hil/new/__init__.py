@@ -2,6 +2,7 @@
 
 from .cell_text import NewCell, cell_of_dh, cell_of_urdf
 from .controller import read_init
+from .home import with_clear_home
 from .known import Known, from_archive, from_init
 
 __all__ = [
@@ -12,4 +13,5 @@ __all__ = [
     "from_archive",
     "from_init",
     "read_init",
+    "with_clear_home",
 ]

@@ -28,7 +28,7 @@ from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.urdf_tree import urdf_tree
 from planner.toml_value import toml_key, toml_value
 
-from .known import Known, from_urdf
+from .known import ASSUMED, Known, assumed_for_design, from_urdf
 
 
 @contextmanager
@@ -150,6 +150,7 @@ class NewCell:
         urdf_path: of the URDF (or the table of DH parameters) that was read.
         collision: the collision shapes' mesh paths; None where the URDF has no shapes at all.
         known: what is known of it.
+        design_only: whether motions are designed and not run: no drive train, no controller.
     """
 
     name: str
@@ -158,6 +159,7 @@ class NewCell:
     urdf_path: Path
     collision: tuple[str, ...] | None
     known: Known
+    design_only: bool = False
 
     def text(self, path: Path) -> tuple[str, tuple[str, ...]]:
         """The cell file as it would stand at `path`, and the fields that are unknown in it."""
@@ -166,6 +168,11 @@ class NewCell:
     def with_known(self, known: Known) -> NewCell:
         """The same arm, with other things known of it."""
         return replace(self, known=known)
+
+    def for_design(self) -> NewCell:
+        """The same arm, its motions to be designed only; what can be assumed is."""
+        known = self.known | assumed_for_design(self.known, len(self.joint_names))
+        return replace(self, known=known, design_only=True)
 
     def urdf_beside(self, path: Path) -> Path:
         """Where the URDF is written, if it has to be: beside the cell file, never over its own."""
@@ -314,7 +321,8 @@ class _Writing:
             joints=", ".join(f"{k} {name}" for k, name in enumerate(new.joint_names, 1)),
             urdf=os.path.relpath(urdf, self._folder),
             mesh_folders=self._mesh_folders(),
-            assumed=[name for name in _ASSUMED if name not in self._values],
+            assumed=self._assumed(),
+            design_only=new.design_only,
             suggested=self._suggested(),
             wrist=UNKNOWN if len(new.joint_names) >= WRIST_AXES else 0.0,
             others=sorted(tables - own - {"controller"}),
@@ -322,6 +330,14 @@ class _Writing:
             rest=self._rest,
         )
         return text.rstrip("\n") + "\n", tuple(self._unknown)
+
+    def _assumed(self) -> list[str]:
+        """Fields that are written though nobody said what stands there."""
+        names = [name for name in _ASSUMED if name not in self._values]
+        if self._new.design_only:
+            names = [name for name in names if not name.startswith("controller.")]
+        found = [name for name, origin in self._origin.items() if origin == ASSUMED]
+        return [*names, *(name for name in found if not name.startswith("campaign."))]
 
     def _sources(self) -> str:
         origins = list(dict.fromkeys(self._origin.values()))

@@ -23,6 +23,8 @@ from hil.reading import toml_of
 _DECIMALS: Final = 3
 """Of degrees: rounding stays below what a cell may exceed its URDF's limits by."""
 _CYCLES: Final = (1, 2)
+ASSUMED: Final = "assumed"
+"""Origin of figures that nobody said."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,47 @@ def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
     if all(0.0 < effort < math.inf for effort in efforts):
         values["limits.torque"] = efforts
     return Known.said_by("from the URDF", values)
+
+
+def assumed_for_design(known: Known, n_joints: int) -> Known:
+    """What a cell needs in which motions are designed and not run, as far as it can be assumed.
+
+    Home is zero, or the middle of a range without it; joints that turn on and on have half a turn
+    either way; full speed is reached in 0.3 s and full acceleration in 0.1 s; nothing is known of
+    friction; and there is a floor at the base, and nothing else around.
+    """
+    lower, upper, speed = (
+        known.values.get(f"limits.{name}_deg", [UNKNOWN] * n_joints)
+        for name in ("lower", "upper", "velocity")
+    )
+    low = [-180.0 if one == UNKNOWN else one for one in lower]
+    high = [180.0 if one == UNKNOWN else one for one in upper]
+
+    def within(seconds: float) -> list[float | str]:
+        return [UNKNOWN if one == UNKNOWN else round(one / seconds, _DECIMALS) for one in speed]
+
+    zeros = [0.0] * n_joints
+    values: dict[str, Any] = {
+        "limits.acceleration_deg": within(0.3),
+        "limits.jerk_deg": within(0.03),
+        "campaign.home_deg": [
+            0.0 if a < 0.0 < b else round(0.5 * (a + b), _DECIMALS)
+            for a, b in zip(low, high, strict=True)
+        ],
+        "campaign.repetitions": 5,
+        "campaign.validation_runs": 2,
+        "workspace.floor": 0.0,
+        "workspace.walls": [],
+        "workspace.margin": 0.02,
+        "nominal.rotor_inertia": zeros,
+        "nominal.coulomb": zeros,
+        "nominal.viscous": zeros,
+    }
+    if low != lower:
+        values["limits.lower_deg"] = low
+    if high != upper:
+        values["limits.upper_deg"] = high
+    return Known.said_by(ASSUMED, values)
 
 
 def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:

@@ -7,7 +7,7 @@ line ends. Here only the bytes of what changes are replaced.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 from xml.parsers import expat
@@ -151,3 +151,16 @@ class XmlSource:
         tag = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>").match(self._bytes, start)
         assert tag is not None, "the parser has seen a whole tag here"
         return tag.end()
+
+
+def with_comment(text: str, lines: Sequence[str]) -> str:
+    """Return an XML text with a comment of these lines in front of its first element.
+
+    Raises:
+        ModelError: the text is not well-formed XML.
+    """
+    source = XmlSource(text)
+    inside = comment_text(source.newline.join(f"  {line}" for line in lines))
+    comment = f"<!--{source.newline}{inside}{source.newline}-->{source.newline}"
+    at = source.root.start
+    return source.edited([Edit(at, at, comment)])

@@ -25,6 +25,8 @@ TYPED_ELSEWHERE = {
     "campaign.md": "tests/hil/test_campaign_day.py",
     "first-hour.md": "tests/hil/test_first_hour.py",
     "payload.md": "tests/hil/test_payload_command.py",
+    "other-robots.md": "tests/docs/test_other_robots.py",
+    "simulators.md": "tests/docs/test_simulators_page.py",
 }
 """Pages whose commands another test types, one after the other."""
 

@@ -1,0 +1,251 @@
+"""The identified arm as files for simulators, and ensembles of variants of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.cell.urdf import urdf_limits
+from hil.errors import InputError
+from hil.files import make_folder, write_together
+from hil.identify import Identification
+from hil.identify.exports import provenance_of
+from hil.identify.surroundings import torque_limits
+from identification.estimators.consistent import ConsistentEstimate
+from identification.estimators.ensemble import Ensemble, sample_ensemble
+from identification.export.simulators import (
+    FORMATS,
+    STATES,
+    Arm,
+    Comparison,
+    MissingMujocoError,
+    Ranges,
+    compare,
+)
+from identification.model.motion import Motion
+
+Array = NDArray[np.float64]
+FormatName = Literal["mjcf", "sdf", "urdf"]
+
+ENSEMBLE: Final = "ensemble.npz"
+_MOST_ROWS: Final = 2000
+"""Of the recorded motion: more change no root mean square by a digit that is printed."""
+_SPREAD_ROWS: Final = 200
+
+
+class Spread(NamedTuple):
+    """How far variants differ in torque, per joint (n,) [N·m or N], over the recorded motion.
+
+    Attributes:
+        variants: standard deviation of their torque.
+        covariance: that which the covariance of the parameters predicts.
+    """
+
+    variants: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """What was written.
+
+    Attributes:
+        path: of the file.
+        joint_names: (n,).
+        units: of torque, per joint.
+        comparison: with the model; in words why there is none.
+        spread: of the ensemble; None without one.
+        verdict: on the model, in a sentence.
+    """
+
+    path: Path
+    joint_names: tuple[str, ...]
+    units: tuple[str, ...]
+    comparison: Comparison | str
+    spread: Spread | None
+    verdict: str
+
+    def lines(self) -> list[str]:
+        """What a person reads."""
+        lines = [f"written: {self.path}"]
+        if isinstance(self.comparison, str):
+            lines.append(f"warning: not read back: {self.comparison}")
+        else:
+            lines.append(
+                f"read back: at {STATES} random states what the format holds differs by"
+                f" {self.comparison.difference:.1e} of a joint's largest torque"
+            )
+            for words, torque in self.comparison.left_out.items():
+                lines.append(f"left out: {words}: {self._row(torque)} rms")
+            lines.append(
+                f"whole torque of the recorded motion: {self._row(self.comparison.torque)}"
+            )
+        if self.spread is not None:
+            lines.append(f"torque of the variants: ± {self._row(self.spread.variants)} (std);")
+            lines.append(f"as the covariance predicts: ± {self._row(self.spread.covariance)}")
+        return [*lines, self.verdict]
+
+    def to_dict(self) -> dict[str, object]:
+        """The same as plain values."""
+        compared, spread = self.comparison, self.spread
+        return {
+            "path": str(self.path),
+            "joints": [*self.joint_names],
+            "read_back": None if isinstance(compared, str) else compared.difference,
+            "not_read_back": compared if isinstance(compared, str) else None,
+            "left_out": {}
+            if isinstance(compared, str)
+            else {words: torque.tolist() for words, torque in compared.left_out.items()},
+            "torque": None if isinstance(compared, str) else compared.torque.tolist(),
+            "spread": None
+            if spread is None
+            else {name: one.tolist() for name, one in spread._asdict().items()},
+            "verdict": self.verdict,
+        }
+
+    def _row(self, torque: Array) -> str:
+        figures = ", ".join(f"{one:.3g}" for one in torque)
+        return f"{figures} {' or '.join(sorted(set(self.units)))}"
+
+
+def arm_of(cell: Cell, consistent: ConsistentEstimate) -> Arm:
+    """The identified arm within the limits of its cell, or those of its URDF."""
+    model, stated = cell.model, urdf_limits(cell.urdf, cell.joint_names)
+    limits, efforts = cell.file.limits, cell.torque_limit
+    if efforts is None:
+        found = torque_limits(cell)
+        efforts = stated.effort if found is None else np.nan_to_num(found, nan=np.inf)
+    own = stated if limits is None else cell.joint_limits
+    ranges = Ranges(own.lower, own.upper, own.velocity, efforts)
+    return Arm(cell.urdf, model, consistent.standard, consistent.estimate.values, ranges)
+
+
+def export_model(
+    found: Identification,
+    output: Path,
+    to: FormatName,
+    *,
+    ensemble: int = 0,
+    seed: int = 0,
+) -> Exported:
+    """Write an identified arm, read it back and compare; with an ensemble, its variants too.
+
+    The variants are `ensemble.npz` and a file each in a folder that has the name of `output`,
+    without its suffix, with ``_ensemble`` behind it.
+
+    Args:
+        found: the identification.
+        output: the file.
+        to: the format.
+        ensemble: number of variants; 0 for none.
+        seed: of the variants.
+
+    Raises:
+        InputError: there are no physically consistent parameters to write.
+        IdentificationError: the arm cannot be written, or reads back as another.
+    """
+    consistency = found.consistency
+    if isinstance(consistency, str):
+        raise InputError(
+            found.paths[0],
+            f"there are no physically consistent parameters: {consistency}",
+            remedy="see the verdict of `hil identify`",
+        )
+    consistent, form = consistency.consistent, FORMATS[to]
+    arm, motion = arm_of(found.cell, consistent), _motion(found)
+    remarks = _remarks(found)
+    make_folder(output.parent)
+    text = form.write(arm, found.cell.name, remarks)
+    try:
+        comparison: Comparison | str = compare(text, form, arm, motion)
+    except MissingMujocoError as error:
+        comparison = str(error)
+    write_together(output.parent, {output.name: text})
+    spread = None
+    if ensemble:
+        variants = sample_ensemble(arm.model, found.estimate.pooled, ensemble, seed)
+        _write_variants(output, to, arm, variants, (*remarks, f"seed of the ensemble: {seed}"))
+        spread = spread_of(arm, variants, found.estimate.pooled.covariance, motion)
+    units = tuple("N·m" if turns else "N" for turns in arm.model.chain.revolute)
+    return Exported(output, arm.model.joint_names, units, comparison, spread, found.verdict.line)
+
+
+def default_output(sources: Sequence[Path], to: FormatName) -> Path:
+    """Where a file goes that nobody named: into the campaign folder, or this one."""
+    folder = sources[0] if sources[0].is_dir() else Path()
+    return folder / f"identified{FORMATS[to].suffix}"
+
+
+def spread_of(arm: Arm, variants: Ensemble, covariance: Array, motion: Motion) -> Spread:
+    """Compare the torque of variants with what the covariance (p, p) of the parameters predicts."""
+    part = motion.rows(_some(motion.n_samples, _SPREAD_ROWS))
+    torque = np.array([arm.model.torque(values, *part[1:]) for values in variants.values])
+    known = np.isfinite(np.diag(covariance))
+    rows = arm.model.regressor(*part[1:]).dense(arm.model.n_parameters)
+    rows = np.reshape(rows, (part.n_samples, arm.model.n_joints, -1))[:, :, known]
+    predicted = np.einsum("mjp,pq,mjq->mj", rows, covariance[np.ix_(known, known)], rows)
+    return Spread(
+        np.sqrt(np.mean(np.var(torque, axis=0), axis=0)), np.sqrt(np.mean(predicted, axis=0))
+    )
+
+
+def _write_variants(
+    output: Path, to: FormatName, arm: Arm, variants: Ensemble, remarks: tuple[str, ...]
+) -> None:
+    """Write a file of every variant, and all of them in one."""
+    folder, form = output.with_name(f"{output.stem}_ensemble"), FORMATS[to]
+    make_folder(folder)
+    width = len(str(len(variants.values) - 1))
+    files: dict[str, str | bytes | None] = {}
+    for k, (standard, values) in enumerate(zip(variants.standard, variants.values, strict=True)):
+        variant = Arm(arm.urdf, arm.model, standard, values, arm.ranges)
+        name = f"{k:0{width}d}"
+        files[name + form.suffix] = form.write(variant, f"{output.stem}_{name}", remarks)
+    content = BytesIO()
+    np.savez_compressed(
+        content,
+        standard=variants.standard,
+        values=variants.values,
+        standard_names=np.array(arm.model.standard_names),
+        names=np.array(arm.model.parameter_names),
+    )
+    write_together(folder, {**files, ENSEMBLE: content.getvalue()})
+
+
+def _motion(found: Identification) -> Motion:
+    """Some rows of the motion that was predicted, from all its recordings."""
+    parts = [samples.motion for samples in found.unseen]
+    share = _MOST_ROWS // len(parts)
+    some = [motion.rows(_some(motion.n_samples, share)) for motion in parts]
+    direction = None
+    if all(one.direction is not None for one in some):
+        direction = np.concatenate([one.direction for one in some if one.direction is not None])
+    return Motion(
+        np.concatenate([one.time for one in some]),
+        np.concatenate([one.position for one in some]),
+        np.concatenate([one.velocity for one in some]),
+        np.concatenate([one.acceleration for one in some]),
+        direction,
+    )
+
+
+def _some(count: int, most: int) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, count - 1, min(count, max(most, 1))).astype(np.intp))
+
+
+def _remarks(found: Identification) -> tuple[str, ...]:
+    """Where the model comes from, a line each."""
+    origin = provenance_of(found.results, found.paths)
+    lines = ["Identified by hil; bodies are physically consistent parameters."]
+    if found.estimate.pooled.undetermined:
+        unknown = ", ".join(found.estimate.pooled.undetermined)
+        lines.append(f"Not determined by the data: {unknown}.")
+    lines += [f"{key}: {value}" for key, value in origin.items()]
+    return tuple(" ".join(line.split()) for line in lines)

@@ -1,0 +1,611 @@
+"""The identified arm as simulators read it: MuJoCo's XML (MJCF), SDF, URDF.
+
+Bodies are those of the physically consistent parameters. What is fixed to a moving link is part of
+it, and so is a payload that is stated. Each format has room for a part of the model:
+
+| | URDF | SDF | MJCF |
+|---|---|---|---|
+| bodies, viscous friction | yes | yes | yes |
+| Coulomb friction f0 | number | number | a bounded constraint force (frictionloss) |
+| friction with the speed squared or cubed | no | no | polynomial damping |
+| rotor inertias | no | no | armature |
+| inertia and friction of coupled motors | no | no | fixed tendons |
+| torsion springs | no | yes | yes |
+| payload | no | yes | yes |
+
+The rest (asymmetry, Stribeck, offset, balancers, torque ripple, dry friction at reversals) is left
+out; :func:`compare` says how much torque that is, after it has read the text back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError
+from identification.export.urdf import WriteBackError, write_urdf
+from identification.export.xml_source import comment_text, with_comment
+from identification.model.elements import TorsionSpring
+from identification.model.friction import Coulomb, Cubic, JointTerm, Kind, Quadratic, Tanh, Viscous
+from identification.model.kinematics import pinocchio_model
+from identification.model.motion import Motion
+from identification.model.pseudo_inertia import Body, body
+from identification.model.regressor import RegressorPlan
+from identification.model.robot import RobotModel
+from identification.model.wrench import LINK_SYMBOLS
+
+Array = NDArray[np.float64]
+Node = ElementTree.Element
+
+STATES: Final = 1000
+"""Random states at which a text is compared with the model."""
+AGREES: Final = 1e-6
+"""Of the largest torque of a joint: what reading back may differ by."""
+_SEED: Final = 20140903
+# Where nothing is stated: rad or m, rad/s or m/s, rad/s² or m/s².
+_ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
+_BASE: Final = "base"
+_DRY: Final = (Coulomb, Tanh)
+_TIMESTEP: Final = 1e-3  # s
+# s; MuJoCo's dry friction follows a constraint of this time constant: no less than two steps.
+_FRICTION_TIME: Final = 2.0 * _TIMESTEP
+_THICKNESS: Final = 0.03  # m, of the sticks that show the arm
+_SHORTEST: Final = 1e-3  # m, of a stick
+
+
+class MissingMujocoError(IdentificationError):
+    """MuJoCo is needed and not installed."""
+
+
+class Ranges(NamedTuple):
+    """Limits of the joints (n,), rad or m, rad/s or m/s, N·m or N; infinite where not known."""
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    effort: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """An arm with parameters that a machine can have.
+
+    Attributes:
+        urdf: the text that the model was made from.
+        model: the robot.
+        standard: standard parameters (s,), every body and rotor possible.
+        values: the parameters (p,) that follow, with friction, springs and balancers.
+        ranges: limits of its joints.
+    """
+
+    urdf: str
+    model: RobotModel
+    standard: Array
+    values: Array
+    ranges: Ranges
+
+    @property
+    def friction(self) -> tuple[dict[str, float], ...]:
+        """Coefficients by symbol of each joint, then of each coupled motor."""
+        return self.model.friction.table(self.values[self.model.friction_part])
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """What each joint moves up to the next, the payload included (n,)."""
+        inertial = self.standard[self.model.layout.links].copy()
+        if self.model.payload is not None:
+            joint, carried = self.model.payload.carried_by(self.model.chain)
+            inertial[joint] += carried
+        return tuple(body(one) for one in inertial)
+
+    @property
+    def rotors(self) -> Array:
+        """Inertia matrix of the rotors in joint coordinates (n, n)."""
+        return self.model.layout.rotor_matrix(self.standard)
+
+    def spring(self, joint: int) -> tuple[float, float]:
+        """Stiffness [N·m/rad] and rest angle [rad] of all torsion springs of a joint together."""
+        springs = [one for one in self.model.elements.placed if one.joint == joint]
+        stiffness = moment = 0.0
+        for one in springs:
+            if isinstance(one.element, TorsionSpring):
+                own = self.values[self.model.element_part][one.part]
+                k = float(own[0]) if len(own) else one.element.stiffness or 0.0
+                stiffness, moment = stiffness + k, moment + k * one.element.rest
+        return stiffness, moment / stiffness if stiffness else 0.0
+
+    def link(self, joint: int) -> str:
+        """Name of the link that a joint moves, unlike that of any joint."""
+        frames = self.model.chain.frames
+        name = next((name for name, frame in frames.items() if frame.joint == joint), "link")
+        return f"{name}_link" if name in self.model.joint_names else name
+
+    def fixed(self, joint: int) -> dict[str, tuple[Array, Array]]:
+        """Axes (3, 3) and origin (3,) of the other links that move with a joint, by name."""
+        names = {self.link(joint), *self.model.joint_names}
+        return {
+            name: (frame.rotation, frame.translation)
+            for name, frame in self.model.chain.frames.items()
+            if frame.joint == joint and name not in names
+        }
+
+
+def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+    """Return the arm as MuJoCo's XML. Gravity compensation is off; motors take joint torque."""
+    model, ranges, rotors = arm.model, arm.ranges, arm.rotors
+    coupled = np.array((rotors != np.diag(np.diag(rotors))).any(axis=1))
+    root = Node("mujoco", model=name)
+    _comment(root, remarks)
+    _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
+    _add(root, "option", gravity=_row(model.gravity), timestep=_row(_TIMESTEP),
+         integrator="implicitfast")  # fmt: skip
+    places = {-1: _add(root, "worldbody")}
+    for joint, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
+        parent = int(model.chain.parents[joint])
+        place = _pose(model.chain.rotation[joint], model.chain.translation[joint])
+        _stick(places[parent], model.chain.translation[joint])
+        link = places[joint] = _add(places[parent], "body", name=arm.link(joint), **place)
+        six = mass.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        _add(link, "inertial", pos=_row(mass.centre), mass=_row(mass.mass), fullinertia=_row(six))
+        friction, (stiffness, rest) = arm.friction[joint], arm.spring(joint)
+        _add(
+            link,
+            "joint",
+            name=joint_name,
+            type="hinge" if model.chain.revolute[joint] else "slide",
+            axis=_row(model.chain.axis[joint]),
+            armature=_row(0.0 if coupled[joint] else rotors[joint, joint]),
+            damping=_row(_damping(arm, joint)),
+            frictionloss=_row(max(0.0, friction.get("f0", 0.0))),
+            solreffriction=_row([_FRICTION_TIME, 1.0]),
+            **_if(stiffness != 0.0, stiffness=_row(stiffness), springref=_row(rest)),
+            **_range(ranges, joint),
+            **_effort(ranges, joint, "actuatorfrcrange"),
+        )
+        for frame, (rotation, translation) in arm.fixed(joint).items():
+            _add(link, "site", name=frame, **_pose(rotation, translation))
+    _tendons(root, arm, coupled)
+    actuators = _add(root, "actuator")
+    for joint, joint_name in enumerate(model.joint_names):
+        limits = _effort(ranges, joint, "ctrlrange")
+        _add(actuators, "motor", name=joint_name, joint=joint_name, **limits)
+    return _text(root)
+
+
+def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+    """Return the arm as a model of SDF 1.9, its base fixed to the world; gravity is the world's."""
+    model, ranges = arm.model, arm.ranges
+    document = Node("sdf", version="1.9")
+    _comment(document, remarks)
+    root = _add(document, "model", name=name)
+    links = [arm.link(joint) for joint in range(model.n_joints)]
+    base = next(one for one in (_BASE, "world_base", "fixed_base") if one not in links)
+    _add(root, "link", name=base)
+    _nested(_add(root, "joint", name=f"{base}_fixed", type="fixed"), parent="world", child=base)
+    for joint, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
+        parent = int(model.chain.parents[joint])
+        above = links[parent] if parent >= 0 else base
+        link = _add(root, "link", name=links[joint])
+        place = _rpy(model.chain.rotation[joint], model.chain.translation[joint])
+        _add(link, "pose", relative_to=above).text = place
+        inertial = _add(link, "inertial")
+        _nested(inertial, pose=_row([*mass.centre, 0.0, 0.0, 0.0]), mass=_row(mass.mass))
+        tensor = {n: _row(mass.inertia[i, j]) for n, (i, j) in _TENSOR.items()}
+        _nested(_add(inertial, "inertia"), **tensor)
+        kind = "revolute" if model.chain.revolute[joint] else "prismatic"
+        node = _add(root, "joint", name=joint_name, type=kind)
+        _nested(node, parent=above, child=links[joint])
+        axis = _add(node, "axis")
+        _nested(axis, xyz=_row(model.chain.axis[joint]))
+        known = {key: float(value[joint]) for key, value in ranges._asdict().items()}
+        _nested(_add(axis, "limit"), **{k: _row(v) for k, v in known.items() if math.isfinite(v)})
+        friction, (stiffness, rest) = arm.friction[joint], arm.spring(joint)
+        _nested(
+            _add(axis, "dynamics"),
+            damping=_row(friction.get("f1", 0.0)),
+            friction=_row(max(0.0, friction.get("f0", 0.0))),
+            **_if(stiffness != 0.0, spring_stiffness=_row(stiffness), spring_reference=_row(rest)),
+        )
+        for frame, (rotation, translation) in arm.fixed(joint).items():
+            fixed = _add(root, "frame", name=frame, attached_to=links[joint])
+            _add(fixed, "pose").text = _rpy(rotation, translation)
+    return _text(document)
+
+
+def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+    """Return the URDF with the arm's bodies and friction, and its own name; see `write_urdf`."""
+    del name
+    text = with_comment(arm.urdf, remarks)
+    return write_urdf(text, arm.model, arm.standard, arm.values[arm.model.friction_part])
+
+
+class Format(NamedTuple):
+    """A file format, and what of the model it has room for.
+
+    Attributes:
+        suffix: of its files.
+        write: an arm, its name and remarks to text.
+        read: text, arm and motion to the torques (m, n) that its bodies, rotors, springs and
+            speed-dependent friction take.
+        friction: kinds of term.
+        rotors: rotor inertias, and inertia and friction of coupled motors.
+        springs: torsion springs.
+        payload: a stated payload.
+    """
+
+    suffix: str
+    write: Callable[[Arm, str, Sequence[str]], str]
+    read: Callable[[str, Arm, Motion], Array]
+    friction: tuple[Kind, ...] = (Coulomb, Tanh, Viscous)
+    rotors: bool = False
+    springs: bool = True
+    payload: bool = True
+
+
+class Comparison(NamedTuple):
+    """A text read back beside the model.
+
+    Attributes:
+        difference: largest at `STATES` random states, as a share of the largest torque of its
+            joint, of what the format has room for.
+        torque: root mean square of the whole torque over the motion (n,) [N·m or N].
+        left_out: that of each part without a place in the format (n,), by words.
+    """
+
+    difference: float
+    torque: Array
+    left_out: Mapping[str, Array]
+
+
+def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
+    """Read a text back, and compare what it says with the model.
+
+    Args:
+        text: as the format writes it.
+        form: the format.
+        arm: what was written.
+        motion: over which the parts that are left out are measured.
+
+    Raises:
+        WriteBackError: at some random state the torque is another one.
+        MissingMujocoError: the format is read by MuJoCo, which is not installed.
+    """
+    states = random_states(arm)
+    expected = _said(form, arm, states)
+    error = np.abs(form.read(text, arm, states) - expected).max(axis=0)
+    largest = np.abs(expected).max(axis=0)
+    difference = float((error / np.where(largest > 0.0, largest, 1.0)).max())
+    if not difference <= AGREES:
+        joint = arm.model.joint_names[int(np.argmax(error))]
+        raise WriteBackError(
+            f"read back, the torque of joint {joint!r} is another one (a share of {difference:.2g})"
+        )
+    left = {words: _rms(torque) for words, torque in _left_out(form, arm, motion).items()}
+    if form.read is _mujoco_torque:
+        dry = _mujoco_torque(text, arm, motion, friction=True) - _said(form, arm, motion)
+        left[_REVERSALS] = _rms(dry - _dry(arm, motion))
+    whole = arm.model.torque(arm.values, *motion[1:]) + arm.model.load_torque(*motion[1:4])
+    return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
+
+
+def random_states(arm: Arm, count: int = STATES) -> Motion:
+    """Return random states within the limits of an arm."""
+    ranges, n = arm.ranges, arm.model.n_joints
+    random = np.random.default_rng(_SEED)
+    lower, upper = np.maximum(ranges.lower, -_ANYWHERE), np.minimum(ranges.upper, _ANYWHERE)
+    speed = np.where(np.isfinite(ranges.velocity), ranges.velocity, _SPEED)
+    return Motion(
+        np.arange(count, dtype=np.float64),
+        random.uniform(lower, np.maximum(lower, upper), (count, n)),
+        random.uniform(-speed, speed, (count, n)),
+        random.uniform(-_ACCELERATION, _ACCELERATION, (count, n)),
+    )
+
+
+_REVERSALS: Final = "dry friction between the two directions (velocity reversals, standstill)"
+
+
+def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
+    """Return the torque (m, n) of each part of the model that a format has no place for."""
+    model, q, qdd = arm.model, motion.position, motion.acceleration
+    own = model.friction.kinds
+    left = {
+        kind.words: _friction(arm, motion, _is_of(kind))
+        for kind in own
+        if kind not in form.friction
+    }
+    left[_REVERSALS] = _dry(arm, motion) - _dry(arm, motion, jumps=True)
+    base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)
+    rounded = model.torque(base, *motion[1:]) - _rigid(arm, motion) - qdd @ arm.rotors
+    if np.abs(rounded).max() > AGREES * np.abs(model.torque(base, *motion[1:])).max():
+        left["what rounded angles of the URDF make of the base parameters"] = rounded
+    if not form.rotors:
+        diagonal = np.diag(arm.rotors)
+        left["rotor inertias"] = qdd * diagonal
+        left["inertia of coupled motors"] = qdd @ (arm.rotors - np.diag(diagonal))
+        left["friction of coupled motors"] = _friction(arm, motion, lambda t: t.motor)
+    if not form.payload:
+        left["the payload"] = model.load_torque(*motion[1:4]) - model.elements.known(q)
+    for one in model.elements.placed:
+        if not (form.springs and isinstance(one.element, TorsionSpring)):
+            words = f"{type(one.element).__name__} of {one.element.joint}"
+            left.setdefault(words, np.zeros(q.shape))[:, one.joint] += one.columns(q) @ arm.values[
+                model.element_part
+            ][one.part] + one.known(q)
+    return left
+
+
+def _is_of(kind: Kind) -> Callable[[JointTerm], bool]:
+    return lambda term: not term.motor and isinstance(term.term, kind)
+
+
+def _said(form: Format, arm: Arm, motion: Motion) -> Array:
+    """Return the torque (m, n) of what a format has room for, without dry friction."""
+    smooth = tuple(kind for kind in form.friction if kind not in _DRY)
+    model = arm.model
+    torque = _rigid(arm, motion) + motion.acceleration @ arm.rotors * form.rotors
+    torque += _friction(
+        arm, motion, lambda t: isinstance(t.term, smooth) and (form.rotors or not t.motor)
+    )
+    if form.payload:
+        known = model.elements.known(motion.position)
+        torque += model.load_torque(*motion[1:4]) - known
+    if form.springs:
+        for joint in range(model.n_joints):
+            stiffness, rest = arm.spring(joint)
+            torque[:, joint] += stiffness * (motion.position[:, joint] - rest)
+    return torque
+
+
+def _rigid(arm: Arm, motion: Motion) -> Array:
+    """Return the torque (m, n) of the links.
+
+    Of the links themselves: the base parameters leave out what rounded angles of a URDF make of
+    columns that depend on others but for the rounding.
+    """
+    model, n = arm.model, arm.model.n_joints
+    everything = [range(len(LINK_SYMBOLS))] * n
+    plan = RegressorPlan(model.chain, model.gravity, everything, [False] * n, None)
+    inertial = arm.standard[model.layout.links].reshape(-1)
+    torque = np.empty(motion.position.shape)
+    for part, rows in plan.chunks(*motion[1:4]):
+        for joint, block in enumerate(rows):
+            torque[part, joint] = inertial[plan.columns[joint]] @ block
+    return torque
+
+
+def _friction(arm: Arm, motion: Motion, which: Callable[[JointTerm], bool]) -> Array:
+    """Return the torque (m, n) of some friction terms."""
+    values = np.zeros(arm.model.n_parameters)
+    part = arm.model.friction_part
+    chosen = np.array([which(term) for term in arm.model.friction.terms], dtype=np.bool_)
+    values[part] = np.where(chosen, arm.values[part], 0.0)
+    return arm.model.torque(values, *motion[1:])
+
+
+def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
+    """Return the torque (m, n) of dry friction, as it is or as one that jumps at zero speed."""
+    if not jumps:
+        return _friction(arm, motion, lambda term: isinstance(term.term, _DRY))
+    friction, n = arm.model.friction, arm.model.n_joints
+    f0 = np.array([row.get("f0", 0.0) for row in arm.friction])
+    shares = friction.motor_speeds()
+    torque = f0[:n] * np.sign(motion.velocity)
+    return np.asarray(torque + (f0[n:] * np.sign(motion.velocity @ shares.T)) @ shares)
+
+
+def _pinocchio_torque(text: str, arm: Arm, motion: Motion) -> Array:
+    """Torques of a URDF's bodies and damping."""
+    model = pinocchio_model(text, arm.model.locked)
+    model.gravity.linear = arm.model.gravity
+    return _rnea(model, motion) + np.asarray(model.damping) * motion.velocity
+
+
+def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
+    """Torques of the bodies, damping and springs of an SDF model, which this reads anew."""
+    root = ElementTree.fromstring(text).find("model")
+    assert root is not None
+    model, places = pin.Model(), {}
+    model.gravity.linear = arm.model.gravity
+    links = {link.get("name"): link for link in root.iter("link")}
+    damping: list[float] = []
+    stiffness: list[float] = []
+    rest: list[float] = []
+    for joint in root.iter("joint"):
+        child, parent = joint.findtext("child"), joint.findtext("parent")
+        if joint.get("type") == "fixed":
+            places[child] = 0
+            continue
+        axis = _figures(joint, "axis/xyz")
+        kind = "Revolute" if joint.get("type") == "revolute" else "Prismatic"
+        kind_of = getattr(pin, f"JointModel{kind}Unaligned")
+        x, y, z, *rpy = _figures(links[child], "pose")
+        place = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
+        places[child] = model.addJoint(places[parent], kind_of(axis), place, joint.get("name"))
+        tensor = [float(_figures(links[child], f"inertial/inertia/{n}")[0]) for n in _TENSOR]
+        matrix = np.zeros((3, 3))
+        for (i, j), value in zip(_TENSOR.values(), tensor, strict=True):
+            matrix[i, j] = matrix[j, i] = value
+        centre = _figures(links[child], "inertial/pose")[:3]
+        mass = float(_figures(links[child], "inertial/mass")[0])
+        model.appendBodyToJoint(
+            places[child], pin.Inertia(mass, centre, matrix), pin.SE3.Identity()
+        )
+        for figures, tag in ((damping, "damping"), (stiffness, "spring_stiffness"),
+                             (rest, "spring_reference")):  # fmt: skip
+            figures.append(float(joint.findtext(f"axis/dynamics/{tag}") or 0.0))
+    torque = _rnea(model, motion) + np.array(damping) * motion.velocity
+    return np.asarray(torque + np.array(stiffness) * (motion.position - np.array(rest)))
+
+
+def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = False) -> Array:
+    """MuJoCo's inverse dynamics; without the constraints that are its dry friction, if not asked.
+
+    Raises:
+        MissingMujocoError: it is not installed.
+        WriteBackError: it does not read the text.
+    """
+    mujoco = load_mujoco()
+    try:
+        model = mujoco.MjModel.from_xml_string(text)
+    except ValueError as error:
+        raise WriteBackError(f"MuJoCo does not read the text: {error}") from error
+    off = mujoco.mjtDisableBit
+    model.opt.disableflags |= off.mjDSBL_LIMIT if friction else off.mjDSBL_CONSTRAINT
+    data = mujoco.MjData(model)
+    order = [int(model.joint(name).dofadr[0]) for name in arm.model.joint_names]
+    torque = np.empty(motion.position.shape)
+    for k, (q, qd, qdd) in enumerate(zip(*motion[1:4], strict=True)):
+        data.qpos[order], data.qvel[order], data.qacc[order] = q, qd, qdd
+        mujoco.mj_inverse(model, data)
+        torque[k] = data.qfrc_inverse[order]
+    return torque
+
+
+def load_mujoco() -> Any:
+    """Return the module `mujoco`.
+
+    Raises:
+        MissingMujocoError: it is not installed.
+    """
+    try:
+        import mujoco  # an extra: not everybody needs it
+    except ImportError as error:
+        raise MissingMujocoError(
+            "MuJoCo is not installed; install hil with its extra: pip install 'hil[mujoco]'"
+        ) from error
+    return mujoco
+
+
+FORMATS: Final[Mapping[str, Format]] = {
+    "mjcf": Format(
+        ".xml",
+        mjcf,
+        _mujoco_torque,
+        friction=(Coulomb, Tanh, Viscous, Quadratic, Cubic),
+        rotors=True,
+    ),
+    "sdf": Format(".sdf", sdf, _sdf_torque),
+    "urdf": Format(".urdf", urdf, _pinocchio_torque, springs=False, payload=False),
+}
+"""Formats by name."""
+
+_TENSOR: Final = {
+    "ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2),
+}  # fmt: skip
+
+
+def _rnea(model: pin.Model, motion: Motion) -> Array:
+    data, still = model.createData(), pin.neutral(model)
+    return np.array(
+        [
+            pin.rnea(model, data, pin.integrate(model, still, q), qd, qdd)
+            for q, qd, qdd in zip(*motion[1:4], strict=True)
+        ]
+    )
+
+
+def _damping(arm: Arm, joint: int) -> list[float]:
+    """Return the coefficients of v, v |v| and v³."""
+    friction = arm.friction[joint]
+    third = {term.symbol: type(term) for term in arm.model.friction.laws[joint].terms}.get("f2")
+    square, cube = (friction["f2"] if third is kind else 0.0 for kind in (Quadratic, Cubic))
+    return [friction.get("f1", 0.0), square, cube]
+
+
+def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
+    """Add inertia and friction of coupled motors, which act on weighted sums of joints."""
+    names, friction = arm.model.joint_names, arm.model.friction
+    rows: list[tuple[str, Array, dict[str, str]]] = []
+    if coupled.any():
+        inertia, directions = np.linalg.eigh(arm.rotors[np.ix_(coupled, coupled)])
+        for k, (own, direction) in enumerate(zip(inertia, directions.T, strict=True)):
+            share = np.zeros(len(names))
+            share[coupled] = direction
+            rows.append((f"rotors_{k + 1}", share, {"armature": _row(max(0.0, float(own)))}))
+    own_friction = arm.friction[len(names) :]
+    for motor, share, row in zip(
+        friction.motors, friction.motor_speeds(), own_friction, strict=True
+    ):
+        loss, slope = max(0.0, row.get("f0", 0.0)), row.get("f1", 0.0)
+        figures = {"damping": _row(slope), "frictionloss": _row(loss)}
+        figures["solreffriction"] = _row([_FRICTION_TIME, 1.0])
+        rows.append((f"motor_{motor + 1}", share, figures))
+    if not rows:
+        return
+    tendons = _add(root, "tendon")
+    for name, share, figures in rows:
+        tendon = _add(tendons, "fixed", name=name, **figures)
+        for joint in np.flatnonzero(share):
+            _add(tendon, "joint", joint=names[joint], coef=_row(share[joint]))
+
+
+def _stick(parent: Node, end: Array) -> None:
+    """Add a stick to a body that shows where its next joint is: no mass, no contact."""
+    if np.linalg.norm(end) > _SHORTEST:
+        line = _row([0.0, 0.0, 0.0, *end])
+        _add(parent, "geom", type="capsule", fromto=line, size=_row(_THICKNESS), mass="0",
+             contype="0", conaffinity="0")  # fmt: skip
+
+
+def _pose(rotation: Array, translation: Array) -> dict[str, str]:
+    return {"pos": _row(translation), "xyaxes": _row([*rotation[:, 0], *rotation[:, 1]])}
+
+
+def _rpy(rotation: Array, translation: Array) -> str:
+    return _row([*translation, *pin.rpy.matrixToRpy(rotation)])
+
+
+def _range(ranges: Ranges, joint: int) -> dict[str, str]:
+    lower, upper = float(ranges.lower[joint]), float(ranges.upper[joint])
+    known = math.isfinite(lower) and math.isfinite(upper) and lower < upper
+    return _if(known, range=_row([lower, upper]))
+
+
+def _effort(ranges: Ranges, joint: int, name: str) -> dict[str, str]:
+    most = float(ranges.effort[joint])
+    return _if(math.isfinite(most), **{name: _row([-most, most])})
+
+
+def _if(there: bool, **attributes: str) -> dict[str, str]:
+    return attributes if there else {}
+
+
+def _comment(node: Node, remarks: Sequence[str]) -> None:
+    if remarks:
+        lines = "".join(f"  {comment_text(line)}\n" for line in remarks)
+        node.append(ElementTree.Comment(f"\n{lines}"))
+
+
+def _add(parent: Node, tag: str, /, **attributes: str) -> Node:
+    return ElementTree.SubElement(parent, tag, attributes)
+
+
+def _nested(node: Node, /, **texts: str) -> None:
+    for tag, text in texts.items():
+        _add(node, tag).text = text
+
+
+def _row(values: float | Sequence[float] | Array) -> str:
+    """Return numbers as the shortest text that is read back as the same ones."""
+    return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(values))
+
+
+def _figures(node: Node, path: str) -> Array:
+    return np.array([float(part) for part in (node.findtext(path) or "").split()])
+
+
+def _rms(torque: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(torque**2, axis=0)))
+
+
+def _text(root: Node) -> str:
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
