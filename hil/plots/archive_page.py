@@ -9,7 +9,7 @@ from jinja2 import ChoiceLoader, FileSystemLoader
 
 from hil.plots.archive_panels import archive_panels
 from hil.plots.archive_view import ArchiveView
-from hil.report.rendering import Numbering, environment, page_bytes
+from hil.report.rendering import environment, page_bytes
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 
@@ -38,7 +38,6 @@ def archive_page(view: ArchiveView) -> bytes:
         *facts.metadata.items(),
     ]
     text = known.get_template("archive.html.j2").render(
-        numbering=Numbering(),
         facts=facts,
         joints=archive_panels(view),
         events=view.events,

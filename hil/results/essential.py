@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from hil.results.frozen import Frozen
 
 
@@ -28,6 +30,11 @@ class EssentialParameter(Frozen):
     unit: str
     estimate: float
     std: float
+
+    @property
+    def relative_std(self) -> float:
+        """Std / |estimate|."""
+        return self.std / abs(self.estimate) if self.estimate else math.inf
 
 
 class BlindResult(Frozen):

@@ -81,3 +81,13 @@ class JudgementResult(Frozen):
     """Independent samples that each joint's rows are worth."""
     friction_over_time: list[list[float | None]] | None
     """Per joint: share by which friction was higher than estimated, in the order of recording."""
+
+    @property
+    def worst_first(self) -> list[FindingResult]:
+        """Findings with the worst first, otherwise in the order of the checks."""
+        levels = ("wrong", "doubtful", "information", "good")
+        return sorted(self.findings, key=lambda finding: levels.index(finding.level))
+
+    def any_joint(self, figure: str) -> bool:
+        """Whether a figure of :class:`JointJudgement` is known of any joint."""
+        return any(getattr(joint, figure) is not None for joint in self.joints)

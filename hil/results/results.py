@@ -7,6 +7,7 @@ Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
@@ -77,6 +78,28 @@ class ParameterResult(Frozen):
     known comes from the data, 1 where all comes from the prior."""
     learned: bool | None = None
     """Whether at least three quarters of what is known of it come from the data."""
+
+    @property
+    def label(self) -> str:
+        """Name for figures, led by the number it has in the paper's Table 2."""
+        return self.name if self.table2_id is None else f"{self.table2_id} {self.name}"
+
+    @property
+    def relative_std(self) -> float:
+        """Std / |estimate|."""
+        return self.std / abs(self.estimate) if self.estimate else math.inf
+
+    @property
+    def deviation(self) -> float | None:
+        """(estimate - truth) / std; None without a truth or a usable standard deviation."""
+        return self.deviation_of(self.estimate, self.std)
+
+    def deviation_of(self, estimate: float, std: float) -> float | None:
+        """The same of another estimate of this parameter."""
+        if self.truth is None or not std > 0.0:
+            return None
+        z = (estimate - self.truth) / std
+        return z if math.isfinite(z) else None
 
 
 class ValidationResult(Frozen):
