@@ -9,7 +9,7 @@ from typing import TypeVar
 from hil.archive import ArchiveName, ArchiveOutcome, open_archive
 from hil.errors import ArchiveError, HilError
 from hil.plural import counted
-from hil.results.conduct import ConductResult, RecordedResult, StepResult, WarmUpResult
+from hil.results.results import ConductResult, RecordedResult, StepResult, WarmUpResult
 
 from .dry_run import DryRun
 from .folder import CampaignFolder, Entry

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +12,7 @@ from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from hil.cell import Cell
 from hil.errors import InputError
@@ -19,6 +21,7 @@ from hil.io.digest import digest, json_digest
 from hil.reading import text_of
 from hil.version import software
 from identification.excitation import (
+    Criteria,
     Design,
     Excitation,
     Objective,
@@ -26,10 +29,137 @@ from identification.excitation import (
 )
 from planner import FourierSeries, JointLimits, PiecewiseCubic, PlanFile, PlannerError, in_child
 
-from .figures import FigureError, count, criteria_of, front_of, number
-from .fingerprint import DECISIVE, fingerprint
 from .settings import RESULT_FORMAT, DesignSettings, SettingsError, settings_of
 from .toml_text import Angles, from_text, to_text
+
+Array = NDArray[np.float64]
+
+_FRONT_COLUMNS = ("log10_det", "coupling_index", "duration")
+
+
+class FigureError(ValueError):
+    """A figure that cannot be what it stands for.
+
+    Attributes:
+        field: its dotted name.
+        problem: what it is, and what it should be.
+    """
+
+    def __init__(self, field: str, problem: str) -> None:
+        super().__init__(f"{field} {problem}")
+        self.field = field
+        self.problem = problem
+
+
+def criteria_of(table: Mapping[str, Any]) -> Criteria:
+    """Return what `[criteria]` says of the motion.
+
+    Raises:
+        FigureError: a figure is missing, is no number, or is one that no motion has.
+    """
+
+    def figure(name: str, least: float = -math.inf) -> float:
+        return number(table, "criteria", name, least=least)
+
+    def condition(name: str) -> float | None:
+        return figure(name, 1.0) if name in table else None
+
+    return Criteria(
+        log10_det=figure("log10_det"),
+        coupling_index=figure("coupling_index", 0.0),
+        fitness=figure("fitness"),
+        n_samples=count(table, "criteria", "n_samples", least=1),
+        condition=condition("condition"),
+        scaled_condition=condition("scaled_condition"),
+    )
+
+
+def front_of(table: Mapping[str, Any]) -> Array:
+    """Return log10 det, coupling index and duration [s] of each point of `[front]`, (k, 3).
+
+    Raises:
+        FigureError: a list is missing, holds what is no number, or is not as long as the others.
+    """
+    columns = []
+    for name in _FRONT_COLUMNS:
+        values = table.get(name)
+        if not isinstance(values, Sequence) or isinstance(values, str):
+            raise FigureError(f"front.{name}", f"is {values!r:.60}, not a list of numbers")
+        entries = dict(enumerate(values))
+        columns.append([number(entries, f"front.{name}", k) for k in entries])
+        if len(columns[-1]) != len(columns[0]):
+            raise FigureError(
+                f"front.{name}",
+                f"has {len(values)} entries, {_FRONT_COLUMNS[0]} has {len(columns[0])}",
+            )
+    return np.array(columns, dtype=np.float64).T
+
+
+def number(
+    table: Mapping[Any, Any], where: str, name: str | int, *, least: float = -math.inf
+) -> float:
+    """Return a finite number that is not below `least`.
+
+    Raises:
+        FigureError: it is missing, or anything else.
+    """
+    field = f"{where}.{name}" if isinstance(name, str) else f"{where}[{name}]"
+    value = table.get(name)
+    found = math.nan
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        found = float(value)
+    if not math.isfinite(found) or found < least:
+        bound = "" if least == -math.inf else f" from {least:g} on"
+        raise FigureError(field, f"is {value!r:.60}, not a finite number{bound}")
+    return found
+
+
+def count(table: Mapping[str, Any], where: str, name: str, *, least: int = 0) -> int:
+    """Return a whole number that is not below `least`.
+
+    Raises:
+        FigureError: it is missing, or anything else.
+    """
+    value = table.get(name)
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise FigureError(f"{where}.{name}", f"is {value!r:.60}, not a whole number from {least}")
+    return value
+
+
+_DIGITS = 16
+# What a motion and its criteria are made from. A change of the rest (walls, motors, home) leaves
+# them what they are: whether the motion may be sent is checked before it is, in the cell as it is
+# then.
+DECISIVE = ("urdf", "robot", "limits")
+
+
+def fingerprint(cell: Cell) -> dict[str, str]:
+    """Return a digest of each part of a cell that a design may depend on, by the part's name.
+
+    Tables are taken as read, so that comments, order and spelling of numbers do not count. The
+    limits are those in URDF angles.
+    """
+    limits = cell.joint_limits
+    home = cell.file.campaign
+    parts: dict[str, Any] = {
+        "urdf": cell.urdf,
+        "robot": _plain(cell.file.robot),
+        "limits": {
+            name: getattr(limits, name).tolist()
+            for name in ("lower", "upper", "velocity", "acceleration", "jerk")
+        },
+        "torque_limit": None if cell.torque_limit is None else cell.torque_limit.tolist(),
+        "drive_train": _plain(cell.file.drive_train),
+        "nominal": _plain(cell.file.nominal),
+        "workspace": _plain(cell.file.workspace),
+        "home": None if home is None else home.home_deg,
+    }
+    return {name: json_digest(part)[:_DIGITS] for name, part in parts.items()}
+
+
+def _plain(table: BaseModel | None) -> Any:
+    return None if table is None else table.model_dump(mode="json")
+
 
 _ANGLES = ("lower", "upper", "velocity", "acceleration", "jerk")
 
@@ -90,8 +220,6 @@ def motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
     """Return what two motions share only if they are the same to the last bit."""
     return digest(json.dumps(trajectory.to_dict()))
 
-
-Array = NDArray[np.float64]
 
 VERSION: Final = 1
 RESULT: Final = "excitation.toml"

@@ -17,8 +17,7 @@ import numpy as np
 from hil.progress import Reporter
 
 from .latency import Latency
-from .permissions import Obtained
-from .storage import DiskTrial
+from .machine import DiskTrial, Obtained
 
 TURNAROUND_PERIOD = 1e-3
 """s between two questions."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hil.arm import Arm
 from hil.cell import AngleFrame, Cell
 from hil.plots import style
-from hil.plots.design_joints import draw_motion
+from hil.plots.joints import draw_motion
 from hil.plots.posture_strip import VIEWS, Strip, draw_strip
 from hil.report.figures.svg import label
 from identification.excitation import correlation, coupling_index, coupling_index_max, information

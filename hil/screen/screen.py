@@ -34,7 +34,7 @@ from hil.plural import counted
 from hil.progress import Silent, Task
 from hil.terminal_text import printable
 
-from . import marks, plain
+from . import layout, marks
 from .keys import Keyboard, after, can_read, stops
 from .layout import SIMULATED, Shown, lines
 
@@ -223,7 +223,7 @@ class PlainLines:
         if at == self._at and time.monotonic() < self._due:
             return
         self._at, self._due = at, time.monotonic() + LINE_EVERY
-        put(self._console, plain.line(status, shown.left))
+        put(self._console, layout.status_line(status, shown.left))
 
     def close(self) -> None:
         """Print what was said last."""

@@ -25,8 +25,7 @@ from typer.testing import CliRunner
 from hil.cell import Cell, CellError
 from hil.cell.text import replaced_value
 from hil.cli import main
-from hil.cli.simulate import simulate
-from hil.cli.simulation_status import WORDS, Status
+from hil.cli.simulate import WORDS, Status, simulate
 from hil.demo_link import free_port
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks

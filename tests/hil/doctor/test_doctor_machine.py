@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.doctor import machine, permissions
+from hil.doctor import machine
+from hil.doctor import machine as permissions
 from hil.doctor.check import Status
-from hil.doctor.permissions import Obtained
-from hil.doctor.storage import DiskTrial, disk_checks
+from hil.doctor.machine import DiskTrial, Obtained, disk_checks
 from hil.doctor.system import run_command
 from tests.hil.doctor.made_up_system import Tree
 
