@@ -12,14 +12,14 @@ from math import degrees, pi
 
 _EXACT = Context(prec=60)
 _PI = Decimal("3.14159265358979323846264338327950288419716939937510")
-_PLAIN_DIGITS = 15
+_SHORT_DIGITS = 15
 _MOST_DIGITS = 20
 
 
 def radians_of(angle: Decimal | int) -> float:
     """Return an angle in rad from one in degrees, as it was written."""
     angle = Decimal(angle)
-    if len(angle.as_tuple().digits) <= _PLAIN_DIGITS or not angle.is_finite():
+    if len(angle.as_tuple().digits) <= _SHORT_DIGITS or not angle.is_finite():
         return float(angle) * (pi / 180.0)
     with localcontext(_EXACT):
         return float(angle * _PI / 180)
@@ -27,12 +27,12 @@ def radians_of(angle: Decimal | int) -> float:
 
 def degrees_text(angle: float) -> str:
     """Return the shortest degrees that `radians_of` turns into this angle [rad], to the bit."""
-    rounded = repr(float(f"{degrees(angle):.{_PLAIN_DIGITS}g}"))
+    rounded = repr(float(f"{degrees(angle):.{_SHORT_DIGITS}g}"))
     if _same(radians_of(Decimal(rounded)), angle):
         return rounded
     with localcontext(_EXACT):
         exact = Decimal(angle) * 180 / _PI
-    for digits in range(_PLAIN_DIGITS + 1, _MOST_DIGITS):
+    for digits in range(_SHORT_DIGITS + 1, _MOST_DIGITS):
         text = f"{exact:.{digits - 1}e}"
         if _same(radians_of(Decimal(text)), angle):
             return f"{Decimal(text):f}" if 1e-4 < abs(exact) < 1e15 else text

@@ -108,12 +108,12 @@ def _in_si(name_of_table: str, fields: Mapping[str, Any]) -> dict[str, Any]:
     angles = _ANGLES.get(name_of_table, frozenset())
     data: dict[str, Any] = {}
     for name, value in fields.items():
-        plain = name.removesuffix(_SUFFIX)
-        if plain != name and plain in angles:
-            if plain in fields:
-                raise InvalidPlanFile(f"both {plain!r} and {name!r} are given")
+        stem = name.removesuffix(_SUFFIX)
+        if stem != name and stem in angles:
+            if stem in fields:
+                raise InvalidPlanFile(f"both {stem!r} and {name!r} are given")
             try:
-                data[plain] = radians_in(name, value)
+                data[stem] = radians_in(name, value)
             except ValueError as error:
                 raise InvalidPlanFile(str(error)) from error
         else:

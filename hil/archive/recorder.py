@@ -283,8 +283,8 @@ class Recorder:
     @property
     def lacks_packets(self) -> bool:
         """Whether raw packets of the newest record archived are still to come, if any are."""
-        kept = self.writer.with_packets and not self._packets_cut
-        return kept and self.newest_packet < self._newest
+        packets_wanted = self.writer.with_packets and not self._packets_cut
+        return packets_wanted and self.newest_packet < self._newest
 
     @property
     def over(self) -> bool:

@@ -414,8 +414,8 @@ class ArchiveWriter:
             cycles["packets"] = self._file.counts[PACKETS]
         if self._first is not None and self._last is not None:
             cycles |= {"first_cycle": self._first, "last_cycle": self._last}
-        counted = {key: str(value) for key, value in cycles.items()}
-        self._file.finish({**(details or {}), "outcome": outcome, "reason": reason, **counted})
+        texts = {key: str(value) for key, value in cycles.items()}
+        self._file.finish({**(details or {}), "outcome": outcome, "reason": reason, **texts})
 
     def __enter__(self) -> Self:
         return self
@@ -491,10 +491,10 @@ def checked_metadata(
         ArchiveWriteError: a key that is ours, no kind or an unknown one, or a contradiction
             between entries and file name.
     """
-    taken = _OWN_KEYS.intersection(metadata)
-    if taken:
+    reserved = _OWN_KEYS.intersection(metadata)
+    if reserved:
         raise ArchiveWriteError(
-            path, f"{', '.join(sorted(taken))} is written by the archive itself"
+            path, f"{', '.join(sorted(reserved))} is written by the archive itself"
         )
     name = ArchiveName.parse(path)
     named = name.metadata() if name else {}

@@ -19,7 +19,7 @@ from hil.terminal_text import printable
 
 app = typer.Typer(help="Look into archives, check and repair them.", no_args_is_help=True)
 
-NOT_KEPT = 5
+PROFILE_BROKEN = 5
 NO_ARCHIVE = 2
 FAILED = 1
 LOST = 3
@@ -58,7 +58,7 @@ def check(files: Files, as_json: Json = False) -> None:
             _say_error(path, error, as_json=as_json)
             continue
         if not found.keeps and not status:
-            status = NOT_KEPT
+            status = PROFILE_BROKEN
         typer.echo(json.dumps(_check_dict(found)) if as_json else _shown(_check_lines(found)))
     raise typer.Exit(status)
 

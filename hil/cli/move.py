@@ -280,7 +280,7 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
         f"limits, motor currents, floor, walls and the arm itself are kept; to {who}"
     )
     below = narrower_thresholds(cell, link.connection)
-    lines += [f"the smaller following-error threshold counts, {told}" for told in below]
+    lines += [f"the smaller following-error threshold counts, {note}" for note in below]
     return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
 
 

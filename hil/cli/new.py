@@ -112,9 +112,9 @@ def new(
     if from_controller is not None:
         known |= _asked(from_controller, bind, len(made.joint_names), arm, wait, quiet=json)
     if from_archive_file is not None:
-        told = from_archive(from_archive_file, made.joint_names)
+        stated = from_archive(from_archive_file, made.joint_names)
         # Limits belong together, with their frame.
-        known = (known.without("limits") if "limits.frame" in told.values else known) | told
+        known = (known.without("limits") if "limits.frame" in stated.values else known) | stated
     text, unknown = made.with_known(known).text(output)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)

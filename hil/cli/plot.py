@@ -97,5 +97,5 @@ def plot(
         if problem:
             typer.echo(printable(f"note: {problem}"))
     shown = f"{view.start:.6g} s to {view.stop:.6g} s of {view.facts.duration:.6g} s"
-    told = f"{target}: {view.facts.title}, {shown}, {len(view.events)} events"
-    typer.echo(printable(told))
+    line_text = f"{target}: {view.facts.title}, {shown}, {len(view.events)} events"
+    typer.echo(printable(line_text))

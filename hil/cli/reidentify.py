@@ -38,7 +38,7 @@ from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
 
-_LISTED: Final = 20
+_MOST_LINES: Final = 20
 _WIDTH: Final = 42
 
 
@@ -76,7 +76,7 @@ def _arm_lines(
             f"  {'campaign':<{_WIDTH}}{'recorded':<12}{'repetitions':>11}"
             f"{'torque error':>14}{'on unseen motion':>18}"
         )
-    shown = campaigns[-_LISTED:]
+    shown = campaigns[-_MOST_LINES:]
     if len(campaigns) > len(shown):
         yield f"  … {len(campaigns) - len(shown)} more: see --output and --json"
     several = len({one.setup for one in campaigns}) > 1
@@ -127,10 +127,10 @@ def written_line(written: Sequence[Path]) -> str:
 
 def broken_lines(broken: Sequence[Broken]) -> Iterator[str]:
     """What could not be used, one by one."""
-    for one in broken[:_LISTED]:
+    for one in broken[:_MOST_LINES]:
         yield f"{one.path} could not be used: {one.reason}"
-    if len(broken) > _LISTED:
-        yield f"and {len(broken) - _LISTED} more: see --output and --json"
+    if len(broken) > _MOST_LINES:
+        yield f"and {len(broken) - _MOST_LINES} more: see --output and --json"
 
 
 def skipped_line(skipped: Sequence[Broken]) -> str:

@@ -33,5 +33,5 @@ def report(
         typer.echo(page)
         return
     verdict = Results.load(opened.folder.results).verdict
-    told = {"report": str(page), "good": verdict.good, "verdict": verdict.line}
-    typer.echo(json_format.dumps(told))
+    document = {"report": str(page), "good": verdict.good, "verdict": verdict.line}
+    typer.echo(json_format.dumps(document))

@@ -26,17 +26,17 @@ def verdict(found: Comparison) -> str:
     axes = [axis.joint for axis in found.axes if any(axis.changed)]
     parts = []
     if axes:
-        parts.append(f"friction of {_listed(axes)}")
+        parts.append(f"friction of {_joined(axes)}")
     if any(found.payload.changed):
         parts.append("what the arm carries")
     if any(found.payload.other):
         parts.append("inertial parameters")
     if not parts and found.friction_slight:
         axes = [axis.joint for axis in found.axes if any(axis.slight)]
-        return f"No change of {_LEAST} or more; friction of {_listed(axes)} differs by less"
+        return f"No change of {_LEAST} or more; friction of {_joined(axes)} differs by less"
     if not parts:
         return "No significant change"
-    return f"Changed: {_listed(parts)}"
+    return f"Changed: {_joined(parts)}"
 
 
 def findings(found: Comparison) -> list[Finding]:
@@ -99,7 +99,7 @@ def _slight(found: Comparison, called: list[str]) -> list[Finding]:
         low, high = (f"{pick(sizes):+.1f}" for pick in (min, max))
         size = low if low == high else f"{low} to {high}"
         words = (
-            f"Friction of {_listed([axis.joint for axis in axes])} has changed by {size} % from"
+            f"Friction of {_joined([axis.joint for axis in axes])} has changed by {size} % from"
             f" {called[0]} to {called[k]}: more than chance, and less than the {_LEAST} that"
             " count as a change."
         )
@@ -114,7 +114,7 @@ def _unchanged(found: Comparison) -> list[Finding]:
     sentences = []
     if judged:
         worst = max(judged, key=lambda axis: float(np.nanmax(axis.smallest)))
-        axes = _listed([axis.joint for axis in judged])
+        axes = _joined([axis.joint for axis in judged])
         sentences.append(
             Finding(
                 "same",
@@ -124,7 +124,7 @@ def _unchanged(found: Comparison) -> list[Finding]:
             )
         )
     if silent:
-        sentences.append(Finding("same", f"Friction of {_listed(silent)} is not determined."))
+        sentences.append(Finding("same", f"Friction of {_joined(silent)} is not determined."))
     if found.payload.untested:
         words = f"Whether it carries the same was not tested: {found.payload.untested}."
         sentences.append(Finding("same", words))
@@ -156,5 +156,5 @@ def _predictions(found: Comparison, called: list[str]) -> list[Finding]:
     return sentences
 
 
-def _listed(words: list[str]) -> str:
+def _joined(words: list[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -44,10 +44,10 @@ _MOST_NAMES: Final = 6
 
 def margins(cell: Cell, problem: Problem, trajectory: Trajectory) -> str:
     """Return how near a motion comes to limits that its search looked at, "" if to none."""
-    kept, motion = problem.constraints, sampled(trajectory)
-    parts = [] if kept.currents is None else [_largest_current(kept.currents, motion)]
-    if kept.checker is not None:
-        parts.append(_nearest(cell, kept.checker, motion))
+    constraints, motion = problem.constraints, sampled(trajectory)
+    parts = [] if constraints.currents is None else [_largest_current(constraints.currents, motion)]
+    if constraints.checker is not None:
+        parts.append(_nearest(cell, constraints.checker, motion))
     return "; ".join(parts)
 
 

@@ -149,7 +149,7 @@ def _offset(cell: Cell, sines: SineTable) -> Array | None:
     if sines.offset == "home":
         return cell.home
     frame, limits = AngleFrame.of(cell), cell.joint_limits
-    shown = _listed(cell, "sines.offset", sines.offset)
+    shown = _angles_of(cell, "sines.offset", sines.offset)
     angles = frame.urdf(shown)
     for joint in np.flatnonzero(~((angles > limits.lower) & (angles < limits.upper))).tolist():
         ends = sorted(float(frame.shown(end)[joint]) for end in (limits.lower, limits.upper))
@@ -165,10 +165,10 @@ def _offset(cell: Cell, sines: SineTable) -> Array | None:
 
 def _per_joint(cell: Cell, field: str, values: list[float]) -> Array:
     """Return one value for each joint (n,); one alone is for all."""
-    return _listed(cell, field, values * len(cell.joint_names) if len(values) == 1 else values)
+    return _angles_of(cell, field, values * len(cell.joint_names) if len(values) == 1 else values)
 
 
-def _listed(cell: Cell, field: str, values: list[float] | str) -> Array:
+def _angles_of(cell: Cell, field: str, values: list[float] | str) -> Array:
     if len(values) != len(cell.joint_names):
         raise SettingsError(
             None,

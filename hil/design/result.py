@@ -143,21 +143,21 @@ def fingerprint(cell: Cell) -> dict[str, str]:
     home = cell.file.campaign
     parts: dict[str, Any] = {
         "urdf": cell.urdf,
-        "robot": _plain(cell.file.robot),
+        "robot": _document(cell.file.robot),
         "limits": {
             name: getattr(limits, name).tolist()
             for name in ("lower", "upper", "velocity", "acceleration", "jerk")
         },
         "torque_limit": None if cell.torque_limit is None else cell.torque_limit.tolist(),
-        "drive_train": _plain(cell.file.drive_train),
-        "nominal": _plain(cell.file.nominal),
-        "workspace": _plain(cell.file.workspace),
+        "drive_train": _document(cell.file.drive_train),
+        "nominal": _document(cell.file.nominal),
+        "workspace": _document(cell.file.workspace),
         "home": None if home is None else home.home_deg,
     }
     return {name: json_digest(part)[:_DIGITS] for name, part in parts.items()}
 
 
-def _plain(table: BaseModel | None) -> Any:
+def _document(table: BaseModel | None) -> Any:
     return None if table is None else table.model_dump(mode="json")
 
 

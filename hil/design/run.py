@@ -156,8 +156,8 @@ def _searched(
         bar = _Bar(task, reporter)
         population = stack.enter_context(Population(problem, workers))
         if journal is not None:
-            bar.journal = kept = _journal(journal, problem, settings, reporter)
-            stack.callback(kept.close)
+            bar.journal = run_journal = _journal(journal, problem, settings, reporter)
+            stack.callback(run_journal.close)
         try:
             design = search(
                 population,

@@ -265,7 +265,7 @@ def governor(system: System) -> Check:
     )
 
 
-def idle_states(system: System, *, kept_awake: bool) -> Check:
+def idle_states(system: System, *, no_sleep: bool) -> Check:
     """How long the deepest sleep in use takes to leave; no matter if processors are kept awake."""
     deepest, slowest = "", -1
     for cpu in cpus(system):
@@ -282,7 +282,7 @@ def idle_states(system: System, *, kept_awake: bool) -> Check:
         found = f"idle driver {driver}" if driver and driver != "none" else "none listed"
         return Check("idle states", Status.OK, found, why)
     found = f"deepest is {deepest}, {slowest} µs to wake"
-    if kept_awake:
+    if no_sleep:
         return Check("idle states", Status.OK, f"{found}; kept awake during an exchange", why)
     bad = slowest > 50
     remedy = "see 'processor kept awake': with that right, no idle state matters"

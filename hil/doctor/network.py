@@ -227,15 +227,15 @@ def firewall(address: str, port: int, system: System) -> Check:
     allow = f"sudo nft insert rule inet filter input ip saddr {address} udp dport {port} accept"
     allow += "   # if table and chain are called so"
     commands = (["nft", "list", "ruleset"], ["iptables", "-S"])
-    answers = [answer for command in commands if (answer := system.run(command)) is not None]
+    outputs = [answer for command in commands if (answer := system.run(command)) is not None]
     look = "sudo nft list ruleset; sudo iptables -S"
-    if any(_may_drop(answer.output) for answer in answers if answer.status == 0):
+    if any(_may_drop(answer.output) for answer in outputs if answer.status == 0):
         found = "there are rules that drop or reject incoming packets"
         ufw = f"# with ufw: sudo ufw allow from {address} to any port {port} proto udp"
         return Check(name, Status.WARN, found, why, (look, allow, ufw))
-    if any(answer.status != 0 for answer in answers):
+    if any(answer.status != 0 for answer in outputs):
         return Check(name, Status.UNKNOWN, "its rules may be read by root only", why, (look,))
-    if answers:
+    if outputs:
         return Check(name, Status.OK, "no rule drops incoming packets", why)
     if not system.path("/proc/net/netfilter").exists():
         return Check(name, Status.OK, "this kernel has no packet filter", why)

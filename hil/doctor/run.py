@@ -204,7 +204,7 @@ def machine_checks(given: machine.Obtained | None, system: System) -> list[Check
         machine.timer_resolution(),
         machine.clock_source(system),
         machine.governor(system),
-        machine.idle_states(system, kept_awake=given is not None and given.cpu_awake),
+        machine.idle_states(system, no_sleep=given is not None and given.cpu_awake),
         machine.isolation(system),
         machine.preemption(system),
         machine.virtualisation(system),

@@ -43,7 +43,7 @@ def consistency_reasons(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
     )
 
 
-def consistency_doubts(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
+def consistency_warnings(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
     """What a reader of the verdict must know of it."""
     if isinstance(consistency, str):
         return (f"no physically consistent parameters were found: {consistency}",)

@@ -20,7 +20,7 @@ def essential_of(
         return str(error)
 
 
-def essential_doubts(choice: EssentialChoice | str) -> tuple[str, ...]:
+def essential_warnings(choice: EssentialChoice | str) -> tuple[str, ...]:
     """What a reader of the verdict must know of it."""
     return (
         (f"essential parameters were not looked for: {choice}",) if isinstance(choice, str) else ()
@@ -32,7 +32,7 @@ def essential_result(choice: EssentialChoice | str) -> EssentialResult | None:
     if isinstance(choice, str):
         return None
     elimination, blind = choice.elimination, choice.blind
-    kept = elimination.estimate
+    estimate_left = elimination.estimate
     return EssentialResult(
         reason=elimination.reason,
         cut=elimination.cut,
@@ -51,10 +51,10 @@ def essential_result(choice: EssentialChoice | str) -> EssentialResult | None:
         parameters=[
             EssentialParameter(name=name, unit=unit, estimate=value, std=std)
             for name, unit, value, std in zip(
-                kept.names,
-                kept.units,
-                kept.values.tolist(),
-                kept.std.tolist(),
+                estimate_left.names,
+                estimate_left.units,
+                estimate_left.values.tolist(),
+                estimate_left.std.tolist(),
                 strict=True,
             )
         ],

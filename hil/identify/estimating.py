@@ -179,12 +179,12 @@ def _robust(loss: Loss) -> Callable[[_Case], _Found]:
             return fits[-1].estimate
 
         result = estimate_repetitions(case.model, case.fitted, fit)
-        return result, _robust_doubts(case.model, fits[-1])  # the last is that of all
+        return result, _robust_warnings(case.model, fits[-1])  # the last is that of all
 
     return run
 
 
-def _robust_doubts(model: RobotModel, found: RobustEstimate) -> list[str]:
+def _robust_warnings(model: RobotModel, found: RobustEstimate) -> list[str]:
     doubts = [
         f"{found.outlying[joint]:.0%} of the rows of {model.joint_names[joint]} lie beyond four "
         "deviations: that is no gross error but something the model leaves out, and a robust loss "
@@ -209,10 +209,10 @@ def _with_prior(case: _Case) -> _Found:
     far = np.flatnonzero(np.abs(surprise) > _SURPRISING)
     if not far.size:
         return result, []
-    listed = ", ".join(case.model.parameter_names[k] for k in far[:6])
+    names_far = ", ".join(case.model.parameter_names[k] for k in far[:6])
     more = f" and {far.size - 6} more" if far.size > 6 else ""
     return result, [
-        f"data and prior contradict each other in {listed}{more} (more than {_SURPRISING:g} "
+        f"data and prior contradict each other in {names_far}{more} (more than {_SURPRISING:g} "
         "deviations): the CAD figures, or their uncertainty in [nominal], are wrong"
     ]
 

@@ -20,8 +20,8 @@ from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import gather
 from identification.validation.verdict import Verdict, judge
 
-from .consistency import consistency_doubts, consistency_of, consistency_reasons
-from .essential import essential_doubts, essential_of
+from .consistency import consistency_of, consistency_reasons, consistency_warnings
+from .essential import essential_of, essential_warnings
 from .estimating import Estimation, estimate_with
 from .judging import judgement_result
 from .options import Options
@@ -147,7 +147,7 @@ def _judged(
             essential = essential_of(cell.model, result.phase, estimation.held_out)
         task.advance(1, "verdict")
         sources = prepared.sources
-        for doubt in (*consistency_doubts(consistency), *essential_doubts(essential)):
+        for doubt in (*consistency_warnings(consistency), *essential_warnings(essential)):
             sources = sources.with_doubt(doubt)
         nominal = nominal_of(cell)
         evidence = gather(

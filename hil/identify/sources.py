@@ -159,7 +159,7 @@ def gather_sources(
         rest[0].recording if rest else None,
     )
     held_out = [source_of(archive, cell) for archive in by_kind.get("validation", [])]
-    doubts = [*known_doubts(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
+    doubts = [*known_warnings(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
     doubts += [
         f"{archive.path.name}: {doubt}"
         for archive in archives
@@ -317,7 +317,7 @@ def _rejected(archive: Archive) -> bool:
     return archive.outcome is not None and archive.outcome.outcome == REJECTED
 
 
-def known_doubts(cell: Cell, archive: Archive) -> list[str]:
+def known_warnings(cell: Cell, archive: Archive) -> list[str]:
     """What is known beforehand to stand between the numbers and the truth, in sentences."""
     doubts = []
     assumed = "drive_train.torque_constant" in cell.file.cell.assumed

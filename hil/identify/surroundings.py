@@ -16,7 +16,7 @@ from identification.model.urdf_tree import urdf_tree
 from identification.selection.inner_prediction import DELAY, LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.validation.evidence import Surroundings
-from identification.validation.findings.finding import Finding, listed
+from identification.validation.findings.finding import Finding, joined
 from identification.validation.nominal_scale import NominalScale, nominal_scale
 from identification.validation.position_jumps import position_jumps
 
@@ -122,7 +122,7 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
             if np.sqrt(noise) > _COARSE * motion.acceleration[:, j].std():
                 coarse[name] = max(step, coarse.get(name, 0.0))
     if coarse:
-        each = listed([f"{name} {step:.2g}" for name, step in coarse.items()])
+        each = joined([f"{name} {step:.2g}" for name, step in coarse.items()])
         yield Finding(
             "resolution",
             "doubtful",

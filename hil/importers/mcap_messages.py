@@ -59,8 +59,8 @@ def check_sizes(stream: BinaryIO) -> None:
         raise ValueError(f"its chunks claim {inflated} bytes of content")
     stream.seek(0)
     summary = make_reader(stream).get_summary()
-    listed = [index.chunk_start_offset for index in summary.chunk_indexes] if summary else []
-    if len(set(listed)) != len(listed) or not begun.issuperset(listed):
+    offsets = [index.chunk_start_offset for index in summary.chunk_indexes] if summary else []
+    if len(set(offsets)) != len(offsets) or not begun.issuperset(offsets):
         raise ValueError("its index does not fit its chunks")
     stream.seek(0)
 

@@ -110,10 +110,10 @@ def _unpacked(file: Path, folder: Path) -> Path:
     target = folder / file.stem
     try:
         most = _SLACK + MOST_INFLATION * file.stat().st_size
-        with file.open("rb") as packed, target.open("wb") as plain:
+        with file.open("rb") as packed, target.open("wb") as unpacked_file:
             for block in zstandard.ZstdDecompressor().read_to_iter(packed):
-                plain.write(block)
-                if plain.tell() > most:
+                unpacked_file.write(block)
+                if unpacked_file.tell() > most:
                     raise SourceError(file, f"becomes more than {MOST_INFLATION} times as large")
     except (OSError, zstandard.ZstdError) as error:
         raise SourceError(file, f"cannot be decompressed ({error})") from error
@@ -278,8 +278,8 @@ def _messages(
     files: list[Path], topic: str | None
 ) -> Iterator[tuple[str, Iterator[tuple[int, bytes]]]]:
     """The topic of the joint states, and time of receipt [ns] and data of its messages."""
-    with unpacked(files) as plain:
-        known = [topics(file) for file in plain]
+    with unpacked(files) as unpacked_file:
+        known = [topics(file) for file in unpacked_file]
         chosen = _choose(
             {name: t for topics in known for name, t in topics.items()}, files[0], topic
         )
@@ -287,7 +287,7 @@ def _messages(
             chosen,
             chain.from_iterable(
                 messages(file, chosen)
-                for file, topics in zip(plain, known, strict=True)
+                for file, topics in zip(unpacked_file, known, strict=True)
                 if chosen in topics  # a part of a split bag may lack it
             ),
         )

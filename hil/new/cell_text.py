@@ -38,14 +38,14 @@ def quiet_libraries() -> Iterator[None]:
     Python's own `sys.stderr` is dropped with it: nothing is to be said inside.
     """
     sys.stderr.flush()
-    kept = os.dup(2)
+    saved = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved, 2)
+        os.close(saved)
         os.close(nowhere)
 
 

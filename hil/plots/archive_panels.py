@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 BINS: Final = 4000
 """Stretches of the time shown whose lowest and highest sample go into the page: every sample of
 16 s at 500 Hz."""
-_DRAWN: Final = 300
+_BINS_SHOWN: Final = 300
 _WIDTH, _LEFT, _RIGHT, _TOP, _PLOT, _STEP, _BOTTOM = 440.0, 56.0, 10.0, 20.0, 66.0, 90.0, 22.0
 _COLOURS: Final = {
     "position": FIRST,
@@ -65,8 +65,8 @@ def _stretches(recorded: Recorded) -> list[tuple[Array, Array]]:
     """The unbroken parts of a line, those of no length left out."""
     broken = np.flatnonzero(np.isnan(recorded.time))
     parts = zip(np.split(recorded.time, broken), np.split(recorded.value, broken), strict=True)
-    kept = [(t[np.isfinite(t)], v[np.isfinite(t)]) for t, v in parts]
-    return [(t, v) for t, v in kept if t.size]
+    finite = [(t[np.isfinite(t)], v[np.isfinite(t)]) for t, v in parts]
+    return [(t, v) for t, v in finite if t.size]
 
 
 def _panel(view: ArchiveView, j: int) -> Panel:
@@ -92,7 +92,7 @@ def _panel(view: ArchiveView, j: int) -> Panel:
     note = f"peaks in % of limits: {', '.join(shares)}" if shares else ""
     with drawing():
         return to_panel(
-            _drawn(grid, plots, marks),
+            _figure(grid, plots, marks),
             key=f"a{j}",
             title=name,
             note=note,
@@ -109,7 +109,7 @@ def _name(title: str) -> str:
     return title.partition(" [")[0]
 
 
-def _drawn(grid: Array, plots: list[Plot], marks: list[float]) -> Figure:
+def _figure(grid: Array, plots: list[Plot], marks: list[float]) -> Figure:
     figure = blank(_WIDTH, _TOP + max(1, len(plots)) * _STEP + _BOTTOM)
     for k, plot in enumerate(plots):
         axes = place(figure, *plot.box)
@@ -126,7 +126,7 @@ def _drawn(grid: Array, plots: list[Plot], marks: list[float]) -> Figure:
 
 def _draw(axes: Axes, grid: Array, plot: Plot) -> None:
     (trace,) = plot.traces
-    for times, values in runs(grid, trace.values, _DRAWN):
+    for times, values in runs(grid, trace.values, _BINS_SHOWN):
         axes.plot(times, values, color=trace.colour, linewidth=trace.width)
     low, high = axes.get_ylim()
     for limit in plot.limits:

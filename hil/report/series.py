@@ -34,7 +34,7 @@ _SHAPES: Final = {
 }
 _OPTIONAL: Final = {
     "excitation_fitted": "mn",
-    "example_counted": "kn",
+    "example_used": "kn",
     "example_inertia": "kn",
     "example_coriolis": "kn",
     "example_gravity": "kn",
@@ -81,7 +81,7 @@ class ReportSeries:
         example_measured: (k, n) [N·m], already low-passed for display.
         example_predicted: (k, n) [N·m], low-passed alike.
         excitation_fitted: (m, n), 1 where the row was fitted and 0 where not.
-        example_counted: (k, n), 1 where the row counts in the error of the verdict, else 0.
+        example_used: (k, n), 1 where the row counts in the error of the verdict, else 0.
         example_inertia: (k, n) part of the predicted torque; the four parts add up to it.
         example_coriolis: (k, n), centrifugal torque included.
         example_gravity: (k, n).
@@ -109,7 +109,7 @@ class ReportSeries:
     example_measured: Array
     example_predicted: Array
     excitation_fitted: Array = field(default_factory=_nothing)
-    example_counted: Array = field(default_factory=_nothing)
+    example_used: Array = field(default_factory=_nothing)
     example_inertia: Array = field(default_factory=_nothing)
     example_coriolis: Array = field(default_factory=_nothing)
     example_gravity: Array = field(default_factory=_nothing)

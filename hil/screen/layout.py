@@ -109,10 +109,10 @@ def lines(shown: Shown, width: int, height: int) -> list[Text]:
     news = [Text(part, style="dim") for line in _news(shown) for part in _wrapped(line, width)]
     room = height - len(head) - len(tail)
     body = _fitting(room, joints, drift, news)
-    drawn = [*head, *body, *[Text()] * max(0, room - len(body)), *tail][:height]
-    for line in drawn:
+    rows = [*head, *body, *[Text()] * max(0, room - len(body)), *tail][:height]
+    for line in rows:
         line.truncate(width, overflow="ellipsis")
-    return drawn
+    return rows
 
 
 def _fitting(room: int, joints: list[Text], drift: list[Text], news: list[Text]) -> list[Text]:
@@ -227,7 +227,7 @@ def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> 
     titles = ("following error / threshold", "current / limit")
     for title in titles if bars else ("following", "current"):
         rule.append(f"  {title}".ljust(14 + bars))
-    drawn = [rule]
+    rows = [rule]
     for index, name in enumerate(names):
         line = Text(name[:name_width].ljust(name_width))
         degrees = np.degrees(motion.following_error[index])
@@ -241,10 +241,10 @@ def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> 
             line.append(marks.percent(share), style=marks.colour(share))
         if hot is not None:
             line.append(f" {hot[index]:3.0f}°C")
-        drawn.append(line)
+        rows.append(line)
     if hot is not None:
         rule.append(" motor")
-    return drawn
+    return rows
 
 
 def _drift(drift: DriftCurve, width: int) -> list[Text]:

@@ -146,7 +146,7 @@ def _table(summary: DryRunSummary) -> Table:
     return table
 
 
-DRAWN_EVERY: Final = 0.1
+REFRESH_PERIOD: Final = 0.1
 """s between two pictures."""
 LINE_EVERY: Final = 5.0
 """s between two lines where there is no terminal."""
@@ -419,7 +419,7 @@ class Screen:
 
     def _draw(self, display: Display, over: threading.Event) -> None:
         try:
-            while not over.wait(DRAWN_EVERY):
+            while not over.wait(REFRESH_PERIOD):
                 display.draw(self.shown())
         except Exception as error:  # it shows nothing more, and `show` says why; the run goes on
             self._undrawn = error

@@ -92,9 +92,9 @@ def fit(reading: Reading, inputs: str) -> FitRecord:
         n_samples=count,
         correlation=correlation(gram).tolist(),
         duration=float(first.motion.time[rows.stop - 1] - first.motion.time[rows.start]),
-        time=_listed(first.motion.time[shown] - first.motion.time[rows.start]),
-        position=[_listed(column) for column in first.motion.position[shown].T],
-        velocity=[_listed(column) for column in first.motion.velocity[shown].T],
+        time=_rounded(first.motion.time[shown] - first.motion.time[rows.start]),
+        position=[_rounded(column) for column in first.motion.position[shown].T],
+        velocity=[_rounded(column) for column in first.motion.velocity[shown].T],
     )
 
 
@@ -209,11 +209,11 @@ def _example(
     shown = _thinned(moving_rows(run))
 
     def joints(torque: Array) -> list[list[float]]:
-        return [_listed(column) for column in for_figure(time, torque)[shown].T]
+        return [_rounded(column) for column in for_figure(time, torque)[shown].T]
 
     return ExampleRecord(
         archive=prepared.sources.training[index].name,
-        time=_listed(time[shown] - time[shown.start]),
+        time=_rounded(time[shown] - time[shown.start]),
         measured=joints(run.torque),
         predicted={
             name: joints(run.predicted_torque(model, values)) for name, values in estimates.items()
@@ -225,7 +225,7 @@ def _thinned(rows: slice) -> slice:
     return slice(rows.start, rows.stop, max(1, (rows.stop - rows.start) // SHOWN))
 
 
-def _listed(values: Array) -> list[float]:
+def _rounded(values: Array) -> list[float]:
     """Numbers of a figure, to as many digits as an eye could want."""
     return [float(f"{value:.{FIGURE_DIGITS}g}") for value in values.tolist()]
 

@@ -24,7 +24,7 @@ from .analysis import Run, fit_all, score_all
 from .campaigns import (
     ABLATION,
     EFFECTS,
-    PLAIN,
+    NO_EFFECTS,
     Plans,
     Workers,
     effect_key,
@@ -51,7 +51,7 @@ from .tables import (
 Array = NDArray[np.float64]
 
 _WORDS: Final = {
-    PLAIN: "the arm is what the model says",
+    NO_EFFECTS: "the arm is what the model says",
     EFFECTS: "the arm has the effects that the model leaves out",
 }
 
@@ -140,8 +140,8 @@ class _Analysis:
         ]
         evidence = Evidence(
             self.fits[ABLATION],
-            self.fits[PLAIN],
-            self.scores[PLAIN],
+            self.fits[NO_EFFECTS],
+            self.scores[NO_EFFECTS],
             truth,
             self.plans.missing,
             self.plans.sines,
@@ -222,13 +222,13 @@ class _Analysis:
             EffectSetting(
                 label, self.fits[one], ClassForms.of(self.scores[one]["fly-by"].forms), base=True
             )
-            for label, one in (("none", PLAIN), ("all", EFFECTS))
+            for label, one in (("none", NO_EFFECTS), ("all", EFFECTS))
         )
         return [none, *found, every]
 
     def _table1(self) -> list[MotionRow]:
         """Of the excitations that the arm bore."""
-        plans, fits = self.plans, self.fits[PLAIN]
+        plans, fits = self.plans, self.fits[NO_EFFECTS]
         searched = {A: plans.sines, AP: plans.printed or plans.sines}
         return [
             MotionRow(

@@ -20,7 +20,7 @@ from identification.errors import IdentificationError
 from identification.estimators.nominal_prior import NOMINAL_SHARE
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.findings.finding import Finding, listed
+from identification.validation.findings.finding import Finding, joined
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ _BLOCKS: Final = 20  # stretches of the recordings whose scatter gives the stand
 # What a friction law does not describe, as a share of the friction (Bittencourt and Gunnarsson
 # 2012: some per cent with speed, load and position).
 _FRICTION_SHARE: Final = 0.03
-_LEAST_TOLD: Final = 0.5  # a tolerance, as a share of the scale, above which an axis says nothing
+_WIDEST: Final = 0.5  # a tolerance, as a share of the scale, above which an axis says nothing
 # Links are wrong each in its own way, which counts where friction takes most of the torque. On a
 # simulated UR5 whose links were off by up to 10 % each no scale was off by more than 7 %.
 _LINKS_APART: Final = 0.05
@@ -57,9 +57,9 @@ class NominalScale:
     @property
     def off(self) -> NDArray[np.intp]:
         """Axes whose scale is a wonder."""
-        told = self.tolerance < _LEAST_TOLD
+        determined = self.tolerance < _WIDEST
         return np.flatnonzero(
-            told & (np.abs(np.where(told, self.scale, 1.0) - 1.0) > self.tolerance)
+            determined & (np.abs(np.where(determined, self.scale, 1.0) - 1.0) > self.tolerance)
         )
 
     @property
@@ -95,7 +95,7 @@ class NominalScale:
                     "direction of axes",
                     "wrong",
                     "all torques seem to have the other sign: over that of the nominal inertias"
-                    f" they are {listed(figures)}",
+                    f" they are {joined(figures)}",
                     "give the torques of the column map scale = -1, or all torque constants the"
                     " other sign",
                 )
@@ -108,7 +108,7 @@ class NominalScale:
             f"{self.joint_names[j]} {self.scale[j]:.3g} ± {self.tolerance[j]:.2g}" for j in off
         ]
         names = [self.joint_names[j] for j in off]
-        step = f"check torque constant and gear ratio of {listed(names)}, what it carries"
+        step = f"check torque constant and gear ratio of {joined(names)}, what it carries"
         if common != 1.0:
             step = "check the unit of the torque (N·m, N·mm?), its side (motor or joint?)"
         return [
@@ -116,7 +116,7 @@ class NominalScale:
                 "scale of the torque",
                 "wrong" if abs(np.log(common)) > np.log(_IMPOSSIBLE) else "doubtful",
                 "the torque is not as large as the nominal inertias ask for, by a factor: "
-                + listed(figures),
+                + joined(figures),
                 f"{step}, and the masses of the URDF",
             )
         ]
@@ -201,5 +201,5 @@ def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
     wonder = _SURE * float(np.sqrt(share**2 * (1.0 + _LINKS_APART * lost) + misfit**2))
     tolerance = student_limit(0.025, _BLOCKS - 1) * std + wonder
     # Friction and noise have the unit of the torque, so a tolerance is large where the scale is.
-    told = tolerance < _LEAST_TOLD * max(1.0, abs(scale))
-    return (scale, float(tolerance)) if told else (np.nan, np.inf)
+    determined = tolerance < _WIDEST * max(1.0, abs(scale))
+    return (scale, float(tolerance)) if determined else (np.nan, np.inf)

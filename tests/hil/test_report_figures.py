@@ -55,7 +55,7 @@ def full_series() -> ReportSeries:
     return replace(
         bare,
         excitation_fitted=fitted,
-        example_counted=counted,
+        example_used=counted,
         example_friction=0.15 * bare.example_predicted,
         **split,
         friction_speed=speed,

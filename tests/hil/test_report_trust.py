@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.identify.consistency import consistency_doubts, consistency_reasons, consistency_result
-from hil.identify.essential import essential_doubts, essential_result
+from hil.identify.consistency import consistency_reasons, consistency_result, consistency_warnings
+from hil.identify.essential import essential_result, essential_warnings
 from hil.report import page
 from hil.report.figures.elimination import elimination_panels
 from hil.report.rendering import environment
@@ -207,8 +207,8 @@ def test_names_of_joints_are_text_and_nothing_else(arm: IdentifiedArm) -> None:
 
 def test_a_machine_is_no_reason_and_no_doubt(arm: IdentifiedArm) -> None:
     assert consistency_reasons(arm.consistency) == ()
-    assert (*essential_doubts(arm.essential), *consistency_doubts(arm.consistency)) == ()
-    doubts = (*consistency_doubts("the solver gave up"), *essential_doubts("no motion"))
+    assert (*essential_warnings(arm.essential), *consistency_warnings(arm.consistency)) == ()
+    doubts = (*consistency_warnings("the solver gave up"), *essential_warnings("no motion"))
     assert len(doubts) == 2
     assert "the solver gave up" in doubts[0]
 

@@ -86,7 +86,7 @@ def torque_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[P
             time,
             series.example_measured[:, j],
             series.example_predicted[:, j],
-            _left_out(time, series.example_counted, j),
+            _left_out(time, series.example_used, j),
         )
         for j, error in enumerate(errors)
     ]
@@ -146,7 +146,7 @@ def split_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Pa
             time,
             series.example_measured[:, j],
             {name: part[:, j] for name, part in parts.items()},
-            _left_out(time, series.example_counted, j),
+            _left_out(time, series.example_used, j),
         )
         for j, one in enumerate(errors)
     ]
@@ -213,11 +213,11 @@ def _time_axes(all_axes: Sequence[Axes], time: Array) -> None:
     footed(all_axes[-1], _SECONDS)
 
 
-def _left_out(time: Array, counted: Array, joint: int) -> Stretches:
+def _left_out(time: Array, used: Array, joint: int) -> Stretches:
     """Stretches of time (m,) in which rows (m, n) of a joint are zero, to midway to the next."""
-    if counted.size == 0:
+    if used.size == 0:
         return ()
-    out = np.concatenate([[False], counted[:, joint] < 0.5, [False]])
+    out = np.concatenate([[False], used[:, joint] < 0.5, [False]])
     edges = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
     changes = edges[np.flatnonzero(np.diff(out.astype(np.int8)))].tolist()
     return tuple(zip(changes[::2], changes[1::2], strict=True))
