@@ -13,6 +13,7 @@ from hil.archive.check import ASPECTS, Check, check_archive
 from hil.archive.overview import Overview, overview
 from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
+from hil.cli.arguments import JsonOption
 from hil.cli.failing import exit_code_of
 from hil.errors import ArchiveError, InputError
 from hil.terminal_text import printable
@@ -25,11 +26,10 @@ FAILED = 1
 LOST = 3
 
 Files = Annotated[list[Path], typer.Argument(help="The archives.", show_default=False)]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object per file instead.")]
 
 
 @app.command("info")
-def info(files: Files, as_json: Json = False) -> None:
+def info(files: Files, as_json: JsonOption = False) -> None:
     """Say what archives hold: motion, joints, channels, sizes, attachments."""
     failed = 0
     for path in files:
@@ -44,7 +44,7 @@ def info(files: Files, as_json: Json = False) -> None:
 
 
 @app.command("check")
-def check(files: Files, as_json: Json = False) -> None:
+def check(files: Files, as_json: JsonOption = False) -> None:
     """Say whether files keep the archive profile (docs/archive-format.md), aspect by aspect.
 
     Exit status: 0 all keep it, 5 one does not, 2 one is no archive.

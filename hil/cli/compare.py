@@ -9,6 +9,7 @@ from typing import Annotated, Final
 import typer
 
 from hil.batch.workers import LocalWorkers
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.compare import compare_campaigns, gather
 from hil.compare.record import to_dict
 from hil.compare.words import caveat, findings, verdict
@@ -38,8 +39,8 @@ def compare(
     fail_on_change: Annotated[
         bool, typer.Option("--fail-on-change", help="Exit status 5 if something has changed.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Compare campaigns of one arm: did the friction change, on which axis, what does it carry?
 

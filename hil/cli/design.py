@@ -19,6 +19,7 @@ from hil import lines
 from hil.campaign.from_design import campaign_of_design, require_replaceable
 from hil.campaign.stop import Stop, stop_on_interrupt
 from hil.cell import Cell
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.design import DesignSettings, Method, load_settings, preset
 from hil.design.advice import WEAK, NoExcitationError, margins, weakest
 from hil.design.compare import References, references
@@ -250,8 +251,8 @@ def design(
     view: Annotated[
         bool, typer.Option("--view", help="Then show the motion in the browser, in 3D.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the criteria as JSON.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Search the motion that excites and decouples the parameters of CELL. Nothing moves.
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from hil.campaign import stop_on_interrupt
+from hil.cli.arguments import JsonOption
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.importers import convention_of
@@ -86,7 +87,7 @@ def new(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier file.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Write a commented cell file for an arm; what nobody has said is marked "?".
 

@@ -15,6 +15,7 @@ import typer
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
+from hil.cli.arguments import JsonOption
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import check_format, draw_plan, save
@@ -227,7 +228,7 @@ def plan(
         int | None,
         typer.Option(min=1, help="Target to draw the corner of; else where the path turns most."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the table as JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Plan a motion through via points and say how each of them is passed. Nothing moves.
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.arguments import JsonOption
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically
 from hil.plots import save
@@ -46,7 +47,7 @@ def plot(
             help="Only this joint, by name or number from 1; may be repeated.", show_default=False
         ),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Draw what is in an archive: position, speed, current, torque, following error, events.
 

@@ -20,6 +20,7 @@ from hil.batch.estimates import relative_error
 from hil.batch.table import write_tables
 from hil.batch.types import Arm, BatchEstimator, BatchResult, Broken, LevelEstimate
 from hil.batch.workers import TIMEOUT, LocalWorkers, Workers
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.identify_options import (
     BandwidthOption,
     DelayOption,
@@ -278,8 +279,8 @@ def reidentify(
     delay: DelayOption = None,
     smoother: SmootherOption = "spline",
     torque_bandwidth: TorqueBandwidthOption = "auto",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only what matters.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Identify every arm from all archives below some folders, campaign by campaign.
 

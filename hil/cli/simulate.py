@@ -14,6 +14,7 @@ import typer
 
 from drivers.transports.faults import FaultyLink
 from hil.cell import Cell
+from hil.cli.arguments import JsonOption
 from hil.errors import InputError
 from hil.serving import Served, buttons, open_far_end, serve_session, undisturbed
 from hil.simulation import controller_settings, own_postures, simulated_controller
@@ -248,7 +249,6 @@ Effects = Annotated[
     bool, typer.Option("--effects", help="Switch on what the identified model leaves out.")
 ]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of noise and model errors.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 
 HELP: Final = """\
 Be the controller: a simulated C4G with its arm, for a PC program on a real network or bus.
@@ -302,7 +302,7 @@ def simulate(
     seed: Seed = None,
     duration: Duration = None,
     priority: Priority = None,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Serve one session; `HELP` is what a person reads."""
     loaded = Cell.load(cell)
