@@ -564,10 +564,6 @@ class Results(Frozen):
                 raise ValueError(f"{name} has {len(found)} entries and not {count}")
         return self
 
-    def to_json(self) -> str:
-        """As indented JSON, the text of `results.json`."""
-        return self.model_dump_json(indent=1) + "\n"
-
     def save(self, path: Path) -> None:
         """Write `path` as indented JSON."""
         write_atomically(path, self.to_json())

@@ -16,7 +16,6 @@ from hil.design import preset
 from hil.io.digest import digest
 from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
-from hil.version import software
 from sim_fixtures.ns16 import CELL_PATH
 
 from .ablations import EffectSetting, Evidence, ablations, effect_ablation
@@ -37,7 +36,7 @@ from .page import write_outcome
 from .records import PLANTED, ClassForms, FitRecord, ScoreRecord
 from .results import ConditionResult, MotionRow, StudyResults
 from .searches import AP, B0, LABELS, A, B, Found, run_searches, searches
-from .sentences import reading_of
+from .sentences import study_results
 from .settings import Stages, StudyFolder, StudySettings
 from .tables import (
     Condition,
@@ -159,16 +158,13 @@ class _Analysis:
         else:
             missing = ["The unmodelled effects were not run."]
         sizes = preset("b").search
-        results = StudyResults(
-            name=self.folder.root.resolve().name,
-            cell=cell.name,
+        return study_results(
+            self.folder.root,
+            cell,
+            parameters_of(cell, truth),
             simulated=True,
             quick=settings.effort_b.tried < sizes.population * sizes.generations,
             settings=settings,
-            software=software(),
-            joint_names=list(cell.joint_names),
-            n_base=len(cell.model.base.names),
-            parameters=parameters_of(cell, truth),
             searches=[
                 one.result(chosen=key in (self.plans.sines, B, B0))
                 for key, one in self.found.items()
@@ -176,11 +172,9 @@ class _Analysis:
             table1=self._table1() + printed_rows(cell),
             conditions=conditions,
             ablations=varied,
-            reading=[],
             missing=missing,
             times={},
         )
-        return results.model_copy(update={"reading": reading_of(results)})
 
     def _scored(
         self, runs: list[Run], place: str, estimates: Mapping[str, Array], shown: tuple[str, ...]
