@@ -11,8 +11,7 @@ import typer
 from hil.batch.workers import LocalWorkers
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.compare import compare_campaigns, gather
-from hil.compare.record import to_dict
-from hil.compare.words import caveat, findings, verdict
+from hil.compare.words import caveat, findings, to_dict, verdict
 from hil.files import make_folder, write_together
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable

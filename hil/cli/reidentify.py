@@ -34,10 +34,9 @@ from hil.cli.identify_options import (
 from hil.compare.findings import findings, summary
 from hil.compare.trend import ArmTrend, Trends, trends
 from hil.files import make_folder, writing_to
-from hil.plural import counted as plural
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
-from hil.terminal_text import printable
+from hil.terminal_text import plural, printable
 
 _MOST_LINES: Final = 20
 _WIDTH: Final = 42

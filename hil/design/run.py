@@ -30,8 +30,7 @@ from identification.excitation.collision.built_in import told
 
 from .advice import exhausted, forbidden, no_excitation
 from .folder import DesignFolder, require_same
-from .knowledge import Knowledge
-from .problem import problem_of, search_settings
+from .problem import Knowledge, problem_of, search_settings
 from .result import DesignResult
 from .settings import DesignSettings
 

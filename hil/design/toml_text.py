@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from typing import Any
 
-from planner.decimals import radians_in, without_decimals
-from planner.degrees import degrees_text
+from planner.decimals import degrees_text, radians_in, without_decimals
 from planner.toml_value import toml_key, toml_value
 
 _SUFFIX = "_deg"

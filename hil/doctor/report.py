@@ -12,7 +12,7 @@ from rich.table import Table
 from hil.terminal_text import printable
 
 from .check import Check, Status
-from .latency import Latency
+from .measure import Latency
 from .run import CRITERIA, Diagnosis, Fitness
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}

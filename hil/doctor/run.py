@@ -14,10 +14,9 @@ from hil.progress import Reporter
 from . import link as links
 from . import machine
 from .check import Check, Status
-from .latency import RESERVE, Latency
 from .link import CanLink, Link, UdpLink, can_check
 from .machine import disk_checks
-from .measure import TURNAROUND_PERIOD, disk_trial, measure, obtained
+from .measure import RESERVE, TURNAROUND_PERIOD, Latency, disk_trial, measure, obtained
 from .network import address_of, network_checks
 from .system import System
 

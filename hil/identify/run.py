@@ -20,15 +20,20 @@ from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import gather
 from identification.validation.verdict import Verdict, judge
 
-from .consistency import consistency_of, consistency_reasons, consistency_warnings
-from .essential import essential_of, essential_warnings
 from .estimating import Estimation, estimate_with
 from .judging import judgement_result
 from .options import Options
 from .prepared import Prepared, prepare_sources
 from .series import report_series
 from .sources import gather_sources
-from .summary import summarise
+from .summary import (
+    consistency_of,
+    consistency_reasons,
+    consistency_warnings,
+    essential_of,
+    essential_warnings,
+    summarise,
+)
 from .surroundings import nominal_of, surroundings_of
 
 

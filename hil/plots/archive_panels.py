@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final
 
 import numpy as np
+from jinja2 import ChoiceLoader, FileSystemLoader
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from hil.report.figures.canvas import blank, footed, headed, place, ruled
 from hil.report.figures.palette import FIRST, INK, MUTED, OUTSIDE_3, ROUTES, SECOND
 from hil.report.figures.svg import Panel, drawing, label, to_panel
 from hil.report.figures.traces import Plot, Trace, even_traces_text
+from hil.report.rendering import environment, page_bytes
 
 Array = NDArray[np.float64]
 
@@ -136,3 +139,48 @@ def _draw(axes: Axes, grid: Array, plot: Plot) -> None:
     ruled(axes, "both", x_ticks=6, y_ticks=3)
     axes.ticklabel_format(axis="y", useOffset=False)
     headed(axes, plot.heading)
+
+
+_TEMPLATES: Final = Path(__file__).parent / "templates"
+
+
+def archive_page(view: ArchiveView) -> bytes:
+    """The page; the same archive gives the same bytes.
+
+    Args:
+        view: read with `BINS`, so that there is something to zoom into.
+    """
+    facts = view.facts
+    known = environment()
+    assert known.loader is not None  # where macros and style sheet of all pages lie
+    known.loader = ChoiceLoader([FileSystemLoader(_TEMPLATES), known.loader])
+    shown = f"{view.start:.3f} s to {view.stop:.3f} s of {facts.duration:.3f} s"
+    rows = [
+        ("shown", shown),
+        ("frame", view.frame),
+        ("joints", ", ".join(facts.joint_names)),
+        ("cycle", "not fixed" if facts.period is None else f"{1e3 * facts.period:g} ms"),
+        ("samples", str(facts.samples)),
+        *_missed(view),
+        ("lost", facts.lost or "nothing"),
+        ("damage", facts.damage or "none"),
+        ("attachments", ", ".join(facts.attachments)),
+        *facts.metadata.items(),
+    ]
+    text = known.get_template("archive.html.j2").render(
+        facts=facts,
+        joints=archive_panels(view),
+        events=view.events,
+        states=view.states,
+        simulated=facts.metadata.get("simulated") == "yes",
+        rows=rows,
+    )
+    return page_bytes(text)
+
+
+def _missed(view: ArchiveView) -> list[tuple[str, str]]:
+    """Where packets were missed; nothing where nobody counted them."""
+    if not view.states:
+        return []
+    places = f"at {len(view.gaps)} place{'s' * (len(view.gaps) > 1)}"
+    return [("packets missed", places if len(view.gaps) else "none")]

@@ -30,9 +30,8 @@ from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.campaign.stop import Stop
 from hil.cell import Cell
 from hil.lines import put
-from hil.plural import counted
 from hil.progress import Silent, Task
-from hil.terminal_text import printable
+from hil.terminal_text import plural, printable
 
 from . import layout, marks
 from .keys import Keyboard, after, can_read, stops
@@ -141,7 +140,7 @@ def _table(summary: DryRunSummary) -> Table:
             agree = Text("not seen")
         table.add_row(Text(printable(name)), degrees, f"{100.0 * share:.0f} % of its limit", agree)
     archives = ", ".join(summary.archives)
-    link = f"{counted(summary.missed, 'packet')} missed, {counted(summary.late, 'answer')} late"
+    link = f"{plural(summary.missed, 'packet')} missed, {plural(summary.late, 'answer')} late"
     table.caption = Text(printable(f"{link}; {archives}"))
     return table
 

@@ -21,9 +21,8 @@ from hil.cell import Cell
 from hil.cli import app
 from hil.compare import Comparison, compare_campaigns, gather
 from hil.compare.gather import Gathered
-from hil.compare.record import to_dict
 from hil.compare.spread import difference, effective_count, holm, known
-from hil.compare.words import findings, names, verdict
+from hil.compare.words import findings, names, to_dict, verdict
 from hil.errors import InputError
 from hil.identify import identify_campaign
 from hil.progress import Silent

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
-from hil.design.knowledge import Knowledge
+from hil.design.problem import Knowledge
 from hil.design.settings import SettingsError, preset_text, settings_of
 from hil.design.toml_text import Angles, from_text, to_text
 from identification.excitation import SineGenome, ViaPointGenome

@@ -18,8 +18,7 @@ from hil.cli import app
 from hil.errors import InputError
 from hil.identify import Options
 from hil.identify.cad_prior import FRICTION_SHARE, cad_prior
-from hil.identify.estimating import Estimation, estimate_with
-from hil.identify.instruments import NARROWEST, widely_smoothed
+from hil.identify.estimating import NARROWEST, Estimation, estimate_with, widely_smoothed
 from hil.identify.options import ESTIMATORS, Estimator
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources

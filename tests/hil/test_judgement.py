@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 import typer
 
-import hil.identify.controller_model
+import hil.identify.surroundings
 from hil.archive import Archive, open_archive
 from hil.campaign import Campaign
 from hil.cell import Cell
 from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.identify import Identification, Options, identify_campaign
-from hil.identify.controller_model import controller_error
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
-from hil.identify.surroundings import torque_limits
+from hil.identify.surroundings import controller_error, torque_limits
 from hil.progress import Silent
 from hil.report.page import judgement_context
 from hil.results import JudgementResult
@@ -81,7 +80,7 @@ def test_a_model_current_of_zeros_is_no_model(
         zeros = np.zeros_like(archive.columns["model_current"])
         return replace(archive, columns={**archive.columns, "model_current": zeros})
 
-    monkeypatch.setattr(hil.identify.controller_model, "open_archive", silent)
+    monkeypatch.setattr(hil.identify.surroundings, "open_archive", silent)
     assert controller_error(paths, cell, sources, samples) is None
 
 

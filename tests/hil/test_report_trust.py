@@ -8,8 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.identify.consistency import consistency_reasons, consistency_result, consistency_warnings
-from hil.identify.essential import essential_result, essential_warnings
+from hil.identify.summary import (
+    consistency_reasons,
+    consistency_result,
+    consistency_warnings,
+    essential_result,
+    essential_warnings,
+)
 from hil.report import page
 from hil.report.figures.elimination import elimination_panels
 from hil.report.rendering import environment

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from planner import JointLimits
-from planner.degrees import degrees_text, radians_of
+from planner.decimals import degrees_text, radians_of
 from planner.errors import InvalidPlanFile
 from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
 from planner.plan_file import PlanFile
