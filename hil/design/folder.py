@@ -11,10 +11,10 @@ from typing import BinaryIO, cast
 from hil.errors import InputError
 from hil.files import exclusive_folder, write_atomically
 from hil.reading import opened
+from planner.toml_text import to_text
 
 from .result import RESULT
 from .settings import DesignSettings, SettingsError, load_settings
-from .toml_text import to_text
 
 PICTURE, SETTINGS, JOURNAL = "excitation.png", "settings.toml", "search.journal"
 DESIGN_FILES = frozenset((RESULT, PICTURE, SETTINGS, JOURNAL))

@@ -28,9 +28,9 @@ from identification.excitation import (
     coupling_index_max,
 )
 from planner import FourierSeries, JointLimits, PiecewiseCubic, PlanFile, PlannerError, in_child
+from planner.toml_text import Angles, from_text, to_text
 
 from .settings import RESULT_FORMAT, DesignSettings, SettingsError, settings_of
-from .toml_text import Angles, from_text, to_text
 
 Array = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from hil.reading import remedy_of, text_of
 from identification.errors import ModelError
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.urdf_tree import urdf_tree
-from planner.toml_value import toml_key, toml_value
+from planner.toml_text import toml_key, toml_value
 
 from .known import Known, from_urdf
 

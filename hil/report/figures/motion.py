@@ -51,7 +51,7 @@ def _excitation(series: ReportSeries, time: Array, j: int, name: str) -> Panel:
         _plot(122.0, 78.0, "velocity [rad/s]", [Trace(velocity, SECOND, 1.5, "v")], shaded),
     )
     words = {"key": f"x{j}", "title": name, "note": note, "alt": alt}
-    return _panel(240.0, time, plots, points=_POINTS, **words)
+    return _panel(240.0, time, plots, _POINTS, **words)
 
 
 def torque_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Panel]:
@@ -73,7 +73,7 @@ def _torque(series: ReportSeries, time: Array, j: int, joint: TorqueError) -> Pa
         _plot(172.0, 50.0, f"measured − predicted [{joint.unit}]", error, shaded),
     )
     words = {"key": f"t{j}", "title": joint.joint, "note": joint.words, "alt": alt}
-    return _panel(262.0, time, plots, **words)
+    return _panel(262.0, time, plots, MOST_POINTS, **words)
 
 
 PARTS: Final = (
@@ -105,7 +105,7 @@ def _split(series: ReportSeries, time: Array, j: int, joint: TorqueError) -> Pan
     shaded = _left_out(time, series.example_used, j)
     plot = _plot(20.0, 140.0, f"torque [{joint.unit}]", lines, shaded)
     words = {"key": f"g{j}", "title": joint.joint, "note": note, "alt": alt}
-    return _panel(200.0, time, (plot,), points=_POINTS, **words)
+    return _panel(200.0, time, (plot,), _POINTS, **words)
 
 
 def _plot(
@@ -115,9 +115,7 @@ def _plot(
     return Plot((_LEFT, top, _INNER, height), heading, traces, shaded=shaded)
 
 
-def _panel(
-    height: float, time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS, **words: str
-) -> Panel:
+def _panel(height: float, time: Array, plots: Sequence[Plot], points: int, **words: str) -> Panel:
     """Plots over the same time, one above the other, with their samples to zoom into."""
     with drawing():
         figure = blank(_WIDTH, height)
