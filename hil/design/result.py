@@ -213,7 +213,7 @@ RESULT: Final = "excitation.toml"
 
 _FRONT = (
     "Motions of which none is better than another in both, by rising coupling index, as the\n"
-    "# search sampled them. "
+    "search sampled them. "
 )
 _CHOSEN = "chosen, counting from 0, is the motion of this file."
 _POLISHED = "The motion of this file is none of them: a polish made it from one, see polished_from."
