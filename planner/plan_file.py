@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from planner.arrays import Array
+from planner.checked_data import DAMAGED, number, numbers, one_or_more, rows, table, text
 from planner.commands import STOP, Fly, FlyDistance, FlyPercent, Move, Overrides
 from planner.errors import InvalidPlanFile, PlannerError
 from planner.limits import JointLimits
 from planner.moves import MotionPlan, plan_moves
 from planner.piecewise_cubic import PiecewiseCubic
-from planner.plain import DAMAGED, number, numbers, one_or_more, rows, table, text
 from planner.toml_text import Angles, Rows, from_text, to_text
 from planner.verify import check_limits, check_smooth
 

@@ -62,7 +62,7 @@ def compare(
         if not quiet:
             for one in findings(found):
                 typer.echo(printable(f"{one.words} {one.next_step}".rstrip()), err=True)
-            for doubt in found.doubts:
+            for doubt in found.warnings:
                 typer.echo(printable(f"note: {doubt}"), err=True)
             typer.echo(f"note: {caveat(found)}", err=True)
         typer.echo(printable(f"{verdict(found)}."))

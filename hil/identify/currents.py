@@ -12,7 +12,7 @@ from hil.errors import ArchiveError
 from identification.estimators.current_scale import CurrentScale, scale_from_nominal
 from identification.signals.recording import Recording
 from identification.signals.samples import smooth
-from planner.plain import numbers
+from planner.checked_data import numbers
 
 from .sources import Sources
 

@@ -131,7 +131,7 @@ class Estimation:
             was learned from the data; in words why there is none.
         endogeneity: whether noise in the regressor has biased least squares; in words why that
             could not be tested.
-        doubts: what a reader must know of the estimate.
+        warnings: what a reader must know of the estimate.
     """
 
     estimator: Estimator
@@ -139,7 +139,7 @@ class Estimation:
     held_out: tuple[PhaseFactor, ...]
     posterior: PosteriorEstimate | str
     endogeneity: EndogeneityTest | str
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 class _Case:
@@ -178,7 +178,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, options.estimator)
         prior = cad_prior(prepared.sources.cell)
         case = _Case(model, fitted, prior, instrumental, prepared.settings.shrinkage)
-        result, doubts = _ESTIMATORS[options.estimator](case)
+        result, warnings = _ESTIMATORS[options.estimator](case)
         if prepared.sources.same_motion:
             result = result.with_scatter()
         result = _with_delay_uncertainty(case, result, prepared.settings.delay_variance)
@@ -195,7 +195,11 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         endogeneity=(
             f"{_UNTESTED}: {instrumental}." if isinstance(instrumental, str) else instrumental.test
         ),
-        doubts=(*doubts, *_conditioning(result.pooled), *_bias(options.estimator, instrumental)),
+        warnings=(
+            *warnings,
+            *_conditioning(result.pooled),
+            *_bias(options.estimator, instrumental),
+        ),
     )
 
 
@@ -240,8 +244,8 @@ def _automatic(case: _Case) -> _Found:
             case.model, total, joint_weights(total), case.shrinkage.prior_weight
         ).estimate.values
     except SolverError as error:
-        found, doubts = _least_squares("weighted")(case)
-        return found, [*doubts, f"least squares is reported, for {error}"]
+        found, warnings = _least_squares("weighted")(case)
+        return found, [*warnings, f"least squares is reported, for {error}"]
 
     def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
         return fit_shrunk(case.model, some, case.shrinkage, centre=centre, phase=phase)
@@ -268,15 +272,15 @@ def _robust(loss: Loss) -> Callable[[_Case], _Found]:
 
 
 def _robust_warnings(model: RobotModel, found: RobustEstimate) -> list[str]:
-    doubts = [
+    warnings = [
         f"{found.outlying[joint]:.0%} of the rows of {model.joint_names[joint]} lie beyond four "
         "deviations: that is no gross error but something the model leaves out, and a robust loss "
         "looks away from it; use --estimator wls"
         for joint in np.flatnonzero(found.doubtful)
     ]
     if not found.converged:
-        doubts.append(f"the reweighting had not settled after {found.iterations} passes")
-    return doubts
+        warnings.append(f"the reweighting had not settled after {found.iterations} passes")
+    return warnings
 
 
 def _with_prior(case: _Case) -> _Found:

@@ -94,7 +94,7 @@ def identify_campaign(
         options,
         predict=predict,
         name=root.resolve().name,
-        doubts=folder.damaged(),
+        warnings=folder.damaged(),
     )
     conduct = conduct_of(folder)
     return replace(found, results=found.results.model_copy(update={"conduct": conduct}))
@@ -107,7 +107,7 @@ def identify_archives(
     *,
     predict: Sequence[Path] = (),
     name: str = "",
-    doubts: Sequence[str] = (),
+    warnings: Sequence[str] = (),
 ) -> Identification:
     """Identify from archives.
 
@@ -117,17 +117,17 @@ def identify_archives(
         options: how.
         predict: archives that are predicted and not fitted, whatever they say.
         name: of the result; that of the first archive if left out.
-        doubts: what is known beforehand to be wrong with the archives.
+        warnings: what is known beforehand to be wrong with the archives.
 
     Raises:
         InputError: the archives cannot be used, or not together, or not by the chosen estimator.
     """
     sources = gather_sources(paths, options.split, predict, in_sample=options.in_sample)
-    for doubt in doubts:
+    for doubt in warnings:
         sources = sources.with_doubt(doubt)
     prepared = prepare_sources(sources, options, reporter)
     estimation = estimate_with(prepared, options, reporter)
-    for doubt in estimation.doubts:
+    for doubt in estimation.warnings:
         prepared = replace(prepared, sources=prepared.sources.with_doubt(doubt))
     return _judged(name or paths[0].stem, (*paths, *predict), prepared, estimation, reporter)
 
