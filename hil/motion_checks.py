@@ -19,7 +19,7 @@ from identification.excitation import (
     Violation,
     check_motion,
 )
-from identification.excitation.collision.built_in import unchecked_pairs
+from identification.excitation.collision.built_in import told
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic
 from planner.verify import check_rest, check_smooth
 
@@ -82,7 +82,7 @@ class MotionChecks:
     @property
     def not_checked(self) -> str | None:
         """What is left out, in a sentence: shapes that are always too close; None for nothing."""
-        return unchecked_pairs(self.checker.built_in)
+        return told(self.checker.built_in)
 
     def refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> str | None:
         """Why a motion must not be sent, or None if it may be."""

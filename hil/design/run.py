@@ -26,7 +26,7 @@ from identification.excitation import (
     sampled,
     search,
 )
-from identification.excitation.collision.built_in import unchecked_pairs
+from identification.excitation.collision.built_in import told
 
 from .advice import exhausted, forbidden, no_excitation
 from .folder import DesignFolder, require_same
@@ -147,7 +147,7 @@ def _searched(
     stop: Callable[[], bool],
 ) -> Design:
     settings, checker = search_settings(asked), problem.constraints.checker
-    not_checked = None if checker is None else unchecked_pairs(checker.built_in)
+    not_checked = None if checker is None else told(checker.built_in)
     if not_checked is not None:
         reporter.say(not_checked)
     with ExitStack() as stack:

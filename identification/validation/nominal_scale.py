@@ -28,7 +28,7 @@ _BLOCKS: Final = 20  # stretches of the recordings whose scatter gives the stand
 # What a friction law does not describe, as a share of the friction (Bittencourt and Gunnarsson
 # 2012: some per cent with speed, load and position).
 _FRICTION_SHARE: Final = 0.03
-_WIDEST: Final = 0.5  # a tolerance, as a share of the scale, above which an axis says nothing
+_LEAST_TOLD: Final = 0.5  # a tolerance, as a share of the scale, above which an axis says nothing
 # Links are wrong each in its own way, which counts where friction takes most of the torque. On a
 # simulated UR5 whose links were off by up to 10 % each no scale was off by more than 7 %.
 _LINKS_APART: Final = 0.05
@@ -57,9 +57,9 @@ class NominalScale:
     @property
     def off(self) -> NDArray[np.intp]:
         """Axes whose scale is a wonder."""
-        determined = self.tolerance < _WIDEST
+        told = self.tolerance < _LEAST_TOLD
         return np.flatnonzero(
-            determined & (np.abs(np.where(determined, self.scale, 1.0) - 1.0) > self.tolerance)
+            told & (np.abs(np.where(told, self.scale, 1.0) - 1.0) > self.tolerance)
         )
 
     @property
@@ -201,5 +201,5 @@ def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
     wonder = _SURE * float(np.sqrt(share**2 * (1.0 + _LINKS_APART * lost) + misfit**2))
     tolerance = student_limit(0.025, _BLOCKS - 1) * std + wonder
     # Friction and noise have the unit of the torque, so a tolerance is large where the scale is.
-    determined = tolerance < _WIDEST * max(1.0, abs(scale))
-    return (scale, float(tolerance)) if determined else (np.nan, np.inf)
+    told = tolerance < _LEAST_TOLD * max(1.0, abs(scale))
+    return (scale, float(tolerance)) if told else (np.nan, np.inf)

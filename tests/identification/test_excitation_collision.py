@@ -24,7 +24,7 @@ from identification.excitation import (
 )
 from identification.excitation.collision import checker as checker_module
 from identification.excitation.collision.bodies import link_bodies
-from identification.excitation.collision.built_in import unchecked_pairs
+from identification.excitation.collision.built_in import told
 from identification.excitation.collision.checker import joint_poses
 from identification.excitation.sampling import sampled
 from identification.model.kinematics import chain_from_urdf
@@ -426,11 +426,9 @@ def test_what_is_built_in_is_named_shape_by_shape():
     (pair,) = wrist.built_in
     assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
     assert pair.nearest <= pair.farthest < 0.0
-    assert unchecked_pairs(
-        wrist.built_in
-    ) is not None and "link_0_0 and link_2_0" in unchecked_pairs(wrist.built_in)
+    assert told(wrist.built_in) is not None and "link_0_0 and link_2_0" in told(wrist.built_in)
     assert checkers(0.05).built_in == ()
-    assert unchecked_pairs(()) is None
+    assert told(()) is None
 
 
 @pytest.mark.parametrize("limit", ['lower="-2" upper="2"', "", 'lower="-0.02" upper="0.02"'])

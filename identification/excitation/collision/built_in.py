@@ -98,7 +98,7 @@ def random_postures(model: pin.Model, limits: JointLimits | None) -> Array:
     return postures
 
 
-def unchecked_pairs(built_in: Sequence[BuiltIn]) -> str | None:
+def told(built_in: Sequence[BuiltIn]) -> str | None:
     """Return the sentence that says what is not checked, None where everything is."""
     if not built_in:
         return None

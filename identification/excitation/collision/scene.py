@@ -164,17 +164,17 @@ class Scene:
     def _leave_out(self, postures: Array) -> tuple[BuiltIn, ...]:
         """Leave out the pairs that are built in, as these postures (k, n) show, and return them."""
         tried = _Tried(self, self.path(postures))
-        allowed_pairs: list[tuple[int, int]] = []
+        kept: list[tuple[int, int]] = []
         left_out: list[BuiltIn] = []
         for pair in range(len(self.separation.first)):
             a, b = self.indices(pair)
             always = always_close(tried, pair, self.margin)
             if always is None:
-                allowed_pairs.append((a, b))
+                kept.append((a, b))
             else:
                 names = self._bodies[a].shape_name, self._bodies[b].shape_name
                 left_out.append(BuiltIn(*names, *always))
-        self.separation = Separation(self._bodies, allowed_pairs)
+        self.separation = Separation(self._bodies, kept)
         return tuple(left_out)
 
     def spread(self, first: str, second: str) -> tuple[float, float]:
