@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict
 
 from hil.cli import imports
-from planner.toml_value import toml_value
+from planner.toml_text import toml_value
 
 CONFIGURATIONS: Final = Path(__file__).parent / "recordings"
 FITTED_SHARE: Final = 0.7

@@ -71,7 +71,7 @@ def common_columns(model: RobotModel) -> tuple[list[int], list[int]]:
     width = len(LINK_SYMBOLS) + model.rotor_inertia
     own: list[int] = []
     foreign: list[int] = []
-    for column, standard in enumerate(model.base.kept):
+    for column, standard in enumerate(model.base.pivots):
         joint, symbol = divmod(int(standard), width)
         if symbol < len(LINK_SYMBOLS):
             own.append(column)

@@ -212,12 +212,12 @@ def _tip(model: pin.Model, solids: Sequence[Solid]) -> Array:
 
 def _sticks(chain: Chain, tip: Array) -> tuple[Solid, ...]:
     """Return a bar from each joint to the next, and from the last ones to their ends."""
-    ways = [(int(parent), chain.translation[k]) for k, parent in enumerate(chain.parents)]
-    ways.append((chain.n_joints - 1, tip))
-    width = _STICK * sum(float(np.linalg.norm(way)) for _, way in ways)
+    links = [(int(parent), chain.translation[k]) for k, parent in enumerate(chain.parents)]
+    links.append((chain.n_joints - 1, tip))
+    width = _STICK * sum(float(np.linalg.norm(way)) for _, way in links)
     return tuple(
         Solid("base" if joint < 0 else chain.joint_names[joint], joint, _bar(way, width))
-        for joint, way in ways
+        for joint, way in links
         if np.linalg.norm(way) > 0.0
     )
 

@@ -11,6 +11,7 @@ from secrets import token_hex
 from tempfile import TemporaryDirectory
 
 from hil.errors import InputError, OutputError
+from hil.io.lock import locked
 
 
 def make_folder(path: Path) -> None:
@@ -27,6 +28,35 @@ def make_folder(path: Path) -> None:
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(path, "cannot be written to", remedy="name another folder")
+
+
+@contextmanager
+def exclusive_folder(root: Path, work: str, option: str) -> Iterator[None]:
+    """Make a folder, and keep every other process with the same work out of it until this is left.
+
+    The lock is on the folder itself, which nobody removes, and goes with this process.
+
+    Args:
+        root: the folder.
+        work: what is done in it, a noun.
+        option: of the command line that names another folder.
+
+    Raises:
+        InputError: another one is at work in it, it cannot be made, or not be locked.
+    """
+    make_folder(root)
+
+    def refusal(error: OSError) -> InputError:
+        if isinstance(error, BlockingIOError):
+            problem = f"a {work} is running in it"
+            remedy = f"wait for its end, stop it (Ctrl-C), or name another folder ({option})"
+        else:
+            problem = f"cannot be locked against a second {work} ({error.strerror})"
+            remedy = f"name a folder on a disk of this PC ({option})"
+        return InputError(root, problem, remedy=remedy)
+
+    with locked(root, refusal):
+        yield
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

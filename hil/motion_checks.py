@@ -65,17 +65,17 @@ class MotionChecks:
             frame=AngleFrame.of(cell),
         )
 
-    def within(self, announced: Array) -> Self:
+    def within(self, controller_limits: Array) -> Self:
         """These checks where a controller announces current limits (n,) [A] of its own.
 
         The narrower of the two count for each motor; these very checks where that is the cell's
         for all of them.
         """
-        below = narrower(announced, self.currents.current_limit)
+        below = narrower(controller_limits, self.currents.current_limit)
         if not below.any():
             return self
         ours = self.currents.current_limit
-        currents = replace(self.currents, current_limit=np.where(below, announced, ours))
+        currents = replace(self.currents, current_limit=np.where(below, controller_limits, ours))
         return replace(self, currents=currents, cell_limit=ours)
 
     @property
@@ -104,11 +104,11 @@ class MotionChecks:
         # First what is quick to tell: nothing else can be told of a motion that is beyond limits.
         result = check_motion(trajectory, self.limits)
         if not result.ok:
-            return self._told(result.violations[0])
+            return self._sentence(result.violations[0])
         result = check_motion(trajectory, self.limits, checker=self.checker, currents=self.currents)
-        return None if result.ok else self._told(result.violations[0])
+        return None if result.ok else self._sentence(result.violations[0])
 
-    def _told(self, violation: Violation) -> str:
+    def _sentence(self, violation: Violation) -> str:
         text, remedy = violation_text(violation, self.frame), always_so(violation, self.checker)
         if violation.kind == "current":
             text += self._whose_limit(violation.subject)

@@ -142,8 +142,8 @@ def straight_way(
     """
     checks = checks or MotionChecks.of(cell)
     speed = cell.campaign.approach_speed if speed is None else speed
-    if (standing := beyond(cell, start)) is not None:
-        raise MotionRefusedError("the way", standing, "jog the arm to within [limits]")
+    if (beyond_limits := beyond(cell, start)) is not None:
+        raise MotionRefusedError("the way", beyond_limits, "jog the arm to within [limits]")
     if (outside := beyond(cell, target, "would go to")) is not None:
         raise MotionRefusedError("the way", outside, "name a posture within [limits]")
     limits = cell.joint_limits

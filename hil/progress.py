@@ -63,7 +63,7 @@ class _SilentTask:
         del units, note
 
 
-class Plain:
+class LineReporter:
     """One line per tenth of a task: for logs and pipes."""
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class Plain:
 
 
 class _PlainTask:
-    def __init__(self, reporter: Plain, title: str, total: float) -> None:
+    def __init__(self, reporter: LineReporter, title: str, total: float) -> None:
         self._reporter, self._title, self._total = reporter, title, max(total, 1e-12)
         self._done, self._said = 0.0, 0
 
@@ -152,4 +152,4 @@ def reporter(*, quiet: bool = False) -> Reporter:
     if quiet:
         return Silent()
     console = Console()
-    return Bar(console) if console.is_terminal else Plain()
+    return Bar(console) if console.is_terminal else LineReporter()

@@ -108,7 +108,7 @@ class Buttons:
         self._drive_on = False
         self._emergency_stop = False
 
-    def wish(self) -> Request:
+    def request(self) -> Request:
         """Go on; or end, by a signal or because the time is over; or give up."""
         if self._at_once:
             return Request.GIVE_UP
@@ -237,14 +237,14 @@ def serve_session(
         record = _Observed(controller, pressed, watch)
         try:
             summary = serve(
-                controller, far_end, faults=faults, wish=pressed.wish, watch=record.observe,
+                controller, far_end, faults=faults, request=pressed.request, watch=record.observe,
                 patience=patience, stretch=stretch,
             )  # fmt: skip
         except DriverError as error:
             raise InputError(None, str(error)) from error
         except PlantDiverged as error:
             raise ControllerFault(str(error)) from error
-        if record.started or not summary.ended or pressed.wish() is not Request.GO_ON:
+        if record.started or not summary.ended or pressed.request() is not Request.GO_ON:
             return Served(
                 summary,
                 phase=controller.phase,
@@ -293,5 +293,5 @@ class _Observed:
 
 def _pause(seconds: float, pressed: Buttons) -> None:
     until = time.monotonic() + seconds
-    while time.monotonic() < until and pressed.wish() is Request.GO_ON:
+    while time.monotonic() < until and pressed.request() is Request.GO_ON:
         time.sleep(0.05)

@@ -81,17 +81,17 @@ def simulated_controller(
         seed: of noise and model errors; the cell's if left out.
         faults: what goes wrong in controller and arm.
     """
-    announced = simulated_drive(cell)
+    nominal_drive = simulated_drive(cell)
     return SimulatedController(
         cell.urdf,
-        drive or announced,
+        drive or nominal_drive,
         truth or planted_truth(cell),
         settings or controller_settings(cell, effects=effects),
         seed=cell.simulation.seed if seed is None else seed,
         effects=unmodelled_effects(cell) if effects else UnmodelledEffects(),
         initial_position=cell.initial,
         gravity=cell.file.robot.gravity,
-        announced=announced,
+        stated=nominal_drive,
         faults=faults,
     )
 

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 
+def plural(number: int, noun: str) -> str:
+    """Number and noun: 1 packet, 2 packets; the noun is one that takes an s."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def printable(text: str, *, keep: str = "\n") -> str:
     """The text with whatever is not printed written out, as Python writes it in a string.
 

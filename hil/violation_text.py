@@ -24,7 +24,7 @@ _UNCHANGED: Final = 0.01
 
 def violation_text(violation: Violation, frame: AngleFrame) -> str:
     """A violation in degrees, and in the angles in which the cell's limits are written."""
-    joints = frame.told(violation.posture) if violation.posture else ""
+    joints = frame.text_of_angles(violation.posture) if violation.posture else ""
     limit = _JOINT_LIMIT.fullmatch(violation.subject) if violation.kind == "joint limit" else None
     if limit is None:
         return violation.sentence(joints)

@@ -190,7 +190,7 @@ def plan_population(points: Array, bounds: LimitRows, fly: float) -> list[Piecew
     block = _assembled(moves, corners, points.shape)
     good = block.keeps(bounds) & block.smooth(bounds)
     return [
-        motion if kept else None for motion, kept in zip(block.tables(), good.tolist(), strict=True)
+        motion if ok else None for motion, ok in zip(block.tables(), good.tolist(), strict=True)
     ]
 
 

@@ -94,8 +94,8 @@ class Block(NamedTuple):
             (np.abs(j), np.abs(j), bounds.jerk),
         ):
             within &= np.maximum(value, start).max(axis=-1) <= bound
-        kept: Mask = within.all(axis=-1)
-        return kept
+        respected: Mask = within.all(axis=-1)
+        return respected
 
     def smooth(self, bounds: LimitRows) -> Mask:
         """Whether each motion is C2 and at rest at both ends, but for rounding, (c,)."""

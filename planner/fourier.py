@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from planner.arrays import Array, read_only
+from planner.checked_data import DAMAGED, number, numbers
 from planner.errors import InvalidSetting, InvalidTrajectory
 from planner.limits import JointLimits
 from planner.piecewise_cubic import Extrema
-from planner.plain import DAMAGED, number, numbers
 
 # The result may exceed the truth by this share of `largest`; some 1e4 times what rounding does.
 _RESOLUTION = 1e-10

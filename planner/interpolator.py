@@ -299,8 +299,8 @@ class Interpolator(MoveServices):
     @property
     def _moving(self) -> bool:
         law = self._law
-        standing = law.motion_time == 0.0 or (law.settled and law.rate == 0.0)
-        return self._queue is not None and bool(self._queue.ahead) and not standing
+        at_rest = law.motion_time == 0.0 or (law.settled and law.rate == 0.0)
+        return self._queue is not None and bool(self._queue.ahead) and not at_rest
 
     def _run(self, bounds: RateBounds) -> None:
         """Bring motion time to the rate it should have, within bounds if they suffice."""

@@ -148,8 +148,8 @@ def finish_many(solutions: Solutions, bounds: LimitRows) -> list[Join | None]:
         groups.append((missed, _closed(tables.take(missed), starts, ends)))
     for rows, block in groups:
         own = bounds.take(rows)
-        kept = block.keeps(own) & _meets(block, solutions.ends[rows], own)
-        for index in np.flatnonzero(kept).tolist():
+        valid = block.keeps(own) & _meets(block, solutions.ends[rows], own)
+        for index in np.flatnonzero(valid).tolist():
             joined[int(rows[index])] = Join(block.knots[index], block.coefficients[index])
     return joined
 

@@ -175,10 +175,10 @@ class MoveServices:
         cancelled = member(FlybyCriterion, criterion)
         if cancelled is None:
             return self._refuse(Status.INCONSISTENT, f"there is no fly-by criterion {criterion}")
-        kept = self._settings.criterion
+        previous = self._settings.criterion
         return self._set(
             flyby={**self._settings.flyby, cancelled: _FLYBY[cancelled]},
-            criterion=FlybyCriterion.PERCENT if kept is cancelled else kept,
+            criterion=FlybyCriterion.PERCENT if previous is cancelled else previous,
         )
 
     def select_point_accuracy(self, accuracy: int) -> Status:

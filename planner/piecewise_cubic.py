@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from planner.arrays import Array
+from planner.checked_data import DAMAGED, numbers, rows
 from planner.errors import InvalidTrajectory
-from planner.plain import DAMAGED, numbers, rows
 
 
 class Extrema(NamedTuple):

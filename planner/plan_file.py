@@ -6,21 +6,68 @@ with angles in degrees, and restores the same bits.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from planner import plan_text
 from planner.arrays import Array
+from planner.checked_data import DAMAGED, number, numbers, one_or_more, rows, table, text
 from planner.commands import STOP, Fly, FlyDistance, FlyPercent, Move, Overrides
 from planner.errors import InvalidPlanFile, PlannerError
 from planner.limits import JointLimits
 from planner.moves import MotionPlan, plan_moves
 from planner.piecewise_cubic import PiecewiseCubic
-from planner.plain import DAMAGED, number, numbers, one_or_more, rows, table, text
+from planner.toml_text import Angles, Rows, from_text, to_text
 from planner.verify import check_limits, check_smooth
+
+_HEAD = """\
+A motion of joint moves. Names that end in _deg hold degrees, degrees/s, degrees/s^2,
+degrees/s^3; shares of speed and acceleration lie in (0, 1]; a move without fly_percent
+(0 to 100) or fly_distance_deg stops at its target."""
+_MOTION = """\
+What the moves above were planned to, to the last bit: per joint the times of its knots [s] and
+position, velocity, acceleration, jerk at each (rad, s). After a change above, delete this table."""
+_ANGLES: Mapping[str, frozenset[str]] = {
+    "": frozenset({"start"}),
+    "limits": frozenset({"lower", "upper", "velocity", "acceleration", "jerk"}),
+    "moves": frozenset({"target", "fly_distance"}),
+}
+"""Which fields of each table are angles or their rates."""
+
+
+def to_toml(data: Mapping[str, Any]) -> str:
+    """Return the data of a plan file as TOML."""
+    marked = _with_angles("", data)
+    if "limits" in data:
+        marked["limits"] = _with_angles("limits", data["limits"])
+    marked["moves"] = [_with_angles("moves", move) for move in data["moves"]]
+    if "motion" in data:
+        lists = {name: Rows(data["motion"][name]) for name in ("knots", "coefficients")}
+        marked["motion"] = {**data["motion"], **lists}
+    return to_text(marked, {"": _HEAD, "motion": _MOTION})
+
+
+def _with_angles(table: str, fields: Mapping[str, Any]) -> dict[str, Any]:
+    angles = _ANGLES[table]
+    return {name: Angles(value) if name in angles else value for name, value in fields.items()}
+
+
+def from_toml(text: str) -> dict[str, Any]:
+    """Return the data of a plan file, in SI units, from TOML.
+
+    Raises:
+        InvalidPlanFile: the text is not TOML, or an angle is not a number.
+    """
+    try:
+        return from_text(text, _ANGLES)
+    except tomllib.TOMLDecodeError as error:
+        raise InvalidPlanFile(f"not TOML: {error}") from error
+    except DAMAGED as error:
+        raise InvalidPlanFile(f"not a plan: {error!r:.200}") from error
+
 
 FORMAT = "joint motion plan"
 VERSION = 1
@@ -136,7 +183,7 @@ class PlanFile:
 
     def to_toml(self) -> str:
         """Return the file as text for people, angles in degrees."""
-        return plan_text.to_toml(self.to_dict())
+        return to_toml(self.to_dict())
 
     @classmethod
     def from_toml(cls, text: str) -> PlanFile:
@@ -145,7 +192,7 @@ class PlanFile:
         Raises:
             InvalidPlanFile: the text is not TOML, or not a plan.
         """
-        return cls.from_dict(plan_text.from_toml(text))
+        return cls.from_dict(from_toml(text))
 
     def _check_motion(self, stored: PiecewiseCubic, planned: MotionPlan) -> None:
         try:

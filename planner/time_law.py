@@ -71,14 +71,14 @@ def _after(
     )
 
 
-def settling_rate(rate: float, slope: float, change: float) -> float:
+def stopping_rate(rate: float, slope: float, change: float) -> float:
     """Return where the rate ends up if its slope dies away as fast as r'' = `change` allows."""
     return rate + slope * abs(slope) / (2.0 * change)
 
 
 def admits(bounds: RateBounds, rate: float, slope: float) -> bool:
     """Whether a state may go on under `bounds` without the rate ever leaving [0, 1]."""
-    return abs(slope) <= bounds.slope and (0.0 <= settling_rate(rate, slope, bounds.change) <= 1.0)
+    return abs(slope) <= bounds.slope and (0.0 <= stopping_rate(rate, slope, bounds.change) <= 1.0)
 
 
 def ramp(rate: float, slope: float, target: float, bounds: RateBounds) -> Ramp:
@@ -87,7 +87,7 @@ def ramp(rate: float, slope: float, target: float, bounds: RateBounds) -> Ramp:
     A slope beyond its bound is not built up further; it is taken to have come from wider bounds.
     """
     way, change = target - rate, bounds.change
-    up = 1.0 if target >= settling_rate(rate, slope, change) else -1.0
+    up = 1.0 if target >= stopping_rate(rate, slope, change) else -1.0
     way, slope_up = up * way, up * slope
     peak = sqrt(max(change * way + 0.5 * slope_up * slope_up, 0.0))
     peak = max(min(peak, bounds.slope), slope_up)

@@ -243,7 +243,7 @@ class SimulatedController:
         effects: UnmodelledEffects = NO_EFFECTS,
         initial_position: ArrayLike | None = None,
         gravity: ArrayLike = EARTH,
-        announced: SimulatedDrive | None = None,
+        stated: SimulatedDrive | None = None,
         faults: Sequence[ControllerFault] = (),
     ) -> None:
         """Power the cabinet up; the arm rests with closed brakes.
@@ -257,7 +257,7 @@ class SimulatedController:
             effects: unmodelled effects, none by default.
             initial_position: joint angles [rad]; the URDF's zero if not given.
             gravity: m/s2 in the base frame.
-            announced: what the init packet tells the PC instead of `drive`.
+            stated: what the init packet tells the PC instead of `drive`.
             faults: what goes wrong with controller and robot, by the number of the packet.
 
         Raises:
@@ -272,7 +272,7 @@ class SimulatedController:
         self.period = settings.period
         self.rejected_replies = 0
         self._drive = drive
-        self._announced = announced if announced is not None else drive
+        self._stated = stated if stated is not None else drive
         self._arm = SimulatedArm(
             urdf, drive, truth, settings,
             effects=effects, gravity=gravity, position=initial_position, rng=noise_rng,
@@ -423,7 +423,7 @@ class SimulatedController:
         if phase is not Phase.START:
             return self._cyclic_packet(phase)
         if self._program.start_step is StartStep.INIT:
-            return self._layout.init(self._announced, self.period)
+            return self._layout.init(self._stated, self.period)
         return CyclicPacket.zeros(self._number, MAX_AXES).encode()
 
     def accept(self, reply: bytes | None) -> None:

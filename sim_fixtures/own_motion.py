@@ -45,7 +45,7 @@ class OwnMotion:
     Attributes:
         position, velocity: set-point of the present tick, (n,) [rad], [rad/s].
         finished: the last posture is reached, or the motion was told to end.
-        standing: no move is under way.
+        at_rest: no move is under way.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class OwnMotion:
         self._ending = False
 
     @property
-    def standing(self) -> bool:
+    def at_rest(self) -> bool:
         """Whether no move is under way."""
         return self._cycle >= self._cycles
 
@@ -103,7 +103,7 @@ class OwnMotion:
     def finished(self) -> bool:
         """Whether nothing is left to do."""
         done = self._ending or not 0 <= self._next < len(self._postures)
-        return done and self.standing
+        return done and self.at_rest
 
     def end(self) -> None:
         """Finish the move that is under way and begin no other."""
@@ -111,11 +111,11 @@ class OwnMotion:
 
     def advance(self) -> tuple[Array, Array]:
         """Return the set-point of the next tick: position [rad] and velocity [rad/s], (n,)."""
-        if self.standing and not self.finished:
+        if self.at_rest and not self.finished:
             self._rested += 1
             if self._rested > self._dwell_cycles:
                 self._start_move()
-        if not self.standing:
+        if not self.at_rest:
             self._cycle += 1
             share, rate = quintic(self._cycle / self._cycles)
             way = self._to - self._from

@@ -171,12 +171,12 @@ class LoopProgram:
         program.reason = "the controller was restarted"
         return program
 
-    def advance(self, answer: Answer, standing: bool, own_motion_done: bool = False) -> None:
+    def advance(self, answer: Answer, at_rest: bool, own_motion_done: bool = False) -> None:
         """End the cycle.
 
         Args:
             answer: what the PC replied to this cycle's packet.
-            standing: the target of every axis stands still.
+            at_rest: the target of every axis stands still.
             own_motion_done: the controller's own motion has come to its end.
         """
         self._age += 1
@@ -187,13 +187,13 @@ class LoopProgram:
         elif self.phase is Phase.START:
             self._advance_start(answer)
         elif self.listening:
-            self._advance_open(answer, standing)
+            self._advance_open(answer, at_rest)
         elif self.phase is Phase.MOVING:
             if own_motion_done:
                 self._own_motion_over = True
                 self._enter(Phase.CLOSED)
         else:
-            self._advance_timed(standing)
+            self._advance_timed(at_rest)
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
@@ -231,7 +231,7 @@ class LoopProgram:
         elif self._age == len(self._start):
             self._enter(Phase.DRIVE_OFF)
 
-    def _advance_open(self, answer: Answer, standing: bool) -> None:
+    def _advance_open(self, answer: Answer, at_rest: bool) -> None:
         """React to the PC while axes are open or opening."""
         settings = self._settings
         self._missed_open = 0 if answer.valid else self._missed_open + 1
@@ -244,7 +244,7 @@ class LoopProgram:
             self._lose_opening("the PC reported a following error (508)")
         elif self._missed >= settings.missed_replies:
             self._miss_replies()
-        elif answer.exit or (self._finishing and standing):
+        elif answer.exit or (self._finishing and at_rest):
             self.openings_lost = 0
             self._enter(Phase.CLOSING)
         elif self.phase is Phase.OPENING:
@@ -289,7 +289,7 @@ class LoopProgram:
             self._reopens_at = 0
             self._enter(Phase.MOVING if self._moves else Phase.OPENING)
 
-    def _advance_timed(self, standing: bool) -> None:
+    def _advance_timed(self, at_rest: bool) -> None:
         """Leave the phases that last a number of cycles."""
         settings = self._settings
         phase, age = self.phase, self._age
@@ -300,7 +300,7 @@ class LoopProgram:
                 self._enter(Phase.DRIVING_ON)
         elif phase is Phase.DRIVING_ON and age >= settings.driving_on_cycles:
             self._enter(Phase.CLOSED)
-        elif phase is Phase.CLOSED and age >= settings.closed_cycles and standing:
+        elif phase is Phase.CLOSED and age >= settings.closed_cycles and at_rest:
             self._advance_closed()
         elif phase is Phase.PAUSED and age >= self._pause_cycles:
             self._enter(Phase.CLOSED)

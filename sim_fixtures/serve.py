@@ -183,7 +183,7 @@ def serve(
     far_end: FarEnd,
     *,
     faults: FaultyLink | None = None,
-    wish: Callable[[], Request] = lambda: Request.GO_ON,
+    request: Callable[[], Request] = lambda: Request.GO_ON,
     watch: Callable[[Tally], None] = lambda _: None,
     clock: Clock | None = None,
     patience: float = PATIENCE,
@@ -198,9 +198,9 @@ def serve(
         peer: the controller.
         far_end: its link, left open.
         faults: what the link does to packets; cycle 0 is that of the first one.
-        wish: asked every cycle. At `END` the controller ends its session, with the drive switched
-            off under a moving arm if it does not stand within `patience` s; at `GIVE_UP` it falls
-            silent at once.
+        request: asked every cycle. At `END` the controller ends its session, with the drive
+            switched off under a moving arm if it does not stand within `patience` s; at `GIVE_UP`
+            it falls silent at once.
         watch: called once a cycle, in the time that is left over, with the counts so far.
         clock: time; the machine's own if left out.
         patience: see `wish`, s.
@@ -210,8 +210,8 @@ def serve(
     """
     clock = clock if clock is not None else MonotonicClock()
     server = _Server(peer, Wire(far_end, faults, clock), clock, watch, stretch)
-    if server.knock(wish):
-        server.run(wish, patience)
+    if server.knock(request):
+        server.run(request, patience)
     return server.tally.summary()
 
 
@@ -238,17 +238,17 @@ class _Server:
         self._patience = 0.0
         self._deserted = False
 
-    def knock(self, wish: Callable[[], Request]) -> bool:
+    def knock(self, request: Callable[[], Request]) -> bool:
         """Repeat the first packet until it is answered; False if told to end before."""
         packet = self._peer.next_packet()
         if packet is None:
             self.tally.ended = True
             return False
-        while wish() is Request.GO_ON:
+        while request() is Request.GO_ON:
             sent = self._clock.now()
             self._wire.send(0 if self.tally.knocks == 0 else _NO_CYCLE, packet)
             self.tally.knocks += 1
-            reply = self._patient_reply(packet, sent + KNOCK_INTERVAL, wish)
+            reply = self._patient_reply(packet, sent + KNOCK_INTERVAL, request)
             if reply is not None:
                 self.tally.cycles += 1
                 self._due = max(sent + self._period, self._clock.now())
@@ -257,21 +257,21 @@ class _Server:
         return False
 
     def _patient_reply(
-        self, packet: bytes, until: float, wish: Callable[[], Request]
+        self, packet: bytes, until: float, request: Callable[[], Request]
     ) -> bytes | None:
         """An answer to the first packet, in steps short enough to notice a wish to end."""
-        while wish() is Request.GO_ON and (now := self._clock.now()) < until:
+        while request() is Request.GO_ON and (now := self._clock.now()) < until:
             reply = self._reply(packet, min(until, now + 0.1))
             self._watch(self.tally)
             if reply is not None:
                 return reply
         return None
 
-    def run(self, wish: Callable[[], Request], patience: float) -> None:
+    def run(self, request: Callable[[], Request], patience: float) -> None:
         """Cycle by cycle to the end."""
         late_by_missing = False
         while True:
-            if not self._heed(wish(), patience):
+            if not self._heed(request(), patience):
                 return
             self._wire.sleep_until(self._due)
             self._note_lateness(excused=late_by_missing)
@@ -308,9 +308,9 @@ class _Server:
         self._peer.accept(None)
         return True
 
-    def _heed(self, wish: Request, patience: float) -> bool:
+    def _heed(self, request: Request, patience: float) -> bool:
         """Ask the controller to end; take its drive away if the arm does not come to rest."""
-        if wish is Request.END:
+        if request is Request.END:
             now = self._clock.now()
             if self._finish_by is None:
                 self._finish_by = now + patience
@@ -321,7 +321,7 @@ class _Server:
                 self._peer.lose_drive(
                     f"the arm did not stand within {self._patience:g} s of the end"
                 )
-        return wish is not Request.GIVE_UP
+        return request is not Request.GIVE_UP
 
     def _note_lateness(self, *, excused: bool) -> None:
         """Count a cycle that begins late; go on from here if a whole period is gone."""

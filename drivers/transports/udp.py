@@ -133,7 +133,7 @@ class UdpTransport:
         while True:
             flags = 0 if timeout == self._timeout else self._have_patience(timeout)
             try:
-                packet, told, _, sender = self._receive(LONGEST + 1, _CONTROL_SPACE, flags)
+                packet, control, _, sender = self._receive(LONGEST + 1, _CONTROL_SPACE, flags)
             except BlockingIOError:
                 # The kernel counts in scheduler ticks and may have ended the wait a tick early.
                 timeout = end - time.monotonic()
@@ -143,7 +143,7 @@ class UdpTransport:
             except OSError as error:
                 raise TransportClosed(self._trouble(error)) from error
             if (sender == self._peer and len(packet) <= LONGEST) or self._accepts(packet, sender):
-                self.arrived = self._arrival(told)
+                self.arrived = self._arrival(control)
                 return packet
             # Strangers do not lengthen the wait, but what is behind them is not left there.
             timeout = max(0.0, end - time.monotonic())
@@ -217,11 +217,11 @@ class UdpTransport:
             return False
         return True
 
-    def _arrival(self, told: list[tuple[int, int, bytes]]) -> float | None:
+    def _arrival(self, control: list[tuple[int, int, bytes]]) -> float | None:
         """The kernel's time of arrival, which is that of the wall clock, on the monotonic clock."""
-        if not told:
+        if not control:
             return None
-        seconds, nanoseconds = _TIMESPEC.unpack(told[0][2])
+        seconds, nanoseconds = _TIMESPEC.unpack(control[0][2])
         wall = time.time()
         now = time.monotonic()
         offset, self._offset = self._offset, wall - now

@@ -76,7 +76,7 @@ class MessageLayout:
         """So many messages with the constant bytes in place, to be filled column by column."""
         return np.frombuffer(bytearray(self.template * count), dtype=self.dtype)
 
-    def is_kept_by(self, messages: NDArray[np.uint8]) -> bool:
+    def holds_in(self, messages: NDArray[np.uint8]) -> bool:
         """Whether the constant bytes of messages, shape (k, size), are those of the template."""
         expected = np.frombuffer(self.template, np.uint8)
         return all((messages[:, run] == expected[run]).all() for run in self._constant_runs)

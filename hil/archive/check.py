@@ -143,7 +143,7 @@ class _Checker:
             self._layouts[topic] = self._layout(topic, messages)
         layout = self._layouts[topic]
         data = messages.matrix(layout.size) if layout else None
-        if layout is None or data is None or not layout.is_kept_by(data):
+        if layout is None or data is None or not layout.holds_in(data):
             return None
         return np.ascontiguousarray(data).view(layout.dtype)[:, 0]
 

@@ -48,7 +48,7 @@ class ArchivedEvent:
         """The event as a log message: the line of text and, if there are data, one of JSON."""
         lines = [" ".join(self.text.split())]
         if self.data:
-            lines.append(json.dumps(_plain(self.data), sort_keys=True, allow_nan=False))
+            lines.append(json.dumps(_document(self.data), sort_keys=True, allow_nan=False))
         return LogMessage(_nanoseconds(self.time), int(self.level), self.name, "\n".join(lines))
 
     @classmethod
@@ -69,14 +69,14 @@ def _nanoseconds(time: float) -> int:
     return max(0, round(time * 1e9)) if math.isfinite(time) else 0
 
 
-def _plain(value: Any) -> Any:
+def _document(value: Any) -> Any:
     """Reduce to what JSON knows. A number that is not finite becomes null."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _document(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(item) for item in value]
+        return [_document(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, str | int):

@@ -83,7 +83,7 @@ class Recent:
         if packets is not None:
             _keep_newest(self._packets, packets, _PACKETS_PER_CYCLE * RECENT)
 
-    def taken(self) -> Session:
+    def take_session(self) -> Session:
         """What belongs to the session that began last; none of it is stored here."""
         records, events, packets = self._records, self._events, self._packets
         self._records, self._events, self._packets = [], [], []
@@ -264,7 +264,7 @@ class ArchiveProcess:
             self._take()
             self._close("interrupted", "another archive was begun")
         self._idle()
-        recent = self._recent.taken()
+        recent = self._recent.take_session()
         overflow, control = self._ring.overflow, self._control
         accepted, ended_count = control.program_accepted, control.ended_count
         try:

@@ -134,7 +134,7 @@ class _Columns:
     def verified(self, messages: Messages, offset: int) -> Bytes:
         """The messages as bytes (k, size), which must be like those before."""
         data = messages.matrix(self._layout.size)
-        if data is None or not self._layout.is_kept_by(data):
+        if data is None or not self._layout.holds_in(data):
             raise Damage(offset, "(chunk) has messages that differ from those before")
         return data
 

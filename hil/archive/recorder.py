@@ -42,7 +42,7 @@ from drivers.exchange import (
 )
 from hil.archive.events import Level
 from hil.archive.writer import ArchiveWriter
-from hil.plural import counted
+from hil.terminal_text import plural
 
 
 def describe(event: ExchangeEvent) -> str:
@@ -51,9 +51,9 @@ def describe(event: ExchangeEvent) -> str:
         case StateChanged():
             return f"{event.before.name} -> {event.after.name} in cycle {event.cycle}"
         case GapSeen():
-            return f"{counted(event.missed, 'packet')} missed before cycle {event.cycle}"
+            return f"{plural(event.missed, 'packet')} missed before cycle {event.cycle}"
         case AnswersLost():
-            were = f"{counted(event.count, 'answer')} {'was' if event.count == 1 else 'were'}"
+            were = f"{plural(event.count, 'answer')} {'was' if event.count == 1 else 'were'}"
             return f"{were} not taken by the controller, until cycle {event.cycle}"
         case MotionStarted():
             return f"first set-point in cycle {event.cycle}"
@@ -64,14 +64,14 @@ def describe(event: ExchangeEvent) -> str:
         case MotionEnded():
             return f"{event.outcome} in cycle {event.cycle}: {event.reason}"
         case PacketRejected(kind="answered late"):
-            return f"{counted(event.count, 'answer')} left more than a cycle after their packet"
+            return f"{plural(event.count, 'answer')} left more than a cycle after their packet"
         case PacketRejected():
             why = f" ({event.why})" if event.why else ""
-            return f"{counted(event.count, f'{event.kind} packet')} got no answer{why}"
+            return f"{plural(event.count, f'{event.kind} packet')} got no answer{why}"
         case Refused():
             return f"{event.error}; {event.error.remedy}"
         case LinkLost(stale=stale) if stale:
-            packets = f"{counted(stale, 'packet')} that cannot follow the last one"
+            packets = f"{plural(stale, 'packet')} that cannot follow the last one"
             return f"only {packets} for {event.silence:.3f} s in state {event.state.name}"
         case LinkLost():
             return f"nothing heard for {event.silence:.3f} s in state {event.state.name}"
@@ -283,8 +283,8 @@ class Recorder:
     @property
     def lacks_packets(self) -> bool:
         """Whether raw packets of the newest record archived are still to come, if any are."""
-        kept = self.writer.with_packets and not self._packets_cut
-        return kept and self.newest_packet < self._newest
+        packets_wanted = self.writer.with_packets and not self._packets_cut
+        return packets_wanted and self.newest_packet < self._newest
 
     @property
     def over(self) -> bool:

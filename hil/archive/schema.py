@@ -298,7 +298,7 @@ def message_layout(
         row = np.frombuffer(first, np.uint8)[None]
         for position, velocity, effort in product((len(joints), 0), repeat=3):
             state = joint_state_layout(joints, position=position, velocity=velocity, effort=effort)
-            if state.size == len(first) and state.is_kept_by(row):
+            if state.size == len(first) and state.holds_in(row):
                 return state
         raise LayoutError(f"they are no joint states of these {len(joints)} joints")
     if record is None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path, PurePath
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -414,18 +413,13 @@ class ArchiveWriter:
             cycles["packets"] = self._file.counts[PACKETS]
         if self._first is not None and self._last is not None:
             cycles |= {"first_cycle": self._first, "last_cycle": self._last}
-        counted = {key: str(value) for key, value in cycles.items()}
-        self._file.finish({**(details or {}), "outcome": outcome, "reason": reason, **counted})
+        texts = {key: str(value) for key, value in cycles.items()}
+        self._file.finish({**(details or {}), "outcome": outcome, "reason": reason, **texts})
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is None:
             self.close("unknown", reason="the recording ended without an outcome")
         else:
@@ -491,10 +485,10 @@ def checked_metadata(
         ArchiveWriteError: a key that is ours, no kind or an unknown one, or a contradiction
             between entries and file name.
     """
-    taken = _OWN_KEYS.intersection(metadata)
-    if taken:
+    reserved = _OWN_KEYS.intersection(metadata)
+    if reserved:
         raise ArchiveWriteError(
-            path, f"{', '.join(sorted(taken))} is written by the archive itself"
+            path, f"{', '.join(sorted(reserved))} is written by the archive itself"
         )
     name = ArchiveName.parse(path)
     named = name.metadata() if name else {}

@@ -40,7 +40,7 @@ from hil.io.digest import digest, json_digest
 from hil.reading import opened
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor
-from planner.plain import DAMAGED
+from planner.checked_data import DAMAGED
 
 from .factors import reduce_bundle
 from .types import ArchiveRef, Broken, Bundle, CacheError, Fit, Summary

@@ -21,7 +21,7 @@ from itertools import islice
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from time import monotonic
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, TypeVar
 
 from hil.errors import HilError, InputError
 from hil.version import install_command
@@ -97,12 +97,6 @@ class DaskWorkers(Workers):
         except BaseException:
             self._client.close()
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def n_workers(self) -> int:

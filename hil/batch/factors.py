@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
 from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
-from hil.identify.sources import Source, known_doubts, source_of
+from hil.identify.sources import Source, known_warnings, source_of
 from hil.io.digest import file_digest
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
@@ -230,7 +230,7 @@ def design_effect(estimate: Estimate, phase: PhaseFactor, weighting: Weighting) 
 
 
 def _warnings(archive: Archive, cell: Cell, source: Source) -> tuple[str, ...]:
-    warnings = [*known_doubts(cell, archive), *archive.header.findings.warnings]
+    warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
     if source.merged:
         warnings.append(
             f"{source.merged} samples had the time stamp of the one before and were averaged "

@@ -19,8 +19,8 @@ from hil.identify.options import Options
 from hil.identify.settings import Settings
 from hil.identify.sources import Source, all_fitted
 from hil.io.digest import json_digest
-from hil.plural import counted as plural
 from hil.progress import Reporter, Silent, Task
+from hil.terminal_text import plural
 from identification import IdentificationError
 from identification.factor.phases import PhaseFactor
 from identification.model.payload import Payload

@@ -17,7 +17,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from types import TracebackType
 from typing import Any, Final, Generic, NamedTuple, Self, TypeVar
 
 from hil.errors import HilError
@@ -150,6 +149,15 @@ class Workers(ABC):
 
     near: bool
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:  # noqa: B027
+        """End or leave those who work, if they are others than this process."""
+
     @abstractmethod
     def sums_in_turn(
         self,
@@ -203,17 +211,6 @@ class LocalWorkers(Workers):
         self._timeout = timeout
         self._children: list[WorkerProcess] = []
         self._idle: list[WorkerProcess] = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the processes."""

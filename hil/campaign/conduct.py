@@ -8,8 +8,8 @@ from typing import TypeVar
 
 from hil.archive import ArchiveName, ArchiveOutcome, open_archive
 from hil.errors import ArchiveError, HilError
-from hil.plural import counted
-from hil.results.conduct import ConductResult, RecordedResult, StepResult, WarmUpResult
+from hil.results.results import ConductResult, RecordedResult, StepResult, WarmUpResult
+from hil.terminal_text import plural
 
 from .dry_run import DryRun
 from .folder import CampaignFolder, Entry
@@ -68,7 +68,7 @@ def _dry_run(folder: CampaignFolder) -> StepResult:
         return StepResult(step=name, done=False, words=found, details=[])
     if found is None:
         return StepResult(step=name, done=False, words="none of this plan on record", details=[])
-    words = f"{counted(len(found.archives), 'motion')} at {found.override:.0%} of their speed"
+    words = f"{plural(len(found.archives), 'motion')} at {found.override:.0%} of their speed"
     if found.accepted is None:
         return StepResult(step=name, done=False, words=f"{words}, not accepted", details=[])
     currents = ", ".join(
@@ -81,7 +81,7 @@ def _dry_run(folder: CampaignFolder) -> StepResult:
         words=f"{words}, accepted by {found.accepted.by} at {found.accepted.at}",
         details=[
             f"largest current, of its limit: {currents}",
-            f"{counted(found.missed, 'packet')} missed, {counted(found.late, 'answer')} late",
+            f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'answer')} late",
             *(f"{doubt}; it was accepted by name" for doubt in found.doubts),
         ],
     )
@@ -97,15 +97,13 @@ def _warmed(found: WarmUp | str | None) -> StepResult:
     return StepResult(
         step=name,
         done=found.outcome == "warm",
-        words=f"{found.outcome} after {counted(len(found.motions), 'motion')}",
+        words=f"{found.outcome} after {plural(len(found.motions), 'motion')}",
         details=details,
     )
 
 
 def _lost(motions: int) -> str:
-    return (
-        f"{counted(motions, 'motion')} before {'was' if motions == 1 else 'were'} lost in a pause"
-    )
+    return f"{plural(motions, 'motion')} before {'was' if motions == 1 else 'were'} lost in a pause"
 
 
 def _drifting(found: WarmUp) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.archive.supervised import Failed
 from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError, UnsafeError
-from hil.plural import counted
+from hil.terminal_text import plural
 
 
 class CampaignFolderError(InputError):
@@ -114,7 +114,7 @@ class RepetitionsRejectedError(HilError):
     def __init__(self, motion: str, reasons: Sequence[str]) -> None:
         self.motion, self.reasons = motion, tuple(reasons)
         super().__init__(
-            f"{motion} was of no use {counted(len(self.reasons), 'time')}, at last because "
+            f"{motion} was of no use {plural(len(self.reasons), 'time')}, at last because "
             f"{self.reasons[-1]}; all attempts are archived with their reasons: find the cause, "
             "then run the campaign again to continue."
         )

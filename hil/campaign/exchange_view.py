@@ -26,7 +26,7 @@ from drivers.exchange import (
 )
 from drivers.exchange.liveness import Pulse
 from drivers.states import State
-from hil.plural import counted
+from hil.terminal_text import plural
 
 from .motion_link import Connection
 from .start_timeout import Beginning
@@ -87,7 +87,7 @@ class ExchangeView:
                 self.refused = event
             elif isinstance(event, PacketRejected) and event.why:
                 self._rejected += event.count
-                packets = counted(self._rejected, "packet")
+                packets = plural(self._rejected, "packet")
                 self.not_understood = f"{packets} came and got no answer: {event.why}"
             elif isinstance(event, MotionStarted | EventsLost):
                 self.began = True

@@ -25,7 +25,7 @@ from hil.simulation import (
     simulated_controller,
     simulated_provenance,
 )
-from planner.toml_value import toml_value
+from planner.toml_text import toml_value
 from sim_fixtures import ServoSettings, SimulatedDrive, UnmodelledEffects
 
 from .link import Link

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from hil.archive import ArchiveName
 from hil.errors import HilError
-from hil.plural import counted
 from hil.reading import lies_there
 from hil.results import Results
+from hil.terminal_text import plural
 
 from .dry_run import DryRun
 from .folder import CampaignFolder, Entry
@@ -136,7 +136,7 @@ def _design(campaign: Campaign) -> _Found:
     excitation, folder = campaign.plan.excitation, campaign.folder
     sentence = (
         f"an excitation of {excitation.trajectory.duration:.1f} s and "
-        f"{counted(len(campaign.plan.validation), 'validation motion')}"
+        f"{plural(len(campaign.plan.validation), 'validation motion')}"
     )
     if folder.manifest():  # until something is recorded, a rehearsal takes changes in
         folder.require_unchanged()
@@ -201,7 +201,7 @@ def _warm_up(campaign: Campaign) -> _Found:
             return _Found(True, "left out", "")
         return _Found(False, "not done", f"hil run {_quoted(folder)}")
     done = found.outcome != "going on"
-    words = f"{found.outcome} after {counted(len(found.motions), 'motion')}"
+    words = f"{found.outcome} after {plural(len(found.motions), 'motion')}"
     return _Found(done, words, f"hil run {_quoted(folder)}")
 
 

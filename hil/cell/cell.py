@@ -18,7 +18,7 @@ from hil.reading import text_of, toml_of
 from identification.excitation import Box, Workspace
 from identification.model.robot import RobotModel
 from planner import JointLimits
-from planner.toml_value import toml_value
+from planner.toml_text import toml_value
 
 from . import link
 from .checks import check_assumed, check_built, check_lengths, check_locked, check_turning

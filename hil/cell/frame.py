@@ -50,7 +50,7 @@ class AngleFrame:
         """Rates to show (..., n) [deg/s, deg/s²] from those of URDF angles [rad]."""
         return np.asarray(np.degrees(rate * self.sign), dtype=np.float64)
 
-    def told(self, q: Array | Sequence[float]) -> str:
+    def text_of_angles(self, q: Array | Sequence[float]) -> str:
         """One posture (n,) [rad] of URDF angles in words, as a person would set it."""
         angles = ", ".join(
             f"J{joint} {angle:z.1f}" for joint, angle in enumerate(self.shown(np.asarray(q)), 1)

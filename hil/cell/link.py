@@ -6,7 +6,7 @@ import ipaddress
 from typing import TYPE_CHECKING, Any
 
 from drivers.errors import DriverError
-from planner.toml_value import toml_value
+from planner.toml_text import toml_value
 
 from .errors import CellError
 from .schema import CanTable

@@ -23,7 +23,7 @@ from hil.version import software
 from identification import IdentificationError
 from planner import PlannerError
 
-from .failing import INTERNAL, asks_for_json, exit_code_of, told_as_json
+from .failing import INTERNAL, asks_for_json, errors_as_json, exit_code_of
 from .lazy import LazyCommands, without_flag_types
 
 COMMANDS = LazyCommands(
@@ -68,14 +68,14 @@ class Group(TyperGroup):
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """The context of one call, which knows whether JSON is asked for."""
         asked = asks_for_json(args)
-        with told_as_json(asked):
+        with errors_as_json(asked):
             context = super().make_context(info_name, args, *more, **extra)
         context.meta[_JSON] = asked
         return context
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; where it fails, say so in the form that was asked for."""
-        with told_as_json(ctx.meta.get(_JSON, False)):
+        with errors_as_json(ctx.meta.get(_JSON, False)):
             return super().invoke(ctx)
 
 

@@ -13,23 +13,23 @@ from hil.archive.check import ASPECTS, Check, check_archive
 from hil.archive.overview import Overview, overview
 from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
+from hil.cli.arguments import JsonOption
 from hil.cli.failing import exit_code_of
 from hil.errors import ArchiveError, InputError
 from hil.terminal_text import printable
 
 app = typer.Typer(help="Look into archives, check and repair them.", no_args_is_help=True)
 
-NOT_KEPT = 5
+PROFILE_BROKEN = 5
 NO_ARCHIVE = 2
 FAILED = 1
 LOST = 3
 
 Files = Annotated[list[Path], typer.Argument(help="The archives.", show_default=False)]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object per file instead.")]
 
 
 @app.command("info")
-def info(files: Files, as_json: Json = False) -> None:
+def info(files: Files, as_json: JsonOption = False) -> None:
     """Say what archives hold: motion, joints, channels, sizes, attachments."""
     failed = 0
     for path in files:
@@ -44,7 +44,7 @@ def info(files: Files, as_json: Json = False) -> None:
 
 
 @app.command("check")
-def check(files: Files, as_json: Json = False) -> None:
+def check(files: Files, as_json: JsonOption = False) -> None:
     """Say whether files keep the archive profile (docs/archive-format.md), aspect by aspect.
 
     Exit status: 0 all keep it, 5 one does not, 2 one is no archive.
@@ -58,7 +58,7 @@ def check(files: Files, as_json: Json = False) -> None:
             _say_error(path, error, as_json=as_json)
             continue
         if not found.keeps and not status:
-            status = NOT_KEPT
+            status = PROFILE_BROKEN
         typer.echo(json.dumps(_check_dict(found)) if as_json else _shown(_check_lines(found)))
     raise typer.Exit(status)
 

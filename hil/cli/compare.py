@@ -9,9 +9,9 @@ from typing import Annotated, Final
 import typer
 
 from hil.batch.workers import LocalWorkers
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.compare import compare_campaigns, gather
-from hil.compare.record import to_dict
-from hil.compare.words import caveat, findings, verdict
+from hil.compare.words import caveat, findings, to_dict, verdict
 from hil.files import make_folder, write_together
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
@@ -38,8 +38,8 @@ def compare(
     fail_on_change: Annotated[
         bool, typer.Option("--fail-on-change", help="Exit status 5 if something has changed.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Compare campaigns of one arm: did the friction change, on which axis, what does it carry?
 
@@ -62,7 +62,7 @@ def compare(
         if not quiet:
             for one in findings(found):
                 typer.echo(printable(f"{one.words} {one.next_step}".rstrip()), err=True)
-            for doubt in found.doubts:
+            for doubt in found.warnings:
                 typer.echo(printable(f"note: {doubt}"), err=True)
             typer.echo(f"note: {caveat(found)}", err=True)
         typer.echo(printable(f"{verdict(found)}."))

@@ -23,6 +23,7 @@ from hil.campaign import (
     stop_on_interrupt,
 )
 from hil.cell import Cell
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.verdict import finish
 from hil.demo_link import CAN, LOOPBACK, loopback_link
 from hil.design import DesignResult
@@ -83,8 +84,8 @@ def demo(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with a campaign in OUTPUT that was stopped.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Design, run, archive, identify and report, all on the simulated COMAU NS 16.
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from hil.cli.arguments import JsonOption
 from hil.cli.verdict import NOT_GOOD
 from hil.doctor.link import controller_in, link_of
 from hil.doctor.report import as_json, show
@@ -33,7 +34,7 @@ def doctor(
     quick: Annotated[
         bool, typer.Option("--quick", help="5 s of each; the verdict is provisional (exit 5).")
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure whether this PC can answer a controller every 1 or 2 ms, and say what to change.
 

@@ -51,24 +51,24 @@ def as_json(error: BaseException) -> dict[str, Any]:
     """
     sentence = error.format_message() if hasattr(error, "format_message") else str(error)
     figures = error.figures if isinstance(error, HilError) else {}
-    told: dict[str, Any] = {
+    document: dict[str, Any] = {
         **figures,
         "error": sentence or type(error).__name__,
         "kind": type(error).__name__,
         "exit_code": exit_code_of(error),
     }
     if isinstance(error, InputError):
-        told |= {
+        document |= {
             "path": None if error.path is None else str(error.path),
             "field": error.field,
             "problem": error.problem,
             "remedy": error.remedy,
         }
-    return told
+    return document
 
 
 @contextmanager
-def told_as_json(asked: bool) -> Iterator[None]:
+def errors_as_json(asked: bool) -> Iterator[None]:
     """Print what ends the block as JSON, if that was asked for; it goes on as it is.
 
     Ctrl-C becomes an `OperatorStopError`.

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.identify_options import LONGEST_DELAY
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
@@ -66,8 +67,8 @@ def gains(
             show_default=False,
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the result.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Find the torque constant of every motor, from recordings with and without a known payload.
 

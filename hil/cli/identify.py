@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.identify_options import (
     BandwidthOption,
     DelayOption,
@@ -84,10 +85,8 @@ def identify(
     delay: DelayOption = None,
     smoother: SmootherOption = "spline",
     torque_bandwidth: TorqueBandwidthOption = "auto",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the verdict and key figures as JSON.")
-    ] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Estimate the dynamic parameters from archives, and say whether the result is good.
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import json as json_format
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from hil.archive import open_archive
+from hil.cli.arguments import JsonOption
 from hil.errors import InputError
 from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
     STANDARD_GRAVITY,
     ColumnMap,
+    Effort,
     Robot,
     Use,
     convention_of,
@@ -103,13 +105,12 @@ Held = Annotated[
     ),
 ]
 Kind = Annotated[
-    str,
+    Use,
     typer.Option(
         help="What it is for: excitation (to be fitted), validation (only predicted) or standstill "
         "(the noise of the positions)."
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")]
 
 
 @app.command("rosbag2")
@@ -127,7 +128,7 @@ def rosbag2(
         str | None, typer.Option(help="Topic of the joint states, if there is more than one.")
     ] = None,
     effort: Annotated[
-        str,
+        Effort,
         typer.Option(
             help="What the effort field holds: torque (N·m), motor_current (A) or ignore."
         ),
@@ -144,7 +145,7 @@ def rosbag2(
     lock_others: LockOthers = False,
     held: Held = None,
     kind: Kind = "excitation",
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Import sensor_msgs/JointState from a rosbag2, or from any MCAP file; joints go by name.
 
@@ -154,15 +155,6 @@ def rosbag2(
 
     **Example:** `hil import rosbag2 bag --urdf arm.urdf --lock-others --gravity 0 0 9.81 -o a.mcap`
     """
-    kinds: dict[str, Literal["torque", "motor_current", "ignore"]] = {
-        "torque": "torque",
-        "motor_current": "motor_current",
-        "ignore": "ignore",
-    }
-    if effort not in kinds:
-        raise InputError(
-            None, f"{effort!r} is unknown", field="--effort", remedy=f"use {', '.join(kinds)}"
-        )
     _require_one_robot(urdf, cell, dh)
     names = _names(rename or [])
     path = import_rosbag2(
@@ -179,10 +171,10 @@ def rosbag2(
             recorded_joints(source, topic, names) if lock_others else None,
         ),
         topic=topic,
-        effort=kinds[effort],
+        effort=effort,
         joint_names=names,
         held_joints=held or (),
-        use=_use(kind),
+        use=kind,
     )
     _tell(path, json=json)
 
@@ -217,7 +209,7 @@ def log(
             "what they explain; angles and torques stay those of the map.",
         ),
     ] = False,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Import a log of numbers: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
 
@@ -252,7 +244,7 @@ def log(
         ),
         columns=found,
         held_joints=held or (),
-        use=_use(kind),
+        use=kind,
         coupled=not uncoupled,
     )
     _tell(path, json=json)
@@ -277,19 +269,6 @@ def _tell(path: Path, *, json: bool) -> None:
     for warning in found.warnings:
         typer.secho(printable(f"warning: {warning}"), fg=typer.colors.YELLOW)
     say(f"wrote {path}")
-
-
-def _use(kind: str) -> Use:
-    kinds: dict[str, Use] = {
-        "excitation": "excitation",
-        "validation": "validation",
-        "standstill": "standstill",
-    }
-    if kind not in kinds:
-        raise InputError(
-            None, f"{kind!r} is unknown", field="--kind", remedy=f"use {', '.join(kinds)}"
-        )
-    return kinds[kind]
 
 
 def _require_one_robot(urdf: Path | None, cell: Path | None, dh: Path | None) -> None:

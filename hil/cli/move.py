@@ -19,6 +19,7 @@ from hil.campaign.announced_limits import checks_in_force, narrower_thresholds
 from hil.campaign.motion_watch import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
+from hil.cli.arguments import JsonOption
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
 from hil.lines import say
@@ -88,7 +89,7 @@ def move(
             "from the cell's; the archive says so.",
         ),
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Move the arm on a straight way in joint space, slowly, and archive it.
 
@@ -280,7 +281,7 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
         f"limits, motor currents, floor, walls and the arm itself are kept; to {who}"
     )
     below = narrower_thresholds(cell, link.connection)
-    lines += [f"the smaller following-error threshold counts, {told}" for told in below]
+    lines += [f"the smaller following-error threshold counts, {note}" for note in below]
     return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from hil.campaign import stop_on_interrupt
+from hil.cli.arguments import JsonOption
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.importers import convention_of
@@ -95,7 +96,7 @@ def new(
         ),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier file.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Write a commented cell file for an arm; what nobody has said is marked "?".
 
@@ -129,9 +130,9 @@ def new(
     if from_controller is not None:
         known |= _asked(from_controller, bind, len(made.joint_names), arm, wait, quiet=json)
     if from_archive_file is not None:
-        told = from_archive(from_archive_file, made.joint_names)
+        stated = from_archive(from_archive_file, made.joint_names)
         # Limits belong together, with their frame.
-        known = (known.without("limits") if "limits.frame" in told.values else known) | told
+        known = (known.without("limits") if "limits.frame" in stated.values else known) | stated
     made = made.with_known(known)
     text, unknown = (made.for_design() if design_only else made).text(output)
     if design_only and not unknown:

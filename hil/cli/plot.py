@@ -8,11 +8,12 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.arguments import JsonOption
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically
 from hil.plots import save
-from hil.plots.archive_page import archive_page
 from hil.plots.archive_panels import BINS as PAGE_BINS
+from hil.plots.archive_panels import archive_page
 from hil.plots.archive_picture import draw_archive
 from hil.plots.archive_view import BINS, view_of
 from hil.plots.plan_picture import FORMATS
@@ -46,7 +47,7 @@ def plot(
             help="Only this joint, by name or number from 1; may be repeated.", show_default=False
         ),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Draw what is in an archive: position, speed, current, torque, following error, events.
 
@@ -97,5 +98,5 @@ def plot(
         if problem:
             typer.echo(printable(f"note: {problem}"))
     shown = f"{view.start:.6g} s to {view.stop:.6g} s of {view.facts.duration:.6g} s"
-    told = f"{target}: {view.facts.title}, {shown}, {len(view.events)} events"
-    typer.echo(printable(told))
+    line_text = f"{target}: {view.facts.title}, {shown}, {len(view.events)} events"
+    typer.echo(printable(line_text))

@@ -18,6 +18,7 @@ from hil.campaign import Progress, Stop, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.errors import ControllerFault, HilError, OperatorStopError
 from hil.lines import say
 from hil.recording import archive_path
@@ -68,8 +69,8 @@ def record(
             show_default=False,
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Record while the controller's own program moves the arm. Nothing is commanded from here.
 

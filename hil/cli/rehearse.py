@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.rehearsal import Rehearsal
+from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
 from hil.lines import say
 from hil.progress import reporter as make_reporter
 
@@ -16,9 +16,7 @@ from .verdict import NOT_GOOD
 
 
 def rehearse(
-    campaign: Annotated[
-        Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
-    ],
+    campaign: CampaignArgument,
     seed: Annotated[
         int | None,
         typer.Option(
@@ -31,8 +29,8 @@ def rehearse(
     again: Annotated[
         bool, typer.Option("--again", help="Rehearse once more, even if it passed.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print rehearsal.json instead.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Run exactly the plan of CAMPAIGN on a simulated arm, and judge it. Nothing moves.
 

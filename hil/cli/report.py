@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import json as json_format
-from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from hil.campaign import Campaign
+from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
 from hil.progress import reporter as make_reporter
 from hil.results import Results
 
 
 def report(
-    campaign: Annotated[
-        Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
-    ],
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print where it is and the verdict as JSON.")
-    ] = False,
+    campaign: CampaignArgument,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Make the report of CAMPAIGN anew and print where it is.
 
@@ -33,5 +28,5 @@ def report(
         typer.echo(page)
         return
     verdict = Results.load(opened.folder.results).verdict
-    told = {"report": str(page), "good": verdict.good, "verdict": verdict.line}
-    typer.echo(json_format.dumps(told))
+    document = {"report": str(page), "good": verdict.good, "verdict": verdict.line}
+    typer.echo(json_format.dumps(document))

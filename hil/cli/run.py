@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json as json_format
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,6 +13,7 @@ from hil.archive.live import LiveView
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.execution_result import RunResult
 from hil.cell_link import require_watchable
+from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
 from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.lines import say
@@ -22,9 +22,7 @@ from hil.screen import Screen
 
 
 def run(
-    campaign: Annotated[
-        Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
-    ],
+    campaign: CampaignArgument,
     rehearse: Annotated[
         bool,
         typer.Option("--rehearse", help="Rehearse the plan first, where that was not passed yet."),
@@ -61,10 +59,8 @@ def run(
             show_default=False,
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the last line.")] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object at the end, errors too.")
-    ] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Run what is missing of a campaign on its controller, then identify and report.
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -13,16 +11,15 @@ from rich.text import Text
 
 from hil.campaign import Campaign
 from hil.campaign.status import CampaignStatus
+from hil.cli.arguments import CampaignArgument, JsonOption
 from hil.terminal_text import printable
 
 _MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("waits", "dim")}
 
 
 def status(
-    campaign: Annotated[
-        Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
-    ],
-    json: Annotated[bool, typer.Option("--json", help="Print the same as JSON.")] = False,
+    campaign: CampaignArgument,
+    json: JsonOption = False,
 ) -> None:
     """Show which steps of CAMPAIGN are done, which is next, and what to type for it.
 

@@ -14,6 +14,7 @@ from typing import Annotated, Final
 import typer
 
 from hil.cell import Cell
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.errors import InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.study import run_study, study_campaigns, study_settings
@@ -73,10 +74,8 @@ def study(
         int | None,
         typer.Option(min=1, max=256, help="Processes; one for each processor if left out."),
     ] = None,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Print only the conclusion.")
-    ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Reproduce the paper: A (sines) against B (via points), on the simulated COMAU NS 16.
 

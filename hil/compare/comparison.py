@@ -116,7 +116,7 @@ class Comparison:
         parameters: one by one.
         payload: what the last link carries.
         prediction: of each other's motions.
-        doubts: what a reader must know.
+        warnings: what a reader must know.
     """
 
     arm: str
@@ -128,7 +128,7 @@ class Comparison:
     parameters: tuple[ParameterChange, ...]
     payload: PayloadTrend
     prediction: Prediction
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     @property
     def changed(self) -> bool:
@@ -176,7 +176,7 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
         parameters=_parameters(model, gathered),
         payload=payload_trend(model, campaigns, _SHARE),
         prediction=_prediction(campaigns, model.n_joints),
-        doubts=(*broken, *_few(gathered, called), *_other_motion(model, campaigns, called), *own),
+        warnings=(*broken, *_few(gathered, called), *_other_motion(model, campaigns, called), *own),
     )
 
 

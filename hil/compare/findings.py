@@ -10,7 +10,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from hil.plural import counted as plural
+from hil.terminal_text import plural
 from identification.model.payload import Payload
 
 from .payload import Change, PayloadTrend, Statement, Verdict

@@ -142,6 +142,13 @@ class AxisTrend:
     drift: Drift | None
     drifts: bool
 
+    @property
+    def relative_drift(self) -> float | None:
+        """Drift over its whole time, as a share of the median friction; None if not known."""
+        known = self.friction.values[np.isfinite(self.friction.values)]
+        size = abs(float(np.median(known))) if known.size else 0.0
+        return self.drift.slope * self.drift.span / size if self.drift and size else None
+
 
 @dataclass(frozen=True, eq=False)
 class ParameterTrend:

@@ -1,13 +1,13 @@
-"""What a comparison means, in plain words: the first thing a reader sees."""
+"""What a comparison means, in sentences and as JSON: the first thing a reader sees."""
 
 from __future__ import annotations
 
 import math
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from .comparison import AxisChange, Comparison
+from .comparison import AxisChange, Comparison, ParameterChange
 from .findings import Finding, payload_findings
 from .trend import FEWEST, LEAST_FRICTION, campaign_names
 
@@ -26,17 +26,17 @@ def verdict(found: Comparison) -> str:
     axes = [axis.joint for axis in found.axes if any(axis.changed)]
     parts = []
     if axes:
-        parts.append(f"friction of {_listed(axes)}")
+        parts.append(f"friction of {_joined(axes)}")
     if any(found.payload.changed):
         parts.append("what the arm carries")
     if any(found.payload.other):
         parts.append("inertial parameters")
     if not parts and found.friction_slight:
         axes = [axis.joint for axis in found.axes if any(axis.slight)]
-        return f"No change of {_LEAST} or more; friction of {_listed(axes)} differs by less"
+        return f"No change of {_LEAST} or more; friction of {_joined(axes)} differs by less"
     if not parts:
         return "No significant change"
-    return f"Changed: {_listed(parts)}"
+    return f"Changed: {_joined(parts)}"
 
 
 def findings(found: Comparison) -> list[Finding]:
@@ -99,7 +99,7 @@ def _slight(found: Comparison, called: list[str]) -> list[Finding]:
         low, high = (f"{pick(sizes):+.1f}" for pick in (min, max))
         size = low if low == high else f"{low} to {high}"
         words = (
-            f"Friction of {_listed([axis.joint for axis in axes])} has changed by {size} % from"
+            f"Friction of {_joined([axis.joint for axis in axes])} has changed by {size} % from"
             f" {called[0]} to {called[k]}: more than chance, and less than the {_LEAST} that"
             " count as a change."
         )
@@ -114,7 +114,7 @@ def _unchanged(found: Comparison) -> list[Finding]:
     sentences = []
     if judged:
         worst = max(judged, key=lambda axis: float(np.nanmax(axis.smallest)))
-        axes = _listed([axis.joint for axis in judged])
+        axes = _joined([axis.joint for axis in judged])
         sentences.append(
             Finding(
                 "same",
@@ -124,7 +124,7 @@ def _unchanged(found: Comparison) -> list[Finding]:
             )
         )
     if silent:
-        sentences.append(Finding("same", f"Friction of {_listed(silent)} is not determined."))
+        sentences.append(Finding("same", f"Friction of {_joined(silent)} is not determined."))
     if found.payload.untested:
         words = f"Whether it carries the same was not tested: {found.payload.untested}."
         sentences.append(Finding("same", words))
@@ -156,5 +156,81 @@ def _predictions(found: Comparison, called: list[str]) -> list[Finding]:
     return sentences
 
 
-def _listed(words: list[str]) -> str:
+def _joined(words: list[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def to_dict(found: Comparison) -> dict[str, Any]:
+    """Everything in SI units; null for what is not known. Lists follow `campaigns`."""
+    payload = found.payload
+    return {
+        "arm": found.arm,
+        "simulated": found.simulated,
+        "changed": found.changed,
+        "friction_changed": found.friction_changed,
+        "friction_slight": found.friction_slight,
+        "load_changed": found.load_changed,
+        "verdict": verdict(found),
+        "told": [vars(one) for one in findings(found)],
+        "caveat": caveat(found),
+        "doubts": list(found.warnings),
+        "campaigns": [
+            {
+                "name": name,
+                "folder": one.campaign,
+                "when": one.when or None,
+                "repetitions": one.repetitions,
+                "stated": one.setup,
+            }
+            for name, one in zip(names(found), found.campaigns, strict=True)
+        ],
+        "axes": [_axis(axis) for axis in found.axes],
+        "payload": {
+            "untested": payload.untested or None,
+            "changed": [bool(x) for x in payload.changed],
+            "other_inertia": [bool(x) for x in payload.other],
+            "mass": [_number(x) for x in payload.mass],
+            "mass_std": [_number(x) for x in payload.mass_std],
+            "p_value": [None if c is None else _number(c.p_value) for c in payload.changes],
+        },
+        "parameters": [_parameter(one) for one in found.parameters],
+        "prediction": {
+            "overall": [[_number(x) for x in row] for row in found.prediction.overall],
+            "joints": [
+                [[_number(x) for x in cell] for cell in row] for row in found.prediction.joints
+            ],
+        },
+    }
+
+
+def _axis(axis: AxisChange) -> dict[str, Any]:
+    changes = [None, *(axis.relative(k) for k in range(1, len(axis.known)))]
+    return {
+        "joint": axis.joint,
+        "unit": axis.unit,
+        "speed": _number(axis.speed),
+        "friction": [_number(one.value) for one in axis.known],
+        "std": [_number(one.std) for one in axis.known],
+        "repetitions": [[_number(x) for x in own] for own in axis.repetitions],
+        "change": [None if one is None else _number(one[0]) for one in changes],
+        "interval": [None if one is None else [_number(x) for x in one[1:]] for one in changes],
+        "p_value": [_number(p) for p in axis.p_values],
+        "changed": list(axis.changed),
+        "slight": list(axis.slight),
+        "smallest": [_number(x) for x in axis.smallest],
+    }
+
+
+def _parameter(one: ParameterChange) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "unit": one.unit,
+        "friction": one.is_friction,
+        "value": [_number(each.value) for each in one.known],
+        "std": [_number(each.std) for each in one.known],
+        "p_value": [_number(p) for p in one.p_values],
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -9,8 +9,7 @@ from pathlib import Path
 from hil.cell import Cell
 from hil.errors import InputError
 
-from .fingerprint import fingerprint
-from .result import DesignResult
+from .result import DesignResult, fingerprint
 from .settings import DesignSettings
 
 _OPTION = "--compare"

@@ -29,8 +29,8 @@ from hil.progress import Reporter
 from identification.excitation import SAMPLE_PERIOD
 from identification.factor.factor import Factor
 
-from .fingerprint import fingerprint
-from .knowledge import Knowledge
+from .problem import Knowledge
+from .result import fingerprint
 
 Array = NDArray[np.float64]
 

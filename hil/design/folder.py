@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, cast
 
 from hil.errors import InputError
-from hil.files import make_folder, write_atomically
-from hil.io.lock import locked
+from hil.files import exclusive_folder, write_atomically
 from hil.reading import opened
+from planner.toml_text import to_text
 
 from .result import RESULT
 from .settings import DesignSettings, SettingsError, load_settings
-from .toml_text import to_text
 
 PICTURE, SETTINGS, JOURNAL = "excitation.png", "settings.toml", "search.journal"
 DESIGN_FILES = frozenset((RESULT, PICTURE, SETTINGS, JOURNAL))
@@ -50,32 +49,9 @@ class DesignFolder:
         """What was scored so far."""
         return self.root / JOURNAL
 
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Make the folder, and keep every other search out of it until this is left.
-
-        The lock is on the folder itself, which no search removes, and goes with this process.
-
-        Raises:
-            InputError: another search is at work in it, it cannot be made, or not be locked.
-        """
-        make_folder(self.root)
-
-        def refusal(error: OSError) -> InputError:
-            if isinstance(error, BlockingIOError):
-                return InputError(
-                    self.root,
-                    "a search is running in it",
-                    remedy="wait for its end, stop it (Ctrl-C), or name another folder (-o)",
-                )
-            return InputError(
-                self.root,
-                f"cannot be locked against a second search ({error.strerror})",
-                remedy="name a folder on a disk of this PC (-o)",
-            )
-
-        with locked(self.root, refusal):
-            yield
+    def held(self) -> AbstractContextManager[None]:
+        """Make the folder, and keep every other search out of it until this is left."""
+        return exclusive_folder(self.root, "search", "-o")
 
     def begin(self, settings: DesignSettings, *, force: bool) -> None:
         """Make room for a new design, and write down what is asked for; the folder is held.

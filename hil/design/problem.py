@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NoReturn
+from dataclasses import dataclass, replace
+from typing import Final, NoReturn
 
 import numpy as np
 import scipy
@@ -28,9 +28,6 @@ from identification.model.motion import Motion
 from .advice import NoExcitationError
 from .settings import DesignSettings, SettingsError, SineTable
 
-if TYPE_CHECKING:
-    from .knowledge import Knowledge
-
 Array = NDArray[np.float64]
 
 # States that excite every parameter of a load that an arm feels, and the share of the largest from
@@ -38,6 +35,39 @@ Array = NDArray[np.float64]
 _STATES: Final = 300
 _SEED: Final = 20140901
 _INDEPENDENT: Final = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """An earlier estimate, and the information that it came from.
+
+    Attributes:
+        names: of the model's parameters (p,).
+        values: their estimates (p,).
+        std: their standard deviations (p,), infinite for one that was not determined.
+        joint_weights: 1 / variance of each joint's torque residual (n,).
+        gram: information (p, p) of all that was moved, held out or not, weighted by these, as if
+            sampled every `identification.excitation.SAMPLE_PERIOD`, as motions of a search are.
+        samples: time samples in it, counted alike.
+        repetitions: how often the new motion is going to be run.
+        archives: name and SHA-256 of each file whose motion is in it.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    std: Array
+    joint_weights: Array
+    gram: Array
+    samples: int
+    repetitions: int
+    archives: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def relative_std(self) -> Array:
+        """Standard deviation as a share of the value's size (p,), infinite for a value of 0."""
+        size = np.abs(self.values)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(size > 0.0, self.std / size, np.inf)
 
 
 def problem_of(cell: Cell, settings: DesignSettings, known: Knowledge | None = None) -> Problem:
@@ -156,7 +186,7 @@ def _offset(cell: Cell, sines: SineTable) -> Array | None:
     if sines.offset == "home":
         return cell.home
     frame, limits = AngleFrame.of(cell), cell.joint_limits
-    shown = _listed(cell, "sines.offset", sines.offset)
+    shown = _angles_of(cell, "sines.offset", sines.offset)
     angles = frame.urdf(shown)
     for joint in np.flatnonzero(~((angles > limits.lower) & (angles < limits.upper))).tolist():
         ends = sorted(float(frame.shown(end)[joint]) for end in (limits.lower, limits.upper))
@@ -172,10 +202,10 @@ def _offset(cell: Cell, sines: SineTable) -> Array | None:
 
 def _per_joint(cell: Cell, field: str, values: list[float]) -> Array:
     """Return one value for each joint (n,); one alone is for all."""
-    return _listed(cell, field, values * len(cell.joint_names) if len(values) == 1 else values)
+    return _angles_of(cell, field, values * len(cell.joint_names) if len(values) == 1 else values)
 
 
-def _listed(cell: Cell, field: str, values: list[float] | str) -> Array:
+def _angles_of(cell: Cell, field: str, values: list[float] | str) -> Array:
     if len(values) != len(cell.joint_names):
         raise SettingsError(
             None,

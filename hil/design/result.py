@@ -7,10 +7,11 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hil.cell import Cell
 from hil.errors import InputError
@@ -19,17 +20,133 @@ from hil.io.digest import digest, json_digest
 from hil.reading import text_of
 from hil.version import software
 from identification.excitation import (
+    Criteria,
     Design,
     Excitation,
     Objective,
     coupling_index_max,
 )
 from planner import FourierSeries, JointLimits, PiecewiseCubic, PlanFile, PlannerError, in_child
+from planner.toml_text import Angles, from_text, to_text
 
-from .figures import FigureError, count, criteria_of, front_of, number
-from .fingerprint import DECISIVE, fingerprint
 from .settings import RESULT_FORMAT, DesignSettings, SettingsError, settings_of
-from .toml_text import Angles, from_text, to_text
+
+Array = NDArray[np.float64]
+
+Whole = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(ge=1)]
+Index = Annotated[float, Field(ge=0.0)]
+"""Of coupling."""
+Condition = Annotated[float, Field(ge=1.0)]
+
+
+class _Table(BaseModel):
+    """A table of the file: finite numbers, none taken from a text."""
+
+    model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
+
+
+class CriteriaTable(_Table):
+    """`[criteria]`: see :class:`identification.excitation.Criteria`."""
+
+    log10_det: float
+    coupling_index: Index
+    fitness: float
+    n_samples: Positive
+    condition: Condition | None = None
+    scaled_condition: Condition | None = None
+
+
+class SearchTable(_Table):
+    """`[search]`: how the motion was found; `parameters` is None for all of the model's."""
+
+    method: str
+    seed: Whole
+    tried: Whole
+    generations: Whole
+    n_parameters: Positive
+    parameters: list[str] | None = None
+    infeasible: dict[str, int]
+
+
+class FrontTable(_Table):
+    """`[front]`: its points, and which of them the motion is; None where it was polished."""
+
+    chosen: int | None = None
+    log10_det: list[float]
+    coupling_index: list[float]
+    duration: list[float]
+
+    @model_validator(mode="after")
+    def _alike(self) -> Self:
+        if not len(self.log10_det) == len(self.coupling_index) == len(self.duration):
+            raise ValueError("its lists are not equally long")
+        return self
+
+    @property
+    def points(self) -> Array:
+        """log10 det, coupling index and duration [s] of each point (k, 3)."""
+        columns = (self.log10_det, self.coupling_index, self.duration)
+        return np.array(columns, dtype=np.float64).T
+
+
+class Origin(_Table):
+    """`[polished_from]`: the point that a polish began with, and its criteria at 1 ms."""
+
+    point: Whole
+    log10_det: float
+    coupling_index: Index
+
+    @classmethod
+    def of(cls, design: Design) -> Self:
+        """Return the origin of a design."""
+        one = design.origin_criteria
+        return cls(point=design.origin, log10_det=one.log10_det, coupling_index=one.coupling_index)
+
+
+class _Figures(_Table):
+    """The tables whose figures are checked."""
+
+    criteria: CriteriaTable
+    search: SearchTable
+    front: FrontTable
+    polished_from: Origin | None = None
+
+
+_DIGITS = 16
+# What a motion and its criteria are made from. A change of the rest (walls, motors, home) leaves
+# them what they are: whether the motion may be sent is checked before it is, in the cell as it is
+# then.
+DECISIVE = ("urdf", "robot", "limits")
+
+
+def fingerprint(cell: Cell) -> dict[str, str]:
+    """Return a digest of each part of a cell that a design may depend on, by the part's name.
+
+    Tables are taken as read, so that comments, order and spelling of numbers do not count. The
+    limits are those in URDF angles.
+    """
+    limits = cell.joint_limits
+    home = cell.file.campaign
+    parts: dict[str, Any] = {
+        "urdf": cell.urdf,
+        "robot": _document(cell.file.robot),
+        "limits": {
+            name: getattr(limits, name).tolist()
+            for name in ("lower", "upper", "velocity", "acceleration", "jerk")
+        },
+        "torque_limit": None if cell.torque_limit is None else cell.torque_limit.tolist(),
+        "drive_train": _document(cell.file.drive_train),
+        "nominal": _document(cell.file.nominal),
+        "workspace": _document(cell.file.workspace),
+        "home": None if home is None else home.home_deg,
+    }
+    return {name: json_digest(part)[:_DIGITS] for name, part in parts.items()}
+
+
+def _document(table: BaseModel | None) -> Any:
+    return None if table is None else table.model_dump(mode="json")
+
 
 _ANGLES = ("lower", "upper", "velocity", "acceleration", "jerk")
 
@@ -91,14 +208,12 @@ def motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
     return digest(json.dumps(trajectory.to_dict()))
 
 
-Array = NDArray[np.float64]
-
 VERSION: Final = 1
 RESULT: Final = "excitation.toml"
 
 _FRONT = (
     "Motions of which none is better than another in both, by rising coupling index, as the\n"
-    "# search sampled them. "
+    "search sampled them. "
 )
 _CHOSEN = "chosen, counting from 0, is the motion of this file."
 _POLISHED = "The motion of this file is none of them: a polish made it from one, see polished_from."
@@ -114,10 +229,10 @@ _HEAD = """\
 """
 _COMMENTS = {
     "criteria": "Of the motion sampled every millisecond. Compare log10_det only between motions "
-    "of one\n# robot in the same units; coupling_index (0 to coupling_index_max) has none.",
+    "of one\nrobot in the same units; coupling_index (0 to coupling_index_max) has none.",
     "search": "How it was found. Of the motions tried so many broke a constraint of each kind.",
     "polished_from": "The point of the front, counting from 0, that the motion grew from, and its "
-    "criteria by\n# the millisecond.",
+    "criteria by\nthe millisecond.",
     "settings": "As the search was asked; `hil design --settings` takes them from this file.",
     "cell": "The cell it was designed for: its name, and a fingerprint of what the design rests "
     "on.",
@@ -126,34 +241,6 @@ _COMMENTS = {
     "earlier": "Archives whose information was added.",
     "seal": "What the lines above and the motion are recognised by.",
 }
-
-
-class Origin(NamedTuple):
-    """Which point of the front a polish began with, and its criteria at 1 ms."""
-
-    point: int
-    log10_det: float
-    coupling_index: float
-
-    @classmethod
-    def of(cls, design: Design) -> Self:
-        """Return the origin of a design."""
-        criteria = design.origin_criteria
-        return cls(design.origin, criteria.log10_det, criteria.coupling_index)
-
-    @classmethod
-    def read(cls, table: Mapping[str, Any]) -> Self:
-        """Return the origin that `[polished_from]` names.
-
-        Raises:
-            FigureError: a figure is none.
-        """
-        where = "polished_from"
-        return cls(
-            count(table, where, "point"),
-            number(table, where, "log10_det"),
-            number(table, where, "coupling_index", least=0.0),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,8 +364,13 @@ class DesignResult:
             result = cls._from_data(data)
         except SettingsError as error:
             raise InputError(path, str(error), remedy=_REMEDY) from error
-        except FigureError as error:
-            raise InputError(path, error.problem, field=error.field, remedy=_REMEDY) from error
+        except ValidationError as error:
+            first = error.errors()[0]
+            name, *inner = first["loc"] or ("front",)
+            rest = (f".{part}" if isinstance(part, str) else f"[{part}]" for part in inner)
+            problem = f"is {first['input']!r:.60}, not a figure: {first['msg'].lower()}"
+            field = f"{name}{''.join(rest)}"
+            raise InputError(path, problem, field=field, remedy=_REMEDY) from error
         except (PlannerError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
             raise InputError(
                 path, f"is not a designed excitation ({error})", remedy=_REMEDY
@@ -347,7 +439,7 @@ class DesignResult:
                 "coupling_index": self.front[:, 1].tolist(),
                 "duration": self.front[:, 2].tolist(),
             },
-            **({"polished_from": self.polished_from._asdict()} if self.polished_from else {}),
+            **({"polished_from": self.polished_from.model_dump()} if self.polished_from else {}),
             "settings": self.settings.to_dict(),
             **(
                 {"earlier": {"archives": [list(a) for a in self.archives]}} if self.archives else {}
@@ -360,31 +452,31 @@ class DesignResult:
     @classmethod
     def _from_data(cls, data: Mapping[str, Any]) -> Self:
         settings = settings_of(data["settings"])
-        search, front = data["search"], data["front"]
-        via = settings.via_points
+        figures = _Figures.model_validate(
+            {name: data[name] for name in _Figures.model_fields if name in data}
+        )
+        search, via = figures.search, settings.via_points
         excitation = Excitation(
-            criteria=criteria_of(data["criteria"]),
-            method=search["method"],
-            seed=count(search, "search", "seed"),
-            tried=count(search, "search", "tried"),
-            rejected=dict(search["infeasible"]),
+            criteria=Criteria(**figures.criteria.model_dump()),
+            method=search.method,
+            seed=search.seed,
+            tried=search.tried,
+            rejected=search.infeasible,
             **motion_from_data(data, None if via is None else via.fly),
         )
-        name, parts = data["cell"]["name"], dict(data["cell"])
-        del parts["name"]
         return cls(
-            cell_name=name,
-            cell_parts=parts,
+            cell_name=data["cell"]["name"],
+            cell_parts={name: part for name, part in data["cell"].items() if name != "name"},
             joint_names=joints_of(data),
             settings=settings,
             excitation=excitation,
-            generations=count(search, "search", "generations"),
+            generations=search.generations,
             complete=data["complete"],
-            n_parameters=count(search, "search", "n_parameters", least=1),
-            parameters=tuple(search["parameters"]) if "parameters" in search else None,
-            front=front_of(front),
-            chosen=front.get("chosen"),
-            polished_from=Origin.read(data["polished_from"]) if "polished_from" in data else None,
+            n_parameters=search.n_parameters,
+            parameters=None if search.parameters is None else tuple(search.parameters),
+            front=figures.front.points,
+            chosen=figures.front.chosen,
+            polished_from=figures.polished_from,
             versions=data["software"],
             archives=tuple(
                 (name, digest) for name, digest in data.get("earlier", {}).get("archives", ())

@@ -29,8 +29,7 @@ from identification.excitation import (
 
 from .advice import exhausted, forbidden, no_excitation
 from .folder import DesignFolder, require_same
-from .knowledge import Knowledge
-from .problem import problem_of, search_settings
+from .problem import Knowledge, problem_of, search_settings
 from .result import DesignResult
 from .settings import DesignSettings
 
@@ -155,8 +154,8 @@ def _searched(
         bar = _Bar(task, reporter)
         population = stack.enter_context(Population(problem, workers))
         if journal is not None:
-            bar.journal = kept = _journal(journal, problem, settings, reporter)
-            stack.callback(kept.close)
+            bar.journal = run_journal = _journal(journal, problem, settings, reporter)
+            stack.callback(run_journal.close)
         try:
             design = search(
                 population,

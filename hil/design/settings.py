@@ -53,7 +53,7 @@ class SettingsError(InputError):
     """The settings of a design cannot be used: names file, field, value and remedy."""
 
 
-def _alone_or_listed(value: Any) -> Any:
+def _one_or_many(value: Any) -> Any:
     return [value] if isinstance(value, int | float) else value
 
 
@@ -122,7 +122,7 @@ class SineTable(_Table):
         description="the time in s in which the sines grow at the beginning and fade at the end, "
         "0 for none (which no controller can execute)"
     )
-    slowest: Annotated[Frequencies, BeforeValidator(_alone_or_listed)] = Field(
+    slowest: Annotated[Frequencies, BeforeValidator(_one_or_many)] = Field(
         description="the lowest angular frequency in rad/s, above 0: one figure, or one for each "
         "joint"
     )
@@ -244,16 +244,16 @@ class DesignSettings(_Table):
         """Sines last as long as they are told to: what is not allowed needs no search."""
         if self.sines is None:
             return self
-        length, kept = self.sines.length, self.constraints
-        if length > kept.max_duration:
+        length, constraints = self.sines.length, self.constraints
+        if length > constraints.max_duration:
             raise ValueError(
                 f"[sines] length = {length:g} s is longer than [constraints] max_duration = "
-                f"{kept.max_duration:g} s; shorten the one or raise the other"
+                f"{constraints.max_duration:g} s; shorten the one or raise the other"
             )
-        if length < kept.min_duration:
+        if length < constraints.min_duration:
             raise ValueError(
                 f"[sines] length = {length:g} s is shorter than [constraints] min_duration = "
-                f"{kept.min_duration:g} s; lengthen the one or lower the other"
+                f"{constraints.min_duration:g} s; lengthen the one or lower the other"
             )
         return self
 
@@ -286,11 +286,11 @@ class DesignSettings(_Table):
     @property
     def unchecked(self) -> tuple[str, ...]:
         """What a search with these settings does not look at; empty for a robot's motion."""
-        kept = self.constraints
+        constraints = self.constraints
         bare = self.sines is not None and self.sines.ramp == 0.0
         return (
-            *(() if kept.collision else ("floor", "walls", "the arm itself")),
-            *(() if kept.current else ("motor currents",)),
+            *(() if constraints.collision else ("floor", "walls", "the arm itself")),
+            *(() if constraints.current else ("motor currents",)),
             *(("rest at both ends",) if bare else ()),
         )
 

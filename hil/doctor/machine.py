@@ -2,15 +2,215 @@
 
 from __future__ import annotations
 
+import getpass
 import gzip
+import os
 import platform
 import re
+import resource
 import sys
 import sysconfig
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.exchange.realtime import LIMITS_FILE, RealTimeSettings
+from hil.archive.process import STALL_LIMIT
 
 from .check import Check, Status
 from .system import System
+
+GROUP = "realtime"
+RULE_FILE = "/etc/udev/rules.d/90-hil.rules"
+_LOG_IN_AGAIN = "# log out and in again, then: ulimit -r; ulimit -l"
+
+
+@dataclass(frozen=True)
+class Obtained:
+    """What a process like the exchange was really given (see `drivers.exchange.realtime`).
+
+    Attributes:
+        scheduling: scheduling class it runs in.
+        memory_locked: its memory stays in RAM.
+        cpu_awake: processors may not sleep while it runs.
+        refused: what was not given, one sentence each.
+    """
+
+    scheduling: str
+    memory_locked: bool
+    cpu_awake: bool
+    refused: tuple[str, ...] = ()
+
+    @classmethod
+    def from_mapping(cls, given: Mapping[str, object]) -> Obtained:
+        """From the probe's answer."""
+        refused = given.get("refused", ())
+        return cls(
+            scheduling=str(given.get("scheduling", "")),
+            memory_locked=given.get("memory_locked") is True,
+            cpu_awake=given.get("cpu_awake") is True,
+            refused=tuple(map(str, refused)) if isinstance(refused, list | tuple) else (),
+        )
+
+
+def user(uid: int | None = None) -> Check:
+    """Who is asking: what root may do says nothing about the operator."""
+    who = os.geteuid() if uid is None else uid
+    why = "nothing of hil needs root, and what root may do says nothing about other users"
+    if who != 0:
+        return Check("user", Status.OK, f"{_name()}, not root", why)
+    return Check(
+        "user", Status.WARN, "root", why, ("# run hil doctor as the user who will run hil",)
+    )
+
+
+def scheduling(obtained: Obtained | None, limit: int | None = None) -> Check:
+    """Whether real-time priority was given to a process that asked for it."""
+    allowed = _limit(resource.RLIMIT_RTPRIO) if limit is None else limit
+    limited = "no limit" if allowed < 0 else f"rtprio limit {allowed}"
+    why = "without it any other program may be served before the controller's packet"
+    name = "real-time priority"
+    if obtained is None:
+        return Check(name, Status.UNKNOWN, f"the probe gave no answer; {limited}", why)
+    if "FIFO" in obtained.scheduling.upper():
+        return Check(name, Status.OK, f"{obtained.scheduling} given ({limited})", why)
+    found = f"refused, its scheduling is {obtained.scheduling or 'ordinary'}; {limited}"
+    remedy = _limit_lines("rtprio", "98")
+    if 0 <= allowed < RealTimeSettings().priority:
+        return Check(name, Status.BAD, found, why, remedy)
+    throttled = "cat /proc/sys/kernel/sched_rt_runtime_us   # 0 forbids real-time programs"
+    return Check(name, Status.BAD, found, why, (*remedy, throttled))
+
+
+def memory_lock(obtained: Obtained | None, limit: int | None = None) -> Check:
+    """Whether memory may be kept in RAM."""
+    allowed = _limit(resource.RLIMIT_MEMLOCK) if limit is None else limit
+    limited = "no limit" if allowed < 0 else f"memlock limit {allowed // 1024} KiB"
+    why = "a page that has to be fetched from disk costs many cycles"
+    name = "memory lock"
+    if obtained is None:
+        return Check(name, Status.UNKNOWN, f"the probe gave no answer; {limited}", why)
+    if obtained.memory_locked:
+        return Check(name, Status.OK, f"given ({limited})", why)
+    partly = any(sentence.startswith("only memory") for sentence in obtained.refused)
+    found = f"{'only what is in use at the start' if partly else 'refused'}; {limited}"
+    status = Status.WARN if partly else Status.BAD
+    return Check(name, status, found, why, _limit_lines("memlock", "unlimited"))
+
+
+def processor_awake(obtained: Obtained | None, system: System) -> Check:
+    """Whether /dev/cpu_dma_latency may be held at 0."""
+    why = "halves the usual wake-up time; matters more than the programming language"
+    name = "processor kept awake"
+    if obtained is not None and obtained.cpu_awake:
+        return Check(name, Status.OK, "/dev/cpu_dma_latency can be held at 0", why)
+    if not system.path("/dev/cpu_dma_latency").exists():
+        return Check(name, Status.UNKNOWN, "this kernel has no /dev/cpu_dma_latency", why)
+    if obtained is None:
+        return Check(name, Status.UNKNOWN, "the probe gave no answer", why)
+    rule = f'KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"'
+    return Check(
+        name,
+        Status.WARN,
+        "/dev/cpu_dma_latency may not be written",
+        why,
+        (
+            _join(),
+            f"echo '{rule}' | sudo tee {RULE_FILE}",
+            "sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency",
+            "# log out and in again, then: ls -l /dev/cpu_dma_latency; groups",
+        ),
+    )
+
+
+def _limit_lines(item: str, value: str) -> tuple[str, ...]:
+    line = f"echo '@{GROUP} - {item} {value}' | sudo tee -a {LIMITS_FILE}"
+    return (_join(), line, _LOG_IN_AGAIN)
+
+
+def _join() -> str:
+    return f"sudo groupadd -f {GROUP} && sudo usermod -aG {GROUP} {_name()}"
+
+
+def _limit(limit: int) -> int:
+    """The limit in force; -1 for none."""
+    return resource.getrlimit(limit)[0]
+
+
+def _name() -> str:
+    try:
+        return os.environ.get("SUDO_USER") or getpass.getuser()
+    except (OSError, KeyError):
+        return str(os.getuid())
+
+
+BYTES_PER_CYCLE = 400
+"""Archived bytes per cycle of six axes, generously."""
+_SLOW, _TOO_SLOW = 0.1 * STALL_LIMIT, 0.5 * STALL_LIMIT
+"""s of one write."""
+_MOVE = "# or put the campaign folder on another, local disk"
+
+
+@dataclass(frozen=True)
+class DiskTrial:
+    """What came of writing to the place of the archives.
+
+    Attributes:
+        folder: where it was tried.
+        free: bytes.
+        seconds: of each write, empty if writing failed.
+        error: why it failed.
+    """
+
+    folder: str
+    free: int
+    seconds: tuple[float, ...] = ()
+    error: str = ""
+
+    @classmethod
+    def from_mapping(cls, given: Mapping[str, Any]) -> DiskTrial:
+        """From the probe's answer."""
+        return cls(
+            folder=str(given.get("folder", "")),
+            free=int(given.get("free", 0)),
+            seconds=tuple(float(each) for each in given.get("seconds", ())),
+            error=str(given.get("error", "")),
+        )
+
+
+def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
+    """Room and write time; None stands for a disk that gave no answer in time."""
+    if trial is None:
+        why = f"a motion is stopped if the disk keeps the archive waiting for {STALL_LIMIT:g} s"
+        look = (f"df -h {place}", _MOVE)
+        return [Check("disk", Status.BAD, f"no answer from the disk of {place}", why, look)]
+    return [_room(trial), _write_time(trial)]
+
+
+def _room(trial: DiskTrial) -> Check:
+    hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
+    return Check(
+        "disk space",
+        Status.OK if hours >= 2 else Status.WARN if hours >= 0.5 else Status.BAD,
+        f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms",
+        "a full disk ends the motion: the arm is stopped, what was archived stays whole",
+        () if hours >= 2 else (f"du -xh {trial.folder} | sort -h | tail",),
+    )
+
+
+def _write_time(trial: DiskTrial) -> Check:
+    name = "disk write"
+    why = f"a motion is stopped if the disk keeps the archive waiting for {STALL_LIMIT:g} s"
+    if not trial.seconds:
+        found = f"cannot write to {trial.folder}: {trial.error or 'no figures'}"
+        return Check(name, Status.BAD, found, why, (f"ls -ld {trial.folder}; id", _MOVE))
+    worst, middle = max(trial.seconds), sorted(trial.seconds)[len(trial.seconds) // 2]
+    found = f"64 KiB are safe after {1e3 * middle:.1f} ms, {1e3 * worst:.1f} ms at worst"
+    status = Status.OK if worst < _SLOW else Status.WARN if worst < _TOO_SLOW else Status.BAD
+    return Check(name, status, found, why, () if status is Status.OK else (_MOVE,))
+
 
 _CPU = "/sys/devices/system/cpu"
 _GOOD_CLOCKS = {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page"}
@@ -65,7 +265,7 @@ def governor(system: System) -> Check:
     )
 
 
-def idle_states(system: System, *, kept_awake: bool) -> Check:
+def idle_states(system: System, *, no_sleep: bool) -> Check:
     """How long the deepest sleep in use takes to leave; no matter if processors are kept awake."""
     deepest, slowest = "", -1
     for cpu in cpus(system):
@@ -82,7 +282,7 @@ def idle_states(system: System, *, kept_awake: bool) -> Check:
         found = f"idle driver {driver}" if driver and driver != "none" else "none listed"
         return Check("idle states", Status.OK, found, why)
     found = f"deepest is {deepest}, {slowest} µs to wake"
-    if kept_awake:
+    if no_sleep:
         return Check("idle states", Status.OK, f"{found}; kept awake during an exchange", why)
     bad = slowest > 50
     remedy = "see 'processor kept awake': with that right, no idle state matters"

@@ -2,11 +2,111 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
+import struct
+from dataclasses import dataclass
 
 from .check import Check, Status
-from .route import LOOPBACK, Neighbour, Route, default_devices, neighbour, route_to
 from .system import System
+
+_UP = 0x1
+_REJECT = 0x200
+_COMPLETE = 0x2
+_PERMANENT = 0x4
+LOOPBACK = "lo"
+
+
+@dataclass(frozen=True)
+class Route:
+    """How packets to an address leave: card, and gateway (None if it is on the card's network)."""
+
+    device: str
+    gateway: str | None
+    is_default: bool = False
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """An entry of the ARP table."""
+
+    address: str
+    mac: str
+    device: str
+    complete: bool
+    permanent: bool
+
+
+def address_of(host: str, system: System) -> str | None:
+    """An IPv4 address as written, or by name from /etc/hosts; None otherwise. No DNS."""
+    try:
+        return str(ipaddress.IPv4Address(host))
+    except ValueError:
+        pass
+    for line in (system.text("/etc/hosts") or "").splitlines():
+        words = line.split("#")[0].split()
+        if host in words[1:] and re.fullmatch(r"[\d.]+", words[0]):
+            return words[0]
+    return None
+
+
+def routes(system: System) -> list[tuple[ipaddress.IPv4Network, int, Route]]:
+    """Network, metric and way of every usable line of /proc/net/route."""
+    found = []
+    for line in (system.text("/proc/net/route") or "").splitlines()[1:]:
+        words = line.split()
+        try:
+            flags, metric = int(words[3], 16), int(words[6])
+            target, gateway, mask = (_dotted(words[i]) for i in (1, 2, 7))
+            network = ipaddress.IPv4Network(f"{target}/{mask}", strict=False)
+        except (IndexError, ValueError, struct.error):
+            continue
+        if not flags & _UP or flags & _REJECT:
+            continue
+        way = Route(words[0], None if gateway == "0.0.0.0" else gateway, network.prefixlen == 0)
+        found.append((network, metric, way))
+    return found
+
+
+def route_to(address: str, system: System) -> Route | None:
+    """The way the main routing table gives: the longest prefix, then the lowest metric."""
+    target = ipaddress.IPv4Address(address)
+    if target.is_loopback or address in own_addresses(system):
+        return Route(LOOPBACK, None)
+    fits = [(-net.prefixlen, metric, way) for net, metric, way in routes(system) if target in net]
+    return min(fits, key=lambda fit: fit[:2])[2] if fits else None
+
+
+def default_devices(system: System) -> set[str]:
+    """Cards that carry a default route."""
+    return {way.device for _, _, way in routes(system) if way.is_default}
+
+
+def own_addresses(system: System) -> set[str]:
+    """IPv4 addresses of this PC, from the local part of /proc/net/fib_trie."""
+    text = system.text("/proc/net/fib_trie") or ""
+    return set(re.findall(r"\|-- ([\d.]+)\n\s+/32 host LOCAL", text))
+
+
+def neighbour(address: str, device: str, system: System) -> Neighbour | None:
+    """The ARP entry of an address on a card."""
+    for line in (system.text("/proc/net/arp") or "").splitlines()[1:]:
+        words = line.split()
+        if len(words) < 6 or words[0] != address or words[5] != device:
+            continue
+        try:
+            flags = int(words[2], 16)
+        except ValueError:
+            continue
+        complete = bool(flags & _COMPLETE) and words[3] != "00:00:00:00:00:00"
+        return Neighbour(words[0], words[3], words[5], complete, bool(flags & _PERMANENT))
+    return None
+
+
+def _dotted(word: str) -> str:
+    """An address of /proc/net/route: hexadecimal in the processor's (little-endian) order."""
+    return str(ipaddress.IPv4Address(struct.unpack("<I", struct.pack(">I", int(word, 16)))[0]))
+
 
 _NET = "/sys/class/net"
 _SPARE_USECS = 50
@@ -127,15 +227,15 @@ def firewall(address: str, port: int, system: System) -> Check:
     allow = f"sudo nft insert rule inet filter input ip saddr {address} udp dport {port} accept"
     allow += "   # if table and chain are called so"
     commands = (["nft", "list", "ruleset"], ["iptables", "-S"])
-    answers = [answer for command in commands if (answer := system.run(command)) is not None]
+    outputs = [answer for command in commands if (answer := system.run(command)) is not None]
     look = "sudo nft list ruleset; sudo iptables -S"
-    if any(_may_drop(answer.output) for answer in answers if answer.status == 0):
+    if any(_may_drop(answer.output) for answer in outputs if answer.status == 0):
         found = "there are rules that drop or reject incoming packets"
         ufw = f"# with ufw: sudo ufw allow from {address} to any port {port} proto udp"
         return Check(name, Status.WARN, found, why, (look, allow, ufw))
-    if any(answer.status != 0 for answer in answers):
+    if any(answer.status != 0 for answer in outputs):
         return Check(name, Status.UNKNOWN, "its rules may be read by root only", why, (look,))
-    if answers:
+    if outputs:
         return Check(name, Status.OK, "no rule drops incoming packets", why)
     if not system.path("/proc/net/netfilter").exists():
         return Check(name, Status.OK, "this kernel has no packet filter", why)

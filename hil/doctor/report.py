@@ -12,9 +12,8 @@ from rich.table import Table
 from hil.terminal_text import printable
 
 from .check import Check, Status
-from .fitness import CRITERIA, Fitness
-from .latency import Latency
-from .run import Diagnosis
+from .measure import Latency
+from .run import CRITERIA, Diagnosis, Fitness
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
 _BAR = 40

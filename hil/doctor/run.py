@@ -2,22 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
+
+from scipy.special import gammaincinv
 
 from hil.progress import Reporter
 
-from . import machine, permissions, port
-from .canbus import can_check
+from . import link as links
+from . import machine
 from .check import Check, Status
-from .fitness import ENOUGH_SECONDS, Fitness, in_words, judge
-from .latency import Latency
-from .link import CanLink, Link, UdpLink
-from .measure import TURNAROUND_PERIOD, disk_trial, measure, obtained
-from .network import network_checks
-from .route import address_of
-from .storage import disk_checks
+from .link import CanLink, Link, UdpLink, can_check
+from .machine import disk_checks
+from .measure import RESERVE, TURNAROUND_PERIOD, Latency, disk_trial, measure, obtained
+from .network import address_of, network_checks
 from .system import System
+
+CRITERIA: Final = (
+    f"a cycle is fit if no cycle of the measurement was late, with {1e6 * RESERVE:.0f} µs kept for "
+    "packet work and wire, and 99.9 % of the latencies used at most half of it"
+)
+ENOUGH_SECONDS: Final = 60.0
+"""s of measurement below which a verdict is provisional."""
+_CONFIDENCE: Final = 0.95
+
+
+@dataclass(frozen=True)
+class Fitness:
+    """The verdict on one cycle.
+
+    Attributes:
+        cycle_ms: the controller's cycle.
+        fit: by `CRITERIA`.
+        late: cycles late in the measurement.
+        late_per_hour_upper_95: upper bound of the rate with 95 % confidence, one-sided, for late
+            cycles that come independently of each other (Poisson). Those of one long stall do not.
+        used: largest 99.9 % latency plus reserve, as a share of the cycle.
+        reason: in words.
+    """
+
+    cycle_ms: int
+    fit: bool
+    late: int
+    late_per_hour_upper_95: float
+    used: float
+    reason: str
+
+
+def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
+    """Judge a cycle by the worse of the latencies; without any, it is not fit."""
+    if not latencies:
+        return Fitness(cycle_ms, False, 0, float("nan"), float("nan"), "nothing was measured")
+    period = cycle_ms / 1000
+    late, worst = max(((each.late_cycles(period), each) for each in latencies), key=lambda p: p[0])
+    slow = max(latencies, key=lambda each: each.percentile(99.9))
+    used = (slow.percentile(99.9) + RESERVE) / period
+    hours = worst.seconds / 3600.0
+    # The mean whose Poisson distribution gives `late` or fewer with 5 % probability only.
+    bound = float(gammaincinv(late + 1, _CONFIDENCE)) / hours
+    if late:
+        longest = 1e3 * float(worst.samples.max())
+        reason = (
+            f"{late} cycles late in {worst.seconds:.0f} s of {worst.name} "
+            f"(some {late / hours:.0f} an hour), the longest {longest:.1f} ms"
+        )
+    elif used > 0.5:
+        reason = f"none late, but {slow.name} uses {100 * used:.0f} % of the cycle at 99.9 %"
+    else:
+        reason = (
+            f"none late in {worst.seconds:.0f} s (fewer than {bound:.0f} an hour, with 95 % "
+            f"confidence); {100 * used:.0f} % of the cycle used at 99.9 %"
+        )
+    return Fitness(cycle_ms, not late and used <= 0.5, late, bound, used, reason)
+
+
+def in_words(one: Fitness, two: Fitness) -> str:
+    """The verdict on both cycles in one sentence."""
+    if one.fit and two.fit:
+        return "1 ms is fit, and so is 2 ms."
+    if two.fit:
+        return "2 ms is fit; 1 ms is not."
+    if one.fit:
+        return "1 ms is fit."
+    return "Neither 1 ms nor 2 ms is fit."
+
 
 CYCLES_MS = (1, 2)
 
@@ -117,23 +187,23 @@ def failed(name: str) -> Check:
     return Check(f"{name} latency", Status.BAD, found, "without it nothing is known", (remedy,))
 
 
-def permission_checks(given: permissions.Obtained | None, system: System) -> list[Check]:
+def permission_checks(given: machine.Obtained | None, system: System) -> list[Check]:
     """What the operating system allows."""
     return [
-        permissions.user(),
-        permissions.scheduling(given),
-        permissions.memory_lock(given),
-        permissions.processor_awake(given, system),
+        machine.user(),
+        machine.scheduling(given),
+        machine.memory_lock(given),
+        machine.processor_awake(given, system),
     ]
 
 
-def machine_checks(given: permissions.Obtained | None, system: System) -> list[Check]:
+def machine_checks(given: machine.Obtained | None, system: System) -> list[Check]:
     """The computer itself."""
     return [
         machine.timer_resolution(),
         machine.clock_source(system),
         machine.governor(system),
-        machine.idle_states(system, kept_awake=given is not None and given.cpu_awake),
+        machine.idle_states(system, no_sleep=given is not None and given.cpu_awake),
         machine.isolation(system),
         machine.preemption(system),
         machine.virtualisation(system),
@@ -146,11 +216,11 @@ def link_checks(link: Link | None, system: System) -> list[Check]:
     if isinstance(link, CanLink):
         return [can_check(link, system)]
     if isinstance(link, UdpLink):
-        trial = port.try_port(link.bind, link.port)
+        trial = links.try_port(link.bind, link.port)
         return [
             *network_checks(link.host, link.port, address_of(link.host, system), system),
-            port.port_check(link.bind, link.port, trial, system),
-            port.options_check(trial),
+            links.port_check(link.bind, link.port, trial, system),
+            links.options_check(trial),
         ]
     why = "routes, ports and buses are looked at when a cell with a real link is given"
     return [Check("controller link", Status.OK, "none: no cell, or a simulated one", why)]

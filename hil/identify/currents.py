@@ -12,7 +12,7 @@ from hil.errors import ArchiveError
 from identification.estimators.current_scale import CurrentScale, scale_from_nominal
 from identification.signals.recording import Recording
 from identification.signals.samples import smooth
-from planner.plain import numbers
+from planner.checked_data import numbers
 
 from .sources import Sources
 
@@ -68,26 +68,26 @@ def with_torques(sources: Sources) -> Sources:
         training=tuple(source.changed(with_torque) for source in sources.training),
         held_out=tuple(source.changed(with_torque) for source in sources.held_out),
     )
-    for doubt in _doubts(sources.cell.joint_names, scale):
+    for doubt in _warnings(sources.cell.joint_names, scale):
         sources = sources.with_doubt(doubt)
     return sources
 
 
-def _doubts(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
+def _warnings(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
     known = scale.determined
     figures = ", ".join(
         f"{name} {value:.4g} ± {2.0 * std:.2g}"
         for name, value, std in zip(names, scale.values, scale.std, strict=True)
         if np.isfinite(std)
     )
-    doubts = [
+    warnings = [
         "only currents were recorded and no torque constants given: they were found by comparing "
         f"the currents with the masses of the URDF ({figures} N·m/A), so every torque and "
         "parameter is as right as those masses; `hil gains` with a known payload does without them"
     ]
     turned = [name for name, negative in zip(names, scale.turned, strict=True) if negative]
     if turned:
-        doubts.append(
+        warnings.append(
             f"the torque constant of {', '.join(turned)} comes out negative: where the current is "
             "positive the weight and inertia of the URDF need a negative torque. Either the sign "
             "of the current or of the axis is turned in the recording, or the URDF's masses are "
@@ -95,14 +95,14 @@ def _doubts(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
         )
     inertial = [name for name, only in zip(names, scale.inertial, strict=True) if only]
     if inertial:
-        doubts.append(
+        warnings.append(
             f"weight hardly loads {', '.join(inertial)}: the torque constant there rests on "
             "inertia and takes the rotor's for that of the links"
         )
     unknown = [name for name, sure in zip(names, known, strict=True) if not sure]
     if unknown:
-        doubts.append(
+        warnings.append(
             f"no torque constant could be found for {', '.join(unknown)}: its torque is the "
             "current in A (times the gears), which predicts the current but no torque"
         )
-    return doubts
+    return warnings

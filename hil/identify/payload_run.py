@@ -297,7 +297,7 @@ def find_payload(
         task.advance(1)
         estimate = identify_payload(cell.model, runs, box)
         task.advance(1)
-    warnings = (*prepared.sources.doubts, *found[True].doubts)
+    warnings = (*prepared.sources.warnings, *found[True].warnings)
     return PayloadFound(
         estimate=estimate,
         frame=frame,

@@ -27,7 +27,7 @@ class Prepared:
     """Sources as samples, and what was done to them.
 
     Attributes:
-        sources: with the friction law that was decided on, and the doubts that preparing raised.
+        sources: with the friction law that was decided on, and the warnings that preparing raised.
         fitted: what the fit reads.
         training: the same recordings as a verdict reads them: torques never smoothed.
         held_out: what is predicted, likewise; `training` where nothing was held out.

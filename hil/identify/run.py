@@ -22,15 +22,20 @@ from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import gather
 from identification.validation.verdict import Verdict, judge
 
-from .consistency import consistency_doubts, consistency_of, consistency_reasons
-from .essential import essential_doubts, essential_of
 from .estimating import Estimation, estimate_with
 from .judging import judgement_result
 from .options import Options
 from .prepared import Prepared, prepare_sources
 from .series import report_series
 from .sources import gather_sources
-from .summary import summarise
+from .summary import (
+    consistency_of,
+    consistency_reasons,
+    consistency_warnings,
+    essential_of,
+    essential_warnings,
+    summarise,
+)
 from .surroundings import nominal_of, surroundings_of
 
 
@@ -126,7 +131,7 @@ def identify_campaign(
         options,
         predict=predict,
         name=root.resolve().name,
-        doubts=folder.damaged(),
+        warnings=folder.damaged(),
     )
     conduct = conduct_of(folder)
     return replace(found, results=found.results.model_copy(update={"conduct": conduct}))
@@ -139,7 +144,7 @@ def identify_archives(
     *,
     predict: Sequence[Path] = (),
     name: str = "",
-    doubts: Sequence[str] = (),
+    warnings: Sequence[str] = (),
 ) -> Identification:
     """Identify from archives.
 
@@ -149,17 +154,17 @@ def identify_archives(
         options: how.
         predict: archives that are predicted and not fitted, whatever they say.
         name: of the result; that of the first archive if left out.
-        doubts: what is known beforehand to be wrong with the archives.
+        warnings: what is known beforehand to be wrong with the archives.
 
     Raises:
         InputError: the archives cannot be used, or not together, or not by the chosen estimator.
     """
     sources = gather_sources(paths, options.split, predict, in_sample=options.in_sample)
-    for doubt in doubts:
+    for doubt in warnings:
         sources = sources.with_doubt(doubt)
     prepared = prepare_sources(sources, options, reporter)
     estimation = estimate_with(prepared, options, reporter)
-    for doubt in estimation.doubts:
+    for doubt in estimation.warnings:
         prepared = replace(prepared, sources=prepared.sources.with_doubt(doubt))
     return _judged(name or paths[0].stem, (*paths, *predict), prepared, estimation, reporter)
 
@@ -184,7 +189,7 @@ def _judged(
             essential = essential_of(cell.model, result.phase, estimation.held_out)
         task.advance(1, "verdict")
         sources = prepared.sources
-        for doubt in (*consistency_doubts(consistency), *essential_doubts(essential)):
+        for doubt in (*consistency_warnings(consistency), *essential_warnings(essential)):
             sources = sources.with_doubt(doubt)
         nominal = nominal_of(cell)
         evidence = gather(

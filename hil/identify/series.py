@@ -60,7 +60,7 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
         example_measured=for_figure(time, example.torque)[seen],
         example_predicted=for_figure(time, predicted)[seen],
         excitation_fitted=excitation.usable[shown].astype(np.float64),
-        example_counted=example.usable[seen].astype(np.float64),
+        example_used=example.usable[seen].astype(np.float64),
         example_inertia=for_figure(time, parts.inertia)[seen],
         example_coriolis=for_figure(time, parts.coriolis)[seen],
         example_gravity=for_figure(time, parts.gravity)[seen],

@@ -78,7 +78,7 @@ class Sources:
         held_out: what is predicted and never fitted.
         noise_variance: of the positions (n,) [rad²]; None where no standstill was recorded.
         torque_variance: of the torques at standstill (n,) [N²·m²]; None likewise.
-        doubts: what a reader must know about the archives.
+        warnings: what a reader must know about the archives.
         tested_on: what is predicted, in words.
         in_sample: whether nothing was held out: `held_out` is `training` then.
     """
@@ -91,13 +91,13 @@ class Sources:
     held_out: tuple[Source, ...]
     noise_variance: Array | None
     torque_variance: Array | None
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     tested_on: str
     in_sample: bool = False
 
     def with_doubt(self, doubt: str) -> Sources:
         """These sources with one more thing a reader must know."""
-        return replace(self, doubts=(*self.doubts, doubt))
+        return replace(self, warnings=(*self.warnings, doubt))
 
 
 def cell_of(archive: Archive) -> Cell:
@@ -159,15 +159,15 @@ def gather_sources(
         rest[0].recording if rest else None,
     )
     held_out = [source_of(archive, cell) for archive in by_kind.get("validation", [])]
-    doubts = [*known_doubts(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
-    doubts += [
+    warnings = [*known_warnings(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
+    warnings += [
         f"{archive.path.name}: {doubt}"
         for archive in archives
         for doubt in archive.header.findings.warnings
     ]
-    doubts += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
+    warnings += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
     if in_sample:
-        return replace(every, doubts=tuple(doubts))
+        return replace(every, warnings=tuple(warnings))
     training, tested_on = every.training, "unseen motion"
     if not held_out:
         whole = len(training) == 1
@@ -179,12 +179,12 @@ def gather_sources(
             else "another recording"
         )
         training, held_out, doubt = _split(training, split)
-        doubts.append(doubt)
+        warnings.append(doubt)
     return replace(
         every,
         training=training,
         held_out=tuple(held_out),
-        doubts=tuple(doubts),
+        warnings=tuple(warnings),
         tested_on=tested_on,
         in_sample=False,
     )
@@ -219,7 +219,7 @@ def all_fitted(
         held_out=training,
         noise_variance=None if rest is None else position_noise(cell, rest),
         torque_variance=None if rest is None else _torque_variance(rest),
-        doubts=(),
+        warnings=(),
         tested_on="the motion that was fitted",
         in_sample=True,
     )
@@ -317,21 +317,21 @@ def _rejected(archive: Archive) -> bool:
     return archive.outcome is not None and archive.outcome.outcome == REJECTED
 
 
-def known_doubts(cell: Cell, archive: Archive) -> list[str]:
+def known_warnings(cell: Cell, archive: Archive) -> list[str]:
     """What is known beforehand to stand between the numbers and the truth, in sentences."""
-    doubts = []
+    warnings = []
     assumed = "drive_train.torque_constant" in cell.file.cell.assumed
     if assumed and not archive.header.only_simulated:
-        doubts.append(
+        warnings.append(
             "the torque constants are assumed: predictions are as good as they look, but every "
             "parameter is in their units"
         )
     if any("friction drift" in effect for effect in archive.header.effects):
-        doubts.append(
+        warnings.append(
             "friction drift is switched on: the planted friction is that of a half-warm joint, "
             "and a short run is colder, so friction estimates differ from it"
         )
-    return doubts
+    return warnings
 
 
 def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 
@@ -12,14 +13,21 @@ from hil.archive import ArchiveHeader
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.results import (
+    BlindResult,
+    CalibrationResult,
     ChoiceResult,
+    ConsistencyResult,
     CoverageResult,
     CriteriaResult,
     DelaysResult,
+    EliminationStepResult,
     EndogeneityResult,
+    EssentialParameter,
+    EssentialResult,
     EstimatorResult,
     ExcitationResult,
     FittedResult,
+    LinkResult,
     ParameterResult,
     Results,
     UncertaintyResult,
@@ -28,8 +36,12 @@ from hil.results import (
 )
 from hil.simulation import planted_values
 from hil.version import software
-from identification import Factor, RobotModel
+from identification import Factor, IdentificationError, RobotModel, estimate
+from identification.estimators.consistent import Consistency
+from identification.estimators.consistent_program import link_parameters
+from identification.estimators.covariance import with_block_covariance
 from identification.estimators.repetitions import RepeatedEstimate
+from identification.estimators.shrinkage import Shrinkage, fitted_values
 from identification.excitation import (
     Excitation,
     condition_number,
@@ -40,22 +52,207 @@ from identification.excitation import (
     information,
     log10_det,
 )
+from identification.factor.factor import joint_weights
+from identification.factor.phases import PhaseFactor
 from identification.model.elements import TorqueRipple
-from identification.selection.essential_choice import EssentialChoice
+from identification.selection.essential_choice import EssentialChoice, choose_essential
 from identification.signals.samples import Samples
-from identification.validation.consistency import ConsistencyCheck
+from identification.validation.calibration import Calibration, TorqueMeans, calibrate
+from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.prediction import PredictionError, over_all, prediction_error
+from identification.validation.residual_blocks import BLOCK
 from identification.validation.verdict import Verdict
 from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, URDF_PATH
 
-from .calibration import calibration_result
-from .consistency import consistency_result
-from .essential import essential_result
 from .estimating import Estimation
 from .options import ESTIMATORS
 from .prepared import Prepared
 from .sources import Source, Sources
+
+Array = NDArray[np.float64]
+
+
+def calibration_result(prepared: Prepared, estimation: Estimation) -> CalibrationResult | None:
+    """Intervals of held-out torque; None without held-out motion, or too little fitted."""
+    if prepared.sources.in_sample:
+        return None
+    model, result = prepared.sources.cell.model, estimation.result
+    shrinkage = _fold_estimator(prepared, estimation)
+
+    def refit(factor: Factor) -> Array:
+        return fitted_values(model, factor, shrinkage)
+
+    try:
+        found = calibrate(
+            result.pooled,
+            result.phase,
+            TorqueMeans.of(model, prepared.training),
+            TorqueMeans.of(model, prepared.held_out),
+            refit,
+        )
+    except IdentificationError:
+        return None
+    return None if math.isnan(found.overall) else _result(found)
+
+
+def _fold_estimator(prepared: Prepared, estimation: Estimation) -> Shrinkage:
+    """The estimator, as far as it works on factors alone.
+
+    Folds are fitted by least squares where it is a robust loss, instruments or a prior from CAD.
+    """
+    if estimation.estimator == "consistent":
+        return Shrinkage(strength=math.inf)
+    return prepared.settings.shrinkage if estimation.estimator == "auto" else Shrinkage()
+
+
+def _result(found: Calibration) -> CalibrationResult:
+    return CalibrationResult(
+        block=BLOCK,
+        means=int(found.blocks.sum()),
+        inside=found.overall,
+        white_inside=found.white_overall,
+        joint_inside=_known(found.inside),
+        half_width=_known(found.half_width),
+    )
+
+
+def _known(values: Array) -> list[float | None]:
+    return [None if math.isnan(value) else value for value in values.tolist()]
+
+
+def consistency_of(
+    model: RobotModel,
+    training: PhaseFactor,
+    held_out: Factor,
+    options: Consistency = Consistency(),  # noqa: B008 - frozen
+) -> ConsistencyCheck | str:
+    """Weighted least squares with the inequalities of a machine and without.
+
+    In words why there is none. It says what the inequalities cost whatever the estimator was.
+    """
+    total = training.total
+    try:
+        weights = joint_weights(total)
+        free = with_block_covariance(estimate(model, total, weights), training, weights)
+        return check_consistency(model, total, held_out, free, weights=weights, options=options)
+    except IdentificationError as error:
+        return str(error)
+
+
+def consistency_reasons(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
+    """Why a model must not be relied on: no machine predicts what it predicts."""
+    if isinstance(consistency, str) or not consistency.impossible:
+        return ()
+    return (
+        f"{consistency.sentence}: look there for a wrong sign, torque constant, coupling or"
+        " description",
+    )
+
+
+def consistency_warnings(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
+    """What a reader of the verdict must know of it."""
+    if isinstance(consistency, str):
+        return (f"no physically consistent parameters were found: {consistency}",)
+    costly = consistency.costly and not consistency.impossible
+    return (consistency.sentence,) if costly else ()
+
+
+def consistency_result(
+    model: RobotModel, check: ConsistencyCheck | str
+) -> ConsistencyResult | None:
+    """As it goes into `results.json`."""
+    if isinstance(check, str):
+        return None
+    found = check.consistent
+    return ConsistencyResult(
+        sentence=check.sentence,
+        impossible=check.impossible,
+        costly=check.costly,
+        held_out=check.held_out,
+        unconstrained_held_out=check.unconstrained_held_out,
+        in_sample=found.relative_error,
+        unconstrained_in_sample=found.unconstrained_relative_error,
+        moved=list(check.moved),
+        shift=found.shift.tolist(),
+        bounds=list(check.bounds),
+        links=_links(model, check),
+        status=found.status,
+    )
+
+
+def _links(model: RobotModel, check: ConsistencyCheck) -> list[LinkResult]:
+    standard = dict(
+        zip(check.consistent.standard_names, check.consistent.standard.tolist(), strict=True)
+    )
+    inertial = link_parameters(model, check.consistent.standard)
+    return [
+        LinkResult(
+            joint=joint,
+            mass=float(inertial[k, 9]),
+            centre=np.divide(inertial[k, 6:9], inertial[k, 9]).tolist(),
+            rotor_inertia=standard.get(f"I{k + 1}m"),
+            room=float(check.room[k]),
+            reference=check.consistent.reference[k],
+        )
+        for k, joint in enumerate(model.joint_names)
+    ]
+
+
+def essential_of(
+    model: RobotModel, training: PhaseFactor, held_out: Sequence[PhaseFactor]
+) -> EssentialChoice | str:
+    """The essential parameters; in words why there are none."""
+    try:
+        return choose_essential(model, training, held_out)
+    except IdentificationError as error:
+        return str(error)
+
+
+def essential_warnings(choice: EssentialChoice | str) -> tuple[str, ...]:
+    """What a reader of the verdict must know of it."""
+    return (
+        (f"essential parameters were not looked for: {choice}",) if isinstance(choice, str) else ()
+    )
+
+
+def essential_result(choice: EssentialChoice | str) -> EssentialResult | None:
+    """As it goes into `results.json`."""
+    if isinstance(choice, str):
+        return None
+    elimination, blind = choice.elimination, choice.blind
+    estimate_left = elimination.estimate
+    return EssentialResult(
+        reason=elimination.reason,
+        cut=elimination.cut,
+        steps=[
+            EliminationStepResult(
+                removed=step.removed,
+                left=step.left,
+                spread=step.spread,
+                in_sample=step.in_sample,
+                held_out=step.held_out,
+                largest_relative_std=step.largest_relative_std,
+            )
+            for step in elimination.steps
+        ],
+        refused=list(elimination.refused),
+        parameters=[
+            EssentialParameter(name=name, unit=unit, estimate=value, std=std)
+            for name, unit, value, std in zip(
+                estimate_left.names,
+                estimate_left.units,
+                estimate_left.values.tolist(),
+                estimate_left.std.tolist(),
+                strict=True,
+            )
+        ],
+        by_spread_left=choice.by_spread.left,
+        by_spread_held_out=choice.by_spread.held_out,
+        blind=None
+        if blind is None
+        else BlindResult(left=blind.left, essential=blind.essential, full=blind.full),
+    )
 
 
 def estimator_result(model: RobotModel, estimation: Estimation) -> EstimatorResult:
@@ -105,9 +302,6 @@ def uncertainty_result(estimation: Estimation) -> UncertaintyResult:
         scatter_of_mean=result.scatter_std.tolist() if many else None,
         posterior=reported if by_posterior else None,
     )
-
-
-Array = NDArray[np.float64]
 
 
 def summarise(
@@ -168,7 +362,7 @@ def summarise(
             good=verdict.good,
             line=verdict.line,
             reasons=[*verdict.reasons],
-            doubts=[*verdict.doubts, *sources.doubts],
+            doubts=[*verdict.doubts, *sources.warnings],
         ),
         essential=essential_result(essential),
         consistency=consistency_result(model, consistency),

@@ -5,13 +5,14 @@ from hil.importers.dh import Convention, convention_of, urdf_of_dh
 from hil.importers.log import import_log
 from hil.importers.output import Use
 from hil.importers.robot import IMPORTED_LAW, STANDARD_GRAVITY, Robot
-from hil.importers.rosbag2 import import_rosbag2, recorded_joints
+from hil.importers.rosbag2 import Effort, import_rosbag2, recorded_joints
 
 __all__ = [
     "IMPORTED_LAW",
     "STANDARD_GRAVITY",
     "ColumnMap",
     "Convention",
+    "Effort",
     "Quantity",
     "Robot",
     "TimeColumn",

@@ -72,10 +72,10 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     """
     known = mcap_messages.topics(path)
     topics = {name: _Reader(topic) for name, topic in known.items() if topic.is_ros2}
-    kept = 0
+    held_bytes = 0
     for name, stamp, data in mcap_messages.messages(path, list(topics)):
-        kept += len(data) if topics[name].add(stamp, data) else 0
-        if kept > MOST_BYTES:
+        held_bytes += len(data) if topics[name].add(stamp, data) else 0
+        if held_bytes > MOST_BYTES:
             raise SourceError(
                 path,
                 f"holds more than {MOST_BYTES} bytes of numbers: too large to be read at once",
@@ -163,7 +163,7 @@ class _Reader:
             raise VaryingError("its messages differ in length")
         joined = np.frombuffer(b"".join(message[:size] for message in batch), np.uint8)
         messages = joined.reshape(len(batch), size)
-        if not self._layout.is_kept_by(messages):
+        if not self._layout.holds_in(messages):
             raise VaryingError("its messages differ in names or lengths of arrays")
         rows = messages.view(self._layout.dtype)[:, 0]
         return {name: rows[name].copy() for name in self._layout.dtype.names or ()}
@@ -311,7 +311,7 @@ _MATLAB_NUMBERS: Final = {"double", "single", "logical"} | {
 }
 _MATLAB_NESTED: Final = ("struct", "cell", "object")
 _MOST_FIELDS: Final = 10_000  # of all structs of a file
-_MOST_LISTED: Final = 30
+_MOST_NAMED: Final = 30
 _ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
 _COMMENT: Final = re.compile(r"[%#].*")
 # Of the process that reads a .mat: the largest array, what it is packed in and its copy.
@@ -428,8 +428,8 @@ class ArrayFile:
             return self._array(name)
         problem, there = self._absent(name)
         shapes = [f"{key} {self.stored[key].shape}" for key in there]
-        if len(shapes) > _MOST_LISTED:
-            shapes[_MOST_LISTED:] = [f"{len(shapes) - _MOST_LISTED} more"]
+        if len(shapes) > _MOST_NAMED:
+            shapes[_MOST_NAMED:] = [f"{len(shapes) - _MOST_NAMED} more"]
         remedy = f"its arrays are {', '.join(shapes)}"
         raise SourceError(self.path, problem, field=field, remedy=remedy)
 
@@ -533,11 +533,11 @@ def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
 
 
 def _mat(path: Path) -> dict[str, Stored]:
-    listed = [one for one in _elsewhere(_variables, str(path)) if not one[0].startswith("__")]
-    nested = [name for name, _, kind in listed if kind in _MATLAB_NESTED]
+    entries = [one for one in _elsewhere(_variables, str(path)) if not one[0].startswith("__")]
+    nested = [name for name, _, kind in entries if kind in _MATLAB_NESTED]
     return {
         name: Stored(shape, partial(_matlab_variable, path, name))
-        for name, shape, kind in listed
+        for name, shape, kind in entries
         if kind in _MATLAB_NUMBERS
     } | _in_memory(_elsewhere(_struct_fields, str(path), nested) if nested else {})
 

@@ -20,7 +20,7 @@ from hil.reading import remedy_of, text_of
 from identification import FrictionLaw
 from identification.errors import ModelError
 from identification.model.kinematics import pinocchio_model
-from planner.toml_value import toml_value
+from planner.toml_text import toml_value
 
 STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
 IMPORTED_LAW: Final = FrictionLaw(third=None, offset=True)

@@ -70,16 +70,16 @@ class Table:
                 f"cannot be read ({why})",
                 remedy="name a text file, or one that ends in .npz, .npy, .mat or .m",
             ) from error
-        kept = [
+        numbered = [
             (number, line)
             for number, line in enumerate(text.splitlines(), 1)
             if number > form.skip_rows and not line.lstrip().startswith(_COMMENTS)
         ]
-        kept = _between(kept, path, form)
-        delimiter, decimal = _written([line for _, line in kept[:_PROBED]], form)
+        numbered = _between(numbered, path, form)
+        delimiter, decimal = _written([line for _, line in numbered[:_PROBED]], form)
         if form.transposed:
-            kept = _transposed(kept, delimiter, path)
-        numbers, lines = [number for number, _ in kept], [line for _, line in kept]
+            numbered = _transposed(numbered, delimiter, path)
+        numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
         names: tuple[str, ...] = ()
         if lines:
             cells = _cells(lines[0], delimiter)
@@ -213,17 +213,17 @@ class Table:
         return values
 
 
-def _between(kept: list[tuple[int, str]], path: Path, form: Format) -> list[tuple[int, str]]:
+def _between(numbered: list[tuple[int, str]], path: Path, form: Format) -> list[tuple[int, str]]:
     """Without empty lines before and after the numbers; one between them may be a lost row."""
-    filled = [place for place, (_, line) in enumerate(kept) if line.strip()]
+    filled = [place for place, (_, line) in enumerate(numbered) if line.strip()]
     if not filled:
         raise SourceError(path, "has no row of numbers")
     if form.skip_empty:
-        return [kept[place] for place in filled]
-    kept = kept[filled[0] : filled[-1] + 1]
-    header = next((place for place, (_, line) in enumerate(kept[1:], 1) if line.strip()), 1)
-    kept = kept[:1] + kept[header:]
-    empty = next((number for number, line in kept if not line.strip()), None)
+        return [numbered[place] for place in filled]
+    numbered = numbered[filled[0] : filled[-1] + 1]
+    header = next((place for place, (_, line) in enumerate(numbered[1:], 1) if line.strip()), 1)
+    numbered = numbered[:1] + numbered[header:]
+    empty = next((number for number, line in numbered if not line.strip()), None)
     if empty is not None:
         raise SourceError(
             path,
@@ -231,14 +231,14 @@ def _between(kept: list[tuple[int, str]], path: Path, form: Format) -> list[tupl
             remedy="take it out, or cut the log there; where empty lines mean nothing, leave them "
             "out: [format] skip_empty = true; skip lines of a header: [format] skip_rows",
         )
-    return kept
+    return numbered
 
 
 def _transposed(
-    kept: list[tuple[int, str]], delimiter: str | None, path: Path
+    numbered: list[tuple[int, str]], delimiter: str | None, path: Path
 ) -> list[tuple[int, str]]:
     """Columns as lines, numbered by sample."""
-    cells = [_cells(line, delimiter) for _, line in kept]
+    cells = [_cells(line, delimiter) for _, line in numbered]
     widths = {len(row) for row in cells}
     if len(widths) > 1:
         raise SourceError(

@@ -26,7 +26,7 @@ from hil.reading import remedy_of, text_of
 from identification.errors import ModelError
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.urdf_tree import urdf_tree
-from planner.toml_value import toml_key, toml_value
+from planner.toml_text import toml_key, toml_value
 
 from .known import ASSUMED, Known, assumed_for_design, from_urdf
 
@@ -38,14 +38,14 @@ def quiet_libraries() -> Iterator[None]:
     Python's own `sys.stderr` is dropped with it: nothing is to be said inside.
     """
     sys.stderr.flush()
-    kept = os.dup(2)
+    saved = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved, 2)
+        os.close(saved)
         os.close(nowhere)
 
 

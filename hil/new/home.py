@@ -15,7 +15,7 @@ from hil.cell.text import replaced_value
 from hil.motion_checks import collision_checker
 from hil.reading import text_of
 from identification.excitation.constraints import clearance
-from planner.toml_value import toml_value
+from planner.toml_text import toml_value
 
 from .cell_text import NewCell
 

@@ -49,8 +49,8 @@ class Known:
 
     def without(self, table: str) -> Known:
         """The same without the figures of one table."""
-        kept = {k: v for k, v in self.values.items() if not k.startswith(f"{table}.")}
-        return replace(self, values=kept, origin={k: self.origin[k] for k in kept})
+        remaining = {k: v for k, v in self.values.items() if not k.startswith(f"{table}.")}
+        return replace(self, values=remaining, origin={k: self.origin[k] for k in remaining})
 
     def __or__(self, other: Known) -> Known:
         """Both; where they differ, `other` counts."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final
 
 import numpy as np
+from jinja2 import ChoiceLoader, FileSystemLoader
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -15,13 +17,14 @@ from hil.report.figures.canvas import blank, footed, headed, place, ruled
 from hil.report.figures.palette import FIRST, INK, MUTED, OUTSIDE_3, ROUTES, SECOND
 from hil.report.figures.svg import Panel, drawing, label, to_panel
 from hil.report.figures.traces import Plot, Trace, even_traces_text
+from hil.report.rendering import environment, page_bytes
 
 Array = NDArray[np.float64]
 
 BINS: Final = 4000
 """Stretches of the time shown whose lowest and highest sample go into the page: every sample of
 16 s at 500 Hz."""
-_DRAWN: Final = 300
+_BINS_SHOWN: Final = 300
 _WIDTH, _LEFT, _RIGHT, _TOP, _PLOT, _STEP, _BOTTOM = 440.0, 56.0, 10.0, 20.0, 66.0, 90.0, 22.0
 _COLOURS: Final = {
     "position": FIRST,
@@ -65,8 +68,8 @@ def _stretches(recorded: Recorded) -> list[tuple[Array, Array]]:
     """The unbroken parts of a line, those of no length left out."""
     broken = np.flatnonzero(np.isnan(recorded.time))
     parts = zip(np.split(recorded.time, broken), np.split(recorded.value, broken), strict=True)
-    kept = [(t[np.isfinite(t)], v[np.isfinite(t)]) for t, v in parts]
-    return [(t, v) for t, v in kept if t.size]
+    finite = [(t[np.isfinite(t)], v[np.isfinite(t)]) for t, v in parts]
+    return [(t, v) for t, v in finite if t.size]
 
 
 def _panel(view: ArchiveView, j: int) -> Panel:
@@ -92,7 +95,7 @@ def _panel(view: ArchiveView, j: int) -> Panel:
     note = f"peaks in % of limits: {', '.join(shares)}" if shares else ""
     with drawing():
         return to_panel(
-            _drawn(grid, plots, marks),
+            _figure(grid, plots, marks),
             key=f"a{j}",
             title=name,
             note=note,
@@ -109,7 +112,7 @@ def _name(title: str) -> str:
     return title.partition(" [")[0]
 
 
-def _drawn(grid: Array, plots: list[Plot], marks: list[float]) -> Figure:
+def _figure(grid: Array, plots: list[Plot], marks: list[float]) -> Figure:
     figure = blank(_WIDTH, _TOP + max(1, len(plots)) * _STEP + _BOTTOM)
     for k, plot in enumerate(plots):
         axes = place(figure, *plot.box)
@@ -126,7 +129,7 @@ def _drawn(grid: Array, plots: list[Plot], marks: list[float]) -> Figure:
 
 def _draw(axes: Axes, grid: Array, plot: Plot) -> None:
     (trace,) = plot.traces
-    for times, values in runs(grid, trace.values, _DRAWN):
+    for times, values in runs(grid, trace.values, _BINS_SHOWN):
         axes.plot(times, values, color=trace.colour, linewidth=trace.width)
     low, high = axes.get_ylim()
     for limit in plot.limits:
@@ -136,3 +139,48 @@ def _draw(axes: Axes, grid: Array, plot: Plot) -> None:
     ruled(axes, "both", x_ticks=6, y_ticks=3)
     axes.ticklabel_format(axis="y", useOffset=False)
     headed(axes, plot.heading)
+
+
+_TEMPLATES: Final = Path(__file__).parent / "templates"
+
+
+def archive_page(view: ArchiveView) -> bytes:
+    """The page; the same archive gives the same bytes.
+
+    Args:
+        view: read with `BINS`, so that there is something to zoom into.
+    """
+    facts = view.facts
+    known = environment()
+    assert known.loader is not None  # where macros and style sheet of all pages lie
+    known.loader = ChoiceLoader([FileSystemLoader(_TEMPLATES), known.loader])
+    shown = f"{view.start:.3f} s to {view.stop:.3f} s of {facts.duration:.3f} s"
+    rows = [
+        ("shown", shown),
+        ("frame", view.frame),
+        ("joints", ", ".join(facts.joint_names)),
+        ("cycle", "not fixed" if facts.period is None else f"{1e3 * facts.period:g} ms"),
+        ("samples", str(facts.samples)),
+        *_missed(view),
+        ("lost", facts.lost or "nothing"),
+        ("damage", facts.damage or "none"),
+        ("attachments", ", ".join(facts.attachments)),
+        *facts.metadata.items(),
+    ]
+    text = known.get_template("archive.html.j2").render(
+        facts=facts,
+        joints=archive_panels(view),
+        events=view.events,
+        states=view.states,
+        simulated=facts.metadata.get("simulated") == "yes",
+        rows=rows,
+    )
+    return page_bytes(text)
+
+
+def _missed(view: ArchiveView) -> list[tuple[str, str]]:
+    """Where packets were missed; nothing where nobody counted them."""
+    if not view.states:
+        return []
+    places = f"at {len(view.gaps)} place{'s' * (len(view.gaps) > 1)}"
+    return [("packets missed", places if len(view.gaps) else "none")]

@@ -18,7 +18,7 @@ _COLUMN, _ROW = 3.1, 1.15
 _LEFT, _RIGHT, _TOP, _STRIP, _BOTTOM, _LINE = 0.95, 0.15, 0.75, 0.32, 0.5, 0.155
 _NAME: Final = 12
 """Letters of a joint's name that a row has room for."""
-_MOST_TOLD: Final = 14
+_MOST_EVENTS: Final = 14
 """Events told below the picture; more are only counted."""
 _SHADES: Final = {
     "open": "#cfe3d6",
@@ -33,11 +33,11 @@ _SHADES: Final = {
 
 def draw_archive(view: ArchiveView) -> Figure:
     """Draw it: one row per joint, one column per quantity; states above, events below."""
-    told = _told(view)
+    events_text = _event_lines(view)
     rows, columns = len(view.joint_names), max(1, len(view.quantities))
     width = _LEFT + columns * _COLUMN + _RIGHT
     strip = _STRIP + 0.18 if view.states else 0.0
-    below = _BOTTOM + _LINE * (len(told) + 1)
+    below = _BOTTOM + _LINE * (len(events_text) + 1)
     height = _TOP + 0.12 + strip + rows * _ROW + below
     with style.page():
         figure = Figure(figsize=(width, height))
@@ -67,7 +67,7 @@ def draw_archive(view: ArchiveView) -> Figure:
             size = ((width - _LEFT - _RIGHT) / width, _STRIP / height)
             _draw_states(figure.add_axes((*across, *size)), view)
         _headline(figure, view, height)
-        for k, line in enumerate(told):
+        for k, line in enumerate(events_text):
             y = (below - _BOTTOM - 0.05 - _LINE * (k + 1)) / height
             figure.text(_LEFT / width, y, line, fontsize=style.SMALL, color=style.INK, va="bottom")
     return figure
@@ -135,7 +135,7 @@ def _draw_states(axes: Axes, view: ArchiveView) -> None:
                 (begin + end) / 2.0, 0.5, name, ha="center", va="center",
                 fontsize=style.SMALL, color=style.INK,
             )  # fmt: skip
-    for number, (time, _, _, warns) in enumerate(view.events[:_MOST_TOLD], 1):
+    for number, (time, _, _, warns) in enumerate(view.events[:_MOST_EVENTS], 1):
         axes.axvline(time, color=style.LIMIT if warns else style.INK, linewidth=0.8)
         if _apart(view, number - 1):
             axes.annotate(
@@ -200,11 +200,11 @@ def _has_limits(view: ArchiveView) -> bool:
     return any(trace.high is not None for q in view.quantities for trace in q.traces)
 
 
-def _told(view: ArchiveView) -> list[str]:
+def _event_lines(view: ArchiveView) -> list[str]:
     lines = [
         f"{number}  {time:.3f} s  {name}: {textwrap.shorten(text, 150, placeholder=' …')}"
-        for number, (time, name, text, _) in enumerate(view.events[:_MOST_TOLD], 1)
+        for number, (time, name, text, _) in enumerate(view.events[:_MOST_EVENTS], 1)
     ]
-    if len(view.events) > _MOST_TOLD:
-        lines.append(f"and {len(view.events) - _MOST_TOLD} more events")
+    if len(view.events) > _MOST_EVENTS:
+        lines.append(f"and {len(view.events) - _MOST_EVENTS} more events")
     return lines

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hil.arm import Arm
 from hil.cell import AngleFrame, Cell
 from hil.plots import style
-from hil.plots.design_joints import draw_motion
+from hil.plots.joints import draw_motion
 from hil.plots.posture_strip import VIEWS, Strip, draw_strip
 from hil.report.figures.svg import label
 from identification.excitation import correlation, coupling_index, coupling_index_max, information
@@ -128,9 +128,9 @@ class FrontView:
         if self.knee is not None:
             found.append(_Mark("grew from", self.knee, _GREW))
         for k, (name, measures) in enumerate(self.references.items()):
-            told = f"{label(name)} (kinematic)" if name in self.kinematic else label(name)
+            wording = f"{label(name)} (kinematic)" if name in self.kinematic else label(name)
             look = {**_REFERENCE, "marker": _MARKERS[k % len(_MARKERS)]}
-            found.append(_Mark(told, measures, look, compared=True))
+            found.append(_Mark(wording, measures, look, compared=True))
         return [mark for mark in found if np.all(np.isfinite(mark.measures))]
 
     @cached_property
@@ -177,8 +177,8 @@ class FrontView:
         if self.front is not None and self.has_line:
             line.append(f"front, {len(self.front.coupling_index)} motions")
         for mark in self.marks:
-            told = f"{mark.text} ({mark.measures[0]:.1f}, {mark.measures[1]:.1f})"
-            line.append(told + (", beyond the edge" if self.is_beyond(mark) else ""))
+            wording = f"{mark.text} ({mark.measures[0]:.1f}, {mark.measures[1]:.1f})"
+            line.append(wording + (", beyond the edge" if self.is_beyond(mark) else ""))
         wide = _KEY + _LETTER * max(map(len, line), default=0)
         columns = 2 if wide <= width / 2.0 else 1
         letters = int((width / columns - _KEY) / _LETTER)

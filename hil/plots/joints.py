@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,13 +14,127 @@ from numpy.typing import NDArray
 from hil.cell import AngleFrame
 from hil.plots import style
 from hil.report.figures.canvas import thinned
+from planner import JointLimits, Trajectory
 from planner.moves import MotionPlan
 
 Array = NDArray[np.float64]
 
 _SAMPLES = 4000
-_MARGIN = 0.08
 _LINES = {"flown": "-", "reduced": "--", "stopped": ":"}
+_LETTERS = 12
+"""As many as a line along a row's height takes."""
+_NAME = 0.4
+"""inch from the axes to the name, which leaves room for the limits' numbers."""
+
+
+def draw_motion(
+    rows: Sequence[Sequence[Axes]],
+    trajectory: Trajectory,
+    limits: JointLimits,
+    joint_names: Sequence[str],
+    frame: AngleFrame,
+    postures: Array,
+) -> None:
+    """Draw one row per joint: position and velocity over a time axis that all share.
+
+    Args:
+        rows: two axes per joint.
+        trajectory: what to draw.
+        limits: its limits, URDF angles.
+        joint_names: one per joint.
+        frame: which angles to show.
+        postures: times that are numbered (k,) [s].
+    """
+    time = np.linspace(0.0, trajectory.duration, _SAMPLES)
+    q, qd, _ = trajectory.sample(time)
+    ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
+    fastest = np.degrees(limits.velocity)
+    for joint, (name, (position, velocity)) in enumerate(zip(joint_names, rows, strict=True)):
+        for axes, values, low, high, colour in (
+            (position, frame.shown(q), ends[0], ends[1], style.POSITION),
+            (velocity, frame.shown_rate(qd), -fastest, fastest, style.VELOCITY),
+        ):
+            least, most = float(low[joint]), float(high[joint])
+            lowest, highest = float(values[:, joint].min()), float(values[:, joint].max())
+            shown = min(least, lowest), max(most, highest)
+            _against_limits(axes, least, most, shown, 0.1, 2.0)
+            for at in postures:
+                axes.axvline(at, color=style.RULE, linewidth=0.8)
+            axes.plot(*thinned(time, values[:, joint], 400), color=colour, linewidth=1.1)
+            axes.set_xlim(0.0, trajectory.duration)
+            axes.tick_params(labelbottom=joint == len(rows) - 1, length=2.0, pad=2.0)
+            style.bare(axes)
+            axes.grid(False, axis="x")
+        _name(position, broken(name))
+    titles = (f"position [deg, {frame.name} angles]", "velocity [deg/s]")
+    for axes, title in zip(rows[0], titles, strict=True):
+        axes.set_title(title, loc="left", color=style.MUTED, pad=13.0)
+        for number, at in enumerate(postures, 1):
+            _number(axes, number, at, fontweight="bold", annotation_clip=False)
+    for axes in rows[-1]:
+        axes.set_xlabel("time [s]")
+
+
+def _name(axes: Axes, name: str) -> None:
+    """Write a name as far from the axes as all others, whatever their width."""
+    size = style.TEXT if "\n" not in name else style.TEXT - 1.0
+    axes.set_ylabel(name, color=style.INK, fontsize=size)
+    width = axes.bbox.width / axes.figure.dpi
+    axes.yaxis.set_label_coords(-_NAME / width, 0.5)
+
+
+def broken(name: str) -> str:
+    """Return a joint's name in at most two lines, none longer than a row of the page is high.
+
+    What does not fit is left out of the middle: beginnings and ends tell joints apart.
+    """
+    name = "".join(c if c.isprintable() else " " for c in name).strip()
+    if len(name) <= _LETTERS:
+        return name
+    ends = [match.end() for match in re.finditer(r"[_\W]+", name)]
+    fitting = [end for end in ends if end <= _LETTERS and end < len(name)]
+    if not fitting:
+        return _shortened(name)
+    at = fitting[-1]
+    return f"{name[:at].rstrip()}\n{_shortened(name[at:])}"
+
+
+def _shortened(text: str) -> str:
+    half = (_LETTERS - 1) // 2
+    return text if len(text) <= _LETTERS else f"{text[:half]}…{text[half + 1 - _LETTERS :]}"
+
+
+def _against_limits(
+    axes: Axes, low: float, high: float, shown: tuple[float, float], share: float, apart: float
+) -> None:
+    """Show both limits, with a share of room about what is `shown`.
+
+    Zero, or the middle where it lies outside, has a tick too, if that lies `apart` times the room
+    from both limits.
+    """
+    for bound in (low, high):
+        axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
+    room = share * (shown[1] - shown[0])
+    axes.set_ylim(shown[0] - room, shown[1] + room)
+    middle = 0.0 if low < 0.0 < high else (low + high) / 2.0
+    inside = min(abs(middle - low), abs(high - middle)) > apart * room
+    axes.set_yticks([low, middle, high] if inside else [low, high])
+    axes.yaxis.set_major_formatter("{x:.4g}")
+
+
+def _number(axes: Axes, number: int, at: float, **words: Any) -> None:
+    """Write a number above the axes."""
+    axes.annotate(
+        str(number),
+        (at, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(0.0, 2.0),
+        textcoords="offset points",
+        ha="center",
+        fontsize=style.SMALL,
+        color=style.INK,
+        **words,
+    )
 
 
 def draw_joints(
@@ -41,7 +157,8 @@ def draw_joints(
     targets = np.array([frame.shown(move.target) for move in plan.moves])
     for joint, (name, row) in enumerate(zip(joint_names, rows, strict=True)):
         for axes, (values, low, high, colour) in zip(row, quantities, strict=True):
-            _limits(axes, float(low[joint]), float(high[joint]))
+            least, most = float(low[joint]), float(high[joint])
+            _against_limits(axes, least, most, (least, most), 0.08, 1.0)
             _corners(axes, plan)
             axes.plot(*thinned(time, values[:, joint], 250), color=colour, linewidth=1.2)
             axes.set_xlim(0.0, max(float(time[-1]), 1e-9))
@@ -81,18 +198,6 @@ def corner_times(plan: MotionPlan) -> list[tuple[float, float]]:
     return times
 
 
-def _limits(axes: Axes, low: float, high: float) -> None:
-    for bound in (low, high):
-        axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
-    room = _MARGIN * (high - low)
-    axes.set_ylim(low - room, high + room)
-    # The limits' own figures stand at the axis; zero too, or the middle where it lies outside.
-    middle = 0.0 if low < 0.0 < high else (low + high) / 2.0
-    apart = min(abs(middle - low), abs(high - middle)) > _MARGIN * (high - low)
-    axes.set_yticks([low, middle, high] if apart else [low, high])
-    axes.yaxis.set_major_formatter("{x:.4g}")
-
-
 def _corners(axes: Axes, plan: MotionPlan) -> None:
     for (begin, end), target in zip(corner_times(plan), plan.targets, strict=False):
         axes.axvspan(begin, end, color=style.SHADE, linewidth=0.0)
@@ -106,13 +211,4 @@ def _numbers(axes: Axes, plan: MotionPlan) -> None:
     shown = [True, *(b - a >= apart for a, b in pairwise(times))]
     for number, (time, show) in enumerate(zip(times, shown, strict=True), 1):
         if show:
-            axes.annotate(
-                str(number),
-                (time, 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(0.0, 2.0),
-                textcoords="offset points",
-                ha="center",
-                fontsize=style.SMALL,
-                color=style.INK,
-            )
+            _number(axes, number, time)

@@ -69,8 +69,8 @@ def flown_corners(plan: MotionPlan, target: int) -> list[FlownCorner]:
 def sharpest_corner(plan: MotionPlan) -> int | None:
     """Return the target at which the path turns most, of those it can fly by; None if none."""
     points = np.array([plan.start, *(move.target for move in plan.moves)])
-    ways = np.diff(points, axis=0)
-    areas = [float(np.max(np.abs(_turn(a, b)))) for a, b in pairwise(ways)]
+    steps = np.diff(points, axis=0)
+    areas = [float(np.max(np.abs(_turn(a, b)))) for a, b in pairwise(steps)]
     return int(np.argmax(areas)) if areas and max(areas) > 0.0 else None
 
 

@@ -10,11 +10,11 @@ from typing import Any
 from hil.compare import words
 from hil.compare.comparison import AxisChange, Comparison, ParameterChange
 from hil.compare.payload import LEAST_EFFECT
-from hil.compare.spread import FEWEST, Known
+from hil.compare.spread import FEWEST
 from hil.compare.trend import FALSE_ALARMS, LEAST_FRICTION
 from hil.report import numbers
 from hil.report.figures.comparison import friction_panels
-from hil.report.rendering import Numbering, environment, page_bytes
+from hil.report.rendering import environment, page_bytes
 from hil.version import software
 
 
@@ -40,7 +40,6 @@ def render_comparison(found: Comparison) -> str:
 def _context(found: Comparison) -> dict[str, Any]:
     letters = [_letter(k) for k in range(len(found.campaigns))]
     return {
-        "numbering": Numbering(),
         "found": found,
         "letters": letters,
         "verdict": words.verdict(found),
@@ -80,8 +79,8 @@ def _campaign(found: Comparison, k: int) -> list[str]:
 
 
 def _axis(axis: AxisChange, letters: list[str]) -> Row:
-    speed = f"{axis.speed:.2g} {axis.speed_unit}" if math.isfinite(axis.speed) else "any speed"
-    cells = [speed, axis.unit, *(_with_std(one) for one in axis.known)]
+    speed = numbers.speed_text(axis.speed, axis.speed_unit)
+    cells = [speed, axis.unit, *(numbers.with_std(one.value, one.std) for one in axis.known)]
     for k in range(1, len(letters)):
         if not math.isfinite(axis.p_values[k]):
             cells += [numbers.MISSING] * 4
@@ -100,9 +99,7 @@ def _axis(axis: AxisChange, letters: list[str]) -> Row:
 def _load(found: Comparison, k: int) -> Row:
     payload, change = found.payload, found.payload.changes[k]
     mass, std = float(payload.mass[k]), float(payload.mass_std[k])
-    text = numbers.MISSING
-    if math.isfinite(mass) and std > 0.0:
-        text = f"{numbers.beside(mass, std)} ± {numbers.significant(std, 2)}"
+    text = numbers.with_std(mass, std) if std > 0.0 else numbers.MISSING
     outcome = (
         "■ changed"
         if payload.changed[k]
@@ -153,7 +150,10 @@ def _joint_predictions(found: Comparison, letters: list[str]) -> list[Row]:
 
 
 def _parameter(one: ParameterChange) -> Row:
-    cells = [one.unit.replace(" ", "·"), *(_with_std(each) for each in one.known)]
+    cells = [
+        one.unit.replace(" ", "·"),
+        *(numbers.with_std(each.value, each.std) for each in one.known),
+    ]
     for k in range(1, len(one.known)):
         apart = one.differences[k]
         if apart is None or not math.isfinite(apart.value):
@@ -165,12 +165,6 @@ def _parameter(one: ParameterChange) -> Row:
             numbers.significant(float(one.p_values[k]), 2),
         ]
     return Row(one.name, cells, any(one.differs(k) for k in range(1, len(one.known))))
-
-
-def _with_std(one: Known) -> str:
-    if not math.isfinite(one.value):
-        return numbers.MISSING
-    return f"{numbers.beside(one.value, one.std)} ± {numbers.significant(one.std, 2)}"
 
 
 def _percent(share: float) -> str:

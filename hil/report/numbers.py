@@ -9,7 +9,7 @@ import math
 import re
 
 MISSING = "–"
-_PLAIN_MINIMUM, _PLAIN_MAXIMUM = 1e-4, 1e6
+_SMALLEST_DECIMAL, _LARGEST_DECIMAL = 1e-4, 1e6
 _MOST_DECIMALS = 6
 
 
@@ -22,7 +22,7 @@ def significant(value: float | None, digits: int = 3) -> str:
     if value == 0.0:
         return "0"
     size = abs(value)
-    if not _PLAIN_MINIMUM <= size < _PLAIN_MAXIMUM:
+    if not _SMALLEST_DECIMAL <= size < _LARGEST_DECIMAL:
         return _short_exponent(f"{value:.{digits - 1}e}")
     # Rounding first: 9.996 to three digits is 10.0, with one decimal and not two.
     exponent = int(f"{size:.{digits - 1}e}".split("e")[1])
@@ -56,16 +56,42 @@ def beside(value: float | None, std: float) -> str:
     return _short_exponent(f"{value:.{digits}e}")
 
 
-def percent(fraction: float | None) -> str:
+def percent(fraction: float | None, decimals: int | None = None) -> str:
     """A fraction in per cent, without the sign: the column head carries it."""
     if fraction is None:
         return MISSING
+    if decimals is not None:
+        return fixed(100.0 * fraction, decimals)
     size = abs(100.0 * fraction)
     if math.isnan(size):
         return "nan"
     if size >= 1000.0:
         return ">999"
     return fixed(100.0 * fraction, 0 if size >= 99.5 else 1 if size >= 9.95 else 2)
+
+
+def with_std(value: float, std: float) -> str:
+    """`value ± std`; the value alone without a usable one."""
+    if not math.isfinite(value):
+        return MISSING
+    if not std > 0.0:
+        return significant(value)
+    return f"{beside(value, std)} ± {significant(std, 2)}"
+
+
+def speed_text(speed: float, unit: str) -> str:
+    """A speed at which friction is compared; NaN is any."""
+    return f"{speed:.2g} {unit}" if math.isfinite(speed) else "any speed"
+
+
+def unit_text(unit: str) -> str:
+    """A unit as pages print it: N·m for `N m`."""
+    return unit.replace(" ", "·")
+
+
+def capitalised(text: str) -> str:
+    """A text with a capital first letter, all others as they are."""
+    return text[:1].upper() + text[1:]
 
 
 def _short_exponent(text: str) -> str:

@@ -1,26 +1,61 @@
-"""The page: results and series in, one self-contained HTML file out."""
+"""The page: results and series in, one self-contained HTML file out.
+
+Templates read the results themselves; here is what has to be computed for them.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
-from hil.report import (
-    choices,
-    conduct,
-    consistency,
-    essential,
-    estimation,
-    figures,
-    overview,
-    parameters,
-    validation,
-    verdict,
+from hil.archive.header import ArchiveName
+from hil.report import figures, numbers, parameters, validation
+from hil.report.figures.conduct import warm_up_panels
+from hil.report.figures.elimination import elimination_panels
+from hil.report.figures.parameters import shift_panels
+from hil.report.figures.residuals import (
+    autocorrelation_panels,
+    friction_panels,
+    position_panels,
+    speed_panels,
 )
-from hil.report.rendering import Numbering, environment, page_bytes
+from hil.report.rendering import environment, page_bytes
 from hil.report.series import ReportSeries
-from hil.results import Results
+from hil.results import (
+    ChoiceResult,
+    CriteriaResult,
+    ParameterResult,
+    RecordedResult,
+    Results,
+)
+
+_METHODS: Final = {
+    "a": "designed by the paper's method A",
+    "b": "designed by the paper's method B",
+    "balanced": "designed for balanced criteria",
+    "front": "designed as the knee of log det and I_c",
+    "random": "the best of random motions",
+}
+_CRITERIA: Final = (
+    ("log10_det", "log₁₀ det(ΦᵀΦ / N)", "eq. 9: information, in SI units; more is better", 2),
+    ("coupling_index", "Coupling index I_c", "eq. 5: sum of |correlations|; less is better", 1),
+    ("coupling_index_max", "Largest possible I_c", "p (p − 1) / 2 for p parameters", 0),
+    ("fitness", "Fitness", "eq. 7: weighted log det and I_c,max / I_c", 2),
+    ("scaled_condition", "Condition, columns scaled", "of Φ with columns of unit norm", 1),
+    ("condition", "Condition", "of Φ as it is, in SI units", 0),
+    ("n_samples", "Samples N", "samples of motion that entered", 0),
+)
+_MOST_CANDIDATES: Final = 6
+"""Candidates of one choice that are shown: the first, and the best of the others."""
+_WELL, _ROUGHLY = 0.1, 0.5
+_PAIRS: Final = 10
+
+Fact = tuple[str, str]
+"""A term and what is known of it."""
 
 
 def report_bytes(results: Results, series: ReportSeries) -> bytes:
@@ -44,29 +79,21 @@ def render_report(results: Results, series: ReportSeries) -> str:
 
 
 def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
-    labels = [parameters.short_label(p) for p in results.parameters]
-    base, friction = parameters.table_rows(results)
     routes = parameters.routes(results)
     errors = validation.example_errors(results)
     return {
-        "numbering": Numbering(),
         "results": results,
         "series": series,
-        "facts": overview.facts(results),
-        "estimation_facts": estimation.facts(results),
-        "criteria": overview.criteria(results),
-        "questions": choices.questions(results),
-        "overall": validation.overall(results),
-        "error_rows": validation.error_rows(results),
-        "joint_errors": validation.joint_errors(results) if results.validation else [],
-        "run_tables": validation.run_tables(results) if len(results.validation) > 1 else [],
-        "base_rows": base,
-        "friction_rows": friction,
+        "facts": facts(results),
+        "estimation_facts": estimation_facts(results),
+        "criteria": criteria(results),
+        "shown_candidates": shown_candidates,
         "tally": parameters.tally(results),
+        "expression": parameters.expression,
         "routes": routes,
         "reported_title": parameters.reported_title(results),
-        "pairs": overview.strongest_pairs(results, labels),
-        "pairs_above": overview.pairs_above(results, 0.9),
+        "pairs": strongest_pairs(results),
+        "pairs_above": pairs_above(results, 0.9),
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
@@ -80,8 +107,236 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "split_panels": figures.split_panels(series, errors),
         "spectrum_panels": figures.spectrum_panels(series, errors),
         "curve_panels": figures.friction_curve_panels(series, errors),
-        **verdict.verdict_context(results),
-        **essential.context(results),
-        **consistency.context(results),
-        **conduct.context(results),
+        **validation.validation_context(results),
+        **judgement_context(results),
+        **trust_context(results),
+        **conduct_context(results),
     }
+
+
+def judgement_context(results: Results) -> dict[str, Any]:
+    """What `judgement.html.j2` and `residuals.html.j2` need."""
+    judgement = results.judgement
+    if judgement is None:
+        return {}
+    return {
+        "every_row_errors": validation.every_row_errors(results),
+        "speed_panels": speed_panels(judgement),
+        "position_panels": position_panels(judgement),
+        "autocorrelation_panels": autocorrelation_panels(judgement),
+        "friction_panels": friction_panels(judgement),
+    }
+
+
+def trust_context(results: Results) -> dict[str, Any]:
+    """What `trust.html.j2` and `consistency.html.j2` need."""
+    essential, consistency = results.essential, results.consistency
+    return {
+        "trust": trust(results),
+        "by_name": {parameter.name: parameter for parameter in results.parameters},
+        "outside_mark": parameters.outside_mark,
+        "elimination_panels": [] if essential is None else elimination_panels(essential),
+        "shift_panels": [] if consistency is None else shift_panels(results, consistency),
+    }
+
+
+def conduct_context(results: Results) -> dict[str, Any]:
+    """What `conduct.html.j2` needs."""
+    if results.conduct is None:
+        return {}
+    recorded = results.conduct.recorded
+    return {
+        "when": when(recorded),
+        "health": health(recorded),
+        "motion_name": motion_name,
+        "warm_up_panels": warm_up_panels(results),
+    }
+
+
+def facts(results: Results) -> list[Fact]:
+    """Cell, motion and software; the archives are listed in the provenance."""
+    excitation, runs = results.excitation, results.validation
+    rate = 1.0 / results.period if results.period > 0 else float("inf")
+    n_friction = len(results.parameters) - results.n_base
+    motion = [f"{numbers.fixed(excitation.duration, 2)} s"]
+    if excitation.n_sines is not None:
+        motion.append(f"{excitation.n_sines} sines per joint")
+    if excitation.n_via is not None:
+        motion.append(f"{excitation.n_via} via points")
+    if excitation.fly is not None:
+        motion.append(f"fly-by {100.0 * excitation.fly:g} %")
+    if excitation.method is not None:
+        motion.append(_METHODS.get(excitation.method, f"found by {excitation.method}"))
+    seconds = numbers.significant(sum(run.duration for run in runs))
+    held_out = f"{len(runs)}, {seconds} s in all, none of it used for fitting" if runs else "none"
+    return [
+        ("Cell", results.cell),
+        ("Joints", f"{len(results.joint_names)}: " + ", ".join(results.joint_names)),
+        ("Cycle", f"{1e3 * results.period:g} ms ({rate:g} Hz)"),
+        ("Excitation", ", ".join(motion)),
+        ("Repetitions", str(len(results.repetitions))),
+        ("Validation runs", held_out),
+        ("Parameters", f"{results.n_base} base + {n_friction} friction"),
+        ("Software", " · ".join(f"{k} {v}" for k, v in results.software.items())),
+    ]
+
+
+def estimation_facts(results: Results) -> list[Fact]:
+    """Estimator, conditioning, bias by noise in the regressor, prior, and base parameters."""
+    estimator = results.estimator
+    condition = numbers.significant(estimator.condition, 3)
+    found = [
+        ("Estimator", f"{estimator.words} (--estimator {estimator.name})"),
+        ("Values and std", results.uncertainty.method),
+        ("Condition", f"{condition} with columns of unit length, weighted by joint"),
+        ("Base parameters", estimator.grouping),
+    ]
+    bias = results.endogeneity.sentence if results.endogeneity else results.endogeneity_untested
+    if bias:
+        found.append(("Noise in the regressor", bias))
+    if estimator.prior:
+        learned = [p.learned for p in results.parameters if p.learned is not None]
+        text = f"Nothing: {estimator.prior}."
+        if learned:
+            text = (
+                f"{estimator.prior}. {sum(learned)} of {len(learned)} parameters were learned from"
+                " the data: at least three quarters of what is now known of them comes from there."
+            )
+        found.append(("Known before the data", text))
+    return found
+
+
+def criteria(results: Results) -> list[tuple[str, str, str, str, str]]:
+    """Title, meaning, planned, executed and change; the paper's equations by number."""
+    planned, executed = results.excitation.planned, results.excitation.executed
+    return [
+        (
+            title,
+            meaning,
+            _criterion(planned, field, decimals),
+            _criterion(executed, field, decimals),
+            _change(planned, executed, field, decimals),
+        )
+        for field, title, meaning, decimals in _CRITERIA
+    ]
+
+
+def _criterion(criteria: CriteriaResult | None, field: str, decimals: int) -> str:
+    value = None if criteria is None else getattr(criteria, field)
+    if value is None:
+        return numbers.MISSING
+    return numbers.fixed(value, decimals) if abs(value) < 1e7 else numbers.significant(value)
+
+
+def _change(
+    planned: CriteriaResult | None, executed: CriteriaResult, field: str, decimals: int
+) -> str:
+    """Executed minus planned; a log has no meaningful percentage, the others get one."""
+    before = None if planned is None else getattr(planned, field)
+    after = getattr(executed, field)
+    if before is None or after is None or field == "n_samples":
+        return numbers.MISSING
+    if field in {"log10_det", "fitness"} or before == 0.0:
+        return numbers.fixed(after - before, decimals, sign=True)
+    return numbers.fixed(100.0 * (after / before - 1.0), 1, sign=True) + " %"
+
+
+def strongest_pairs(results: Results) -> list[tuple[str, str, float]]:
+    """Ten pairs of largest |correlation| with it, friction included."""
+    size, rho = len(results.correlation), results.correlation
+    labels = [p.label for p in results.parameters]
+    pairs = [
+        (labels[i], labels[j], rho[i][j])
+        for i in range(size)
+        for j in range(i + 1, size)
+        if math.isfinite(rho[i][j])  # none is, where the motion excites too little
+    ]
+    return sorted(pairs, key=lambda pair: -abs(pair[2]))[:_PAIRS]
+
+
+def pairs_above(results: Results, limit: float) -> tuple[int, int]:
+    """Pairs of base parameters with |correlation| above `limit`, and all such pairs."""
+    n = results.n_base
+    above = sum(abs(results.correlation[i][j]) > limit for i in range(n) for j in range(i + 1, n))
+    return above, n * (n - 1) // 2
+
+
+def shown_candidates(choice: ChoiceResult) -> list[int]:
+    """Indices of the candidates of a choice that the page shows, the first one first."""
+    errors = [math.inf if error is None else error for error in choice.errors]
+    shown = list(range(len(errors)))
+    if len(shown) <= _MOST_CANDIDATES:
+        return shown
+    # The first is the simplest, against which the others had to pay: least squares.
+    best = sorted(shown[1:], key=lambda k: (k != choice.chosen, errors[k]))
+    return [0, *best[: _MOST_CANDIDATES - 1]]
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Parameters of the full model by how well the data determine them."""
+
+    well: list[str]
+    roughly: list[str]
+    hardly: list[str]
+    undetermined: list[str]
+    not_learned: list[str] | None
+    """Of which the nominal figures say more than the data; None without a prior."""
+
+
+def trust(results: Results) -> Trust:
+    """Sort the parameters by relative standard deviation."""
+    found: dict[str, list[str]] = {"well": [], "roughly": [], "hardly": [], "undetermined": []}
+    for parameter in results.parameters:
+        found[_grade(parameter)].append(parameter.name)
+    without_prior = all(parameter.learned is None for parameter in results.parameters)
+    not_learned = [p.name for p in results.parameters if p.learned is False]
+    return Trust(**found, not_learned=None if without_prior else not_learned)
+
+
+def _grade(parameter: ParameterResult) -> str:
+    if parameter.undetermined or not math.isfinite(parameter.std):
+        return "undetermined"
+    size = abs(parameter.estimate)
+    if parameter.std <= _WELL * size:
+        return "well"
+    return "roughly" if parameter.std <= _ROUGHLY * size else "hardly"
+
+
+def when(recorded: Sequence[RecordedResult]) -> str:
+    """From the first archive's begin to the last one's, in a sentence."""
+    begins = sorted(one.when for one in recorded if one.when is not None)
+    if not begins:
+        return (
+            "No date is on record; virtual time has none." if recorded else "Nothing was recorded."
+        )
+    first, last = (one[:16].replace("T", " ") for one in (begins[0], begins[-1]))
+    if first[:10] == last[:10]:
+        last = last[11:]
+    return f"{first} to {last}, where the last motion began (UTC)."
+
+
+def health(recorded: Sequence[RecordedResult]) -> str:
+    """How the link did over all archives, in a sentence."""
+    cycles = sum(one.cycles for one in recorded)
+    if not cycles:
+        return "No archive could be read."
+    sums = {
+        "packets missed": sum(one.missed for one in recorded),
+        "answers late": sum(one.late for one in recorded),
+        "answers not taken": sum(one.not_taken for one in recorded),
+        "cycles not archived": sum(one.lost for one in recorded),
+    }
+    losses = [
+        f"{count} {words} ({numbers.significant(1e6 * count / cycles, 2)} in a million)"
+        for words, count in sums.items()
+        if count
+    ]
+    size = f"{cycles:,} cycles in {len(recorded)} archives".replace(",", "\u202f")
+    return f"{size}: {', '.join(losses) or 'no packet missed, no answer late, none lost'}."
+
+
+def motion_name(one: RecordedResult) -> str:
+    """The motion of an archive as a person calls it."""
+    name = ArchiveName.parse(one.archive)
+    return one.kind if name is None else name.motion

@@ -20,29 +20,6 @@ _VISCOUS_UNITS = frozenset({"N·m·s/rad", "N·m/(rad/s)", "N m s/rad", "Nms/rad
 
 
 @dataclass(frozen=True)
-class ParameterRow:
-    """One line of the table, every number already text."""
-
-    label: str
-    table2_id: str
-    name: str
-    expression: str
-    unit: str
-    truth: str
-    estimate: str
-    std: str
-    low: str
-    high: str
-    deviation: str
-    relative_std: str
-    repetition_mean: str
-    repetition_std: str
-    mark: str
-    """`out3`, `out2` or empty."""
-    significant: bool
-
-
-@dataclass(frozen=True)
 class Tally:
     """How many parameters are where; `expected_*` is what chance alone would give."""
 
@@ -111,63 +88,14 @@ _SLOTS = {
 }
 
 
-def deviation(parameter: ParameterResult) -> float | None:
-    """(estimate - truth) / std; None without a truth or a usable standard deviation."""
-    if parameter.truth is None or not parameter.std > 0.0:
-        return None
-    z = (parameter.estimate - parameter.truth) / parameter.std
-    return z if math.isfinite(z) else None
-
-
-def is_significant(parameter: ParameterResult, factor: float) -> bool:
-    """Whether the 95 % interval leaves zero out."""
-    return abs(parameter.estimate) > factor * parameter.std
-
-
-def short_label(parameter: ParameterResult) -> str:
-    """Name for figures, led by the number it has in the paper's Table 2."""
-    number = "" if parameter.table2_id is None else f"{parameter.table2_id} "
-    return number + parameter.name
-
-
-def table_rows(results: Results) -> tuple[list[ParameterRow], list[ParameterRow]]:
-    """Rows of the base parameters and rows of the friction."""
-    factor = results.uncertainty.interval_factor
-    rows = [_row(parameter, factor) for parameter in results.parameters]
-    return rows[: results.n_base], rows[results.n_base :]
-
-
-def _row(p: ParameterResult, factor: float) -> ParameterRow:
-    z = deviation(p)
-    half = factor * p.std
-    return ParameterRow(
-        label=short_label(p),
-        table2_id="" if p.table2_id is None else str(p.table2_id),
-        name=p.name,
-        expression=_expression(p),
-        unit=p.unit.replace(" ", "·"),
-        truth=numbers.beside(p.truth, p.std),
-        estimate=numbers.beside(p.estimate, p.std),
-        std=numbers.significant(p.std, 2),
-        low=numbers.beside(p.estimate - half, p.std),
-        high=numbers.beside(p.estimate + half, p.std),
-        deviation=numbers.fixed(z, 2, sign=True),
-        relative_std=numbers.percent(p.std / abs(p.estimate) if p.estimate else math.inf),
-        repetition_mean=numbers.beside(p.repetition_mean, p.std),
-        repetition_std=numbers.significant(p.repetition_std, 2),
-        mark=mark(z),
-        significant=is_significant(p, factor),
-    )
-
-
-def mark(z: float | None) -> str:
+def outside_mark(z: float | None) -> str:
     """`out3` or `out2` for a deviation beyond 3 or 2 standard deviations; "" for any other."""
     if z is None or abs(z) <= 2.0:
         return ""
     return "out3" if abs(z) > 3.0 else "out2"
 
 
-def _expression(p: ParameterResult) -> str:
+def expression(p: ParameterResult) -> str:
     """What the name stands for; viscous friction also in the unit that manufacturers print."""
     text = p.expression if p.expression != p.name else ""
     if p.unit not in _VISCOUS_UNITS:
@@ -179,17 +107,17 @@ def _expression(p: ParameterResult) -> str:
 
 def tally(results: Results) -> Tally:
     """Count what the table marks."""
-    compared = [(p, z) for p in results.parameters if (z := deviation(p)) is not None]
+    compared = [(p, z) for p in results.parameters if (z := p.deviation) is not None]
     return Tally(
         compared=len(compared),
-        outside_2=[short_label(p) for p, z in compared if abs(z) > 2.0],
-        outside_3=[short_label(p) for p, z in compared if abs(z) > 3.0],
+        outside_2=[p.label for p, z in compared if abs(z) > 2.0],
+        outside_3=[p.label for p, z in compared if abs(z) > 3.0],
         expected_2=numbers.fixed(_OUTSIDE_2 * len(compared), 1),
         expected_3=numbers.fixed(_OUTSIDE_3 * len(compared), 1),
         not_significant=[
-            short_label(p)
+            p.label
             for p in results.parameters
-            if not is_significant(p, results.uncertainty.interval_factor)
+            if not abs(p.estimate) > results.uncertainty.interval_factor * p.std
         ],
         total=len(results.parameters),
     )

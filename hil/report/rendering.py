@@ -12,11 +12,16 @@ from typing import Final
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from hil.report import numbers
 from hil.terminal_text import written_out
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 _STYLE: Final = "report.css"
 _SCRIPT: Final = "page.js"
+_FORMATS: Final = (
+    *("significant", "fixed", "beside", "percent", "with_std"),
+    *("unit_text", "capitalised"),
+)
 _STEERING: Final = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
 )
@@ -41,7 +46,8 @@ class Numbering:
 def environment() -> Environment:
     """The templates of the pages: `page.html.j2` is what all of them extend.
 
-    It has the one style sheet and the one script that the policy of the page lets run.
+    It has the one style sheet and the one script that the policy of the page lets run, and the
+    formats of :mod:`hil.report.numbers` as filters.
     """
     # Autoescape without conditions: names come out of archives, and archives out of anywhere.
     found = Environment(
@@ -54,6 +60,17 @@ def environment() -> Environment:
     )
     style, script = ((_TEMPLATES / name).read_text("utf-8") for name in (_STYLE, _SCRIPT))
     found.globals |= {"style": Markup(style), "script": Markup(script), "policy": policy(script)}
+    found.globals |= {"numbers": numbers, "numbering": Numbering()}
+    for name in (
+        "significant",
+        "fixed",
+        "beside",
+        "percent",
+        "with_std",
+        "unit_text",
+        "capitalised",
+    ):
+        found.filters[name] = getattr(numbers, name)
     return found
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Annotated, Final, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,32 +24,6 @@ class SeriesError(ValueError):
         self.field, self.shape, self.expected = field, shape, expected
 
 
-_SHAPES: Final = {
-    "excitation_time": "m",
-    "excitation_position": "mn",
-    "excitation_velocity": "mn",
-    "example_time": "k",
-    "example_measured": "kn",
-    "example_predicted": "kn",
-}
-_OPTIONAL: Final = {
-    "excitation_fitted": "mn",
-    "example_counted": "kn",
-    "example_inertia": "kn",
-    "example_coriolis": "kn",
-    "example_gravity": "kn",
-    "example_friction": "kn",
-    "friction_speed": "cn",
-    "friction_torque": "cn",
-    "law_speed": "sn",
-    "law_torque": "sn",
-    "reversal_travel": "rn",
-    "reversal_torque": "rn",
-    "spectrum_frequency": "f",
-    "spectrum_torque": "fn",
-    "spectrum_residual": "fn",
-    "motion_bandwidth": "n",
-}
 # The field whose length each letter is; n is the number of joints.
 _LENGTHS: Final = {
     "m": "excitation_time",
@@ -61,7 +35,7 @@ _LENGTHS: Final = {
 }
 
 
-def _nothing() -> Array:
+def _empty() -> Array:
     return np.empty((0, 0))
 
 
@@ -81,7 +55,7 @@ class ReportSeries:
         example_measured: (k, n) [N·m], already low-passed for display.
         example_predicted: (k, n) [N·m], low-passed alike.
         excitation_fitted: (m, n), 1 where the row was fitted and 0 where not.
-        example_counted: (k, n), 1 where the row counts in the error of the verdict, else 0.
+        example_used: (k, n), 1 where the row counts in the error of the verdict, else 0.
         example_inertia: (k, n) part of the predicted torque; the four parts add up to it.
         example_coriolis: (k, n), centrifugal torque included.
         example_gravity: (k, n).
@@ -101,29 +75,29 @@ class ReportSeries:
         SeriesError: the shapes do not belong together.
     """
 
-    excitation_time: Array
-    excitation_position: Array
-    excitation_velocity: Array
+    excitation_time: Annotated[Array, "m"]
+    excitation_position: Annotated[Array, "mn"]
+    excitation_velocity: Annotated[Array, "mn"]
     example_archive: str
-    example_time: Array
-    example_measured: Array
-    example_predicted: Array
-    excitation_fitted: Array = field(default_factory=_nothing)
-    example_counted: Array = field(default_factory=_nothing)
-    example_inertia: Array = field(default_factory=_nothing)
-    example_coriolis: Array = field(default_factory=_nothing)
-    example_gravity: Array = field(default_factory=_nothing)
-    example_friction: Array = field(default_factory=_nothing)
-    friction_speed: Array = field(default_factory=_nothing)
-    friction_torque: Array = field(default_factory=_nothing)
-    law_speed: Array = field(default_factory=_nothing)
-    law_torque: Array = field(default_factory=_nothing)
-    reversal_travel: Array = field(default_factory=_nothing)
-    reversal_torque: Array = field(default_factory=_nothing)
-    spectrum_frequency: Array = field(default_factory=_nothing)
-    spectrum_torque: Array = field(default_factory=_nothing)
-    spectrum_residual: Array = field(default_factory=_nothing)
-    motion_bandwidth: Array = field(default_factory=_nothing)
+    example_time: Annotated[Array, "k"]
+    example_measured: Annotated[Array, "kn"]
+    example_predicted: Annotated[Array, "kn"]
+    excitation_fitted: Annotated[Array, "mn"] = field(default_factory=_empty)
+    example_used: Annotated[Array, "kn"] = field(default_factory=_empty)
+    example_inertia: Annotated[Array, "kn"] = field(default_factory=_empty)
+    example_coriolis: Annotated[Array, "kn"] = field(default_factory=_empty)
+    example_gravity: Annotated[Array, "kn"] = field(default_factory=_empty)
+    example_friction: Annotated[Array, "kn"] = field(default_factory=_empty)
+    friction_speed: Annotated[Array, "cn"] = field(default_factory=_empty)
+    friction_torque: Annotated[Array, "cn"] = field(default_factory=_empty)
+    law_speed: Annotated[Array, "sn"] = field(default_factory=_empty)
+    law_torque: Annotated[Array, "sn"] = field(default_factory=_empty)
+    reversal_travel: Annotated[Array, "rn"] = field(default_factory=_empty)
+    reversal_torque: Annotated[Array, "rn"] = field(default_factory=_empty)
+    spectrum_frequency: Annotated[Array, "f"] = field(default_factory=_empty)
+    spectrum_torque: Annotated[Array, "fn"] = field(default_factory=_empty)
+    spectrum_residual: Annotated[Array, "fn"] = field(default_factory=_empty)
+    motion_bandwidth: Annotated[Array, "n"] = field(default_factory=_empty)
 
     def __post_init__(self) -> None:
         position = self.excitation_position
@@ -131,13 +105,15 @@ class ReportSeries:
         for letter, name in _LENGTHS.items():
             values = getattr(self, name)
             sizes[letter] = values.shape[0] if values.ndim else 0
-        for name, letters in (_SHAPES | _OPTIONAL).items():
-            found = getattr(self, name)
-            if name in _OPTIONAL and found.size == 0:
+        hints = get_type_hints(type(self), include_extras=True)
+        for one in fields(self):
+            found, letters = getattr(self, one.name), getattr(hints[one.name], "__metadata__", None)
+            optional = one.default_factory is not MISSING
+            if letters is None or (optional and found.size == 0):
                 continue
-            shape = tuple(sizes[letter] for letter in letters)
+            shape = tuple(sizes[letter] for letter in letters[0])
             if found.shape != shape or found.dtype != np.float64 or not _drawable(found):
-                raise SeriesError(name, found.shape, shape)
+                raise SeriesError(one.name, found.shape, shape)
 
     @property
     def n_joints(self) -> int:

@@ -1,10 +1,10 @@
-"""Torque prediction on unseen motion, gathered for the page's tables."""
+"""Torque prediction on unseen motion, gathered for the page's tables and figures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,25 +14,18 @@ from hil.results import FittedResult, Results, ValidationResult
 
 @dataclass(frozen=True)
 class JointError:
-    """One joint over all validation runs, every number already text."""
+    """One joint over all validation runs, N·m or N, and as shares of the measured torque."""
 
     joint: str
-    median: str
-    quartiles: str
-    rms: str
-    mean: str
-    relative_median: str
-    relative_worst: str
-    fit_std: str
-
-
-@dataclass(frozen=True)
-class ErrorRow:
-    """Torque error over all joints on some motion, in per cent, as text."""
-
-    motion: str
-    counted: str
-    every_row: str
+    lower: float
+    median: float
+    upper: float
+    """Quartiles of the mean absolute error over the runs."""
+    rms: float
+    mean: float
+    relative_median: float
+    relative_worst: float
+    fit_std: float
 
 
 @dataclass(frozen=True)
@@ -44,89 +37,64 @@ class TorqueError:
     words: str
 
 
-@dataclass(frozen=True)
-class RunTable:
-    """One error measure of every run and joint, every number already text.
-
-    A row begins with the archive and ends with the error over all joints if `has_overall`;
-    otherwise the duration of the run stands after the archive.
-    """
-
-    title: str
-    unit: str
-    rows: list[list[str]]
-    has_overall: bool
-
-
 def joint_errors(results: Results) -> list[JointError]:
     """Summary per joint; RMS and signed mean over all runs, each counting by its duration."""
     runs = results.validation
+    if not runs:
+        return []
     seconds = np.array([run.duration for run in runs])
     mean_abs = np.array([run.mean_abs_error for run in runs])
     squares = np.array([run.rms_error for run in runs]) ** 2
     signed = np.array([run.mean_error for run in runs])
     relative = np.array([run.relative_error for run in runs])
-    found = []
-    for j, name in enumerate(results.joint_names):
-        low, middle, high = np.percentile(mean_abs[:, j], (25.0, 50.0, 75.0))
-        rms = math.sqrt(float(np.average(squares[:, j], weights=seconds)))
-        found.append(
-            JointError(
-                joint=name,
-                median=numbers.significant(float(middle)),
-                quartiles=f"{numbers.significant(float(low))} to "
-                f"{numbers.significant(float(high))}",
-                rms=numbers.significant(rms),
-                # To the same decimals as the RMS: a bias is small or not beside that.
-                mean=numbers.beside(float(np.average(signed[:, j], weights=seconds)), rms / 10.0),
-                relative_median=numbers.percent(float(np.median(relative[:, j]))),
-                relative_worst=numbers.percent(float(np.max(relative[:, j]))),
-                fit_std=numbers.significant(results.noise_std[j]),
-            )
+    lower, median, upper = np.percentile(mean_abs, (25.0, 50.0, 75.0), axis=0).tolist()
+    return [
+        JointError(
+            joint=name,
+            lower=lower[j],
+            median=median[j],
+            upper=upper[j],
+            rms=math.sqrt(float(np.average(squares[:, j], weights=seconds))),
+            mean=float(np.average(signed[:, j], weights=seconds)),
+            relative_median=float(np.median(relative[:, j])),
+            relative_worst=float(np.max(relative[:, j])),
+            fit_std=results.noise_std[j],
         )
-    return found
+        for j, name in enumerate(results.joint_names)
+    ]
 
 
-def error_rows(results: Results) -> list[ErrorRow]:
-    """Errors of the verdict and those of every row: on unseen motion, and on what was fitted."""
-    runs, fitted, found = results.validation, results.fitted, []
+def error_rows(results: Results) -> list[tuple[str, float | None, float]]:
+    """Motion, error of the verdict and error over every row, all joints, as shares."""
+    runs, fitted = results.validation, results.fitted
+    found: list[tuple[str, float | None, float]] = []
     if runs:
         both = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
         many = len(runs) > 1
         title = f"unseen, median of {len(runs)} runs" if many else "unseen"
-        found.append(_error_row(title, *np.median(both, axis=0).tolist()))
+        found.append((title, *np.median(both, axis=0).tolist()))
         if many:
-            found.append(_error_row("unseen, worst run", *both.max(axis=0).tolist()))
+            found.append(("unseen, worst run", *both.max(axis=0).tolist()))
     if fitted is not None:
-        found.append(
-            _error_row(
-                "fitted" if runs else "fitted (in-sample: nothing was held out)",
-                fitted.overall_relative_error,
-                fitted.all_rows_relative_error,
-            )
-        )
+        title = "fitted" if runs else "fitted (in-sample: nothing was held out)"
+        found.append((title, fitted.overall_relative_error, fitted.all_rows_relative_error))
         smoothed = fitted.smoothed_overall_relative_error
         if smoothed is not None:
-            found.append(_error_row("fitted, torque smoothed as it was fitted", None, smoothed))
+            found.append(("fitted, torque smoothed as it was fitted", None, smoothed))
     return found
 
 
-def _error_row(motion: str, counted: float | None, every_row: float) -> ErrorRow:
-    return ErrorRow(motion, numbers.percent(counted), numbers.percent(every_row))
-
-
-def every_row_errors(results: Results) -> list[str]:
-    """Error of each joint over every row, in per cent; empty where no file says it.
+def every_row_errors(results: Results) -> list[float]:
+    """Error of each joint over every row, as a share; empty where no file says it.
 
     The median of the runs on unseen motion, or the error on what was fitted.
     """
-    if results.validation:
-        known = [run.all_rows_joint_errors for run in results.validation]
-    else:
-        known = [] if results.fitted is None else [results.fitted.all_rows_joint_errors]
+    known = [run.all_rows_joint_errors for run in results.validation]
+    if not known and results.fitted is not None:
+        known = [results.fitted.all_rows_joint_errors]
     if not known or not all(known):
         return []
-    return [numbers.percent(value) for value in np.median(np.array(known), axis=0).tolist()]
+    return [float(value) for value in np.median(np.array(known), axis=0)]
 
 
 def example_errors(results: Results) -> list[TorqueError]:
@@ -153,92 +121,32 @@ def _error_words(example: ValidationResult | FittedResult | None, joint: int) ->
     return words
 
 
-def run_tables(results: Results) -> list[RunTable]:
-    """Mean |e|, RMS, signed mean and relative error of each run, per joint."""
-    runs = results.validation
-    return [
-        RunTable("Mean |e|", "N·m", _rows(runs, lambda r: r.mean_abs_error), False),
-        RunTable("RMS error", "N·m", _rows(runs, lambda r: r.rms_error), False),
-        RunTable("Signed mean error", "N·m", _signed_rows(runs), False),
-        RunTable("Relative error", "%", _relative_rows(runs), True),
-        *_every_row_table(runs),
+def validation_context(results: Results) -> dict[str, Any]:
+    """What `verdict.html.j2` and `validation.html.j2` need; `unseen` is None without runs."""
+    runs, unseen = results.validation, None
+    measures = [
+        ("Mean |e|", "mean_abs_error", ""),
+        ("RMS error", "rms_error", ""),
+        ("Signed mean error", "mean_error", ""),
+        ("Relative error", "relative_error", "overall_relative_error"),
     ]
-
-
-def _rows(
-    runs: Sequence[ValidationResult], pick: Callable[[ValidationResult], Sequence[float]]
-) -> list[list[str]]:
-    return [[*_head(run), *(numbers.significant(v) for v in pick(run))] for run in runs]
-
-
-def _signed_rows(runs: Sequence[ValidationResult]) -> list[list[str]]:
-    # One number of decimals per joint, so that a column can be read down.
-    usual = np.median([run.rms_error for run in runs], axis=0)
-    return [
-        [
-            *_head(run),
-            *(
-                numbers.beside(mean, rms / 10.0)
-                for mean, rms in zip(run.mean_error, usual.tolist(), strict=True)
-            ),
-        ]
-        for run in runs
-    ]
-
-
-def _relative_rows(runs: Sequence[ValidationResult]) -> list[list[str]]:
-    return [
-        [
-            run.archive,
-            *(numbers.percent(v) for v in run.relative_error),
-            numbers.percent(run.overall_relative_error),
-        ]
-        for run in runs
-    ]
-
-
-def _every_row_table(runs: Sequence[ValidationResult]) -> list[RunTable]:
-    if not all(run.all_rows_joint_errors for run in runs):
-        return []
-    rows = [
-        [
-            run.archive,
-            *(numbers.percent(v) for v in run.all_rows_joint_errors),
-            numbers.percent(run.all_rows_relative_error),
-        ]
-        for run in runs
-    ]
-    return [RunTable("Relative error over every row", "%", rows, True)]
-
-
-def _head(run: ValidationResult) -> list[str]:
-    return [run.archive, numbers.fixed(run.duration, 1)]
-
-
-@dataclass(frozen=True)
-class Overall:
-    """Relative torque error over all joints: median and worst of the runs, in per cent."""
-
-    runs: int
-    seconds: str
-    median: str
-    worst: str
-    worst_archive: str
-    every_row: str
-
-
-def overall(results: Results) -> Overall | None:
-    """The headline figures; None where nothing was validated."""
-    runs = results.validation
-    if not runs:
-        return None
-    errors = [run.overall_relative_error for run in runs]
-    worst = int(np.argmax(errors))
-    return Overall(
-        runs=len(runs),
-        seconds=numbers.significant(sum(run.duration for run in runs)),
-        median=numbers.percent(float(np.median(errors))),
-        worst=numbers.percent(errors[worst]),
-        worst_archive=runs[worst].archive,
-        every_row=numbers.percent(float(np.median([run.all_rows_relative_error for run in runs]))),
-    )
+    if all(run.all_rows_joint_errors for run in runs):
+        every = ("Relative error over every row", "all_rows_joint_errors")
+        measures.append((*every, "all_rows_relative_error"))
+    if runs:
+        worst = max(runs, key=lambda run: run.overall_relative_error)
+        unseen = {
+            "seconds": sum(run.duration for run in runs),
+            "median": float(np.median([run.overall_relative_error for run in runs])),
+            "worst": worst.overall_relative_error,
+            "worst_archive": worst.archive,
+            "every_row": float(np.median([run.all_rows_relative_error for run in runs])),
+        }
+    return {
+        "unseen": unseen,
+        "error_rows": error_rows(results),
+        "joint_errors": joint_errors(results),
+        "run_measures": measures,
+        # One number of decimals per joint, so that a column of signed means can be read down.
+        "usual_rms": [float(x) for x in np.median([r.rms_error for r in runs] or [[]], axis=0)],
+    }

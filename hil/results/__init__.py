@@ -1,26 +1,36 @@
 """What an identification leaves behind, as plain numbers: `results.json`."""
 
-from .conduct import ConductResult, RecordedResult, StepResult, WarmUpResult
-from .consistency import ConsistencyResult, LinkResult
-from .essential import BlindResult, EliminationStepResult, EssentialParameter, EssentialResult
-from .exports import ExportResult
-from .judgement import FindingResult, JointJudgement, JudgementResult, ProfileResult
 from .results import (
     SCHEMA_VERSION,
+    BlindResult,
     CalibrationResult,
     ChoiceResult,
+    ConductResult,
+    ConsistencyResult,
     CoverageResult,
     CriteriaResult,
     DelaysResult,
+    EliminationStepResult,
     EndogeneityResult,
+    EssentialParameter,
+    EssentialResult,
     EstimatorResult,
     ExcitationResult,
+    ExportResult,
+    FindingResult,
     FittedResult,
+    JointJudgement,
+    JudgementResult,
+    LinkResult,
     ParameterResult,
+    ProfileResult,
+    RecordedResult,
     Results,
+    StepResult,
     UncertaintyResult,
     ValidationResult,
     VerdictResult,
+    WarmUpResult,
 )
 
 __all__ = [

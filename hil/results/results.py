@@ -7,6 +7,7 @@ Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
@@ -16,12 +17,247 @@ from pydantic import Field, ValidationError, model_validator
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.reading import json_of, text_of
-from hil.results.conduct import ConductResult
-from hil.results.consistency import ConsistencyResult
-from hil.results.essential import EssentialResult
-from hil.results.exports import ExportResult
 from hil.results.frozen import Frozen
-from hil.results.judgement import JudgementResult
+
+
+class StepResult(Frozen):
+    """One step of a campaign."""
+
+    step: str
+    done: bool
+    words: str
+    """What is known of it."""
+    details: list[str]
+
+
+class RecordedResult(Frozen):
+    """One motion, as its archive has it."""
+
+    archive: str
+    kind: str
+    when: str | None
+    """Begin, ISO 8601 (UTC); null in virtual time."""
+    seconds: float
+    cycles: int
+    missed: int
+    """Packets that never arrived."""
+    late: int
+    """Answers that were late."""
+    not_taken: int
+    """Answers that the controller did not take."""
+    lost: int
+    """Cycles that were exchanged and not archived."""
+    outcome: str
+    why: str
+    """Why it ended so."""
+
+
+class WarmUpResult(Frozen):
+    """Friction while the arm warmed up, motion by motion."""
+
+    verdict: str
+    """One of `warm`, `not warm`, `going on`."""
+    threshold: float
+    """Change per motion that counts as warm, as a share."""
+    friction: list[list[float | None]]
+    """Of each motion and joint, N·m or N; null for a joint that hardly moves."""
+    change: list[float | None]
+    """Largest change per motion of any joint, as a share; null before it can be determined."""
+
+
+class ConductResult(Frozen):
+    """How a campaign was run."""
+
+    steps: list[StepResult]
+    warm_up: WarmUpResult | None
+    recorded: list[RecordedResult]
+    """Every archive of the manifest, in the order in which they were made."""
+
+
+class FindingResult(Frozen):
+    """One check and its outcome."""
+
+    check: str
+    level: Literal["good", "information", "doubtful", "wrong"]
+    words: str
+    next_step: str
+    """What to do about it; empty where nothing needs doing."""
+
+
+class JointJudgement(Frozen):
+    """One joint on unseen motion; on that of the fit where `JudgementResult.in_sample`."""
+
+    joint: str
+    unit: Literal["N·m", "N"]
+    rms: float
+    """Root mean square of the torque error, in `unit`."""
+    relative: float | None
+    """||e|| / ||tau||."""
+    fitted_relative: float | None = None
+    """The same on the motion that was fitted."""
+    explained: float | None
+    """Share of the torque's variance that is explained (R²): zero is no better than a constant."""
+    limit: float | None
+    """Largest torque of the joint, in `unit`; of the drive, or the URDF's effort limit."""
+    share_of_limit: float | None
+    """RMS error over `limit`."""
+    nominal_relative: float | None
+    """||e|| / ||tau|| of the nominal (CAD) model on the same motion."""
+    controller_relative: float | None
+    """The same of the controller's own dynamic model."""
+    nominal_scale: float | None = None
+    """Measured torque over what the nominal inertias ask for, friction set aside."""
+    controller_inertia: float | None = None
+    """The controller's own diagonal inertia (joint side, rotor included) over the identified one:
+    median over the recorded postures."""
+    controller_inertia_spread: float | None = None
+    """Standard deviation of that ratio over the postures."""
+
+
+class ProfileResult(Frozen):
+    """Mean residual of one joint over bins of its speed or position, all recordings."""
+
+    centre: list[float]
+    mean: list[float | None]
+    std: list[float | None]
+    """Standard error that allows for the residual's correlation in time."""
+
+
+class JudgementResult(Frozen):
+    """Every check, the figures per joint, and what the residual follows."""
+
+    in_sample: bool = False
+    """Whether nothing was held out: all figures are of the fitted motion then."""
+    nominal: str | None = None
+    """What `JointJudgement.nominal_relative` is of, in words."""
+    findings: list[FindingResult]
+    next_steps: list[str]
+    joints: list[JointJudgement]
+    speed: list[ProfileResult]
+    """Over rad/s or m/s."""
+    position: list[ProfileResult]
+    """Over rad or m."""
+    lag: list[float]
+    """Of `autocorrelation`, s."""
+    autocorrelation: list[list[float | None]]
+    """Of each joint's residual."""
+    effective_rows: list[float]
+    """Independent samples that each joint's rows are worth."""
+    friction_over_time: list[list[float | None]] | None
+    """Per joint: share by which friction was higher than estimated, in the order of recording."""
+
+    @property
+    def worst_first(self) -> list[FindingResult]:
+        """Findings with the worst first, otherwise in the order of the checks."""
+        levels = ("wrong", "doubtful", "information", "good")
+        return sorted(self.findings, key=lambda finding: levels.index(finding.level))
+
+    def any_joint(self, figure: str) -> bool:
+        """Whether a figure of :class:`JointJudgement` is known of any joint."""
+        return any(getattr(joint, figure) is not None for joint in self.joints)
+
+
+class EliminationStepResult(Frozen):
+    """The model after one more parameter was taken out."""
+
+    removed: str | None
+    """None for the model it all begins with."""
+    left: int
+    spread: float
+    """Largest over smallest relative standard deviation of those left."""
+    in_sample: float
+    """Relative torque error on the fitted motion."""
+    held_out: float
+    """Relative torque error on the held-out motion."""
+    largest_relative_std: float
+    """Of those left."""
+
+
+class EssentialParameter(Frozen):
+    """One parameter of the essential model, as estimated with the others of it."""
+
+    name: str
+    unit: str
+    estimate: float
+    std: float
+
+    @property
+    def relative_std(self) -> float:
+        """Std / |estimate|."""
+        return self.std / abs(self.estimate) if self.estimate else math.inf
+
+
+class BlindResult(Frozen):
+    """Parameters chosen inside the fitted motion alone, tried on the held-out motion."""
+
+    left: int
+    """How many were chosen."""
+    essential: float
+    """Relative torque error of these on the held-out motion, which had no say in the choice."""
+    full: float
+    """That of all parameters."""
+
+
+class EssentialResult(Frozen):
+    """Which parameters the motion needs."""
+
+    reason: str
+    """Why the cut is where it is."""
+    cut: int
+    """Index of the step chosen."""
+    steps: list[EliminationStepResult]
+    """The whole path, down to one parameter."""
+    refused: list[str]
+    """Less well known than the rule of thumb allows, but needed by the held-out motion."""
+    parameters: list[EssentialParameter]
+    by_spread_left: int
+    """Number of parameters that relative standard deviations alone leave (Pham and Gautier)."""
+    by_spread_held_out: float
+    """Held-out error of those."""
+    blind: BlindResult | None
+
+
+class LinkResult(Frozen):
+    """A link of the physically consistent model, about its joint's origin, SI units."""
+
+    joint: str
+    mass: float
+    centre: list[float]
+    """Centre of mass in the joint's frame, m."""
+    rotor_inertia: float | None
+    room: float
+    """Smallest second moment over the nominal body's: 1 as there, 0 at the edge of possible."""
+    reference: str
+    """What stood for its nominal body."""
+
+
+class ConsistencyResult(Frozen):
+    """The nearest parameters that a machine can have, and what they cost."""
+
+    sentence: str
+    impossible: bool
+    costly: bool
+    held_out: float
+    """Relative torque error of the consistent model on held-out motion."""
+    unconstrained_held_out: float
+    in_sample: float
+    unconstrained_in_sample: float
+    moved: list[str]
+    """Parameters moved by more than three standard deviations."""
+    shift: list[float]
+    """How far each parameter was moved, in its standard deviations."""
+    bounds: list[str]
+    links: list[LinkResult]
+    status: str
+
+
+class ExportResult(Frozen):
+    """Files for other tools, in the folder of `results.json`."""
+
+    written: list[str]
+    withheld: dict[str, str]
+    """File name and why it was not written."""
+
 
 SCHEMA_VERSION = 2
 
@@ -77,6 +313,28 @@ class ParameterResult(Frozen):
     known comes from the data, 1 where all comes from the prior."""
     learned: bool | None = None
     """Whether at least three quarters of what is known of it come from the data."""
+
+    @property
+    def label(self) -> str:
+        """Name for figures, led by the number it has in the paper's Table 2."""
+        return self.name if self.table2_id is None else f"{self.table2_id} {self.name}"
+
+    @property
+    def relative_std(self) -> float:
+        """Std / |estimate|."""
+        return self.std / abs(self.estimate) if self.estimate else math.inf
+
+    @property
+    def deviation(self) -> float | None:
+        """(estimate - truth) / std; None without a truth or a usable standard deviation."""
+        return self.deviation_of(self.estimate, self.std)
+
+    def deviation_of(self, estimate: float, std: float) -> float | None:
+        """The same of another estimate of this parameter."""
+        if self.truth is None or not std > 0.0:
+            return None
+        z = (estimate - self.truth) / std
+        return z if math.isfinite(z) else None
 
 
 class ValidationResult(Frozen):
@@ -305,10 +563,6 @@ class Results(Frozen):
             if found is not None and len(found) != count:
                 raise ValueError(f"{name} has {len(found)} entries and not {count}")
         return self
-
-    def to_json(self) -> str:
-        """As indented JSON, the text of `results.json`."""
-        return self.model_dump_json(indent=1) + "\n"
 
     def save(self, path: Path) -> None:
         """Write `path` as indented JSON."""

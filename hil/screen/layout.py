@@ -21,6 +21,38 @@ from hil.terminal_text import printable
 from . import marks
 from .keys import HELP, SHORT_HELP
 
+
+def status_line(status: RunStatus, left: str = "") -> str:
+    """Where a run stands, in one line; `left` says in words how long a person waits."""
+    parts = [f"{status.phase} {status.number} of {status.total}"]
+    motion = status.motion
+    if motion is not None:
+        if motion.motion_time is not None and motion.duration:
+            parts.append(f"{motion.motion_time:.1f} of {motion.duration:.1f} s")
+        if motion.held:
+            parts.append("held")
+        if motion.override != 1.0:
+            parts.append(f"override {100.0 * motion.override:.0f} %")
+        parts += [f"{motion.missed} missed", f"{motion.late} late"]
+        if motion.untaken:
+            parts.append(f"{motion.untaken} not taken")
+        if motion.latency is not None:
+            parts.append(f"latency {marks.duration(motion.latency.p99)} (99 %)")
+        for what, share in (
+            ("following error", motion.following_share), ("current", motion.current_share)
+        ):  # fmt: skip
+            if share is not None:
+                parts.append(f"{what} {100.0 * share.max():.0f} % of its limit")
+    drift = status.drift
+    if drift is not None and len(drift.change) > 1:
+        parts.append(
+            f"friction changed by {100.0 * drift.change[-1]:.1f} % "
+            f"(warm below {100.0 * drift.threshold:g} %)"
+        )
+    parts.append(left or f"{marks.clock(status.time_left)} left")
+    return ", ".join(parts)
+
+
 WIDE: Final = 64
 """Columns from which on there are bars beside the numbers."""
 STALE: Final = 1.0
@@ -77,10 +109,10 @@ def lines(shown: Shown, width: int, height: int) -> list[Text]:
     news = [Text(part, style="dim") for line in _news(shown) for part in _wrapped(line, width)]
     room = height - len(head) - len(tail)
     body = _fitting(room, joints, drift, news)
-    drawn = [*head, *body, *[Text()] * max(0, room - len(body)), *tail][:height]
-    for line in drawn:
+    rows = [*head, *body, *[Text()] * max(0, room - len(body)), *tail][:height]
+    for line in rows:
         line.truncate(width, overflow="ellipsis")
-    return drawn
+    return rows
 
 
 def _fitting(room: int, joints: list[Text], drift: list[Text], news: list[Text]) -> list[Text]:
@@ -195,7 +227,7 @@ def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> 
     titles = ("following error / threshold", "current / limit")
     for title in titles if bars else ("following", "current"):
         rule.append(f"  {title}".ljust(14 + bars))
-    drawn = [rule]
+    rows = [rule]
     for index, name in enumerate(names):
         line = Text(name[:name_width].ljust(name_width))
         degrees = np.degrees(motion.following_error[index])
@@ -209,10 +241,10 @@ def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> 
             line.append(marks.percent(share), style=marks.colour(share))
         if hot is not None:
             line.append(f" {hot[index]:3.0f}°C")
-        drawn.append(line)
+        rows.append(line)
     if hot is not None:
         rule.append(" motor")
-    return drawn
+    return rows
 
 
 def _drift(drift: DriftCurve, width: int) -> list[Text]:

@@ -20,9 +20,9 @@ def bar(share: float, width: int) -> Text:
         return Text("?".ljust(width), style="bold red")
     filled = round(8 * width * min(max(share, 0.0), 1.0))
     whole, rest = divmod(filled, 8)
-    drawn = "█" * whole + (_EIGHTHS[rest] if rest else "")
-    text = Text(drawn, style=colour(share))
-    text.append("·" * (width - len(drawn)), style="dim")
+    filled_blocks = "█" * whole + (_EIGHTHS[rest] if rest else "")
+    text = Text(filled_blocks, style=colour(share))
+    text.append("·" * (width - len(filled_blocks)), style="dim")
     if share > 1.0:
         text = Text("█" * (width - 1) + "▶", style=colour(share))
     return text

@@ -30,11 +30,10 @@ from hil.campaign.operator import DryRunSummary, RunStatus
 from hil.campaign.stop import Stop
 from hil.cell import Cell
 from hil.lines import put
-from hil.plural import counted
 from hil.progress import Silent, Task
-from hil.terminal_text import printable
+from hil.terminal_text import plural, printable
 
-from . import marks, plain
+from . import layout, marks
 from .keys import Keyboard, after, can_read, stops
 from .layout import SIMULATED, Shown, lines
 
@@ -141,12 +140,12 @@ def _table(summary: DryRunSummary) -> Table:
             agree = Text("not seen")
         table.add_row(Text(printable(name)), degrees, f"{100.0 * share:.0f} % of its limit", agree)
     archives = ", ".join(summary.archives)
-    link = f"{counted(summary.missed, 'packet')} missed, {counted(summary.late, 'answer')} late"
+    link = f"{plural(summary.missed, 'packet')} missed, {plural(summary.late, 'answer')} late"
     table.caption = Text(printable(f"{link}; {archives}"))
     return table
 
 
-DRAWN_EVERY: Final = 0.1
+REFRESH_PERIOD: Final = 0.1
 """s between two pictures."""
 LINE_EVERY: Final = 5.0
 """s between two lines where there is no terminal."""
@@ -223,7 +222,7 @@ class PlainLines:
         if at == self._at and time.monotonic() < self._due:
             return
         self._at, self._due = at, time.monotonic() + LINE_EVERY
-        put(self._console, plain.line(status, shown.left))
+        put(self._console, layout.status_line(status, shown.left))
 
     def close(self) -> None:
         """Print what was said last."""
@@ -419,7 +418,7 @@ class Screen:
 
     def _draw(self, display: Display, over: threading.Event) -> None:
         try:
-            while not over.wait(DRAWN_EVERY):
+            while not over.wait(REFRESH_PERIOD):
                 display.draw(self.shown())
         except Exception as error:  # it shows nothing more, and `show` says why; the run goes on
             self._undrawn = error

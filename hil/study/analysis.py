@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from identification import Factor, RobotModel
 from identification.estimators.repetitions import estimate_repetitions
 from identification.excitation import correlation, coupling_index, information, log10_det
 from identification.signals.samples import Samples
-from identification.validation.prediction import PredictionError, for_figure
+from identification.validation.prediction import for_figure
 from planner import FlyDistance, FlyPercent, InvalidPlanFile
 from planner.commands import Fly
 
@@ -92,9 +92,9 @@ def fit(reading: Reading, inputs: str) -> FitRecord:
         n_samples=count,
         correlation=correlation(gram).tolist(),
         duration=float(first.motion.time[rows.stop - 1] - first.motion.time[rows.start]),
-        time=_listed(first.motion.time[shown] - first.motion.time[rows.start]),
-        position=[_listed(column) for column in first.motion.position[shown].T],
-        velocity=[_listed(column) for column in first.motion.velocity[shown].T],
+        time=_rounded(first.motion.time[shown] - first.motion.time[rows.start]),
+        position=[_rounded(column) for column in first.motion.position[shown].T],
+        velocity=[_rounded(column) for column in first.motion.velocity[shown].T],
     )
 
 
@@ -113,15 +113,15 @@ def score(
     model, runs = prepared.sources.cell.model, prepared.fitted
     table = np.array(list(estimates.values()), dtype=np.float64)
     truth = list(estimates).index(PLANTED) if PLANTED in estimates else None
-    by_motion = [_scored(model, table, run, truth) for run in runs]
+    by_motion = [_errors(model, table, run, truth) for run in runs]
     usable = [run.usable[_motion_rows(run)] for run in runs]
-    errors = {
+    errors: dict[str, dict[str, Any]] = {"own": {}} | {
         quantity: {
-            name: [some[k][quantity] for some in by_motion]
+            name: [some[quantity][k].tolist() for some in by_motion]
             for k, name in enumerate(estimates)
-            if quantity in by_motion[0][k]
+            if quantity != "own" or k != truth
         }
-        for quantity in ("overall", "unfiltered", "all_rows", "own", "mean_abs")
+        for quantity in by_motion[0]
     }
     examples = []
     if shown:
@@ -143,49 +143,39 @@ def score(
     )
 
 
-def _scored(
-    model: RobotModel, table: Array, run: Samples, truth: int | None
-) -> list[dict[str, Any]]:
-    """Errors of every row of a table of estimates (k, p) on one motion; one may be the truth.
+def _errors(model: RobotModel, table: Array, run: Samples, truth: int | None) -> dict[str, Array]:
+    """Errors of every row of a table of estimates (k, p) on one motion: (k,), `mean_abs` (k, n).
 
-    The regressor and the low-pass, which cost most, are made once for all of them.
+    The regressor and the low-pass, which cost most, are made once for all of them. `own` is what an
+    estimate adds to what the planted values, one of the rows, leave: noise and unmodelled effects.
     """
     left = np.zeros((*run.torque.shape, len(table)))
     blocks, columns = run.regressor(model)
     for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
         left[:, j] = run.torque[:, j, None] - block @ table[:, used].T
-    everywhere = low_passed(run, left.reshape(len(left), -1)).reshape(left.shape)
+
+    def filtered(error: Array) -> Array:
+        return low_passed(run, error.reshape(len(error), -1)).reshape(error.shape)
+
+    everywhere, whole = filtered(left), _motion_rows(run)
     left[~run.usable] = 0.0
-    slow = low_passed(run, left.reshape(len(left), -1)).reshape(left.shape)
-    best = None if truth is None else left[..., truth]
-    return [
-        _errors(run, left[..., k], slow[..., k], everywhere[..., k], None if k == truth else best)
-        for k in range(len(table))
-    ]
-
-
-def _errors(
-    run: Samples, left: Array, slow: Array, everywhere: Array, best: Array | None
-) -> dict[str, Any]:
-    """Errors of what an estimate leaves of the torque (m, n), as it is and low-passed.
-
-    `everywhere` is low-passed with the rows that are not usable, `best` is what the planted values
-    leave: the noise, and what the model leaves out.
-    """
-    whole = _motion_rows(run)
-    error = PredictionError.between(run.torque, run.torque - slow, run.usable)
-    raw = PredictionError.between(run.torque, run.torque - left, run.usable)
-    all_rows = PredictionError.between(run.torque[whole], run.torque[whole] - everywhere[whole])
+    slow = np.where(run.usable[..., None], filtered(left), 0.0)
+    torque = np.where(run.usable, run.torque, 0.0)
+    rows = np.maximum(np.count_nonzero(run.usable, axis=0), 1)
     found = {
-        "overall": error.overall,
-        "unfiltered": raw.overall,
-        "all_rows": all_rows.overall,
-        "mean_abs": error.mean_absolute.tolist(),
+        "overall": _relative(slow, torque),
+        "unfiltered": _relative(left, torque),
+        "all_rows": _relative(everywhere[whole], run.torque[whole]),
+        "mean_abs": (np.abs(slow).sum(axis=0) / rows[:, None]).T,
     }
-    if best is not None:
-        own = PredictionError.between(run.torque, run.torque - (left - best), run.usable)
-        found["own"] = own.overall
+    if truth is not None:
+        found["own"] = _relative(left - left[..., truth, None], torque)
     return found
+
+
+def _relative(error: Array, torque: Array) -> Array:
+    """||e|| / ||tau|| (k,) of errors (m, n, k) over all joints."""
+    return np.asarray(np.sqrt((error**2).sum(axis=(0, 1)) / (torque**2).sum()))
 
 
 def _motion_rows(run: Samples) -> slice:
@@ -209,11 +199,11 @@ def _example(
     shown = _thinned(moving_rows(run))
 
     def joints(torque: Array) -> list[list[float]]:
-        return [_listed(column) for column in for_figure(time, torque)[shown].T]
+        return [_rounded(column) for column in for_figure(time, torque)[shown].T]
 
     return ExampleRecord(
         archive=prepared.sources.training[index].name,
-        time=_listed(time[shown] - time[shown.start]),
+        time=_rounded(time[shown] - time[shown.start]),
         measured=joints(run.torque),
         predicted={
             name: joints(run.predicted_torque(model, values)) for name, values in estimates.items()
@@ -225,7 +215,7 @@ def _thinned(rows: slice) -> slice:
     return slice(rows.start, rows.stop, max(1, (rows.stop - rows.start) // SHOWN))
 
 
-def _listed(values: Array) -> list[float]:
+def _rounded(values: Array) -> list[float]:
     """Numbers of a figure, to as many digits as an eye could want."""
     return [float(f"{value:.{FIGURE_DIGITS}g}") for value in values.tolist()]
 
@@ -280,15 +270,15 @@ def fit_all(
     Raises:
         InputError: a run has no whole excitation.
     """
-    tasks: list[_Task[FitRecord]] = []
+    tasks = []
     for run in runs:
         archives = run.archives("excitation")
         if not archives:
             raise InputError(run.root, "holds no whole excitation", remedy="run the campaign first")
         inputs = digest([*archives, *run.archives("standstill")], {})
         place = fits / f"{run.key}.json"
-        tasks.append(_Task(place, inputs, FitRecord, fit, (run.reading("excitation"), inputs)))
-    found = _all(tasks, "estimating (excitations)", reporter, workers)
+        tasks.append((place, inputs, fit, (run.reading("excitation"), inputs)))
+    found = _all(FitRecord, tasks, "estimating (excitations)", reporter, workers)
     return {run.key: record for run, record in zip(runs, found, strict=True)}
 
 
@@ -301,7 +291,7 @@ def score_all(
     workers: Workers,
 ) -> dict[str, ScoreRecord]:
     """Predict the held-out motions of all runs, class by class; by class."""
-    tasks: list[_Task[ScoreRecord]] = []
+    tasks = []
     values = {name: estimate.tolist() for name, estimate in estimates.items()}
     classes = [(run, name, names) for run in runs for name, names in classes_of(run).items()]
     for run, name, names in classes:
@@ -310,8 +300,8 @@ def score_all(
         inputs = digest(archives, {"estimates": values, "shown": [*shown]})
         arguments = (run.reading("validation", names), inputs, values, list(shown))
         place = fits / f"{run.key}-{name}.json"
-        tasks.append(_Task(place, inputs, ScoreRecord, score, arguments))
-    found = _all(tasks, "predicting (classes of motion)", reporter, workers)
+        tasks.append((place, inputs, score, arguments))
+    found = _all(ScoreRecord, tasks, "predicting (classes of motion)", reporter, workers)
     by_class: dict[str, ScoreRecord] = {}
     for (run, name, _), record in zip(classes, found, strict=True):
         named = _named(record, run.key)
@@ -319,26 +309,24 @@ def score_all(
     return {name: by_class[name] for name in CLASSES if name in by_class}
 
 
-@dataclass(frozen=True, eq=False)
-class _Task(Generic[R]):
-    """A record, and how to make it from archives."""
+def _all(
+    kind: type[R],
+    tasks: Sequence[tuple[Path, str, Callable[..., R], tuple[Any, ...]]],
+    title: str,
+    reporter: Reporter,
+    workers: Workers,
+) -> list[R]:
+    """Records by place and inputs; those missing, or of other archives, are made by the function.
 
-    place: Path
-    inputs: str
-    kind: type[R]
-    function: Callable[..., R]
-    arguments: tuple[Any, ...]
-
-
-def _all(tasks: Sequence[_Task[R]], title: str, reporter: Reporter, workers: Workers) -> list[R]:
-    """The records; those that are missing, or rest on other archives, are made."""
-    found = {k: read_record(one.place, one.kind, one.inputs) for k, one in enumerate(tasks)}
+    The function is called with the given arguments.
+    """
+    found = {k: read_record(place, kind, inputs) for k, (place, inputs, *_) in enumerate(tasks)}
     missing = [k for k, record in found.items() if record is None]
     with reporter.task(title, len(tasks)) as task:
         task.advance(len(tasks) - len(missing))
         made = workers.map(
             make_record,
-            [(tasks[k].place, tasks[k].function, *tasks[k].arguments) for k in missing],
+            [(place, function, *own) for place, _, function, own in (tasks[k] for k in missing)],
             done=lambda count: task.advance(count),
         )
     found |= dict(zip(missing, made, strict=True))

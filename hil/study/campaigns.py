@@ -51,7 +51,7 @@ from .settings import StudyFolder, StudySettings
 
 T = TypeVar("T")
 
-PLAIN, EFFECTS, ABLATION = "plain", "effects", "ablation"
+NO_EFFECTS, EFFECTS, ABLATION = "plain", "effects", "ablation"
 EFFECT_SETTINGS: Final = {
     "ripple": ("torque_ripple", 0.0),
     "drift": ("friction_drift", 0.0),
@@ -224,7 +224,7 @@ def plan_study(
         one = Execution(folder.campaign(condition, key), arm, plan, effects)
         executions.setdefault(condition, {})[key] = one
 
-    for condition in (PLAIN, EFFECTS) if settings.effects else (PLAIN,):
+    for condition in (NO_EFFECTS, EFFECTS) if settings.effects else (NO_EFFECTS,):
         for key, one in excitations.items():
             on = condition == EFFECTS
             add(condition, key, main, one, held_out.get(key, ()), effects=on)

@@ -9,18 +9,18 @@ from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hil.files import write_together
 from hil.progress import Reporter
 from hil.report import numbers
-from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, place, ruled
+from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, log_ticks, place, ruled
 from hil.report.figures.correlation import matrix_panel
 from hil.report.figures.palette import BAND, FIRST, INK, MUTED, ROUTES, SECOND, WIDE
 from hil.report.figures.svg import Panel, drawing, to_panel
 from hil.report.figures.traces import Plot, Trace, traces_text
-from hil.report.rendering import Numbering, environment, page_bytes
+from hil.report.rendering import environment, page_bytes
 
 from .records import ExampleRecord
 from .results import AblationBand, AblationResult, ComparisonResult, ConditionResult, StudyResults
@@ -56,8 +56,6 @@ def study_page(results: StudyResults) -> bytes:
     first, joints = results.conditions[0], results.joint_names
     template = environment().get_template("study.html.j2")
     text = template.render(
-        numbering=Numbering(),
-        numbers=numbers,
         results=results,
         labels=first.labels,
         paragraphs={one.key: one for one in results.reading},
@@ -239,9 +237,7 @@ def _ratios(condition: ConditionResult, limits: tuple[float, float]) -> Panel:
         axes.set_yticks(range(len(rows)), names)
         axes.tick_params(axis="y", length=0.0)
         axes.spines["left"].set_visible(False)
-        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        log_ticks(axes.xaxis, MaxNLocator(6, steps=[1, 2, 5, 10]))
         axes.grid(True, axis="x", color=BAND, linewidth=0.8)
         footed(axes, "ratio of errors, geometric mean over the motions")
         shown = [f"{name} {one.ratio:.3f}" for name, one in zip(names, rows, strict=True)]
@@ -361,8 +357,7 @@ def _lines(
         shown += [band.high for some in bands.values() for band in some]
         if shown and max(shown) > _DECADES * min(shown):
             axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            axes.yaxis.set_minor_locator(NullLocator())
+            log_ticks(axes.yaxis, axes.yaxis.get_major_locator())
         elif shown and key != "log10_det":  # a logarithm has no zero to begin at
             axes.set_ylim(0.0, 1.12 * max(shown))
         headed(axes, title)

@@ -23,7 +23,6 @@ from hil.identify.sources import cell_of
 from hil.identify.summary import planted_in
 from hil.io.digest import digest
 from hil.progress import Reporter
-from hil.version import software
 from identification.excitation import Excitation
 
 from .ablations import Evidence, repetition_ablation
@@ -33,7 +32,7 @@ from .page import write_outcome
 from .records import CLASSES, PLANTED, FitRecord, ScoreRecord
 from .results import MotionRow, StudyResults
 from .searches import AP, B0, LABELS, A, B
-from .sentences import reading_of
+from .sentences import study_results
 from .settings import StudyFolder
 from .tables import (
     Condition,
@@ -157,16 +156,13 @@ def study_campaigns(
             ): scored([one])
             for one in homes(runs)
         } or {Condition("recorded", "as recorded", first.effects): scores}
-        results = StudyResults(
-            name=root.resolve().name,
-            cell=cell.name,
+        results = study_results(
+            root,
+            cell,
+            parameters,
             simulated=first.simulated,
             quick=False,
             settings=None,
-            software=software(),
-            joint_names=list(cell.joint_names),
-            n_base=len(cell.model.base.names),
-            parameters=parameters,
             searches=[],
             table1=[one.row(fits[one.run.key]) for one in recorded] + printed_rows(cell),
             conditions=[
@@ -174,11 +170,9 @@ def study_campaigns(
                 for one, some in conditions.items()
             ],
             ablations=[repetition_ablation(Evidence({}, fits, scores, truth), SUBSETS, keys)],
-            reading=[],
             missing=_missing(recorded, truth, list(scores)),
             times={"estimates and predictions": round(time.perf_counter() - begin, 1)},
         )
-        results = results.model_copy(update={"reading": reading_of(results)})
         write_outcome(root, results, reporter)
     return results
 

@@ -277,8 +277,6 @@ class Paragraph(Frozen):
     verdict: str = ""
     """The conclusion in one line, where the heading is a question."""
     sentences: list[str]
-    more: list[str] = Field(default_factory=list)
-    """Details."""
 
 
 class StudyResults(Frozen):
@@ -308,10 +306,6 @@ class StudyResults(Frozen):
     """Processor time [s], this process and its children, likewise."""
     times_whole: bool = True
     """False where a session was killed: the times are then at least so long."""
-
-    def to_json(self) -> str:
-        """As indented JSON, the text of `results.json`."""
-        return self.model_dump_json(indent=1) + "\n"
 
     @classmethod
     def load(cls, path: Path) -> Self:

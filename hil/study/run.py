@@ -16,7 +16,6 @@ from hil.design import preset
 from hil.io.digest import digest
 from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
-from hil.version import software
 from sim_fixtures.ns16 import CELL_PATH
 
 from .ablations import EffectSetting, Evidence, ablations, effect_ablation
@@ -24,7 +23,7 @@ from .analysis import Run, fit_all, score_all
 from .campaigns import (
     ABLATION,
     EFFECTS,
-    PLAIN,
+    NO_EFFECTS,
     Plans,
     Workers,
     effect_key,
@@ -37,7 +36,7 @@ from .page import write_outcome
 from .records import PLANTED, ClassForms, FitRecord, ScoreRecord
 from .results import ConditionResult, MotionRow, StudyResults
 from .searches import AP, B0, LABELS, A, B, Found, run_searches, searches
-from .sentences import reading_of
+from .sentences import study_results
 from .settings import Stages, StudyFolder, StudySettings
 from .tables import (
     Condition,
@@ -51,7 +50,7 @@ from .tables import (
 Array = NDArray[np.float64]
 
 _WORDS: Final = {
-    PLAIN: "the arm is what the model says",
+    NO_EFFECTS: "the arm is what the model says",
     EFFECTS: "the arm has the effects that the model leaves out",
 }
 
@@ -140,8 +139,8 @@ class _Analysis:
         ]
         evidence = Evidence(
             self.fits[ABLATION],
-            self.fits[PLAIN],
-            self.scores[PLAIN],
+            self.fits[NO_EFFECTS],
+            self.scores[NO_EFFECTS],
             truth,
             self.plans.missing,
             self.plans.sines,
@@ -159,16 +158,13 @@ class _Analysis:
         else:
             missing = ["The unmodelled effects were not run."]
         sizes = preset("b").search
-        results = StudyResults(
-            name=self.folder.root.resolve().name,
-            cell=cell.name,
+        return study_results(
+            self.folder.root,
+            cell,
+            parameters_of(cell, truth),
             simulated=True,
             quick=settings.effort_b.tried < sizes.population * sizes.generations,
             settings=settings,
-            software=software(),
-            joint_names=list(cell.joint_names),
-            n_base=len(cell.model.base.names),
-            parameters=parameters_of(cell, truth),
             searches=[
                 one.result(chosen=key in (self.plans.sines, B, B0))
                 for key, one in self.found.items()
@@ -176,11 +172,9 @@ class _Analysis:
             table1=self._table1() + printed_rows(cell),
             conditions=conditions,
             ablations=varied,
-            reading=[],
             missing=missing,
             times={},
         )
-        return results.model_copy(update={"reading": reading_of(results)})
 
     def _scored(
         self, runs: list[Run], place: str, estimates: Mapping[str, Array], shown: tuple[str, ...]
@@ -222,13 +216,13 @@ class _Analysis:
             EffectSetting(
                 label, self.fits[one], ClassForms.of(self.scores[one]["fly-by"].forms), base=True
             )
-            for label, one in (("none", PLAIN), ("all", EFFECTS))
+            for label, one in (("none", NO_EFFECTS), ("all", EFFECTS))
         )
         return [none, *found, every]
 
     def _table1(self) -> list[MotionRow]:
         """Of the excitations that the arm bore."""
-        plans, fits = self.plans, self.fits[PLAIN]
+        plans, fits = self.plans, self.fits[NO_EFFECTS]
         searched = {A: plans.sines, AP: plans.printed or plans.sines}
         return [
             MotionRow(

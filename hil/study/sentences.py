@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final
 
-from hil.report.numbers import fixed, significant
+from hil.cell import Cell
+from hil.report.numbers import capitalised, fixed, significant
+from hil.version import software
 
-from .results import AblationResult, ComparisonResult, ConditionResult, Paragraph, StudyResults
+from .results import (
+    AblationResult,
+    ComparisonResult,
+    ConditionResult,
+    Paragraph,
+    StudyParameter,
+    StudyResults,
+)
 from .searches import AP, B0, A, B
 
 _NONE: Final = "no significant difference"
@@ -26,6 +36,23 @@ def reading_of(results: StudyResults) -> list[Paragraph]:
         *(_ablation(one) for one in results.ablations),
     ]
     return [one for one in paragraphs if one is not None]
+
+
+def study_results(
+    root: Path, cell: Cell, parameters: list[StudyParameter], **tables: Any
+) -> StudyResults:
+    """Results of a study with what its numbers say; `tables` are the other fields."""
+    results = StudyResults(
+        name=root.resolve().name,
+        cell=cell.name,
+        software=software(),
+        joint_names=list(cell.joint_names),
+        n_base=len(cell.model.base.names),
+        parameters=parameters,
+        reading=[],
+        **tables,
+    )
+    return results.model_copy(update={"reading": reading_of(results)})
 
 
 def summary_of(results: StudyResults) -> dict[str, Any]:
@@ -129,9 +156,9 @@ def _effects(results: StudyResults) -> Paragraph | None:
         verdict="No." if same else f"Yes: {_each([(by_key['effects'], after)])}",
         sentences=[
             f"The effects change the ratio of the errors from {fixed(before.ratio, 3)} to"
-            f" {fixed(after.ratio, 3)} on {after.motion_class} motions."
+            f" {fixed(after.ratio, 3)} on {after.motion_class} motions.",
+            f"Effects: {'; '.join(by_key['effects'].effects)}.",
         ],
-        more=[f"Effects: {'; '.join(by_key['effects'].effects)}."],
     )
 
 
@@ -169,9 +196,9 @@ def _each(pairs: Sequence[tuple[ConditionResult, ComparisonResult]]) -> str:
     """The conclusion under each condition; once where it is the same."""
     texts = [_outcome(condition, row) for condition, row in pairs]
     if len(set(texts)) == 1:
-        return f"{_upper(texts[0]) if texts[0] in (TOO_FEW, _NONE) else texts[0]}."
+        return f"{capitalised(texts[0]) if texts[0] in (TOO_FEW, _NONE) else texts[0]}."
     named = [f"{_lower(_where(one))} {text}" for (one, _), text in zip(pairs, texts, strict=True)]
-    return _upper("; ".join(named) + ".")
+    return capitalised("; ".join(named) + ".")
 
 
 def _outcome(condition: ConditionResult, row: ComparisonResult) -> str:
@@ -197,11 +224,7 @@ def _ratio(row: ComparisonResult, labels: dict[str, str]) -> str:
 
 
 def _where(condition: ConditionResult) -> str:
-    return _upper(_WHERE.get(condition.key, condition.words))
-
-
-def _upper(words: str) -> str:
-    return words[:1].upper() + words[1:]
+    return capitalised(_WHERE.get(condition.key, condition.words))
 
 
 def _lower(words: str) -> str:

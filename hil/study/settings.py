@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
@@ -13,8 +13,7 @@ from typing import Annotated, Final, TypeVar
 from pydantic import Field
 
 from hil.errors import InputError, OutputError
-from hil.files import make_folder, write_or_tell
-from hil.io.lock import locked
+from hil.files import exclusive_folder, write_or_tell
 from hil.reading import text_of
 from hil.results.frozen import Frozen
 
@@ -56,10 +55,6 @@ class StudySettings(Frozen):
     def single_effects(self) -> bool:
         """Whether the effects are tried one by one: fewer than 3 repetitions show nothing."""
         return self.effects and self.ablation_repetitions >= 3
-
-    def to_json(self) -> str:
-        """As indented JSON."""
-        return self.model_dump_json(indent=1) + "\n"
 
 
 FULL: Final = StudySettings(
@@ -147,25 +142,9 @@ class StudyFolder:
         """What was asked for."""
         return self.root / "study.json"
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Make the folder, and keep every other study out of it until this is left.
-
-        Raises:
-            InputError: another study is running in it, or it cannot be made.
-        """
-        make_folder(self.root)
-
-        def refusal(error: OSError) -> InputError:
-            if isinstance(error, BlockingIOError):
-                problem = "another study is running in it"
-                remedy = "wait for its end, stop it (Ctrl-C), or name another folder (--output)"
-                return InputError(self.root, problem, remedy=remedy)
-            problem = f"cannot be locked against a second study ({error.strerror})"
-            return InputError(self.root, problem, remedy="name another folder (--output)")
-
-        with locked(self.root, refusal):
-            yield
+    def locked(self) -> AbstractContextManager[None]:
+        """Make the folder, and keep every other study out of it until this is left."""
+        return exclusive_folder(self.root, "study", "--output")
 
     def begin(self, settings: StudySettings) -> None:
         """Write down what is asked for, or resume a study that was asked for the same.
@@ -240,7 +219,7 @@ class Stages:
         end()
 
     def _write(self, times: Times) -> None:
-        write_or_tell(self._path, times.model_dump_json(indent=1) + "\n")
+        write_or_tell(self._path, times.to_json())
 
 
 def _processor() -> float:

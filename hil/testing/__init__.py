@@ -10,8 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .faulty import faulty_controller, faulty_link
-    from .short import run_campaign, shortened
+    from .faulty import faulty_controller, faulty_link, run_campaign, shortened
     from .udp import UdpController
 
 _HOME = {

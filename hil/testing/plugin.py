@@ -38,7 +38,7 @@ def simulated_cell() -> Cell:
     table [simulation].
     """
     from hil.cell import Cell
-    from hil.testing.short import shortened
+    from hil.testing.faulty import shortened
     from sim_fixtures.ns16 import CELL_PATH
 
     return shortened(Cell.load(CELL_PATH))
@@ -75,7 +75,7 @@ def simulated_link(
 @pytest.fixture(scope="session")
 def short_campaign(tmp_path_factory: pytest.TempPathFactory, simulated_cell: Cell) -> Campaign:
     """A finished campaign of `simulated_cell`: every archive of it is whole. Only read it."""
-    from hil.testing.short import run_campaign
+    from hil.testing.faulty import run_campaign
 
     return run_campaign(tmp_path_factory.mktemp("hil") / "campaign", simulated_cell)
 

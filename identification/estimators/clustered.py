@@ -62,14 +62,14 @@ def clustered_covariance(
     length = block_length(blocks.scores[used])
     information = merged(blocks.information[used], length)
     curvature, vectors = np.linalg.eigh(information.sum(axis=0))
-    kept = curvature > _FLAT
+    steep = curvature > _FLAT
     # In these coordinates all blocks together have the information 1.
-    to_unit = vectors[:, kept] / np.sqrt(curvature[kept])
+    to_unit = vectors[:, steep] / np.sqrt(curvature[steep])
     scores = merged(blocks.scores[used], length) @ solution.root @ to_unit
     corrected = leverage_corrected(to_unit.T @ information @ to_unit, scores)
     spread = solution.root @ to_unit @ corrected.T
     size = np.maximum(np.linalg.norm(solution.root, axis=1), np.finfo(np.float64).tiny)
-    flat = np.abs(solution.root @ vectors[:, ~kept]).max(axis=1, initial=0.0)
+    flat = np.abs(solution.root @ vectors[:, ~steep]).max(axis=1, initial=0.0)
     determined = solution.determined & (flat < _PARTICIPATION * size)
     covariance = spread @ spread.T
     mark_undetermined(covariance, determined)

@@ -308,8 +308,8 @@ def square_root(equations: NormalEquations) -> SquareRoot:
     length = np.sqrt(np.diag(equations.A))
     scale = np.where(length > 0.0, length, 1.0)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    kept = eigenvalues > eigenvalues[-1] / WORST_CONDITION**2
-    basis, root = vectors[:, kept].T, np.sqrt(eigenvalues[kept])
+    significant = eigenvalues > eigenvalues[-1] / WORST_CONDITION**2
+    basis, root = vectors[:, significant].T, np.sqrt(eigenvalues[significant])
     # Times the length itself: a column without data stays exactly zero, without rounding.
     return SquareRoot(R=root[:, None] * basis * length, z=basis @ (equations.b / scale) / root)
 
@@ -353,7 +353,7 @@ class Program:
         nominal = model.nominal if options.nominal is None else np.asarray(options.nominal)
         bodies = reference_bodies(link_parameters(model, nominal), model.chain.translation)
         n, b = model.n_joints, model.base.rank
-        layout, taken = model.layout, dissipation(model.friction)
+        layout, losses = model.layout, dissipation(model.friction)
         others = np.concatenate([layout.rotors, layout.couplings])
         s, k = layout.size, model.n_parameters - b
         v = s + k
@@ -367,7 +367,7 @@ class Program:
         to_standard[others, rotors] = unit
         rest = np.arange(s, v)
         combine = np.eye(k)  # springs and balancers are free
-        combine[: len(taken.combine), : len(taken.combine)] = taken.combine
+        combine[: len(losses.combine), : len(losses.combine)] = losses.combine
         directions = np.vstack([np.zeros((b, k)), combine])
         to_others[:, rest] = combine * _whole_torque_units(root, directions)
         mapping = np.vstack([model.base.grouping @ to_standard, to_others])
@@ -383,7 +383,7 @@ class Program:
             rows=SquareRoot(root.R @ mapping, root.z),
             cones=(Cone(links, _SYMMETRIC),) + (() if coupled is None else (coupled,)),
             centre=np.concatenate([nominal[others] / unit, np.zeros(k)]),
-            not_negative=np.concatenate([alone, rest[: len(taken.combine)][taken.not_negative]]),
+            not_negative=np.concatenate([alone, rest[: len(losses.combine)][losses.not_negative]]),
             masses=to_standard[layout.links[:, -1]],
         )
 

@@ -240,10 +240,10 @@ def leverage_corrected(shares: Array, scores: Array) -> Array:
     for b in dependent:
         u, rest, vt = np.linalg.svd(identity - shares[b])
         trusted = np.clip((rest - (1.0 - _OTHERS)) / (_OTHERS - _OWN), 0.0, 1.0)
-        told = (u.T @ scores[b]) / np.maximum(rest, 1.0 - _OTHERS)
-        squares += float((trusted * told**2 * rest).sum())
+        without_own = (u.T @ scores[b]) / np.maximum(rest, 1.0 - _OTHERS)
+        squares += float((trusted * without_own**2 * rest).sum())
         leverage += float((trusted * (1.0 - rest)).sum())
-        rows.append(((np.sqrt(trusted) * told) @ vt)[None])
+        rows.append(((np.sqrt(trusted) * without_own) @ vt)[None])
         replaced = np.sqrt((1.0 - trusted) * np.maximum(1.0 - rest, 0.0))
         added.append((replaced[:, None] * vt)[trusted < 1.0])
     effect = max(1.0, squares / leverage) if leverage > 0.0 else 1.0

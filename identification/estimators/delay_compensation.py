@@ -45,11 +45,11 @@ def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recordi
     moved = {name: array.copy() for name, array in channels.items() if array is not None}
     for segment in recording.segments():
         inside = time[segment]
-        kept = (inside + shift.min() >= inside[0]) & (inside + shift.max() <= inside[-1])
-        if not kept.any() or len(inside) < 2:
+        covered = (inside + shift.min() >= inside[0]) & (inside + shift.max() <= inside[-1])
+        if not covered.any() or len(inside) < 2:
             continue
-        keep[segment] = kept
-        gap[segment.start + int(np.argmax(kept))] = True
+        keep[segment] = covered
+        gap[segment.start + int(np.argmax(covered))] = True
         for array in moved.values():
             for joint in np.flatnonzero(shift):
                 array[segment, joint] = read_at(

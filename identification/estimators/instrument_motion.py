@@ -27,7 +27,7 @@ _ROWS: Final = 4000  # enough for a lag, however long the recording
 _COMMAND_TOLERANCE: Final = 1e-20  # rad² or m²
 # Of a joint's own range: clocks of repetitions start within a cycle of each other.
 _SAME_PLAN: Final = 0.01
-_STANDING: Final = 1e-4  # rad or m
+_STILL: Final = 1e-4  # rad or m
 _OVERLAP: Final = 0.9
 _COMPARED: Final = 400  # instants
 
@@ -126,7 +126,7 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
         np.quantile(np.abs(np.interp(at, time, a) - np.interp(at, other_time, b)), _OVERLAP)
         for a, b in zip(one.T, other.T, strict=True)
     ]
-    return bool(np.all(np.array(apart) <= _SAME_PLAN * np.maximum(np.ptp(one, axis=0), _STANDING)))
+    return bool(np.all(np.array(apart) <= _SAME_PLAN * np.maximum(np.ptp(one, axis=0), _STILL)))
 
 
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:

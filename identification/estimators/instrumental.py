@@ -99,10 +99,10 @@ def solve_cross(total: Array) -> CrossSolution:
     scale = np.where(length > 0.0, length, 1.0)
     left, right = scale[:p], scale[p:]
     u, singular, vt = np.linalg.svd(total[:p, p : 2 * p] / np.outer(left, right))
-    kept = singular > singular[0] / WORST_CONDITION**2
-    lost = np.abs(vt[~kept]).max(axis=0, initial=0.0)
-    root = np.sqrt(singular[kept])
-    own_right, own_left = vt[kept].T / root / right[:, None], u[:, kept] / root / left[:, None]
+    large = singular > singular[0] / WORST_CONDITION**2
+    lost = np.abs(vt[~large]).max(axis=0, initial=0.0)
+    root = np.sqrt(singular[large])
+    own_right, own_left = vt[large].T / root / right[:, None], u[:, large] / root / left[:, None]
     return CrossSolution(
         values=own_right @ (own_left.T @ total[:p, -1]),
         right=own_right,

@@ -41,9 +41,9 @@ from identification.factor.phases import (
     FINE_BLOCK,
     PhaseFactor,
     add_grams,
-    counted,
     equal_runs,
     fine_blocks,
+    samples_by_cell,
 )
 from identification.model.kinematics import Chain
 from identification.model.pseudo_inertia import (
@@ -155,7 +155,7 @@ class Run:
             *LINK_SYMBOLS,
             *(f"offset of {joint}" for joint in model.joint_names),
         )
-        counts = counted(index, samples.usable)
+        counts = samples_by_cell(index, samples.usable)
         return cls(name, PhaseFactor(tuple(grams), tuple(places), counts, names), loaded)
 
 

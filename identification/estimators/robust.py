@@ -249,9 +249,9 @@ def _result(
 ) -> RobustEstimate:
     clustered = clustered_covariance(model, recordings, state.solution, _weights(state.scale), loss)
     scaled = np.concatenate(state.residuals) / state.scale
-    counted = np.isfinite(scaled)
-    rows = np.where(np.isfinite(state.scale), np.count_nonzero(counted, axis=0), np.nan)
-    doubt = np.where(counted, loss.weight(np.where(counted, scaled, 0.0)), 0.0)
+    finite = np.isfinite(scaled)
+    rows = np.where(np.isfinite(state.scale), np.count_nonzero(finite, axis=0), np.nan)
+    doubt = np.where(finite, loss.weight(np.where(finite, scaled, 0.0)), 0.0)
     ended = "" if state.converged else ", NOT converged"
     return RobustEstimate(
         estimate=Estimate(
@@ -268,7 +268,7 @@ def _result(
             interval_factor=clustered.interval_factor,
         ),
         mean_weight=doubt.sum(axis=0) / rows,
-        outlying=np.count_nonzero(counted & (np.abs(scaled) > OUTLYING), axis=0) / rows,
+        outlying=np.count_nonzero(finite & (np.abs(scaled) > OUTLYING), axis=0) / rows,
         iterations=state.passes,
         converged=state.converged,
     )

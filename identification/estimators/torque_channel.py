@@ -83,8 +83,8 @@ def possible_low_passes(
         for delay in {still, options.torque_delay}
     }
     # What a delay by itself explains as well is no low-pass.
-    plain = min(float(np.nanmean(one.log_residuals())) for one in channels.values())
-    enough = plain + math.log(1.0 - _WORTHWHILE)
+    unfiltered = min(float(np.nanmean(one.log_residuals())) for one in channels.values())
+    enough = unfiltered + math.log(1.0 - _WORTHWHILE)
     found = []
     for delays, shapes in ((tuple(channels), WITHOUT_PHASE), ((still,), FORWARDS)):
         fits = [(channels[delay].best(shape), delay) for delay in delays for shape in shapes]
@@ -132,8 +132,8 @@ class _Channel:
         noise_variance: Array | None,
         options: Preprocessing,
     ) -> Self:
-        plain = replace(options, torque_bandwidth=None)
-        samples = prepare(recording, model, noise_variance=noise_variance, options=plain)
+        unfiltered = replace(options, torque_bandwidth=None)
+        samples = prepare(recording, model, noise_variance=noise_variance, options=unfiltered)
         # The ends that the narrowest filter knows badly count for none.
         usable = samples.usable & ~torn_rows(recording, LONGEST_END)[:, None]
         load = np.zeros_like(samples.torque)
@@ -198,14 +198,14 @@ def _averaging(
     A mean is linear and the same for torque and regressor: what relates them stays.
     """
     counts = [(one.stop - one.start) // every for one in segments]
-    kept = [(s.start, c) for s, c in zip(segments, counts, strict=True) if c >= _SHORTEST]
+    lasting = [(s.start, c) for s, c in zip(segments, counts, strict=True) if c >= _SHORTEST]
 
     def average(values: Array) -> Array:
         parts = [
             values[start : start + count * every].reshape(count, every, *values.shape[1:])
-            for start, count in kept
+            for start, count in lasting
         ]
         return np.concatenate([part.mean(axis=1) for part in parts])
 
-    edges = np.concatenate([[0], np.cumsum([count for _, count in kept])]).astype(int).tolist()
+    edges = np.concatenate([[0], np.cumsum([count for _, count in lasting])]).astype(int).tolist()
     return average, tuple(slice(a, b) for a, b in pairwise(edges))

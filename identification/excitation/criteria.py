@@ -22,7 +22,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.factor.factor import Factor
-from planner.plain import number, whole
+from planner.checked_data import number, whole
 
 Array = NDArray[np.float64]
 

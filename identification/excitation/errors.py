@@ -102,14 +102,14 @@ class NoFeasibleMotionError(IdentificationError):
         self.stopped = stopped
         super().__init__(self.sentence())
 
-    def sentence(self, told: Callable[[Violation], str] = str) -> str:
+    def sentence(self, text_of: Callable[[Violation], str] = str) -> str:
         """In words; `told` puts a violation into the words and units of the reader."""
         reasons = [
-            f"{kind} forbids {count}, the mildest: {told(self.nearest[kind])}"
+            f"{kind} forbids {count}, the mildest: {text_of(self.nearest[kind])}"
             for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])
         ]
         if len(self.closest) > 1:
-            all_of_it = " and ".join(map(told, self.closest))
+            all_of_it = " and ".join(map(text_of, self.closest))
             reasons.append(f"the motion that comes closest breaks {all_of_it}")
         if self.unexciting:
             reasons.append(

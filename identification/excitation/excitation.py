@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from identification.excitation.criteria import Criteria
 from identification.excitation.random_motion import moves_through
 from planner import FourierSeries, Move, PiecewiseCubic
-from planner.plain import DAMAGED, number, numbers, table, text, whole
+from planner.checked_data import DAMAGED, number, numbers, table, text, whole
 
 Array = NDArray[np.float64]
 

@@ -67,7 +67,7 @@ def limit_violations(
     found = _beyond(attained, limits, motion)
     for ramp in _short_ramps(trajectory, motion):
         found = found or _beyond(_attained(ramp), limits, ramp)
-    if found or _kept(attained, _swing(trajectory, motion), limits):
+    if found or _within(attained, _swing(trajectory, motion), limits):
         return found
     return _beyond(trajectory.extrema(), limits, motion)
 
@@ -180,7 +180,7 @@ def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
     ]
 
 
-def _kept(attained: Extrema, swing: _Swing, limits: JointLimits) -> bool:
+def _within(attained: Extrema, swing: _Swing, limits: JointLimits) -> bool:
     return bool(
         np.all(attained.lower - swing.position >= limits.lower)
         and np.all(attained.upper + swing.position <= limits.upper)

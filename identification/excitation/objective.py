@@ -135,12 +135,12 @@ class Objective:
             velocity=motion.velocity,
             acceleration=motion.acceleration,
         )
-        standing = None if self.earlier is None else ~model.moving(states[1])
+        still = None if self.earlier is None else ~model.moving(states[1])
         sums = [np.zeros((len(used), len(used))) for used in model.plan.columns]
         for part, rows in model.plan.chunks(*states):
             for joint, block in enumerate(rows):
-                if standing is not None:
-                    np.copyto(block, 0.0, where=standing[part, joint])
+                if still is not None:
+                    np.copyto(block, 0.0, where=still[part, joint])
                 sums[joint] += block @ block.T
         total = np.zeros((p, p))
         weights = np.ones(n) if self.joint_weights is None else self.joint_weights

@@ -23,10 +23,10 @@ def straight_way(start: Array, end: Array) -> Array:
     return np.linspace(start, end, steps + 1)
 
 
-def free_ways(checker: CollisionChecker, ways: Sequence[Array]) -> NDArray[np.bool_]:
+def free_segments(checker: CollisionChecker, segments: Sequence[Array]) -> NDArray[np.bool_]:
     """Return which ways (m_i, n) keep the clearance at every posture, (len(ways),)."""
-    starts = np.cumsum([0, *(len(way) for way in ways[:-1])])
-    return np.logical_and.reduceat(checker.clear(np.concatenate(ways)), starts)
+    starts = np.cumsum([0, *(len(way) for way in segments[:-1])])
+    return np.logical_and.reduceat(checker.clear(np.concatenate(segments)), starts)
 
 
 def is_inside(posture: ArrayLike, limits: JointLimits) -> bool:

@@ -107,9 +107,9 @@ def random_validation_motions(
     motions = []
     for k in range(count):
         for attempt in range(_TRIES_PER_MOTION):
-            drawn = draw(np.random.default_rng([_VALIDATION, seed, k, attempt]))
-            if drawn is not None:
-                motions.append(drawn)
+            candidate = draw(np.random.default_rng([_VALIDATION, seed, k, attempt]))
+            if candidate is not None:
+                motions.append(candidate)
                 break
         else:
             raise draw.failure()

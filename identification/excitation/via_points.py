@@ -15,7 +15,7 @@ from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genome import between, checked_genes, share_between
-from identification.excitation.straight_paths import free_ways, is_inside, straight_way
+from identification.excitation.straight_paths import free_segments, is_inside, straight_way
 from planner import FourierSeries, JointLimits, PiecewiseCubic, PlannerError, plan_in_child
 from planner.arrays import read_only
 from planner.batch import plan_chunk
@@ -173,7 +173,7 @@ class ViaPointGenome:
             if draw > 0:
                 coordinates[blocked] = random.random((len(blocked), self.limits.n_joints))
             points = self._points(coordinates[blocked])
-            ways = [
+            segments = [
                 np.concatenate(
                     (
                         point[None] if before is None else straight_way(before[index], point),
@@ -182,7 +182,7 @@ class ViaPointGenome:
                 )
                 for index, point in zip(blocked.tolist(), points, strict=True)
             ]
-            blocked = blocked[~free_ways(checker, ways)]
+            blocked = blocked[~free_segments(checker, segments)]
             if len(blocked) == 0:
                 break
         return self._points(coordinates)

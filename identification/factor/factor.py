@@ -345,11 +345,11 @@ def solve(equations: NormalEquations) -> Solution:
     scale = np.where(present, length, 1.0)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
     largest = eigenvalues[-1]
-    kept = eigenvalues > largest / WORST_CONDITION**2
-    lost = vectors[:, ~kept]
+    significant = eigenvalues > largest / WORST_CONDITION**2
+    lost = vectors[:, ~significant]
     determined = present & (np.abs(lost).max(axis=1, initial=0.0) < _PARTICIPATION)
-    basis = vectors[:, kept]
-    root = basis / np.sqrt(eigenvalues[kept]) / scale[:, None]
+    basis = vectors[:, significant]
+    root = basis / np.sqrt(eigenvalues[significant]) / scale[:, None]
     smallest = eigenvalues[0] if present.all() else 0.0
     return Solution(
         values=root @ (root.T @ equations.b),
@@ -378,13 +378,13 @@ def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -
     p = rows.shape[1]
     padded = np.zeros(p)
     padded[: len(singular)] = singular
-    kept = (padded > padded.max(initial=0.0) / worst) & (padded > 0.0)
-    lost = right[~kept]
+    significant = (padded > padded.max(initial=0.0) / worst) & (padded > 0.0)
+    lost = right[~significant]
     determined = present & (np.abs(lost).max(axis=0, initial=0.0) < _PARTICIPATION)
-    root = right[kept].T / padded[kept] / scale[:, None]
+    root = right[significant].T / padded[significant] / scale[:, None]
     smallest = padded.min(initial=np.inf) if present.all() else 0.0
     return Solution(
-        values=root @ (left[:, : len(singular)].T @ target)[kept[: len(singular)]],
+        values=root @ (left[:, : len(singular)].T @ target)[significant[: len(singular)]],
         root=root,
         condition=float(padded[0] / smallest) if smallest > 0.0 else np.inf,
         determined=np.asarray(determined),
@@ -400,9 +400,9 @@ def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
     length = np.sqrt(np.maximum(np.diag(equations.A), 0.0))
     scale = np.where(length > 0.0, length, 1.0)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    kept = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
-    singular = np.sqrt(eigenvalues[kept])
-    basis = vectors[:, kept].T
+    significant = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
+    singular = np.sqrt(eigenvalues[significant])
+    basis = vectors[:, significant].T
     return singular[:, None] * basis * scale, (basis @ (equations.b / scale)) / singular
 
 

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
 from identification.factor.augmented_rows import augmented_rows
-from identification.factor.phases import PhaseFactor, add_grams, counted, equal_runs, fine_blocks
+from identification.factor.phases import (
+    PhaseFactor,
+    add_grams,
+    equal_runs,
+    fine_blocks,
+    samples_by_cell,
+)
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -82,7 +88,7 @@ class InstrumentFactor:
             runs = equal_runs(index[part])
             for total, noisy, quiet in zip(gram, blocks, clean, strict=True):
                 add_grams(total, np.concatenate([quiet[:-1], noisy]), runs)
-        return cls(gram, columns, counted(index, rows), model.parameter_names)
+        return cls(gram, columns, samples_by_cell(index, rows), model.parameter_names)
 
     @property
     def n_parameters(self) -> int:

@@ -68,7 +68,7 @@ class PhaseFactor:
             runs = equal_runs(index[part])
             for total, block in zip(gram, rows, strict=True):
                 add_grams(total, block, runs)
-        return cls(gram, columns, counted(index, samples.usable), model.parameter_names)
+        return cls(gram, columns, samples_by_cell(index, samples.usable), model.parameter_names)
 
     @property
     def n_joints(self) -> int:
@@ -139,17 +139,17 @@ class PhaseFactor:
             whole[joint][np.ix_(place, place)] = gram.sum(axis=0)
         return Factor(whole, self.samples.sum(axis=0), self.parameter_names)
 
-    def restricted(self, kept: NDArray[np.intp]) -> PhaseFactor:
+    def restricted(self, chosen: NDArray[np.intp]) -> PhaseFactor:
         """The same samples for a model that has only the parameters `kept` (k,), in that order."""
         place = np.full(self.n_parameters, -1, dtype=np.intp)
-        place[kept] = np.arange(len(kept))
+        place[chosen] = np.arange(len(chosen))
         gram, columns = [], []
         for own, used in zip(self.gram, self.columns, strict=True):
             stays = np.flatnonzero(place[used] >= 0)
             both = np.append(stays, len(used))
             gram.append(own[:, both[:, None], both])
             columns.append(place[used[stays]])
-        names = tuple(self.parameter_names[k] for k in kept)
+        names = tuple(self.parameter_names[k] for k in chosen)
         return PhaseFactor(tuple(gram), tuple(columns), self.samples, names)
 
 
@@ -221,7 +221,7 @@ def add_grams(total: Array, rows: Array, runs: Iterable[EqualRuns]) -> None:
         total[first : first + count] += own @ own.transpose(0, 2, 1)
 
 
-def counted(index: NDArray[np.int64], usable: NDArray[np.bool_]) -> NDArray[np.intp]:
+def samples_by_cell(index: NDArray[np.int64], usable: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Rows that count (B, n) of a mask (m, n), by a rising index of blocks (m,)."""
     if not len(index):
         return np.zeros((0, usable.shape[1]), dtype=np.intp)

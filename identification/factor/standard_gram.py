@@ -65,9 +65,9 @@ class StandardGram:
         n = model.n_joints
         gram, rows = np.zeros((n, 4 * s + 1, 4 * s + 1)), np.zeros(n)
         for samples in recordings:
-            kept = slice(None, None, max(1, len(samples.torque) // _MOST_ROWS))
-            still, *pulled = (_rows(plan, samples, kept, s) for plan in plans)
-            usable, torque = samples.usable[kept], samples.torque[kept]
+            rows_used = slice(None, None, max(1, len(samples.torque) // _MOST_ROWS))
+            still, *pulled = (_rows(plan, samples, rows_used, s) for plan in plans)
+            usable, torque = samples.usable[rows_used], samples.torque[rows_used]
             for joint in range(n):
                 parts = [still[joint], *(one[joint] - still[joint] for one in pulled)]
                 table = np.column_stack([*parts, torque[:, joint]])[usable[:, joint]]
@@ -93,9 +93,9 @@ def solve(gram: Array, weights: Array) -> Array:
     length = np.sqrt(np.diag(total)[:-1])
     scale = np.where(length > 0.0, length, 1.0)
     values, vectors = np.linalg.eigh(total[:-1, :-1] / np.outer(scale, scale))
-    kept = values > _NEGLIGIBLE * values[-1]
-    into = vectors[:, kept].T @ (total[:-1, -1] / scale)
-    return np.asarray((vectors[:, kept] @ (into / values[kept])) / scale)
+    rows_used = values > _NEGLIGIBLE * values[-1]
+    into = vectors[:, rows_used].T @ (total[:-1, -1] / scale)
+    return np.asarray((vectors[:, rows_used] @ (into / values[rows_used])) / scale)
 
 
 def squared_errors(gram: Array, values: Array) -> Array:
@@ -118,18 +118,18 @@ def _plan(model: RobotModel, gravity: Array) -> RegressorPlan:
     )
 
 
-def _rows(plan: RegressorPlan, samples: Samples, kept: slice, s: int) -> list[Array]:
+def _rows(plan: RegressorPlan, samples: Samples, rows_used: slice, s: int) -> list[Array]:
     """Rows of each joint with all s columns, as the torque channel records them."""
     motion = samples.motion
     filtered = samples.torque_bandwidth is not None
-    part = slice(None) if filtered else kept
+    part = slice(None) if filtered else rows_used
     found: Regressor = plan.evaluate(
         motion.position[part], motion.velocity[part], motion.acceleration[part]
     )
     rows = []
     for joint, (block, columns) in enumerate(zip(found.blocks, found.columns, strict=True)):
         if filtered:
-            block = samples.as_measured(joint, block)[kept]
+            block = samples.as_measured(joint, block)[rows_used]
         full = np.zeros((len(block), s))
         full[:, columns] = block
         rows.append(full)

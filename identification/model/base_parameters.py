@@ -31,20 +31,20 @@ class BaseParameters:
 
     Attributes:
         names: names of the kept parameters, shape (b,): each stands for its group.
-        kept: indices of the kept standard parameters, rising, shape (b,).
+        pivots: indices of the kept standard parameters, rising, shape (b,).
         grouping: ``base_values = grouping @ standard_values``, shape (b, s).
         standard_names: names of all standard parameters, shape (s,).
-        smallest_kept: how much of a kept column the columns kept before it leave unexplained,
+        smallest_pivot: how much of a kept column the columns kept before it leave unexplained,
             as a share of the longest column of its unit; the smallest over all kept.
         largest_dropped: the same, the largest over all dropped: zero but for rounding.
         shares: the same of each standard parameter, shape (s,).
     """
 
     names: tuple[str, ...]
-    kept: NDArray[np.intp]
+    pivots: NDArray[np.intp]
     grouping: Array
     standard_names: tuple[str, ...]
-    smallest_kept: float
+    smallest_pivot: float
     largest_dropped: float
     shares: Array
 
@@ -56,7 +56,7 @@ class BaseParameters:
     @property
     def gap(self) -> float:
         """How clear the rank decision is: smallest kept over largest dropped share."""
-        return self.smallest_kept / max(self.largest_dropped, np.finfo(np.float64).tiny)
+        return self.smallest_pivot / max(self.largest_dropped, np.finfo(np.float64).tiny)
 
     @property
     def unobservable(self) -> tuple[str, ...]:
@@ -77,13 +77,13 @@ class BaseParameters:
         )
         if dropped + len(self.unobservable) == 0:
             return f"{text} Nothing had to be decided."
-        weakest = self.names[int(np.argmin(self.shares[self.kept]))]
+        weakest = self.names[int(np.argmin(self.shares[self.pivots]))]
         text += (
-            f" The weakest kept one, {weakest}, leaves {self.smallest_kept:.1e} of its column"
+            f" The weakest kept one, {weakest}, leaves {self.smallest_pivot:.1e} of its column"
             f" unexplained, the strongest dropped one {self.largest_dropped:.1e}; the threshold is"
             f" {TOLERANCE:g}."
         )
-        if self.gap < _CLEAR or self.smallest_kept < _WEAK:
+        if self.gap < _CLEAR or self.smallest_pivot < _WEAK:
             return (
                 f"{text} That is close: small lengths or angles of the robot description, meant as"
                 f" zero or not, decide whether {weakest} is a parameter of its own. Check them; a"
@@ -102,7 +102,7 @@ class BaseParameters:
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
         """Return each group in words: ``I1yy + I1m + 0.09 m2 + ...``."""
-        return tuple(self._expression(row, int(k), digits) for row, k in enumerate(self.kept))
+        return tuple(self._expression(row, int(k), digits) for row, k in enumerate(self.pivots))
 
     def _expression(self, row: int, pivot: int, digits: int) -> str:
         text = self.standard_names[pivot]
@@ -133,22 +133,22 @@ def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) ->
     longest = {unit: lengths[np.array(units) == unit].max() for unit in units}
     scale = np.array([longest[unit] or 1.0 for unit in units])
     scaled = reduced / scale
-    kept, shares = _first_independent(scaled)
-    dropped = np.setdiff1d(np.arange(len(names)), kept)
+    pivots, shares = _first_independent(scaled)
+    dropped = np.setdiff1d(np.arange(len(names)), pivots)
     largest_dropped = float(shares[dropped].max(initial=0.0))
 
-    relation, *_ = np.linalg.lstsq(scaled[:, kept], scaled, rcond=None)
+    relation, *_ = np.linalg.lstsq(scaled[:, pivots], scaled, rcond=None)
     # What is no larger than what stays unexplained is rounding, not grouping.
-    unexplained = np.linalg.norm(scaled - scaled[:, kept] @ relation, axis=0).max(initial=0.0)
+    unexplained = np.linalg.norm(scaled - scaled[:, pivots] @ relation, axis=0).max(initial=0.0)
     relation[np.abs(relation) < max(_ROUNDING, 10.0 * float(unexplained))] = 0.0
-    grouping = relation * scale / scale[kept, None]
-    grouping[:, kept] = np.eye(len(kept))
+    grouping = relation * scale / scale[pivots, None]
+    grouping[:, pivots] = np.eye(len(pivots))
     return BaseParameters(
-        names=tuple(names[k] for k in kept),
-        kept=kept,
+        names=tuple(names[k] for k in pivots),
+        pivots=pivots,
         grouping=grouping,
         standard_names=tuple(names),
-        smallest_kept=float(shares[kept].min(initial=1.0)),
+        smallest_pivot=float(shares[pivots].min(initial=1.0)),
         largest_dropped=largest_dropped,
         shares=shares,
     )
@@ -165,15 +165,15 @@ def share_left(columns: Array, basis: Array) -> Array:
 def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array]:
     """Return the kept indices, and per column the length that earlier kept ones leave of it."""
     basis = np.zeros_like(columns)
-    kept: list[int] = []
+    pivots: list[int] = []
     shares = np.zeros(columns.shape[1])
     for index in range(columns.shape[1]):
         rest = columns[:, index].copy()
         for _ in range(2):  # twice is enough to be orthogonal to rounding
-            known = basis[:, : len(kept)]
+            known = basis[:, : len(pivots)]
             rest -= known @ (known.T @ rest)
         shares[index] = np.linalg.norm(rest)
-        if shares[index] > TOLERANCE and len(kept) < basis.shape[1]:
-            basis[:, len(kept)] = rest / shares[index]
-            kept.append(index)
-    return np.array(kept, dtype=np.intp), shares
+        if shares[index] > TOLERANCE and len(pivots) < basis.shape[1]:
+            basis[:, len(pivots)] = rest / shares[index]
+            pivots.append(index)
+    return np.array(pivots, dtype=np.intp), shares

@@ -374,14 +374,14 @@ class FrictionLaw:
 
     def words(self) -> tuple[str, str]:
         """The terms, and what dry friction does at a reversal, in words."""
-        listed = ", ".join(
+        joined = ", ".join(
             f"{term.label} ({term.speed:g} rad/s)" if term.speed_symbol else term.label
             for term in self.terms
         )
         reversal = f"presliding over {self.presliding:g} rad" if self.presliding else "sgn(v)"
         if self.tanh is not None:
             reversal = f"tanh(v / {self.tanh:g} rad/s)"
-        return listed or "no friction", reversal
+        return joined or "no friction", reversal
 
     def sign(self, velocity: Array, out: Array | None = None) -> Array:
         """Return the direction of motion: sgn(v), in a linear zone v / standstill.

@@ -92,14 +92,14 @@ class RegressorPlan:
     ) -> None:
         self.chain = chain
         self.gravity = gravity
-        self.links = tuple(tuple(kept) for kept in links)
+        self.links = tuple(tuple(symbols) for symbols in links)
         self.rotors = tuple(rotors)
         self.friction = friction
         self.couplings = tuple(couplings)
         self.elements = elements.identified if elements is not None else ()
         # Order in the working array: columns of the links, then of the joint's drive: friction,
         # motor friction, rotor, coupling inertias, elements, response.
-        self.first_own = sum(len(kept) for kept in links)
+        self.first_own = sum(len(symbols) for symbols in links)
         self.own = tuple(_OwnRows.of(self, joint) for joint in range(chain.n_joints))
         self.rows: tuple[Rows, ...]
         self.columns: tuple[NDArray[np.intp], ...]
@@ -390,13 +390,13 @@ def joint_arrays(n_joints: int, **arrays: Array) -> tuple[Array, ...]:
 def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.intp], ...]]:
     """Return per joint its rows in the working array, and their parameter indices."""
     chain, n = plan.chain, plan.chain.n_joints
-    sizes = [len(kept) + rotor for kept, rotor in zip(plan.links, plan.rotors, strict=True)]
+    sizes = [len(symbols) + rotor for symbols, rotor in zip(plan.links, plan.rotors, strict=True)]
     offsets = np.concatenate([[0], np.cumsum(sizes)]).tolist()
     rows: list[list[int]] = [[] for _ in range(n)]
     columns: list[list[int]] = [[] for _ in range(n)]
     place = 0
-    for link, kept in enumerate(plan.links):
-        for position, symbol in enumerate(kept):
+    for link, symbols in enumerate(plan.links):
+        for position, symbol in enumerate(symbols):
             for joint in chain.ancestors(link):
                 # A sliding joint does not feel moments: it has no inertia columns.
                 if chain.revolute[joint] or symbol >= N_INERTIA:

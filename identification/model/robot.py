@@ -89,13 +89,13 @@ class StandardLayout:
         """Unit of each (s,)."""
         return tuple(self._unit(standard) for standard in range(self.size))
 
-    def split(self, kept: Sequence[int]) -> tuple[list[list[int]], list[bool], list[int]]:
+    def split(self, pivots: Sequence[int]) -> tuple[list[list[int]], list[bool], list[int]]:
         """Return what of each joint is among `kept`: link symbols, rotor, and which couplings."""
         links: list[list[int]] = [[] for _ in self.revolute]
         rotors = [False] * self.n_joints
         couplings: list[int] = []
         first = self.n_joints * self.width
-        for standard in (int(k) for k in kept):
+        for standard in (int(k) for k in pivots):
             joint, symbol = divmod(standard, self.width)
             if standard >= first:
                 couplings.append(standard - first)
@@ -249,8 +249,8 @@ class RobotModel:
             friction=all_friction,
             base=base,
             parameter_names=base.names + all_friction.names + beside.names,
-            units=tuple(layout.units[k] for k in base.kept) + all_friction.units + beside.units,
-            plan=_plan(chain, down, layout, base.kept, all_friction, beside),
+            units=tuple(layout.units[k] for k in base.pivots) + all_friction.units + beside.units,
+            plan=_plan(chain, down, layout, base.pivots, all_friction, beside),
             locked=dict(locked),
             coupling=coupling,
             payload=payload,
@@ -280,10 +280,10 @@ class RobotModel:
             friction=friction,
             elements=elements,
             parameter_names=self.base.names + friction.names + elements.names,
-            units=tuple(self.layout.units[k] for k in self.base.kept)
+            units=tuple(self.layout.units[k] for k in self.base.pivots)
             + friction.units
             + elements.units,
-            plan=_plan(self.chain, self.gravity, self.layout, self.base.kept, friction, elements),
+            plan=_plan(self.chain, self.gravity, self.layout, self.base.pivots, friction, elements),
         )
 
     def of_payload(self) -> RobotModel:
@@ -433,11 +433,11 @@ def _plan(
     chain: Chain,
     gravity: Array,
     layout: StandardLayout,
-    kept: NDArray[np.intp],
+    pivots: NDArray[np.intp],
     friction: JointFriction | None,
     elements: JointElements | None = None,
 ) -> RegressorPlan:
-    links, rotors, couplings = layout.split(kept.tolist())
+    links, rotors, couplings = layout.split(pivots.tolist())
     pairs = [layout.pairs[k] for k in couplings]
     return RegressorPlan(chain, gravity, links, rotors, friction, pairs, elements)
 
@@ -458,8 +458,8 @@ def _base_parameters(
     plan = _plan(chain, gravity, layout, everything, None)
     rows = plan.evaluate(q, qd, qdd).dense(layout.size).reshape(-1, layout.size)
     base = select_base(rows, layout.names, layout.units)
-    _refuse_weight_as_offset(chain, friction, rows[:, base.kept])
-    _refuse_known_shape(friction, elements, rows[:, base.kept], q)
+    _refuse_weight_as_offset(chain, friction, rows[:, base.pivots])
+    _refuse_known_shape(friction, elements, rows[:, base.pivots], q)
     return base
 
 

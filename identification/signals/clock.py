@@ -352,12 +352,14 @@ def _numbers(time: Array, signals: Array, step: float) -> Array:
         noise = np.maximum(_level(moved - each * steps[:, None]), resolution)
         unit, way = each / noise, moved / noise
         clarity = (unit**2).sum(axis=1)
-        counted = np.rint((unit * way).sum(axis=1) / np.maximum(clarity, 1.0))
-        alike = (np.abs(way - unit * counted[:, None]) < _OUTLIER + 0.5 * pace / noise).all(axis=1)
+        whole_steps = np.rint((unit * way).sum(axis=1) / np.maximum(clarity, 1.0))
+        alike = (np.abs(way - unit * whole_steps[:, None]) < _OUTLIER + 0.5 * pace / noise).all(
+            axis=1
+        )
         steady = _steady(before / passed[0] / noise, after / passed[1] / noise, 0.25)
         clear = clarity - (unit**2).max(axis=1) > _CLEAR**2
-        clear &= alike & steady & (counted >= 0.0) & (counted <= GAP_STEPS)
-        steps = np.where(clear, counted, phased)
+        clear &= alike & steady & (whole_steps >= 0.0) & (whole_steps <= GAP_STEPS)
+        steps = np.where(clear, whole_steps, phased)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 

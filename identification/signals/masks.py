@@ -143,14 +143,14 @@ def mask_rows(
     bandwidth = np.asarray(bandwidth, dtype=np.float64)
     if bandwidth.shape != shape[1:]:
         raise ShapeError("bandwidth", bandwidth.shape, f"{shape[1:]}")
-    standing = ~model.moving(motion.velocity)
+    still = ~model.moving(motion.velocity)
     saturated = np.zeros(shape, dtype=np.bool_)
     for values, limit in (
         (recording.torque, torque_limit),
         (recording.motor_current, current_limit),
     ):
         if values is not None:
-            saturated |= flat_topped(values, ~standing)
+            saturated |= flat_topped(values, ~still)
             if limit is not None:
                 saturated |= at_limit(values, limit)
     slowest = float(bandwidth[np.ptp(recording.position, axis=0) > 0.0].min(initial=np.inf))
@@ -160,18 +160,18 @@ def mask_rows(
     reversal = near_any_reversal(model, motion, reversal_periods / bandwidth)
     reasons = {TORN: np.broadcast_to(torn[:, None], shape)}
     if left_out == "rests":
-        reasons[REST] = long_halts(motion.time, standing)
+        reasons[REST] = long_rests(motion.time, still)
     elif left_out == "slow":
-        reasons |= {STANDSTILL: standing, REVERSAL: reversal}
+        reasons |= {STANDSTILL: still, REVERSAL: reversal}
     reasons[SATURATED] = saturated
-    moving = ~(reasons[TORN] | saturated | standing | reversal)
+    moving = ~(reasons[TORN] | saturated | still | reversal)
     return RowMask(MappingProxyType(reasons), (shape[0], shape[1]), moving)
 
 
-def long_halts(time: Array, standing: Rows) -> Rows:
+def long_rests(time: Array, still: Rows) -> Rows:
     """Rows (m, n) within a run of standing rows (m, n) that lasts longer than `LONGEST_HALT`."""
-    resting = np.zeros_like(standing)
-    for joint, column in enumerate(standing.T):
+    resting = np.zeros_like(still)
+    for joint, column in enumerate(still.T):
         for start, stop in _runs(column):
             resting[start:stop, joint] = time[stop - 1] - time[start] > LONGEST_HALT
     return resting

@@ -30,7 +30,13 @@ from identification.distributions import normal_limit, student_limit
 from identification.errors import IdentificationError
 from identification.factor.augmented_rows import augmented_rows
 from identification.factor.factor import Estimate, Factor
-from identification.factor.phases import FINE_BLOCK, PhaseFactor, block_runs, counted, merged
+from identification.factor.phases import (
+    FINE_BLOCK,
+    PhaseFactor,
+    block_runs,
+    merged,
+    samples_by_cell,
+)
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS
 from identification.signals.masks import SATURATED, TORN
@@ -226,7 +232,7 @@ def _means(model: RobotModel, samples: Samples) -> TorqueMeans:
             known &= ~samples.mask.reasons[reason]
     index = block_index(samples)
     present = np.unique(index)
-    count = counted(index, known)[present]
+    count = samples_by_cell(index, known)[present]
     sums = [np.zeros((int(index[-1]) + 1, len(own) + 1)) for own in model.plan.columns]
     for part, chunk in augmented_rows(model, replace(samples, usable=known)):
         for block, at in block_runs(index[part]):

@@ -26,7 +26,7 @@ from identification.model.pseudo_inertia import pseudo_inertia
 from identification.model.reference_bodies import reference_bodies
 from identification.model.robot import RobotModel
 from identification.selection.essential_choice import relative_error
-from identification.validation.findings.finding import listed
+from identification.validation.findings.finding import joined
 
 Array = NDArray[np.float64]
 
@@ -143,7 +143,7 @@ class ConsistencyCheck:
             words.append(_link_words(links[0]))
         elif links:
             words.append(
-                f"the links of {listed(links, _SHOWN_LINKS)} would need a negative mass or moment"
+                f"the links of {joined(links, _SHOWN_LINKS)} would need a negative mass or moment"
                 " of inertia"
             )
         return words

@@ -233,9 +233,9 @@ def _shift(blocks: Array) -> tuple[Array, Array, int]:
 def _words(test: EndogeneityTest, result: InstrumentalEstimate, joints: Sequence[str]) -> str:
     """Put the answer in words."""
     if result.weak:
-        listed = ", ".join(result.weak[:6])
+        weak_names = ", ".join(result.weak[:6])
         more = f" and {len(result.weak) - 6} more" if len(result.weak) > 6 else ""
-        caution = f" The instruments are too weak for {listed}{more}."
+        caution = f" The instruments are too weak for {weak_names}{more}."
     else:
         caution = ""
     if np.isnan(test.p_value):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from identification.errors import ShapeError
 from identification.model.robot import RobotModel
-from identification.validation.findings.finding import Finding, listed
+from identification.validation.findings.finding import Finding, joined
 
 Array = NDArray[np.float64]
 
@@ -41,12 +41,12 @@ class InertiaRatio:
         off = [j for j in known if not 1.0 / (1.0 + _OFF) <= self.ratio[j] <= 1.0 + _OFF]
 
         def words(joints: Sequence[int]) -> str:
-            return listed([f"{self.joint_names[j]} {self.ratio[j]:.2f}" for j in joints])
+            return joined([f"{self.joint_names[j]} {self.ratio[j]:.2f}" for j in joints])
 
         if not off:
             text = "the controller's own inertia of each joint is about the identified one, times "
             return [Finding("against the controller's inertia", "good", text + words(known))]
-        names = listed([self.joint_names[j] for j in off])
+        names = joined([self.joint_names[j] for j in off])
         return [
             Finding(
                 "against the controller's inertia",

@@ -20,7 +20,7 @@ from identification.errors import IdentificationError
 from identification.estimators.nominal_prior import NOMINAL_SHARE
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.findings.finding import Finding, listed
+from identification.validation.findings.finding import Finding, joined
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ class NominalScale:
                     "direction of axes",
                     "wrong",
                     "all torques seem to have the other sign: over that of the nominal inertias"
-                    f" they are {listed(figures)}",
+                    f" they are {joined(figures)}",
                     "give the torques of the column map scale = -1, or all torque constants the"
                     " other sign",
                 )
@@ -109,7 +109,7 @@ class NominalScale:
             f"{self.joint_names[j]} {self.scale[j]:.3g} ± {self.tolerance[j]:.2g}" for j in off
         ]
         names = [self.joint_names[j] for j in off]
-        step = f"check torque constant and gear ratio of {listed(names)}, what it carries"
+        step = f"check torque constant and gear ratio of {joined(names)}, what it carries"
         if common != 1.0:
             step = "check the unit of the torque (N·m, N·mm?), its side (motor or joint?)"
         return [
@@ -117,7 +117,7 @@ class NominalScale:
                 "scale of the torque",
                 "wrong" if abs(np.log(common)) > np.log(_IMPOSSIBLE) else "doubtful",
                 "the torque is not as large as the nominal inertias ask for, by a factor: "
-                + listed(figures),
+                + joined(figures),
                 f"{step}, and the masses of the URDF",
             )
         ]

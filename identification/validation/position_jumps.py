@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.signals.recording import GAP_STEPS, Recording
-from identification.validation.findings.finding import Finding, listed
+from identification.validation.findings.finding import Finding, joined
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -155,8 +155,8 @@ def jump_findings(jumps: Sequence[PositionJump]) -> list[Finding]:
             "position jumps",
             "wrong",
             "the measured position jumped where no arm can follow (rad or m): "
-            + listed(where, _SHOWN),
-            f"look at encoder, coupling and cable of {listed(names)}, and record again; or leave"
+            + joined(where, _SHOWN),
+            f"look at encoder, coupling and cable of {joined(names)}, and record again; or leave"
             " out what was recorded after the jump",
         )
     ]

@@ -192,8 +192,8 @@ def autocorrelation(
     products: Array | None = None
     pairs: Array | None = None
     for residual, usable in residuals:
-        kept = np.where(usable, residual, 0.0)
-        own = _products(kept, lags), _products(usable.astype(np.float64), lags)
+        used_residual = np.where(usable, residual, 0.0)
+        own = _products(used_residual, lags), _products(usable.astype(np.float64), lags)
         products = own[0] if products is None else products + own[0]
         pairs = own[1] if pairs is None else pairs + own[1]
     if products is None or pairs is None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from drivers.packets import CyclicPacket
-from drivers.transports.can.answers import words_of
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.dbc import FILES, dbc_text
 from drivers.transports.can.ends import ControllerEnd
@@ -18,6 +17,7 @@ from drivers.transports.can.layout import (
     SLOW_FIELDS,
     Frame,
 )
+from drivers.transports.can.reply_fields import words_of
 from tests.drivers.can_bench import PROFILES, N, Wire, decoded, init_packet, random_packet
 
 CODES = {"fd": FD_MODE_CODES, "classic": CLASSIC_MODE_CODES}

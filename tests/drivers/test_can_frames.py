@@ -7,9 +7,9 @@ import pytest
 
 from drivers import CyclicPacket, Mode
 from drivers.packets import next_number
-from drivers.transports.can.answers import words_of
 from drivers.transports.can.errors import CanModeError, CanValueError
 from drivers.transports.can.layout import CLASSIC_MODE_CODES, FD_MODE_CODES
+from drivers.transports.can.reply_fields import words_of
 from drivers.transports.can.slow import NEVER
 from tests.drivers.can_bench import PROFILES, N, Wire, decoded, init_packet, random_packet
 from tests.drivers.rig import Rig, smooth_move

@@ -19,7 +19,6 @@ from hil.campaign.folder import CampaignFolder
 from hil.campaign.rehearsal import Rehearsal
 from hil.cell import Cell
 from hil.design.result import DesignResult
-from hil.design.toml_text import from_text
 from hil.errors import ArchiveError, InputError, SourceError
 from hil.importers import ColumnMap, import_log, import_rosbag2
 from hil.new import from_archive
@@ -27,6 +26,7 @@ from hil.plots.archive_view import _state_name, view_of
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
 from identification.model.payload import Payload
+from planner.toml_text import from_text
 from tests.fault_matrix.small_cell import URDF
 from tests.fuzz.targets import documents, importers
 from tests.hil.fast_cell import CELL

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hil.cell.text import replaced_value
-from planner.toml_value import toml_value
+from planner.toml_text import toml_value
 
 TWO_JOINTS = """<?xml version="1.0"?>
 <robot name="two">

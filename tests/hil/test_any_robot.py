@@ -194,7 +194,7 @@ def test_currents_only_get_their_scale_from_the_masses_and_say_so(tmp_path: Path
     made = (torque / recorded.motor_current).mean(axis=0)
     assert made[1:5] == pytest.approx(gains[1:5], rel=0.03)
     assert found.held_out_error < 2.0 * TORQUE_NOISE
-    doubts = " ".join(found.prepared.sources.doubts)
+    doubts = " ".join(found.prepared.sources.warnings)
     assert "only currents were recorded" in doubts
     assert "shoulder_pan_joint" in doubts  # its axis is vertical: no weight
 

@@ -20,7 +20,7 @@ from hil.batch.run import Plan, reidentify
 from hil.batch.types import ArchiveRef, BatchResult, Broken, Summary
 from hil.cell import Cell
 from hil.cli import app
-from hil.cli.reidentify_words import alarm_lines, skipped_line
+from hil.cli.reidentify import alarm_lines, skipped_line
 from hil.compare.trend import Trends
 from hil.identify.options import FIXED
 from hil.progress import Silent

@@ -21,9 +21,8 @@ from hil.cell import Cell
 from hil.cli import app
 from hil.compare import Comparison, compare_campaigns, gather
 from hil.compare.gather import Gathered
-from hil.compare.record import to_dict
 from hil.compare.spread import difference, effective_count, holm, known
-from hil.compare.words import findings, names, verdict
+from hil.compare.words import findings, names, to_dict, verdict
 from hil.errors import InputError
 from hil.identify import identify_campaign
 from hil.progress import Silent
@@ -227,7 +226,7 @@ def test_what_a_killed_run_left_and_a_later_one_made_good_is_not_told(
     whole.write_bytes(later.read_bytes()[:5000])
     found = compared(folders["march"], killed)
     assert found.friction_changed
-    assert not any(whole.name in doubt for doubt in found.doubts)
+    assert not any(whole.name in doubt for doubt in found.warnings)
 
 
 def test_a_page_of_hostile_names_is_inert() -> None:
@@ -242,7 +241,7 @@ def test_a_page_of_hostile_names_is_inert() -> None:
         dated=False,
         axes=tuple(replace(axis, joint=axis.joint + HOSTILE) for axis in found.axes),
         parameters=tuple(replace(p, name=p.name + HOSTILE) for p in found.parameters),
-        doubts=(HOSTILE,),
+        warnings=(HOSTILE,),
     )
     page = Page(render_comparison(spoilt))
     assert [tag for tag, _ in page.tags if tag in {"script", "img"}] == ["script"]
@@ -260,7 +259,7 @@ def test_what_cannot_be_known_is_not_judged() -> None:
     again = compare_campaigns(Gathered(arm, levels, ((levels[0],), (levels[1],)), True, ()))
     assert not again.changed
     assert any("is not determined" in one.words for one in findings(again))
-    assert any("one repetition" in doubt for doubt in again.doubts)
+    assert any("one repetition" in doubt for doubt in again.warnings)
     Page(render_comparison(again))
 
 

@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.identify import identify_campaign
 from hil.progress import Silent
 from hil.recording import dated_anew, origin_of
-from hil.report.conduct import when
+from hil.report.page import when
 from sim_fixtures.ns16 import CELL_PATH
 
 from .fast_cell import fast_campaign, fast_cell, pass_rehearsal

@@ -24,8 +24,7 @@ from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from hil.cell import Cell
-from hil.cli.design import design
-from hil.cli.design_words import summary
+from hil.cli.design import design, summary
 from hil.design import DesignResult, load_design, preset, run_search
 from hil.design.advice import NoExcitationError
 from hil.design.folder import DesignFolder
@@ -451,12 +450,10 @@ def test_what_is_no_finite_number_is_null(bare):
 
 
 def test_parameters_that_are_hardly_told_apart_are_named(invoke, copied, monkeypatch):
-    monkeypatch.setattr(
-        "hil.cli.design_words.weakest", lambda *_: pytest.fail("named for a fine motion")
-    )
+    monkeypatch.setattr("hil.cli.design.weakest", lambda *_: pytest.fail("named for a fine motion"))
     invoke(CELL_PATH, "--resume", "-o", copied)
-    monkeypatch.setattr("hil.cli.design_words.WEAK", 1.0)
-    monkeypatch.setattr("hil.cli.design_words.weakest", lambda *_: ("I6zz", "f1_6"))
+    monkeypatch.setattr("hil.cli.design.WEAK", 1.0)
+    monkeypatch.setattr("hil.cli.design.weakest", lambda *_: ("I6zz", "f1_6"))
     assert "hardly tells apart I6zz, f1_6: take more via points" in (
         invoke(CELL_PATH, "--resume", "-o", copied).output
     )

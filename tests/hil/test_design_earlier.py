@@ -19,7 +19,7 @@ from hil.cell import Cell
 from hil.cli.design import design
 from hil.design import preset, problem_of
 from hil.design.earlier import known_from
-from hil.design.knowledge import Knowledge
+from hil.design.problem import Knowledge
 from hil.errors import InputError
 from hil.identify import identify_archives
 from hil.identify.options import FIXED

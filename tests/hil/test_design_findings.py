@@ -12,7 +12,7 @@ import pytest
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.design import preset, problem_of
-from hil.design.findings import margins, weakest
+from hil.design.advice import margins, weakest
 from hil.motion_checks import MotionChecks
 from identification.excitation import CollisionChecker, Objective, check_motion, sampled
 from planner import FourierSeries

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from hil.arm import Arm, surface_points
 from hil.cell import Cell
 from hil.plots import save, style
-from hil.plots.design_joints import broken
 from hil.plots.design_picture import POSTURES, FrontView, blocks, draw_design
+from hil.plots.joints import broken
 from hil.plots.posture_strip import SIDE, TOP, Strip, covered, outlines, posture_times, swept
 from identification.excitation import correlation, information
 from identification.excitation.criteria import Criteria

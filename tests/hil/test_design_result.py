@@ -9,9 +9,8 @@ import pytest
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.design import DesignResult, load_design, preset, problem_of
-from hil.design.fingerprint import fingerprint
 from hil.design.folder import DesignFolder
-from hil.design.result import _seal
+from hil.design.result import _seal, fingerprint
 from hil.design.run import Designed, run_design
 from hil.errors import InputError
 from hil.progress import Silent

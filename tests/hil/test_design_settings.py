@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
-from hil.design.knowledge import Knowledge
+from hil.design.problem import Knowledge
 from hil.design.settings import SettingsError, preset_text, settings_of
-from hil.design.toml_text import Angles, from_text, to_text
 from identification.excitation import SineGenome, ViaPointGenome
 from identification.model.payload import Load, Payload
+from planner.toml_text import Angles, from_text, to_text
 from sim_fixtures.ns16 import CELL_PATH
 from tests.docs.typed import ROOT
 

@@ -18,8 +18,7 @@ from hil.cli import app
 from hil.errors import InputError
 from hil.identify import Options
 from hil.identify.cad_prior import FRICTION_SHARE, cad_prior
-from hil.identify.estimating import Estimation, estimate_with
-from hil.identify.instruments import NARROWEST, widely_smoothed
+from hil.identify.estimating import NARROWEST, Estimation, estimate_with, widely_smoothed
 from hil.identify.options import ESTIMATORS, Estimator
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
@@ -119,7 +118,7 @@ def test_noise_in_the_regressor_is_tested_for_wherever_commands_were_recorded(
         assert not isinstance(found.endogeneity, str)
         assert 0.0 <= found.endogeneity.p_value <= 1.0
         # The bias of so good an encoder is no doubt about the result.
-        assert not any("biased" in doubt for doubt in found.doubts)
+        assert not any("biased" in doubt for doubt in found.warnings)
 
 
 def test_where_no_command_was_recorded_it_is_said_that_this_was_not_tested(
@@ -282,4 +281,4 @@ class TestAutomaticEstimator:
         found = estimate_with(replace(prepared, settings=settings), Options(), Silent())
         expected = estimations["wls"].result.pooled.values
         np.testing.assert_array_equal(found.result.pooled.values, expected)
-        assert any("least squares is reported" in one for one in found.doubts)
+        assert any("least squares is reported" in one for one in found.warnings)

@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from hil.archive import container
 from hil.archive.cdr import ENCAPSULATION, LayoutError
 from hil.errors import SourceError
-from hil.importers import Robot, arrays, bags, import_rosbag2
+from hil.importers import Robot, arrays, import_rosbag2, rosbag2
 from hil.importers.arrays import layout_of, read_mcap
 from identification import FrictionLaw
 from tests.hil import mcap_bytes
@@ -82,10 +82,10 @@ class TestCompressedMessages:
     def test_a_file_that_becomes_a_disk(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(bags, "_SLACK", 1000)
+        monkeypatch.setattr(rosbag2, "_SLACK", 1000)
         path = tmp_path / "x.db3.zstd"
         path.write_bytes(zstandard.compress(bytes(1 << 26)))
-        with pytest.raises(SourceError, match="1000 times"), bags.unpacked([path]):
+        with pytest.raises(SourceError, match="1000 times"), rosbag2.unpacked([path]):
             pass
 
 

@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 import typer
 
-import hil.identify.controller_model
+import hil.identify.surroundings
 from hil.archive import Archive, open_archive
 from hil.campaign import Campaign
 from hil.cell import Cell
 from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.identify import Identification, Options, identify_campaign
-from hil.identify.controller_model import controller_error
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
-from hil.identify.surroundings import torque_limits
+from hil.identify.surroundings import controller_error, torque_limits
 from hil.progress import Silent
-from hil.report.verdict import verdict_context
+from hil.report.page import judgement_context
 from hil.results import JudgementResult
 
 TWO_LINK = Path(__file__).parents[1] / "identification" / "two_link.urdf"
@@ -81,7 +80,7 @@ def test_a_model_current_of_zeros_is_no_model(
         zeros = np.zeros_like(archive.columns["model_current"])
         return replace(archive, columns={**archive.columns, "model_current": zeros})
 
-    monkeypatch.setattr(hil.identify.controller_model, "open_archive", silent)
+    monkeypatch.setattr(hil.identify.surroundings, "open_archive", silent)
     assert controller_error(paths, cell, sources, samples) is None
 
 
@@ -153,8 +152,10 @@ def test_the_line_comes_last_and_the_status_tells(
 def test_the_page_shows_the_worst_findings_first_and_a_figure_per_joint(
     found: Identification,
 ) -> None:
-    context = verdict_context(found.results)
-    levels = [finding.level for finding in context["findings"]]
+    judgement = found.results.judgement
+    assert judgement is not None
+    context = judgement_context(found.results)
+    levels = [finding.level for finding in judgement.worst_first]
     assert levels == sorted(levels, key=["wrong", "doubtful", "information", "good"].index)
     for kind in ("speed_panels", "position_panels", "autocorrelation_panels"):
         assert [panel.title for panel in context[kind]] == found.results.joint_names
@@ -165,7 +166,7 @@ def test_the_page_shows_the_worst_findings_first_and_a_figure_per_joint(
 
 def test_results_without_a_judgement_have_no_such_section(found: Identification) -> None:
     old = found.results.model_copy(update={"judgement": None})
-    assert verdict_context(old) == {"judgement": None}
+    assert judgement_context(old) == {}
     assert table(old) == []
 
 

@@ -12,8 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from hil.cell import AngleFrame, Cell
-from hil.cli.plan import plan
-from hil.cli.plan_input import read_plan_file
+from hil.cli.plan import plan, read_plan_file
 from hil.errors import InputError
 from hil.plots import draw_plan
 from hil.plots.joints import corner_times

@@ -20,8 +20,7 @@ from hil.archive import Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import ArchiveError, InputError
-from hil.plots.archive_page import archive_page
-from hil.plots.archive_panels import BINS, even
+from hil.plots.archive_panels import BINS, archive_page, even
 from hil.plots.archive_picture import draw_archive
 from hil.plots.archive_view import ArchiveView, Trace, view_of
 

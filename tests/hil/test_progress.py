@@ -7,11 +7,11 @@ import io
 import pytest
 from rich.console import Console
 
-from hil.progress import Bar, Plain, Silent, reporter
+from hil.progress import Bar, LineReporter, Silent, reporter
 
 
 def test_lines_come_every_tenth_of_the_way(capsys: pytest.CaptureFixture[str]) -> None:
-    plain = Plain()
+    plain = LineReporter()
     with plain.task("smoothing", 40) as task:
         for k in range(40):
             task.advance(1, f"file {k}")
@@ -57,4 +57,4 @@ def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_what_is_no_terminal_gets_lines() -> None:
-    assert isinstance(reporter(), Plain)
+    assert isinstance(reporter(), LineReporter)

@@ -24,7 +24,7 @@ from hil.motion_checks import PLANNED_CURRENT, MotionChecks
 from hil.progress import Silent
 from identification.excitation import sampled
 from planner import FourierSeries, PiecewiseCubic
-from planner.toml_value import toml_value
+from planner.toml_text import toml_value
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from hil.report import ReportSeries, SeriesError, render_report
-from hil.report.choices import questions
 from hil.report.figures import (
     excitation_panels,
     friction_curve_panels,
@@ -19,6 +18,7 @@ from hil.report.figures import (
     split_panels,
     torque_panels,
 )
+from hil.report.page import shown_candidates
 from hil.report.validation import error_rows, every_row_errors, example_errors
 from hil.results import ChoiceResult, Results
 from tests.hil.test_report import JOINTS, TORQUE, Page, make_results, make_series
@@ -55,7 +55,7 @@ def full_series() -> ReportSeries:
     return replace(
         bare,
         excitation_fitted=fitted,
-        example_counted=counted,
+        example_used=counted,
         example_friction=0.15 * bare.example_predicted,
         **split,
         friction_speed=speed,
@@ -103,18 +103,16 @@ class TestChoices:
     """The table of settings that inner prediction decided."""
 
     def test_show_least_squares_and_the_best_five(self, results: Results) -> None:
-        estimator = questions(results)[1]
-        words = [one.words for one in estimator.candidates]
+        estimator = results.choices[1]
+        words = [estimator.candidates[k] for k in shown_candidates(estimator)]
         assert words == ["least squares", *(f"ridge {k}" for k in range(5))]
-        assert estimator.others == 5
 
     def test_show_the_chosen_one_even_if_others_predict_better(self) -> None:
         choice = ChoiceResult(
             name="x", candidates=list("abcdefgh"), errors=[0.1] * 7 + [0.9], chosen=7
         )
-        (question,) = questions(make_results(choices=[choice.model_dump()]))
-        assert [one.words for one in question.candidates if one.chosen] == ["h"]
-        assert len(question.candidates) == 6
+        shown = shown_candidates(choice)
+        assert 7 in shown and len(shown) == 6
 
     def test_stand_in_the_page_with_errors_and_a_mark(self, html: str) -> None:
         text = Page(html).text
@@ -132,10 +130,11 @@ class TestErrors:
     def test_stand_side_by_side_for_unseen_and_fitted_motion(self, results: Results) -> None:
         runs = results.validation
         median, worst, fitted = error_rows(results)
-        assert (fitted.counted, fitted.every_row) == ("2.10", "4.30")
-        assert median.every_row == "5.00" == worst.every_row
-        assert float(worst.counted) >= float(median.counted) > 0.0
-        assert f"median of {len(runs)} runs" in median.motion
+        assert fitted == ("fitted", 0.021, 0.043)
+        assert median[2] == pytest.approx(0.05) == worst[2]
+        assert worst[1] is not None and median[1] is not None
+        assert worst[1] >= median[1] > 0.0
+        assert f"median of {len(runs)} runs" in median[0]
 
     def test_are_defined_once_and_before_the_first_section(self, html: str) -> None:
         head = Page(html[: html.index("<main>")])
@@ -144,14 +143,14 @@ class TestErrors:
         assert Page(html).text.count("standstill and reversals included") == 1
 
     def test_stand_beside_each_joint(self, results: Results) -> None:
-        assert every_row_errors(results) == ["6.00"] * N
+        assert every_row_errors(results) == [0.06] * N
         assert every_row_errors(make_results()) == []
         assert all("every row 6.00 %" in one.words for one in example_errors(results))
 
     def test_are_those_of_the_fit_where_nothing_was_held_out(self) -> None:
         alone = make_results(fitted=FITTED, validation=[], repetitions=["log.mcap"])
         (row,) = error_rows(alone)
-        assert "in-sample" in row.motion
+        assert "in-sample" in row[0]
         assert example_errors(alone)[0].words == "error 2.00 %, every row 5.00 %"
 
 

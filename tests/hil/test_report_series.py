@@ -70,7 +70,7 @@ class TestReportSeries:
         rest = one.excitation_time[first] - one.excitation_time[0]
         assert 0.9 < rest < 1.1
         assert 0.3 < one.excitation_fitted.mean() < 1.0
-        assert set(np.unique(one.example_counted)) <= {0.0, 1.0}
+        assert set(np.unique(one.example_used)) <= {0.0, 1.0}
 
     def test_friction_data_lie_around_the_law(self, found: Identification) -> None:
         one = found.series

@@ -8,11 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.identify.consistency import consistency_doubts, consistency_reasons, consistency_result
-from hil.identify.essential import essential_doubts, essential_result
-from hil.report import consistency, essential
+from hil.identify.summary import (
+    consistency_reasons,
+    consistency_result,
+    consistency_warnings,
+    essential_result,
+    essential_warnings,
+)
+from hil.report import page
 from hil.report.figures.elimination import elimination_panels
-from hil.report.rendering import Numbering, environment
+from hil.report.rendering import environment
 from hil.results import BlindResult, ConsistencyResult, EssentialResult, ParameterResult
 
 from .identified_arm import IdentifiedArm, identified_arm
@@ -55,16 +60,13 @@ class Sections:
 
 
 def rendered(sections: Any) -> str:
-    context = {**essential.context(sections), **consistency.context(sections)}
-    page = (
+    source = (
         '{% from "macros.html.j2" import panels, swatch, dot, table_open %}'
         '{% include "trust.html.j2" %}{% include "consistency.html.j2" %}'
     )
-    return (
-        environment()
-        .from_string(page)
-        .render(**context, results=sections, numbering=Numbering(), has_truth=False)
-    )
+    has_truth = any(one.truth is not None for one in sections.parameters)
+    template = environment().from_string(source)
+    return template.render(**page.trust_context(sections), results=sections, has_truth=has_truth)
 
 
 def essential_part(sections: Sections) -> EssentialResult:
@@ -81,13 +83,15 @@ def test_essential_estimates_far_from_the_truth_are_marked(arm: IdentifiedArm) -
         parameter.model_copy(update={"truth": truths.get(parameter.name)})
         for parameter in sections.parameters
     ]
-    rows = essential.essential_part(sections, essential_part(sections)).rows  # type: ignore[arg-type]
-    assert [(row.deviation, row.mark) for row in rows[:2]] == [("+4.00", "out3"), ("-2.50", "out2")]
-    assert {row.mark for row in rows[2:]} == {""}
+    marks = re.findall(
+        r'<tr( class="\w+")?><th scope="row">.*?<td class="z">([^<]*)<', rendered(sections)
+    )
+    assert marks[:2] == [(' class="out3"', "+4.00"), (' class="out2"', "-2.50")]
+    assert {mark for mark, _ in marks[2:]} == {""}
 
 
 def test_every_parameter_has_one_grade(arm: IdentifiedArm) -> None:
-    found = essential.trust(Sections(arm))  # type: ignore[arg-type]
+    found = page.trust(Sections(arm))  # type: ignore[arg-type]
     graded = [*found.well, *found.roughly, *found.hardly, *found.undetermined]
     assert sorted(graded) == sorted(arm.estimate.names)
     relative = dict(
@@ -208,8 +212,8 @@ def test_names_of_joints_are_text_and_nothing_else(arm: IdentifiedArm) -> None:
 
 def test_a_machine_is_no_reason_and_no_doubt(arm: IdentifiedArm) -> None:
     assert consistency_reasons(arm.consistency) == ()
-    assert (*essential_doubts(arm.essential), *consistency_doubts(arm.consistency)) == ()
-    doubts = (*consistency_doubts("the solver gave up"), *essential_doubts("no motion"))
+    assert (*essential_warnings(arm.essential), *consistency_warnings(arm.consistency)) == ()
+    doubts = (*consistency_warnings("the solver gave up"), *essential_warnings("no motion"))
     assert len(doubts) == 2
     assert "the solver gave up" in doubts[0]
 

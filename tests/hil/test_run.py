@@ -298,7 +298,7 @@ def test_torques_of_a_right_cell_are_not_doubted(make: Make) -> None:
     assert campaign.run(dry_run_only=True).against_gravity == ()
     found = DryRun.load(campaign.folder)
     assert found is not None
-    assert (found.doubts, found.gravity_not_seen) == ((), ())
+    assert (found.warnings, found.gravity_not_seen) == ((), ())
 
 
 def test_a_torque_is_judged_by_the_weight_beside_friction_and_not_without_any() -> None:
@@ -350,7 +350,9 @@ def test_a_repetition_that_was_slowed_is_rejected_with_its_reason_and_run_again(
     loose = sorted(campaign.folder.archives.glob("excitation_*"))
     sources = gather_sources(loose, split=0.5)
     assert rejected.archive not in {one.name for one in (*sources.training, *sources.held_out)}
-    assert any("rejected and left out: it was held or slowed" in doubt for doubt in sources.doubts)
+    assert any(
+        "rejected and left out: it was held or slowed" in doubt for doubt in sources.warnings
+    )
 
 
 def test_a_motion_that_is_never_of_use_ends_the_run_after_as_many_tries_as_allowed(

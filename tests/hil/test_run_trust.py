@@ -498,7 +498,7 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
     (told,) = (one for one in found.skipped if one.path == slowed.as_posix())
     assert "not named in its campaign's manifest.json" in told.reason
     good = campaign.folder.completed("excitation")
-    doubts = gather_sources([*good, slowed], 0.5).doubts
+    doubts = gather_sources([*good, slowed], 0.5).warnings
     assert any(doubt.startswith(f"{slowed.name} is not named") for doubt in doubts)
     again = campaign.run(unrehearsed=True)
     assert again.repetitions == (2, 2)

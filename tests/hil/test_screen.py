@@ -33,7 +33,7 @@ from hil.cell import Cell
 from hil.cell.link import with_link
 from hil.cell.schema import CanTable
 from hil.lines import put
-from hil.screen import Screen, marks, plain
+from hil.screen import Screen, layout, marks
 from hil.screen.keys import Keyboard, after, single_keys, typed
 from hil.screen.layout import Shown, lines
 from hil.screen.screen import Pace, ScreenError, far_end_of
@@ -193,8 +193,8 @@ def test_a_bar_is_as_long_as_its_share() -> None:
 
 
 def test_a_plain_line_says_the_same() -> None:
-    line = plain.line(status())
-    assert plain.line(status(), "0:42 left").endswith(", 0:42 left")
+    line = layout.status_line(status())
+    assert layout.status_line(status(), "0:42 left").endswith(", 0:42 left")
     for words in (
         "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
         "following error 130 % of its limit", "current 88 % of its limit", "19:05 left",
@@ -509,7 +509,7 @@ def broken(_: str) -> None:
 def test_a_picture_that_cannot_be_drawn_is_told_and_ends_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(plain, "line", lambda *_: 1 / 0)
+    monkeypatch.setattr(layout, "status_line", lambda *_: 1 / 0)
     with Screen(NAMES, Stop(), console=Console(file=StringIO())) as screen:
         until = time.monotonic() + 5.0
         with pytest.raises(ScreenError, match="ZeroDivisionError"):

@@ -25,8 +25,7 @@ from typer.testing import CliRunner
 from hil.cell import Cell, CellError
 from hil.cell.text import replaced_value
 from hil.cli import main
-from hil.cli.simulate import simulate
-from hil.cli.simulation_status import WORDS, Status
+from hil.cli.simulate import WORDS, Status, simulate
 from hil.demo_link import free_port
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
@@ -449,16 +448,16 @@ def test_bad_input_is_one_sentence_and_exit_status_2():
 
 def test_the_first_signal_asks_for_the_end_and_the_second_gives_up():
     buttons = Buttons()
-    assert buttons.wish() is Request.GO_ON
+    assert buttons.request() is Request.GO_ON
     buttons.press(signal.SIGINT)
-    assert buttons.wish() is Request.END
+    assert buttons.request() is Request.END
     buttons.press(signal.SIGTERM)
-    assert buttons.wish() is Request.GIVE_UP
+    assert buttons.request() is Request.GIVE_UP
 
 
 def test_a_duration_that_is_over_asks_for_the_end_but_is_no_interrupt():
     buttons = Buttons(duration=0.0)
-    assert buttons.wish() is Request.END
+    assert buttons.request() is Request.END
     assert not buttons.interrupted
 
 

@@ -22,7 +22,7 @@ from hil.demo_link import loopback_link
 from hil.identify import Identification, identify_campaign
 from hil.motion_checks import MotionChecks
 from hil.progress import Silent
-from hil.report.overview import facts
+from hil.report.page import facts
 from identification.excitation import Constraints, Criteria, Excitation, sampled
 from planner import FourierSeries, TrajectoryPlayer
 
@@ -142,7 +142,7 @@ def test_the_criteria_of_what_was_executed_are_the_planned_ones(found: Identific
 
 
 def test_the_report_says_which_method_found_which_motion(found: Identification) -> None:
-    (motion,) = (fact.text for fact in facts(found.results) if fact.term == "Excitation")
+    (motion,) = (text for term, text in facts(found.results) if term == "Excitation")
     assert motion == "8.00 s, 3 sines per joint, designed by the paper's method A"
 
 

@@ -76,9 +76,7 @@ def study(*conditions: ConditionResult, ablations: Sequence[AblationResult] = ()
 
 
 def text_of(results: StudyResults) -> str:
-    return " ".join(
-        text for one in results.reading for text in (one.verdict, *one.sentences, *one.more)
-    )
+    return " ".join(text for one in results.reading for text in (one.verdict, *one.sentences))
 
 
 class TestConclusion:

@@ -56,10 +56,10 @@ def cell() -> Cell:
 
 
 def test_a_posture_is_told_as_the_teach_pendant_shows_it(cell: Cell) -> None:
-    told = AngleFrame.of(cell).told(cell.home)
+    told = AngleFrame.of(cell).text_of_angles(cell.home)
     assert told == "J1 0.0, J2 0.0, J3 -90.0, J4 0.0, J5 90.0, J6 0.0 deg, teach pendant angles"
     plain = AngleFrame("urdf", np.ones(2), np.zeros(2))
-    assert plain.told((0.5, -1.0)) == "J1 28.6, J2 -57.3 deg, angles of the URDF"
+    assert plain.text_of_angles((0.5, -1.0)) == "J1 28.6, J2 -57.3 deg, angles of the URDF"
 
 
 def test_a_joint_limit_is_told_in_the_angles_of_the_file(cell: Cell) -> None:
@@ -161,7 +161,9 @@ def test_a_missing_mesh_gets_file_mesh_and_remedy(tmp_path: Path) -> None:
 
 def test_a_refusal_before_a_motion_is_sent_is_told_in_degrees(cell: Cell) -> None:
     checks = MotionChecks.of(cell)
-    told = checks._told(Violation("joint limit", "velocity of joint 1", 3.0, 2.0, 0.5, (0.0,) * 6))
+    told = checks._sentence(
+        Violation("joint limit", "velocity of joint 1", 3.0, 2.0, 0.5, (0.0,) * 6)
+    )
     assert "J2" in told
     assert "deg/s" in told
 

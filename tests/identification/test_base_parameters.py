@@ -64,7 +64,7 @@ def test_the_rank_of_the_ns16(gravity: tuple[float, ...], rotors: bool, rank: in
     base = RobotModel.from_urdf(urdf_text(), gravity=gravity, rotor_inertia=rotors).base
     assert base.rank == len(base.names) == rank
     assert base.gap > 1e10
-    assert base.smallest_kept > 1000 * TOLERANCE
+    assert base.smallest_pivot > 1000 * TOLERANCE
 
 
 def test_hanging_upside_down_groups_alike(model: RobotModel) -> None:
@@ -77,7 +77,7 @@ def test_angles_rounded_in_the_file_do_not_split_groups(model: RobotModel) -> No
     assert "1.5707963267948966" in text
     rounded = RobotModel.from_urdf(text.replace("1.5707963267948966", "1.5708")).base
     assert rounded.names == model.base.names
-    assert 1e-8 < rounded.largest_dropped < 1e-5 < rounded.smallest_kept
+    assert 1e-8 < rounded.largest_dropped < 1e-5 < rounded.smallest_pivot
     # Their traces are not printed as groups either.
     assert np.array_equal(rounded.grouping != 0.0, model.base.grouping != 0.0)
 
@@ -90,16 +90,16 @@ def test_the_choice_is_the_same_every_time(model: RobotModel) -> None:
 
 def test_each_kept_parameter_stands_for_itself(model: RobotModel) -> None:
     base = model.base
-    assert np.array_equal(base.grouping[:, base.kept], np.eye(base.rank))
-    assert tuple(base.standard_names[k] for k in base.kept) == base.names
-    assert np.all(np.diff(base.kept) > 0)
+    assert np.array_equal(base.grouping[:, base.pivots], np.eye(base.rank))
+    assert tuple(base.standard_names[k] for k in base.pivots) == base.names
+    assert np.all(np.diff(base.pivots) > 0)
 
 
 def test_the_first_independent_columns_are_kept(model: RobotModel) -> None:
     # A parameter is only grouped into parameters before it: it was dropped since they explain it.
     base = model.base
-    for column in set(range(len(base.standard_names))) - set(base.kept.tolist()):
-        groups = base.kept[np.flatnonzero(base.grouping[:, column])]
+    for column in set(range(len(base.standard_names))) - set(base.pivots.tolist()):
+        groups = base.pivots[np.flatnonzero(base.grouping[:, column])]
         assert np.all(groups < column), base.standard_names[column]
 
 
@@ -136,9 +136,9 @@ def test_a_rank_that_hangs_on_a_hair_is_said_to(model: RobotModel) -> None:
     skewed = urdf_text().replace("1.5707963267948966", "1.5709")
     base = RobotModel.from_urdf(skewed).base
     assert base.rank > model.base.rank
-    assert base.smallest_kept < 1e-4
+    assert base.smallest_pivot < 1e-4
     assert "That is close" in base.explanation()
-    weakest = base.names[int(np.argmin(base.shares[base.kept]))]
+    weakest = base.names[int(np.argmin(base.shares[base.pivots]))]
     assert f"whether {weakest} is a parameter of its own" in base.explanation()
 
 

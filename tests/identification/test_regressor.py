@@ -29,7 +29,7 @@ def test_inertial_columns_are_pinocchios(model: RobotModel) -> None:
     reference = pin.buildModelFromXML(urdf_text())
     data = reference.createData()
     dense = model.regressor(q, qd, qdd).dense(model.n_parameters)
-    for column, standard in enumerate(model.base.kept):
+    for column, standard in enumerate(model.base.pivots):
         joint, symbol = divmod(int(standard), 11)
         if symbol == 10:
             continue

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from planner import JointLimits
-from planner.degrees import degrees_text, radians_of
 from planner.errors import InvalidPlanFile
 from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
 from planner.plan_file import PlanFile
+from planner.toml_text import degrees_text, radians_of
 
 NAMES = tuple(f"joint_{i}" for i in range(1, 7))
 

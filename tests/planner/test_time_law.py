@@ -8,7 +8,7 @@ import ruckig
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from planner.time_law import RateBounds, TimeLaw, admits, ramp, settling_rate
+from planner.time_law import RateBounds, TimeLaw, admits, ramp, stopping_rate
 
 fractions = st.one_of(st.sampled_from([0.0, 0.2, 1.0]), st.floats(0.0, 1.0))
 bounds_of_any_size = st.builds(RateBounds, st.floats(0.01, 100.0), st.floats(0.01, 1000.0))
@@ -101,7 +101,7 @@ def test_where_the_slope_would_die_away_moves_monotonically_to_the_target(state,
     way = ramp(rate, slope, target, bounds)
     now = way.sample(share * way.duration)
     later = way.sample((share + (1.0 - share) / 2.0) * way.duration)
-    off = [abs(target - settling_rate(r, dr, bounds.change)) for _, r, dr in (now, later)]
+    off = [abs(target - stopping_rate(r, dr, bounds.change)) for _, r, dr in (now, later)]
     assert off[1] <= off[0] + 1e-9
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planner.toml_value import toml_key, toml_value
+from planner.toml_text import toml_key, toml_value
 
 texts = st.text(st.characters(codec="utf-8"))
 single = (

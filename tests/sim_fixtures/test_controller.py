@@ -34,7 +34,7 @@ def make(drive: SimulatedDrive, truth: PlantTruth) -> Make:
     def build(**changes: Any) -> SimulatedController:
         options = {"drive": drive, "seed": 1, "initial_position": HOME} | {
             k: changes.pop(k)
-            for k in ("drive", "seed", "initial_position", "announced", "effects")
+            for k in ("drive", "seed", "initial_position", "stated", "effects")
             if k in changes
         }
         settings = ControllerSettings(**(QUICK | changes))
@@ -113,7 +113,7 @@ class TestStart:
         self, make: Make, make_drive: Callable[..., SimulatedDrive]
     ) -> None:
         lying = make_drive(gear_ratio=[116.0, 116.0, -106.0, -50.0, 51.5, -33.0])
-        told = make(cold_start=False, announced=lying)
+        told = make(cold_start=False, stated=lying)
         honest = make(cold_start=False)
         packet = told.next_packet()
         assert packet is not None

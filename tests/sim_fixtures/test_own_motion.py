@@ -68,7 +68,7 @@ def test_the_jerk_is_finite_as_the_cycle_shrinks() -> None:
 
 def test_told_to_end_it_finishes_the_move_under_way_and_begins_no_other() -> None:
     made = motion((0.5, 0.5), (1.0, 1.0))
-    while made.standing:
+    while made.at_rest:
         made.advance()
     made.end()
     q, _ = play(made)
@@ -81,10 +81,10 @@ def test_repeated_it_goes_to_and_fro_on_the_ways_of_the_list() -> None:
     made.begin((0.0, 0.0))
     visited: list[tuple[float, ...]] = []
     while len(visited) < 8:
-        moved = not made.standing
+        moved = not made.at_rest
         made.advance()
         assert not made.finished
-        if moved and made.standing:
+        if moved and made.at_rest:
             visited.append(tuple(made.position.tolist()))
     first, second, third = stops
     assert visited == [first, second, third, second, first, second, third, second]

@@ -25,7 +25,7 @@ def program(**changes: Any) -> LoopProgram:
 
 def advance(loop: LoopProgram, cycles: int = 1, answer: Answer = FINE) -> None:
     for _ in range(cycles):
-        loop.advance(answer, standing=True)
+        loop.advance(answer, at_rest=True)
 
 
 def advance_to(loop: LoopProgram, phase: Phase) -> None:
@@ -263,9 +263,9 @@ def test_finish_waits_until_the_arm_stands() -> None:
     loop = program()
     advance_to(loop, Phase.OPEN)
     loop.finish()
-    loop.advance(FINE, standing=False)
+    loop.advance(FINE, at_rest=False)
     assert loop.phase is Phase.OPEN
-    loop.advance(FINE, standing=True)
+    loop.advance(FINE, at_rest=True)
     assert loop.phase is Phase.CLOSING
     phases = []
     while loop.phase is not Phase.ENDED:

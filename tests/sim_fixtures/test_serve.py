@@ -313,7 +313,7 @@ def test_at_the_end_a_pc_that_has_left_is_waited_for_once():
     wishes = iter([Request.GO_ON] * 5)
     summary, cabinet, _ = served(
         lambda k, p: prompt(k, p) if k < 10 else [],
-        wish=lambda: next(wishes, Request.END),
+        request=lambda: next(wishes, Request.END),
         stretch=0.5,
         patience=1.0,
         standing=False,
@@ -340,7 +340,7 @@ def test_a_wish_to_end_before_anybody_answered_ends_at_once():
     asked = iter(range(100))
     summary, cabinet, _ = served(
         lambda k, p: [],
-        wish=lambda: Request.END if next(asked) > 10 else Request.GO_ON,
+        request=lambda: Request.END if next(asked) > 10 else Request.GO_ON,
     )
     assert not summary.ended
     assert (summary.cycles, cabinet.accepted) == (0, [])
@@ -353,7 +353,7 @@ def test_a_wish_to_end_lets_the_controller_finish():
         cabinet,
         VirtualLink(clock),
         clock=clock,
-        wish=lambda: Request.END if clock.time > 100.05 else Request.GO_ON,
+        request=lambda: Request.END if clock.time > 100.05 else Request.GO_ON,
     )
     assert summary.ended
     assert cabinet.finished and not cabinet.stopped
@@ -364,10 +364,10 @@ def test_an_arm_that_never_stands_loses_its_drive_when_patience_is_over():
     cabinet = Cabinet(clock, cycles=10_000)
     cabinet.stands = False
 
-    def wish() -> Request:
+    def request() -> Request:
         return Request.END if len(cabinet.accepted) > 5 else Request.GO_ON
 
-    summary = serve(cabinet, VirtualLink(clock), clock=clock, wish=wish, patience=0.5)
+    summary = serve(cabinet, VirtualLink(clock), clock=clock, request=request, patience=0.5)
     assert summary.ended and cabinet.stopped
     assert cabinet.reason == "the arm did not stand within 0.5 s of the end"
     assert cabinet.sent_at[-1] - cabinet.sent_at[5] == pytest.approx(0.5, abs=0.01)
@@ -380,7 +380,7 @@ def test_giving_up_stops_in_the_middle():
         cabinet,
         VirtualLink(clock),
         clock=clock,
-        wish=lambda: Request.GIVE_UP if len(cabinet.accepted) == 7 else Request.GO_ON,
+        request=lambda: Request.GIVE_UP if len(cabinet.accepted) == 7 else Request.GO_ON,
     )
     assert (summary.cycles, summary.ended) == (7, False)
 

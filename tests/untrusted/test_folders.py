@@ -33,12 +33,12 @@ from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.warmup import WarmUp
 from hil.cell import AngleFrame, Cell
 from hil.cli import app
-from hil.cli.plan_input import read_plan_file, read_via_points
+from hil.cli.plan import read_plan_file, read_via_points
 from hil.errors import ArchiveError, HilError, InputError
 from hil.files import write_atomically, write_together
 from hil.importers.arrays import READERS, ArrayFile
-from hil.importers.bags import bag_files, topics
 from hil.importers.column_map import Format
+from hil.importers.rosbag2 import bag_files, topics
 from hil.importers.table import Table
 from hil.outcome import SERIES, _load_series, rewrite_report
 from hil.reading import json_of, opened, text_of, toml_of

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from drivers.errors import PacketError
 from drivers.packets import DRIVE_ON, EXIT_FROM_OPEN, LAST_NUMBER, Mode, next_number
-from drivers.transports.can.answers import Answer, AxisAnswer, Sent
 from drivers.transports.can.errors import CanModeError, CanValueError
 from drivers.transports.can.fd import UpSet
 from drivers.transports.can.layout import (
@@ -35,6 +34,7 @@ from drivers.transports.can.layout import (
     Frame,
     Word,
 )
+from drivers.transports.can.reply_fields import Answer, AxisAnswer, Sent
 from drivers.transports.can.slow import WORDS_PER_AXIS, Words
 
 _ABSOLUTE: Final = frozenset(
@@ -141,7 +141,7 @@ class ClassicCodec:
             frames.append(Frame(frame_id, packed.to_bytes(8, "little")))
         return frames
 
-    def answers(self, frame: Frame, sent_number: int) -> bool:
+    def is_reply_to(self, frame: Frame, sent_number: int) -> bool:
         """Whether a frame down belongs to the answer to that packet."""
         return frame.data[0] & _DOWN_MASK == next_number(sent_number) & _DOWN_MASK
 

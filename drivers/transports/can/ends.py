@@ -23,14 +23,6 @@ from drivers.packets import (
     is_init,
     next_number,
 )
-from drivers.transports.can.answers import (
-    Mirror,
-    Sent,
-    drive_off,
-    read_reply,
-    words_of,
-    write_reply,
-)
 from drivers.transports.can.assembler import SetAssembler
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.classic import ClassicCodec
@@ -42,6 +34,14 @@ from drivers.transports.can.layout import (
     SEGMENT_DOWN,
     SEGMENT_UP,
     Frame,
+)
+from drivers.transports.can.reply_fields import (
+    Mirror,
+    Sent,
+    drive_off,
+    read_reply,
+    words_of,
+    write_reply,
 )
 from drivers.transports.can.segments import SegmentAssembler, Segmenter
 from drivers.transports.can.slow import NEVER, Ages, SlowSender, SlowStore
@@ -306,7 +306,7 @@ class ControllerEnd:
 
     def _reply(self, codec: Codec, frame: Frame, payloads: Sequence[bytes]) -> bytes | None:
         for sent in reversed(self._sent):
-            if codec.answers(frame, sent.number):
+            if codec.is_reply_to(frame, sent.number):
                 break
         else:
             self.discarded["stale"] += 1

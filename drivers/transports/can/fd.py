@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from drivers.errors import PacketError
 from drivers.packets import LAST_NUMBER, next_number
-from drivers.transports.can.answers import Answer, AxisAnswer, Sent
 from drivers.transports.can.errors import CanModeError
 from drivers.transports.can.layout import (
     FD_DOWN,
@@ -21,6 +20,7 @@ from drivers.transports.can.layout import (
     MAX_AXES,
     Frame,
 )
+from drivers.transports.can.reply_fields import Answer, AxisAnswer, Sent
 from drivers.transports.can.slow import WORDS_PER_AXIS, Words
 
 _UP_A: Final = np.dtype(
@@ -128,7 +128,7 @@ class FdCodec:
         )
         return [Frame(FD_DOWN, payload)]
 
-    def answers(self, frame: Frame, sent_number: int) -> bool:
+    def is_reply_to(self, frame: Frame, sent_number: int) -> bool:
         """Whether a frame down belongs to the answer to that packet."""
         return _number(frame.data) == next_number(sent_number)
 

@@ -14,12 +14,12 @@ def table() -> str:
         rates = BusRates("fd" if profile == "fd" else "classic")
         for n_axes in axes:
             for period in (0.001, 0.002):
-                plain = rates.load(n_axes, period, stuffed=False)
+                unstuffed = rates.load(n_axes, period, stuffed=False)
                 worst = rates.load(n_axes, period)
                 verdict = "fits" if worst <= LOAD_LIMIT else "refused"
                 lines.append(
                     f"{profile:8} {n_axes:4}  {len(rates.cycle_payloads(n_axes)):6}  "
-                    f"{1e3 * period:.0f} ms  {100 * plain:18.1f} %  {100 * worst:13.1f} %  "
+                    f"{1e3 * period:.0f} ms  {100 * unstuffed:18.1f} %  {100 * worst:13.1f} %  "
                     f"{verdict}"
                 )
     return "\n".join(lines) + "\n"

@@ -8,8 +8,9 @@ from typing import Literal
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from hil.report.figures.palette import GRID, INK, MUTED
@@ -17,6 +18,9 @@ from hil.report.figures.palette import GRID, INK, MUTED
 Array = NDArray[np.float64]
 
 TICK_SIZE, TEXT_SIZE = 10.5, 11.0
+PANEL_WIDTH = 370.0
+"""Of most figures, px."""
+_TOP = 20.0
 
 
 def blank(width: float, height: float) -> Figure:
@@ -40,6 +44,21 @@ def place(figure: Figure, left: float, top: float, width: float, height: float) 
     )
     _style(axes)
     return axes
+
+
+def plot_panel(
+    height: float, *, left: float = 46.0, right: float = 10.0, bottom: float = 40.0
+) -> tuple[Figure, Axes]:
+    """A figure of the page's usual width with one plot, and the room for its labels [px]."""
+    figure = blank(PANEL_WIDTH, height)
+    return figure, place(figure, left, _TOP, PANEL_WIDTH - left - right, height - _TOP - bottom)
+
+
+def log_ticks(axis: Axis, locator: Locator) -> None:
+    """Ticks of a logarithmic axis as decimal numbers, and none between them."""
+    axis.set_major_locator(locator)
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def _style(axes: Axes) -> None:

@@ -7,12 +7,10 @@ from matplotlib.axes import Axes
 
 from hil.compare.comparison import AxisChange, Comparison
 from hil.report import numbers
-from hil.report.figures.canvas import blank, headed, place, ruled
+from hil.report.figures.canvas import headed, plot_panel, ruled
 from hil.report.figures.palette import FIRST, MUTED, OUTSIDE_3, WIDE
 from hil.report.figures.svg import Panel, drawing, label, to_panel
 
-_WIDTH, _HEIGHT = 370.0, 200.0
-_LEFT, _TOP, _RIGHT, _BOTTOM = 50.0, 20.0, 12.0, 28.0
 _SPREAD = 0.24
 _LEAST_REACH = 0.1  # of the friction: a scale that makes nothing look like much is none
 
@@ -38,9 +36,7 @@ def _panel(axis: AxisChange, j: int, letters: list[str]) -> Panel:
     )
     alt = f"{axis.joint}: friction in {axis.unit} by campaign: {values}."
     with drawing():
-        figure = blank(_WIDTH, _HEIGHT)
-        inner = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
-        axes = place(figure, _LEFT, _TOP, *inner)
+        figure, axes = plot_panel(200.0, left=50.0, right=12.0, bottom=28.0)
         for k, one in enumerate(axis.known):
             own = axis.repetitions[k]
             if len(own) > 1:

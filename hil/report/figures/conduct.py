@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hil.report import numbers
-from hil.report.figures.canvas import blank, footed, headed, place, ruled
+from hil.report.figures.canvas import footed, headed, plot_panel, ruled
 from hil.report.figures.palette import FIRST, SECOND
 from hil.report.figures.svg import Panel, drawing, label, to_panel
 from hil.results import Results
 
 Array = NDArray[np.float64]
 
-_WIDTH, _HEIGHT = 370.0, 180.0
-_LEFT, _TOP, _RIGHT, _BOTTOM = 50.0, 20.0, 12.0, 42.0
 _LEAST_SPAN = 0.05  # of the last value: a scale that makes nothing look like much is none
 
 
@@ -41,7 +38,7 @@ def _joint(j: int, name: str, values: Array) -> Panel:
     note = f"{numbers.significant(float(known[-1]))} N·m, {100.0 * share:+.1f} %"
     alt = f"{name}: friction over {len(values)} motions of the warm-up; at last {note}."
     with drawing():
-        figure, axes = _one()
+        figure, axes = plot_panel(180.0, left=50.0, right=12.0, bottom=42.0)
         axes.plot(np.arange(1, len(values) + 1), values, color=FIRST, marker="o", markersize=3.6)
         low, high = axes.get_ylim()
         least = _LEAST_SPAN * abs(float(known[-1]))
@@ -59,7 +56,7 @@ def _change(change: Array, threshold: float) -> Panel:
     note = f"{last}, at most {100.0 * threshold:.2g} % wanted"
     alt = f"Largest change of friction per motion over the warm-up; at last {note}."
     with drawing():
-        figure, axes = _one()
+        figure, axes = plot_panel(180.0, left=50.0, right=12.0, bottom=42.0)
         axes.plot(
             np.arange(1, len(change) + 1), 100.0 * change, color=FIRST, marker="o", markersize=3.6
         )
@@ -68,11 +65,6 @@ def _change(change: Array, threshold: float) -> Panel:
         axes.set_ylim(0.0, 115.0 * top)
         _framed(axes, "largest change per motion [%]")
         return to_panel(figure, key="wu", title="Change per motion", note=note, alt=alt)
-
-
-def _one() -> tuple[Figure, Axes]:
-    figure = blank(_WIDTH, _HEIGHT)
-    return figure, place(figure, _LEFT, _TOP, _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM)
 
 
 def _framed(axes: Axes, heading: str) -> None:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from hil.report.figures.canvas import TICK_SIZE, blank, place
 from hil.report.figures.palette import INK, MUTED
 from hil.report.figures.svg import Panel, drawing, label, to_panel
-from hil.report.parameters import short_label
 from hil.results import Results
 
 _LABELS, _SCALE = 84.0, 78.0
@@ -25,7 +24,7 @@ def correlation_matrix(results: Results) -> Panel | None:
     if n == 0:
         return None
     matrix = np.array(results.correlation, dtype=np.float64)[:n, :n]
-    return matrix_panel(matrix, [short_label(p) for p in results.parameters[:n]], key="c")
+    return matrix_panel(matrix, [p.label for p in results.parameters[:n]], key="c")
 
 
 def matrix_panel(

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
-from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, place, ruled
+from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, log_ticks, place, ruled
 from hil.report.figures.palette import FIRST, GRID, INK, MUTED, PAPER, SECOND
 from hil.report.figures.svg import Panel, drawing, to_panel
 from hil.results import EliminationStepResult, EssentialResult
@@ -84,9 +84,7 @@ def _deviations(essential: EssentialResult, steps: list[EliminationStepResult]) 
         high = 2.0 * min(float(largest[usable].max(initial=1.0)), 1e5)
         axes.set_ylim(low, high)
         decades = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
-        axes.yaxis.set_major_locator(FixedLocator([10.0**k for k in decades]))
-        axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        log_ticks(axes.yaxis, FixedLocator([10.0**k for k in decades]))
         axes.grid(True, axis="y", color=GRID, linewidth=0.8)
         _cut(axes, chosen.left, worst if math.isfinite(worst) else high, high)
         headed(axes, "largest std / |estimate| [%]")

@@ -13,7 +13,7 @@ from hil.report import numbers
 from hil.report.figures.canvas import blank, footed, headed, place, ruled, thinned
 from hil.report.figures.palette import BAND, FIRST, INK, MUTED, ROUTES, SECOND, WIDE
 from hil.report.figures.svg import Panel, drawing, to_panel
-from hil.report.figures.traces import Plot, Trace, traces_text
+from hil.report.figures.traces import MOST_POINTS, Plot, Trace, traces_text
 from hil.report.series import ReportSeries
 from hil.report.validation import TorqueError
 
@@ -31,22 +31,11 @@ Stretches = Sequence[tuple[float, float]]
 def excitation_panels(series: ReportSeries, joint_names: Sequence[str]) -> list[Panel]:
     """Position and velocity of each joint (the paper's Fig. 1)."""
     time = _from_zero(series.excitation_time)
-    return [
-        _excitation(
-            j,
-            name,
-            time,
-            series.excitation_position[:, j],
-            series.excitation_velocity[:, j],
-            _left_out(time, series.excitation_fitted, j),
-        )
-        for j, name in enumerate(joint_names)
-    ]
+    return [_excitation(series, time, j, name) for j, name in enumerate(joint_names)]
 
 
-def _excitation(
-    j: int, name: str, time: Array, position: Array, velocity: Array, shaded: Stretches
-) -> Panel:
+def _excitation(series: ReportSeries, time: Array, j: int, name: str) -> Panel:
+    position, velocity = series.excitation_position[:, j], series.excitation_velocity[:, j]
     low, high = float(np.min(position)), float(np.max(position))
     fastest = float(np.max(np.abs(velocity)))
     ends = (numbers.fixed(float(np.degrees(end)), 0) for end in (low, high))
@@ -56,22 +45,13 @@ def _excitation(
         f"{name}: position between {numbers.significant(low)} and {numbers.significant(high)} rad,"
         f" speed up to {numbers.significant(fastest)} rad/s, over {_length(time)} s."
     )
+    shaded = _left_out(time, series.excitation_fitted, j)
     plots = (
-        Plot(
-            (_LEFT, 20.0, _INNER, 78.0),
-            "position [rad]",
-            [Trace(position, FIRST, 1.5, "q")],
-            shaded=shaded,
-        ),
-        Plot(
-            (_LEFT, 122.0, _INNER, 78.0),
-            "velocity [rad/s]",
-            [Trace(velocity, SECOND, 1.5, "v")],
-            shaded=shaded,
-        ),
+        _plot(20.0, 78.0, "position [rad]", [Trace(position, FIRST, 1.5, "q")], shaded),
+        _plot(122.0, 78.0, "velocity [rad/s]", [Trace(velocity, SECOND, 1.5, "v")], shaded),
     )
-    traces = traces_text(time, plots, points=_POINTS)
-    return _panel(240.0, time, plots, key=f"x{j}", title=name, note=note, alt=alt, traces=traces)
+    words = {"key": f"x{j}", "title": name, "note": note, "alt": alt}
+    return _panel(240.0, time, plots, _POINTS, **words)
 
 
 def torque_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Panel]:
@@ -79,49 +59,21 @@ def torque_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[P
     if series.example_time.size == 0:
         return []
     time = _from_zero(series.example_time)
-    return [
-        _torque(
-            j,
-            error,
-            time,
-            series.example_measured[:, j],
-            series.example_predicted[:, j],
-            _left_out(time, series.example_counted, j),
-        )
-        for j, error in enumerate(errors)
-    ]
+    return [_torque(series, time, j, joint) for j, joint in enumerate(errors)]
 
 
-def _torque(
-    j: int, joint: TorqueError, time: Array, measured: Array, predicted: Array, shaded: Stretches
-) -> Panel:
-    error = measured - predicted
+def _torque(series: ReportSeries, time: Array, j: int, joint: TorqueError) -> Panel:
+    measured, predicted = series.example_measured[:, j], series.example_predicted[:, j]
     alt = f"{joint.joint}: measured and predicted torque over {_length(time)} s; {joint.words}."
+    both = [Trace(measured, WIDE, 4.0, "measured"), Trace(predicted, INK, 1.1, "predicted")]
+    error = [Trace(measured - predicted, SECOND, 0.9, "difference")]
+    shaded = _left_out(time, series.example_used, j)
     plots = (
-        Plot(
-            (_LEFT, 20.0, _INNER, 128.0),
-            f"torque [{joint.unit}]",
-            [Trace(measured, WIDE, 4.0, "measured"), Trace(predicted, INK, 1.1, "predicted")],
-            shaded=shaded,
-        ),
-        Plot(
-            (_LEFT, 172.0, _INNER, 50.0),
-            f"measured − predicted [{joint.unit}]",
-            [Trace(error, SECOND, 0.9, "difference")],
-            shaded=shaded,
-        ),
+        _plot(20.0, 128.0, f"torque [{joint.unit}]", both, shaded),
+        _plot(172.0, 50.0, f"measured − predicted [{joint.unit}]", error, shaded),
     )
-    traces = traces_text(time, plots)
-    return _panel(
-        262.0,
-        time,
-        plots,
-        key=f"t{j}",
-        title=joint.joint,
-        note=joint.words,
-        alt=alt,
-        traces=traces,
-    )
+    words = {"key": f"t{j}", "title": joint.joint, "note": joint.words, "alt": alt}
+    return _panel(262.0, time, plots, MOST_POINTS, **words)
 
 
 PARTS: Final = (
@@ -138,48 +90,33 @@ def split_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Pa
     if series.example_time.size == 0 or series.example_gravity.size == 0:
         return []
     time = _from_zero(series.example_time)
-    parts = {name: getattr(series, f"example_{name}") for name, _, _ in PARTS}
-    return [
-        _split(
-            j,
-            one,
-            time,
-            series.example_measured[:, j],
-            {name: part[:, j] for name, part in parts.items()},
-            _left_out(time, series.example_counted, j),
-        )
-        for j, one in enumerate(errors)
-    ]
+    return [_split(series, time, j, joint) for j, joint in enumerate(errors)]
 
 
-def _split(
-    j: int,
-    joint: TorqueError,
-    time: Array,
-    measured: Array,
-    parts: dict[str, Array],
-    shaded: Stretches,
-) -> Panel:
+def _split(series: ReportSeries, time: Array, j: int, joint: TorqueError) -> Panel:
+    parts = {name: getattr(series, f"example_{name}")[:, j] for name, _, _ in PARTS}
     sizes = {name: float(np.sqrt(np.mean(part**2))) for name, part in parts.items()}
-    words = ", ".join(f"{name} {numbers.significant(size, 2)}" for name, size in sizes.items())
-    alt = f"{joint.joint}: parts of the predicted torque; RMS of {words} {joint.unit}."
+    rms = ", ".join(f"{name} {numbers.significant(size, 2)}" for name, size in sizes.items())
+    alt = f"{joint.joint}: parts of the predicted torque; RMS of {rms} {joint.unit}."
     largest = max(sizes, key=lambda name: sizes[name])
     note = f"largest: {largest}, RMS {numbers.significant(sizes[largest])} {joint.unit}"
-    lines = [Trace(parts[name], colour, width, name) for name, colour, width in PARTS]
-    plot = Plot(
-        (_LEFT, 20.0, _INNER, 140.0),
-        f"torque [{joint.unit}]",
-        [Trace(measured, WIDE, 4.0, "measured"), *lines],
-        shaded=shaded,
-    )
-    traces = traces_text(time, [plot], points=_POINTS)
-    return _panel(
-        200.0, time, (plot,), key=f"g{j}", title=joint.joint, note=note, alt=alt, traces=traces
-    )
+    lines = [Trace(series.example_measured[:, j], WIDE, 4.0, "measured")]
+    lines += [Trace(parts[name], colour, width, name) for name, colour, width in PARTS]
+    shaded = _left_out(time, series.example_used, j)
+    plot = _plot(20.0, 140.0, f"torque [{joint.unit}]", lines, shaded)
+    words = {"key": f"g{j}", "title": joint.joint, "note": note, "alt": alt}
+    return _panel(200.0, time, (plot,), _POINTS, **words)
 
 
-def _panel(height: float, time: Array, plots: Sequence[Plot], **words: str) -> Panel:
-    """Plots over the same time, one above the other."""
+def _plot(
+    top: float, height: float, heading: str, traces: Sequence[Trace], shaded: Stretches
+) -> Plot:
+    """A plot of the panels' width at its place below their upper edge [px]."""
+    return Plot((_LEFT, top, _INNER, height), heading, traces, shaded=shaded)
+
+
+def _panel(height: float, time: Array, plots: Sequence[Plot], points: int, **words: str) -> Panel:
+    """Plots over the same time, one above the other, with their samples to zoom into."""
     with drawing():
         figure = blank(_WIDTH, height)
         all_axes = [place(figure, *plot.box) for plot in plots]
@@ -191,7 +128,8 @@ def _panel(height: float, time: Array, plots: Sequence[Plot], **words: str) -> P
             headed(axes, plot.heading)
             _zero_line(axes, plot)
         _time_axes(all_axes, time)
-        return to_panel(figure, **words)
+        traces = traces_text(time, plots, points=points)
+        return to_panel(figure, traces=traces, **words)
 
 
 def _zero_line(axes: Axes, plot: Plot) -> None:
@@ -213,11 +151,11 @@ def _time_axes(all_axes: Sequence[Axes], time: Array) -> None:
     footed(all_axes[-1], _SECONDS)
 
 
-def _left_out(time: Array, counted: Array, joint: int) -> Stretches:
+def _left_out(time: Array, used: Array, joint: int) -> Stretches:
     """Stretches of time (m,) in which rows (m, n) of a joint are zero, to midway to the next."""
-    if counted.size == 0:
+    if used.size == 0:
         return ()
-    out = np.concatenate([[False], counted[:, joint] < 0.5, [False]])
+    out = np.concatenate([[False], used[:, joint] < 0.5, [False]])
     edges = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
     changes = edges[np.flatnonzero(np.diff(out.astype(np.int8)))].tolist()
     return tuple(zip(changes[::2], changes[1::2], strict=True))

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator
 
 from hil.report import numbers
-from hil.report.figures.canvas import TICK_SIZE, blank, footed, place
+from hil.report.figures.canvas import TICK_SIZE, blank, footed, log_ticks, place
 from hil.report.figures.palette import (
     BAND,
+    FIRST,
     GRID,
     INK,
     INSIDE,
@@ -24,13 +25,15 @@ from hil.report.figures.palette import (
     ROUTES,
 )
 from hil.report.figures.svg import Panel, drawing, label, to_panel
-from hil.report.parameters import Route, deviation, short_label
-from hil.results import Results
+from hil.report.parameters import Route
+from hil.results import ConsistencyResult, Results
 
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 370.0, 92.0, 14.0, 8.0, 40.0
 _ROW = 14.5
 _MOST_ROWS = 20
 _FURTHEST = 6.5
+_MOVED = 3.0
+"""Standard deviations from which consistency is at odds with the data."""
 _ROUTE_MARKERS = ("o", "D", "^", "s")
 
 
@@ -52,7 +55,7 @@ def groups(results: Results) -> list[tuple[str, list[int]]]:
 
 def deviation_panels(results: Results) -> list[Panel]:
     """(estimate - truth) / std of every parameter that has a planted truth."""
-    values = [deviation(p) for p in results.parameters]
+    values = [p.deviation for p in results.parameters]
     known = [z for z in values if z is not None]
     if not known:
         return []
@@ -148,9 +151,7 @@ def _uncertainty_panel(
             _route_dots(axes, route, members)
         axes.set_xlim(*limits)
         ticks = [t for t in _LOG_TICKS if limits[0] <= t <= limits[1]]
-        axes.xaxis.set_major_locator(FixedLocator(ticks if len(ticks) < 9 else ticks[::3]))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        log_ticks(axes.xaxis, FixedLocator(ticks if len(ticks) < 9 else ticks[::3]))
         axes.grid(True, axis="x", color=GRID, linewidth=0.8)
         footed(axes, "std / reported std")
         return to_panel(figure, key=f"u{k}", title=title, note="", alt=alt)
@@ -182,8 +183,65 @@ def parameter_rows(results: Results, members: list[int]) -> tuple[Figure, Axes]:
     axes = place(figure, _LEFT, _TOP, _WIDTH - _LEFT - _RIGHT, height)
     axes.set_ylim(len(members) - 0.5, -0.5)
     axes.set_yticks(range(len(members)))
-    axes.set_yticklabels([label(short_label(results.parameters[i])) for i in members])
+    axes.set_yticklabels([label(results.parameters[i].label) for i in members])
     axes.tick_params(axis="y", length=0.0)
     axes.grid(True, axis="y", color=GRID, linewidth=0.8)
     axes.spines["left"].set_visible(False)
     return figure, axes
+
+
+def shift_panels(results: Results, consistency: ConsistencyResult) -> list[Panel]:
+    """(consistent - estimate) / std of every parameter."""
+    largest = max((abs(z) for z in consistency.shift), default=0.0)
+    reach = min(12.0, max(4.0, 1.1 * largest))
+    return [
+        _shift_panel(results, consistency, k, title, members, reach)
+        for k, (title, members) in enumerate(groups(results))
+    ]
+
+
+def _shift_panel(
+    results: Results,
+    consistency: ConsistencyResult,
+    k: int,
+    title: str,
+    members: list[int],
+    reach: float,
+) -> Panel:
+    values = [consistency.shift[i] for i in members]
+    moved = sum(abs(z) > _MOVED for z in values)
+    alt = (
+        f"{title}: how far consistency moves {len(members)} parameters, in standard deviations;"
+        f" {moved} by more than {_MOVED:g}."
+    )
+    with drawing():
+        figure, axes = parameter_rows(results, members)
+        axes.axvspan(-_MOVED, _MOVED, color=BAND, linewidth=0.0)
+        axes.axvline(0.0, color=MUTED, linewidth=0.9)
+        for row, z in enumerate(values):
+            far = abs(z) > _MOVED
+            color = OUTSIDE_3 if far else FIRST
+            end = math.copysign(min(abs(z), reach - 0.2), z)
+            axes.plot([0.0, end], [row, row], color=color, linewidth=2.2 if far else 1.6)
+            axes.scatter(
+                [end], [row], s=30.0, marker="s" if far else "o", color=color, linewidths=0.0
+            )
+            if far:
+                _shift_number(axes, end, row, z)
+        axes.set_xlim(-reach, reach)
+        footed(axes, "(consistent − estimate) / std")
+        return to_panel(figure, key=f"co{k}", title=title, note="", alt=alt)
+
+
+def _shift_number(axes: Axes, end: float, row: int, z: float) -> None:
+    """The number beside a bar, towards the middle, where there is room."""
+    axes.annotate(
+        numbers.fixed(z, 1, sign=True).replace("-", "−"),
+        (0.0, row),
+        xytext=(-5.0 if end > 0.0 else 5.0, 0.0),
+        textcoords="offset points",
+        ha="right" if end > 0.0 else "left",
+        va="center",
+        fontsize=TICK_SIZE,
+        color=INK,
+    )

@@ -6,16 +6,14 @@ import math
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from hil.report import numbers
-from hil.report.figures.canvas import blank, footed, headed, place, ruled
+from hil.report.figures.canvas import footed, headed, plot_panel, ruled
 from hil.report.figures.palette import BAND, FIRST, MUTED, SECOND
 from hil.report.figures.svg import Panel, drawing, to_panel
 from hil.results import JudgementResult, ProfileResult
 
-_WIDTH, _HEIGHT = 370.0, 170.0
-_LEFT, _TOP, _RIGHT, _BOTTOM = 46.0, 20.0, 10.0, 40.0
+_HEIGHT = 170.0
 # Half a 95 % interval, in standard errors.
 _INTERVAL = 1.96
 
@@ -54,18 +52,12 @@ def _profile_panels(
             f" {joint.unit} at {numbers.significant(at)} {unit}; {note}."
         )
         with drawing():
-            figure, axes = _one()
+            figure, axes = plot_panel(_HEIGHT)
             _profile(axes, profile, joint.rms)
             headed(axes, f"mean residual [{joint.unit}]")
             footed(axes, f"{what} [{unit}]")
             panels.append(to_panel(figure, key=f"{key}{j}", title=joint.joint, note=note, alt=alt))
     return panels
-
-
-def _one(height: float = _HEIGHT) -> tuple[Figure, Axes]:
-    figure = blank(_WIDTH, height)
-    width = _WIDTH - _LEFT - _RIGHT
-    return figure, place(figure, _LEFT, _TOP, width, height - _TOP - _BOTTOM)
 
 
 def _profile(axes: Axes, profile: ProfileResult, rms: float) -> None:
@@ -105,7 +97,7 @@ def autocorrelation_panels(judgement: JudgementResult) -> list[Panel]:
         values = [value for value in column if value is not None]
         note = f"worth {worth:.0f} independent samples"
         with drawing():
-            figure, axes = _one()
+            figure, axes = plot_panel(_HEIGHT)
             axes.axhline(0.0, color=MUTED, linewidth=0.9)
             axes.plot(milliseconds, values, color=FIRST, linewidth=1.4)
             axes.set_xlim(0.0, milliseconds[-1])
@@ -140,7 +132,7 @@ def friction_panels(judgement: JudgementResult) -> list[Panel]:
         if not points:
             continue
         with drawing():
-            figure, axes = _one(150.0)
+            figure, axes = plot_panel(150.0)
             _friction(axes, points, len(row), reach)
             first, last = points[0][1], points[-1][1]
             alt = f"{joint.joint}: friction, from {first:+.1f} % to {last:+.1f} % of the estimate."

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogLocator
 from numpy.typing import NDArray
 
 from hil.report import numbers
-from hil.report.figures.canvas import blank, footed, headed, place
+from hil.report.figures.canvas import footed, headed, log_ticks, plot_panel
 from hil.report.figures.palette import GRID, MUTED, SECOND, WIDE
 from hil.report.figures.svg import Panel, drawing, to_panel
 from hil.report.series import ReportSeries
@@ -17,8 +17,6 @@ from hil.report.validation import TorqueError
 
 Array = NDArray[np.float64]
 
-_WIDTH, _HEIGHT = 370.0, 190.0
-_LEFT, _TOP, _RIGHT, _BOTTOM = 46.0, 20.0, 10.0, 40.0
 _TICKS = [m * 10.0**e for e in range(-2, 5) for m in (1, 3)]
 _DEEPEST = 1e-5  # of the highest: below it lies rounding
 
@@ -48,8 +46,7 @@ def _joint(j: int, series: ReportSeries, joint: TorqueError) -> Panel:
     highest = float(max(torque.max(), residual.max()))
     lowest = max(float(min(torque.min(), residual.min())), _DEEPEST * highest)
     with drawing():
-        figure = blank(_WIDTH, _HEIGHT)
-        axes = place(figure, _LEFT, _TOP, _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM)
+        figure, axes = plot_panel(190.0)
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.plot(frequency, torque, color=WIDE, linewidth=3.0, solid_joinstyle="round")
@@ -58,14 +55,9 @@ def _joint(j: int, series: ReportSeries, joint: TorqueError) -> Panel:
             axes.axvline(bandwidth, color=MUTED, linewidth=1.1, linestyle=(0, (4, 3)))
         axes.set_xlim(float(frequency[0]), float(frequency[-1]))
         axes.set_ylim(lowest / 1.5, highest * 1.5)
-        axes.xaxis.set_major_locator(
-            FixedLocator([tick for tick in _TICKS if frequency[0] <= tick <= frequency[-1]])
-        )
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_major_locator(LogLocator(numticks=6))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_minor_locator(NullLocator())
+        ticks = [tick for tick in _TICKS if frequency[0] <= tick <= frequency[-1]]
+        log_ticks(axes.xaxis, FixedLocator(ticks))
+        log_ticks(axes.yaxis, LogLocator(numticks=6))
         axes.grid(True, color=GRID, linewidth=0.8)
         headed(axes, f"amplitude [{joint.unit}/√Hz]")
         footed(axes, "frequency [Hz]")

@@ -7,23 +7,71 @@ from typing import Any, Final
 
 import matplotlib.dates as mdates
 import numpy as np
+from markupsafe import Markup, escape
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hil.compare.trend import ArmTrend, AxisTrend, ParameterTrend, Watched
 from hil.report import numbers
-from hil.report.figures.canvas import TICK_SIZE, blank, headed, place, ruled
+from hil.report.figures.canvas import TICK_SIZE, headed, plot_panel, ruled
 from hil.report.figures.palette import BAND, FIRST, MUTED, OUTSIDE_3, SECOND
-from hil.report.figures.sparkline import sparkline
 from hil.report.figures.svg import Panel, drawing, label, to_panel
 from hil.timestamps import instant
 
 Array = NDArray[np.float64]
 
-_WIDTH, _HEIGHT = 370.0, 180.0
-_LEFT, _TOP, _RIGHT, _BOTTOM = 50.0, 20.0, 12.0, 32.0
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 200.0, 84.0, 8.0, 8.0, 8.0, 18.0
+_TEXT: Final = 10.5
+
+
+def sparkline(
+    at: Array, values: Array, half: Array, *, colour: str, ends: Sequence[str], alt: str
+) -> Markup:
+    """Points with bars as inline SVG, their median, and both ends in words.
+
+    Args:
+        at: horizontal place (c,), rising.
+        values: (c,), NaN where there is none; one at least is finite.
+        half: half length of the bars (c,).
+        colour: variable of the style sheet.
+        ends: what stands below the first and the last place.
+        alt: what it shows.
+    """
+    known = np.isfinite(values)
+    low, high = float((values - half)[known].min()), float((values + half)[known].max())
+    if not high > low:
+        low, high = low - 0.5, high + 0.5
+    span = float(at[-1] - at[0]) or 1.0
+    inner, tall = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
+    x = _LEFT + inner * ((at - at[0]) / span if at[-1] > at[0] else np.full(len(at), 0.5))
+    y, top, bottom = (
+        _TOP + tall * (high - line) / (high - low)
+        for line in (values, values + half, values - half)
+    )
+    bars = "".join(f"M{x[k]:.1f} {top[k]:.1f}V{bottom[k]:.1f}" for k in np.flatnonzero(known))
+    dots = "".join(
+        f'<circle cx="{x[k]:.1f}" cy="{y[k]:.1f}" r="2.4"/>' for k in np.flatnonzero(known)
+    )
+    middle = float(np.median(values[known]))
+    level = _TOP + tall * (high - middle) / (high - low)
+    words = "".join(
+        f'<text x="{place:g}" y="{_HEIGHT - 4:g}" text-anchor="{anchor}" font-size="{_TEXT}"'
+        f' style="fill:var(--muted)">{escape(text)}</text>'
+        for place, anchor, text in ((_LEFT, "start", ends[0]), (_WIDTH - _RIGHT, "end", ends[-1]))
+    )
+    reach = f"{numbers.significant(low)} and {numbers.significant(high)}"
+    described = f"{alt} Intervals lie within {reach}."
+    median = f"M{_LEFT:g} {level:.1f}H{_WIDTH - _RIGHT:g}"
+    return Markup(
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img"'
+        f' aria-label="{escape(described)}">'
+        f'<path d="{median}" style="stroke:var(--line);fill:none"/>'
+        f'<path d="{bars}" style="stroke:var({colour});stroke-width:1.1;fill:none"/>'
+        f'<g style="fill:var({colour})">{dots}</g>{words}</svg>'
+    )
+
+
 _TICKS = 4
 _DAY = 86400.0
 # Half a 95 % interval, in standard deviations.
@@ -55,7 +103,7 @@ def payload_panels(arm: ArmTrend, key: str) -> list[Panel]:
         return []
     changed = np.asarray(payload.changed)
     with drawing():
-        figure, axes = _one(_WIDTH, _HEIGHT)
+        figure, axes = plot_panel(180.0, left=50.0, right=12.0, bottom=32.0)
         axes.axhline(0.0, color=MUTED, linewidth=0.9)
         _points(axes, arm, payload.mass, _INTERVAL * payload.mass_std, FIRST, changed)
         _framed(axes, arm, "kg")
@@ -105,7 +153,7 @@ def _axis_panel(
         for k in np.flatnonzero(np.isfinite(watched.values))[[0, -1]]
     )
     with drawing():
-        figure, axes = _one(_WIDTH, _HEIGHT)
+        figure, axes = plot_panel(180.0, left=50.0, right=12.0, bottom=32.0)
         low, high = _reach(watched)
         axes.set_ylim(low, high)
         _band(axes, arm, watched, low, high)
@@ -219,9 +267,3 @@ def _when(arm: ArmTrend) -> list[float]:
         return [float(t) for t in arm.time]
     start = first.timestamp() / _DAY
     return [start + float(t) for t in arm.time]
-
-
-def _one(width: float, height: float) -> tuple[Figure, Axes]:
-    figure = blank(width, height)
-    inner = width - _LEFT - _RIGHT
-    return figure, place(figure, _LEFT, _TOP, inner, height - _TOP - _BOTTOM)

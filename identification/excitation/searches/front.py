@@ -64,7 +64,7 @@ class Front:
         if rows.ndim != 2 or len(rows) != len(scores.log10_det):
             raise ShapeError("genes", rows.shape, f"({len(scores.log10_det)}, n_genes)")
         everything = cls(rows, scores.log10_det, scores.coupling_index, scores.duration)
-        return everything._taken(np.flatnonzero(scores.usable))._unbeaten()
+        return everything._selected(np.flatnonzero(scores.usable))._unbeaten()
 
     def __len__(self) -> int:
         return len(self.log10_det)
@@ -111,7 +111,7 @@ class Front:
         better = np.flatnonzero((size > 0.0) & (decoupling > 0.0))
         return better if len(better) else everything
 
-    def _taken(self, rows: NDArray[np.intp]) -> Self:
+    def _selected(self, rows: NDArray[np.intp]) -> Self:
         return type(self)(
             self.genes[rows], self.log10_det[rows], self.coupling_index[rows], self.duration[rows]
         )
@@ -129,7 +129,7 @@ class Front:
             ],
             axis=0,
         )
-        return self._taken(_first_of_each(leader[alike], order[alike], self.genes))
+        return self._selected(_first_of_each(leader[alike], order[alike], self.genes))
 
 
 def _first_of_each(

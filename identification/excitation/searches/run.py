@@ -300,8 +300,8 @@ class _Search:
         p = self._population.problem.objective.n_parameters
         if not _needs_scale(self._settings):
             return Goal(self._settings, p, None)
-        drawn = self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT)
-        scores = self._ledger.score(drawn)
+        scale_genes = self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT)
+        scores = self._ledger.score(scale_genes)
         try:
             return Goal(self._settings, p, Scale.of(scores))
         except DesignError:

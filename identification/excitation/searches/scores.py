@@ -36,8 +36,8 @@ class Scores(NamedTuple):
     @property
     def feasible(self) -> NDArray[np.bool_]:
         """Which motions keep every constraint, (m,)."""
-        kept: NDArray[np.bool_] = np.all(self.excess == 0.0, axis=1)
-        return kept
+        met: NDArray[np.bool_] = np.all(self.excess == 0.0, axis=1)
+        return met
 
     @property
     def usable(self) -> NDArray[np.bool_]:

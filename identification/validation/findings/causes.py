@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from identification.validation.causes import Cause, Kind
 from identification.validation.evidence import Evidence
-from identification.validation.findings.finding import Finding, listed
+from identification.validation.findings.finding import Finding, joined
 from identification.validation.prediction import FRICTION_CHANGE
 from identification.validation.residual_checks import Outliers
 from identification.validation.thresholds import Thresholds
@@ -64,7 +64,7 @@ def causes(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Itera
             "direction of axes",
             "information",
             "the data do not determine the direction of"
-            f" {listed([names[j] for j in found.undecided], len(names))}: the opposite direction"
+            f" {joined([names[j] for j in found.undecided], len(names))}: the opposite direction"
             " fits about as well",
         )
 
@@ -163,7 +163,7 @@ def _figures(names: Sequence[str], cause: Cause, template: _Template) -> dict[st
     joints = [names[j] for j in cause.fault.joints] or ["all axes"]
     size, scale = cause.size or 0.0, template.scale
     return {
-        "joints": listed(joints, len(names)),
+        "joints": joined(joints, len(names)),
         "first": joints[0],
         "last": joints[-1],
         "part": "" if cause.fault.part is None else cause.fault.part.words,
@@ -209,7 +209,7 @@ def outliers(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Ite
         "outliers",
         "wrong" if spoilt_by_outliers(evidence, limit) else "doubtful",
         f"single samples far outside of all others cause most of the error of"
-        f" {listed([names[j] for j in joints])} on {evidence.tested_on} (at most"
+        f" {joined([names[j] for j in joints])} on {evidence.tested_on} (at most"
         f" {found.share[most]:.2%} of the samples, {names[most]}); without them it is"
         f" {found.without.overall:.1%} over all axes",
         "look at the torques in the log: spikes, damaged packets, collisions; correct or leave them"
@@ -254,7 +254,7 @@ def friction_change(
     )
     words += " estimated"
     if decisive.any():
-        spoilt = listed([names[j] for j in np.flatnonzero(decisive).tolist()], len(names))
+        spoilt = joined([names[j] for j in np.flatnonzero(decisive).tolist()], len(names))
         words += (
             f", more than the {FRICTION_CHANGE:.0%} expected of warmer gears; that explains the"
         )
@@ -274,4 +274,4 @@ def _changes(names: Sequence[str], change: Array, joints: NDArray[np.intp]) -> s
     for j in joints.tolist():
         what = f"{abs(change[j]):.0%} {'higher' if change[j] > 0.0 else 'lower'}"
         alike.setdefault(what, []).append(names[j])
-    return ", of ".join(f"{listed(those, len(names))} was {what}" for what, those in alike.items())
+    return ", of ".join(f"{joined(those, len(names))} was {what}" for what, those in alike.items())

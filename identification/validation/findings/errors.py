@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.validation.evidence import Evidence
-from identification.validation.findings.finding import Finding, Level, listed
+from identification.validation.findings.finding import Finding, Level, joined
 from identification.validation.thresholds import Thresholds
 
 # What was fitted well and is predicted badly has no wrong sign, which would spoil both.
@@ -32,15 +32,15 @@ def untested(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Ite
         yield Finding(
             "tested",
             "wrong",
-            f"{listed(still)} moved in fewer than {limit.rows} samples of"
+            f"{joined(still)} moved in fewer than {limit.rows} samples of"
             f" {evidence.tested_on}, which tests nothing",
-            f"record an unseen motion in which {listed(still)} moves; if it is meant to stand"
+            f"record an unseen motion in which {joined(still)} moves; if it is meant to stand"
             " still, lock it (locked under [robot] in the cell file, or `hil import log --held"
             " JOINT`)",
         )
     silent = (rows > 0) & (evidence.held_out.torque_squared == 0.0)
     if silent.any():
-        without = listed([name for name, zero in zip(names, silent, strict=True) if zero])
+        without = joined([name for name, zero in zip(names, silent, strict=True) if zero])
         yield Finding(
             "tested",
             "wrong",
@@ -67,7 +67,7 @@ def size(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterato
         )
     large = error.relative > limit.axis
     covered = ~(error.relative > limit.generalisation * evidence.training.relative)
-    blamed = listed([name for axis, name in enumerate(names) if large[axis] and covered[axis]])
+    blamed = joined([name for axis, name in enumerate(names) if large[axis] and covered[axis]])
     for axis, name in enumerate(names):
         if large[axis]:
             yield Finding(
@@ -110,7 +110,7 @@ def explained(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> It
     share = error.explained
     if np.all(np.isnan(share)):
         return
-    still = listed([n for axis, n in enumerate(names) if share[axis] < limit.little_explained])
+    still = joined([n for axis, n in enumerate(names) if share[axis] < limit.little_explained])
     faster = f"move {still} faster and further, so that its torque stands out of noise"
     for axis, name in enumerate(names):
         if share[axis] <= limit.explained:

@@ -31,7 +31,7 @@ class Finding:
     role: Role = "condition"
 
 
-def listed(names: Sequence[str], most: int = 6) -> str:
+def joined(names: Sequence[str], most: int = 6) -> str:
     """Names in a row, the first few of many."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

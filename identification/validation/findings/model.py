@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.validation.evidence import SIGMAS, Evidence
-from identification.validation.findings.finding import Finding, listed
+from identification.validation.findings.finding import Finding, joined
 from identification.validation.thresholds import Thresholds
 
 _RICHER = "design a motion for this arm (`hil design`) and record that"
@@ -21,7 +21,7 @@ def determined(_: Sequence[str], evidence: Evidence, limit: Thresholds) -> Itera
         yield Finding(
             "excitation",
             "wrong",
-            f"the motion does not determine {listed(names, len(names))}",
+            f"the motion does not determine {joined(names, len(names))}",
             _RICHER,
         )
         return
@@ -119,7 +119,7 @@ def _constants(names: Sequence[str], joints: NDArray[np.intp], evidence: Evidenc
 
 
 def _all(names: Sequence[str], joints: NDArray[np.intp]) -> str:
-    return listed([names[j] for j in joints.tolist()], len(joints))
+    return joined([names[j] for j in joints.tolist()], len(joints))
 
 
 def consistent(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterator[Finding]:
@@ -172,7 +172,7 @@ def delay(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterat
             "delay",
             "doubtful",
             "the torque seems to lag the position by another time than was assumed: "
-            + listed([measured[j] for j in off]),
+            + joined([measured[j] for j in off]),
             "compare with `hil identify --delay auto`, or correct the delay in the cell",
             "cause",
         )
@@ -182,5 +182,5 @@ def delay(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> Iterat
             "delay",
             "good",
             "no delay stands out but the assumed one; the torque lags the position by: "
-            + listed([measured[j] for j in known], 2),
+            + joined([measured[j] for j in known], 2),
         )

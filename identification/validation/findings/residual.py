@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.validation.evidence import Evidence
-from identification.validation.findings.finding import Finding, listed
+from identification.validation.findings.finding import Finding, joined
 from identification.validation.residual_checks import ResidualChecks
 from identification.validation.residual_profile import Profile
 from identification.validation.thresholds import Thresholds
@@ -190,7 +190,7 @@ def _stand_out(
 
 
 def _names(names: Sequence[str], joints: Sequence[int]) -> str:
-    return listed([names[j] for j in joints])
+    return joined([names[j] for j in joints])
 
 
 def _worst_bins(

@@ -15,7 +15,7 @@ from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.warmup import WarmUp
-from hil.cli.plan_input import read_plan_file
+from hil.cli.plan import read_plan_file
 from hil.design.result import DesignResult, _seal
 from hil.design.settings import load_settings, preset_text
 from hil.errors import InputError

@@ -30,7 +30,7 @@ def test_records_and_their_packets_go_together(batch: int) -> None:
     for begin in cycles[::batch]:
         part = cycles[begin : begin + batch]
         recent.keep(records(*part), [], packets(*part))
-    kept, _, kept_packets = recent.taken()
+    kept, _, kept_packets = recent.take_session()
     assert RECENT <= len(kept) < RECENT + batch
     assert kept["cycle"].tolist() == list(cycles[-len(kept) :])
     assert kept_packets["cycle"].tolist() == np.repeat(kept["cycle"], 2).tolist()
@@ -40,8 +40,8 @@ def test_only_the_session_that_began_last_counts_and_is_given_once() -> None:
     recent = Recent()
     recent.keep(records(7, 8, 0, 1), [], packets(7, 8, 0, 1))
     recent.keep(records(2), [], packets(2))
-    kept, events, kept_packets = recent.taken()
+    kept, events, kept_packets = recent.take_session()
     assert kept["cycle"].tolist() == [0, 1, 2]
     assert kept_packets["cycle"].tolist() == [0, 0, 1, 1, 2, 2]
     assert not events
-    assert not len(recent.taken().records)
+    assert not len(recent.take_session().records)

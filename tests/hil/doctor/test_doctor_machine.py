@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.doctor import machine, permissions
+from hil.doctor import machine
+from hil.doctor import machine as permissions
 from hil.doctor.check import Status
-from hil.doctor.permissions import Obtained
-from hil.doctor.storage import DiskTrial, disk_checks
+from hil.doctor.machine import DiskTrial, Obtained, disk_checks
 from hil.doctor.system import run_command
 from tests.hil.doctor.made_up_system import Tree
 
@@ -57,11 +57,11 @@ def test_one_processor_that_saves_power_is_enough_for_a_warning(tree: Tree) -> N
 
 
 @pytest.mark.parametrize(
-    ("kept_awake", "disabled", "status"),
+    ("no_sleep", "disabled", "status"),
     [(False, "0", Status.WARN), (True, "0", Status.OK), (False, "1", Status.OK)],
 )
 def test_a_deep_idle_state_matters_unless_disabled_or_kept_out(
-    tree: Tree, kept_awake: bool, disabled: str, status: Status
+    tree: Tree, no_sleep: bool, disabled: str, status: Status
 ) -> None:
     state = {"cpuidle/state1/name": "C1", "cpuidle/state1/latency": "2"}
     deep = {
@@ -70,7 +70,7 @@ def test_a_deep_idle_state_matters_unless_disabled_or_kept_out(
         "cpuidle/state3/disable": disabled,
     }
     tree.write(processors(2, state | deep))
-    check = machine.idle_states(tree.system(), kept_awake=kept_awake)
+    check = machine.idle_states(tree.system(), no_sleep=no_sleep)
     assert check.status is status
     assert ("C6" in check.found) == (disabled == "0")
 
@@ -151,7 +151,7 @@ def test_nonsense_in_sysfs_never_stops_the_examination(
     system = tree.system()
     checks = [
         machine.governor(system),
-        machine.idle_states(system, kept_awake=False),
+        machine.idle_states(system, no_sleep=False),
         machine.preemption(system),
         machine.virtualisation(system),
         machine.load(system),

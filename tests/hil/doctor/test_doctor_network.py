@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.doctor import port, route
-from hil.doctor.canbus import can_check
+from hil.doctor import link as port
+from hil.doctor import network as route
 from hil.doctor.check import Check, Status
-from hil.doctor.link import CanLink
+from hil.doctor.link import CanLink, can_check
 from hil.doctor.network import coalescing, device_check, firewall, network_checks
 from hil.doctor.system import Answer
 from tests.hil.doctor.made_up_system import Tree

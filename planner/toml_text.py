@@ -1,0 +1,215 @@
+"""Plain data as TOML for people, to the last bit: angles in degrees, one line per list.
+
+A field of angles is an `Angles` in the data and a name that ends in `_deg` in the text. Numbers are
+read as `Decimal`, which keeps angles exact.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date, time
+from decimal import Context, Decimal, InvalidOperation, localcontext
+from math import degrees, pi
+from typing import Any
+
+_EXACT = Context(prec=60)
+_PI = Decimal("3.14159265358979323846264338327950288419716939937510")
+_SHORT_DIGITS = 15
+_MOST_DIGITS = 20
+_SUFFIX = "_deg"
+
+
+@dataclass(frozen=True)
+class Angles:
+    """Angles or their rates in rad (s), a number or nested lists, which the text has in degrees."""
+
+    values: Any
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Lists of lists of numbers, which the text has one row a line."""
+
+    values: Sequence[Any]
+
+
+def to_text(data: Mapping[str, Any], comments: Mapping[str, str]) -> str:
+    """Return data as TOML.
+
+    Args:
+        data: tables, lists of tables, lists, numbers, texts; None is left out.
+        comments: lines that are to stand before the table of that (dotted) name, "" the first.
+    """
+    return "\n".join(_table("", data, comments))
+
+
+def from_text(text: str, angles: Mapping[str, Collection[str]] | None = None) -> dict[str, Any]:
+    """Return the data of a TOML text, angles in rad under their name without `_deg`.
+
+    Args:
+        text: of the file.
+        angles: fields of each table (by its name, "" of the first) that are angles; any that ends
+            in `_deg` if left out.
+
+    Raises:
+        ValueError: the text is not TOML, or an angle is no number, or given twice.
+    """
+    try:
+        return _read(tomllib.loads(text, parse_float=Decimal), angles)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
+    except InvalidOperation as error:
+        raise ValueError("it has a number beyond all bounds") from error
+
+
+def _table(path: str, data: Mapping[str, Any], comments: Mapping[str, str]) -> list[str]:
+    """Return the blocks of a table: its own fields first, then those of the tables in it."""
+    own = {name: value for name, value in data.items() if not _is_table(value)}
+    head = "".join(f"# {line}\n" for line in comments.get(path, "").splitlines())
+    fields = "".join(_field(name, value) for name, value in own.items() if value is not None)
+    blocks = []
+    if fields or head or not data:
+        blocks.append(f"{head}[{path}]\n{fields}" if path else head + fields)
+    for name, value in data.items():
+        below = f"{path}.{toml_key(name)}" if path else toml_key(name)
+        if isinstance(value, Mapping):
+            blocks += _table(below, value, comments)
+        elif _is_table(value):
+            blocks += [
+                f"[[{below}]]\n{''.join(_field(*item) for item in row.items())}" for row in value
+            ]
+    return blocks
+
+
+def _is_table(value: Any) -> bool:
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return len(value) > 0 and isinstance(value[0], Mapping)
+    return isinstance(value, Mapping)
+
+
+def _field(name: str, value: Any) -> str:
+    if isinstance(value, Angles):
+        return f"{toml_key(name + _SUFFIX)} = {_degrees(value.values)}\n"
+    text = _laid_out(value.values) if isinstance(value, Rows) else toml_value(value)
+    return f"{toml_key(name)} = {text}\n"
+
+
+def _laid_out(values: Sequence[Any], indent: str = "") -> str:
+    inner = indent + "  "
+    rows = (
+        _laid_out(row, inner) if row and isinstance(row[0], Sequence) else toml_value(row)
+        for row in values
+    )
+    return f"[\n{''.join(f'{inner}{row},' + chr(10) for row in rows)}{indent}]"
+
+
+def _degrees(values: Any) -> str:
+    if isinstance(values, Sequence):
+        return f"[{', '.join(_degrees(entry) for entry in values)}]"
+    return degrees_text(values)
+
+
+def _read(
+    table: Mapping[str, Any], angles: Mapping[str, Collection[str]] | None, path: str = ""
+) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in table.items():
+        stem = name.removesuffix(_SUFFIX)
+        if stem == name or (angles is not None and stem not in angles.get(path, ())):
+            found[name] = _below(value, angles, name)
+        elif stem in table:
+            raise ValueError(f"both {stem!r} and {name!r} are given")
+        else:
+            found[stem] = radians_in(name, value)
+    return found
+
+
+def _below(value: Any, angles: Mapping[str, Collection[str]] | None, path: str) -> Any:
+    """Return a value in which tables may be, and in them angles."""
+    if isinstance(value, Mapping):
+        return _read(value, angles, path)
+    if isinstance(value, list):
+        return [_below(entry, angles, path) for entry in value]
+    return float(value) if isinstance(value, Decimal) else value
+
+
+def toml_key(name: str) -> str:
+    """Return a key, quoted where it has to be."""
+    bare = name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
+    return name if bare else toml_text(name)
+
+
+def toml_text(value: str) -> str:
+    """Return a text in quotes."""
+    # JSON's quoting, but for what TOML wants otherwise: no pairs of surrogates, no bare DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def toml_value(value: Any) -> str:
+    """Return a number, text, truth value, date, time, list or table (inline) of these.
+
+    Raises:
+        TypeError: it is something else.
+    """
+    if isinstance(value, float):
+        return repr(float(value)) if math.isfinite(value) else str(float(value))  # inf, -inf, nan
+    if isinstance(value, str):
+        return toml_text(value)
+    if isinstance(value, Mapping):
+        entries = (f"{toml_key(name)} = {toml_value(entry)}" for name, entry in value.items())
+        return f"{{ {', '.join(entries)} }}"
+    if isinstance(value, Sequence):
+        return f"[{', '.join(toml_value(entry) for entry in value)}]"
+    if isinstance(value, date | time):
+        return value.isoformat()
+    if isinstance(value, int):  # truth values are numbers, too
+        return json.dumps(value)
+    raise TypeError(f"TOML has no value like {value!r}")
+
+
+def radians_of(angle: Decimal | int) -> float:
+    """Return an angle in rad from one in degrees, as it was written."""
+    angle = Decimal(angle)
+    if len(angle.as_tuple().digits) <= _SHORT_DIGITS or not angle.is_finite():
+        return float(angle) * (pi / 180.0)
+    with localcontext(_EXACT):
+        return float(angle * _PI / 180)
+
+
+def degrees_text(angle: float) -> str:
+    """Return the shortest degrees that `radians_of` turns into this angle [rad], to the bit."""
+    rounded = repr(float(f"{degrees(angle):.{_SHORT_DIGITS}g}"))
+    if _same(radians_of(Decimal(rounded)), angle):
+        return rounded
+    with localcontext(_EXACT):
+        exact = Decimal(angle) * 180 / _PI
+    for digits in range(_SHORT_DIGITS + 1, _MOST_DIGITS):
+        text = f"{exact:.{digits - 1}e}"
+        if _same(radians_of(Decimal(text)), angle):
+            return f"{Decimal(text):f}" if 1e-4 < abs(exact) < 1e15 else text
+    raise AssertionError(f"{angle!r} rad has no degrees")  # 18 digits tell any two floats apart
+
+
+def _same(a: float, b: float) -> bool:
+    return a == b and str(a) == str(b)  # the latter tells -0.0 from 0.0
+
+
+def radians_in(name: str, value: Any) -> Any:
+    """Return degrees, one number or nested lists of them, in rad.
+
+    Args:
+        name: of the field, for the error.
+        value: as read.
+
+    Raises:
+        ValueError: an entry is not a number.
+    """
+    if isinstance(value, list):
+        return [radians_in(name, entry) for entry in value]
+    if isinstance(value, bool) or not isinstance(value, Decimal | int):
+        raise ValueError(f"{name}: {value!r} is not a number of degrees")
+    return radians_of(value)
