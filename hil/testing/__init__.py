@@ -17,8 +17,8 @@ _HOME = {
     "UdpController": "udp",
     "faulty_controller": "faulty",
     "faulty_link": "faulty",
-    "run_campaign": "short",
-    "shortened": "short",
+    "run_campaign": "faulty",
+    "shortened": "faulty",
 }
 
 __all__ = ["UdpController", "faulty_controller", "faulty_link", "run_campaign", "shortened"]

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from hil.cell import Cell
-from hil.cli.design import design, summary
+from hil.cli.design import design, design_summary
 from hil.design import DesignResult, load_design, preset, run_search
 from hil.design.advice import NoExcitationError
 from hil.design.folder import DesignFolder
@@ -444,7 +444,7 @@ def test_what_is_no_finite_number_is_null(bare):
     excitation = replace(result.excitation, criteria=criteria)
     found = SimpleNamespace(complete=True, exhausted=False, front=SimpleNamespace(log10_det=[]))
     done = SimpleNamespace(result=replace(result, excitation=excitation), design=found)
-    printed = json.dumps(summary(done, DesignFolder(bare[0])), allow_nan=False)
+    printed = json.dumps(design_summary(done, DesignFolder(bare[0])), allow_nan=False)
     names = ("log10_det", "coupling_index", "condition")
     assert [json.loads(printed)[name] for name in names] == [None, None, None]
 
