@@ -40,10 +40,12 @@ _ROUTE_MARKERS = ("o", "D", "^", "s")
 def groups(results: Results) -> list[tuple[str, list[int]]]:
     """Parameters in stretches of at most twenty; base parameters and friction never mixed."""
     found = []
-    everything = list(range(len(results.parameters)))
+    base, more = range(results.n_base), range(results.n_base, len(results.parameters))
+    own = {i: results.parameters[i].of_this_run for i in more}
     for name, members in (
-        ("Base parameters", everything[: results.n_base]),
-        ("Friction", everything[results.n_base :]),
+        ("Base parameters", [*base]),
+        ("Friction", [i for i in more if own[i]]),
+        ("Elements", [i for i in more if not own[i]]),
     ):
         count = math.ceil(len(members) / _MOST_ROWS)
         parts = [part.tolist() for part in np.array_split(members, count)] if count else []
@@ -63,6 +65,7 @@ def deviation_panels(results: Results) -> list[Panel]:
     return [
         _deviation_panel(results, k, title, members, values, reach)
         for k, (title, members) in enumerate(groups(results))
+        if any(values[i] is not None for i in members)
     ]
 
 
