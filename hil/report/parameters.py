@@ -116,9 +116,8 @@ def tally(results: Results) -> Tally:
         expected_3=numbers.fixed(_OUTSIDE_3 * len(compared), 1),
         not_significant=[
             p.label
-            for k, p in enumerate(results.parameters)
-            if (k < results.n_base or p.of_this_run)
-            and not abs(p.estimate) > results.uncertainty.interval_factor * p.std
+            for p in results.parameters
+            if not abs(p.estimate) > results.uncertainty.interval_factor * p.std
         ],
         total=len(results.parameters),
     )

@@ -270,6 +270,8 @@ def choose_settings(
             if found.choice.chosen:
                 now, choices = filtered, behind
             choices = [*choices, found.choice]
+    # Models with other columns are compared, each with a centre of its own: now it needs one, too.
+    trial.renew_centres()
     if "friction" in questions:
         found = trial.decide("friction at speed", _friction_terms(now), TERM_WORTHWHILE)
         now, choices = found.settings, [*choices, found.choice]
@@ -278,7 +280,6 @@ def choose_settings(
         found = trial.decide("torque ripple", [now, *rippled])
         now, choices = found.settings, [*choices, found.choice]
     if "estimator" in questions:
-        trial.renew_centres()
         weights = PRIOR_WEIGHTS if now.shrinkage.strength > 0.0 else (now.shrinkage.prior_weight,)
         candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
         found = trial.decide("estimator", candidates, 0.0)

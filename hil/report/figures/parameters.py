@@ -41,11 +41,11 @@ def groups(results: Results) -> list[tuple[str, list[int]]]:
     """Parameters in stretches of at most twenty; base parameters and friction never mixed."""
     found = []
     base, more = range(results.n_base), range(results.n_base, len(results.parameters))
-    own = {i: results.parameters[i].of_this_run for i in more}
+    friction = [i for i in more if results.parameters[i].of_this_run] or [*more]
     for name, members in (
         ("Base parameters", [*base]),
-        ("Friction", [i for i in more if own[i]]),
-        ("Elements", [i for i in more if not own[i]]),
+        ("Friction", friction),
+        ("Elements", [i for i in more if i not in friction]),
     ):
         count = math.ceil(len(members) / _MOST_ROWS)
         parts = [part.tolist() for part in np.array_split(members, count)] if count else []
