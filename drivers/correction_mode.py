@@ -99,9 +99,7 @@ class CorrectionMode(OpenMode):
 
     def require_carried_on(
         self,
-        execution: Execution | None,  # noqa: ARG002  the path is not ours
         reading: Reading,  # noqa: ARG002  zero is zero in every axis
-        commanded: Array,  # noqa: ARG002
         cycle: int,
     ) -> None:
         """A correction that was not zero may have been kept or dropped: nothing tells."""

@@ -26,8 +26,6 @@ Joints = NDArray[np.bool_]
 TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
 _NEEDED_FIRST: Final = (TARGET, ACTUAL, ACTUAL_VELOCITY)
 _NEEDED_AFTER_GAP: Final = (TARGET, TARGET_VELOCITY, ACTUAL_VELOCITY)
-MOST_SKIPPED: Final = 100
-"""Set-points that a motion may skip where the controller carried its target on."""
 
 
 class OpenMode(ABC):
@@ -93,17 +91,13 @@ class OpenMode(ABC):
         """
 
     @abstractmethod
-    def require_carried_on(
-        self, execution: Execution | None, reading: Reading, commanded: Array, cycle: int
-    ) -> None:
+    def require_carried_on(self, reading: Reading, cycle: int) -> None:
         """The packet read last, the first after a long gap, against what was sent last.
 
-        Axes that have closed, or did so since the first set-point, do not matter. Where the
-        controller carried its target on, the motion goes on from there: it skips what was missed.
+        Axes that have closed, or did so since the first set-point, do not matter.
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld: going on would be a jump.
-            RefusalError: the source failed or the guard said no.
         """
 
     @abstractmethod
@@ -200,10 +194,6 @@ class PositionMode(OpenMode):
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
             return
-        self._go_on(execution, commanded, cycle)
-
-    def _go_on(self, execution: Execution, commanded: Array, cycle: int) -> None:
-        """Write the motion's next set-point."""
         assert isinstance(execution, MotionExecution)
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
@@ -245,22 +235,13 @@ class PositionMode(OpenMode):
         wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
         wire.put(frame, D5, current)
 
-    def require_carried_on(
-        self, execution: Execution | None, reading: Reading, commanded: Array, cycle: int
-    ) -> None:
-        """Target and velocity received against the set-point sent last, held or carried on."""
+    def require_carried_on(self, reading: Reading, cycle: int) -> None:
+        """Target and velocity received against the set-point sent last."""
         where = self._kept & reading.ready
         self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle, where)
-        raw, step = self._wire.raw, self._step
-        target, expected = raw[TARGET], self._sent + self.missed * step
-        carried_on = np.abs(target - expected).sum() < np.abs(target - self._sent).sum()
-        carried_on &= execution is not None and self.missed <= MOST_SKIPPED
-        if not carried_on:
-            expected = self._sent
-        self._guard.check_after_gap(target, raw[1:4:2], expected, step, cycle, where)
-        if execution is not None and carried_on:
-            for _ in range(self.missed):
-                self._go_on(execution, commanded, cycle)
+        raw = self._wire.raw
+        velocity, step = raw[1:4:2], self._step
+        self._guard.check_after_gap(raw[TARGET], velocity, self._sent, step, cycle, where)
 
     def require_no_pause(self, reading: Reading, cycle: int) -> None:
         """Velocity of the arm against that of the set-points sent last."""

@@ -14,15 +14,13 @@ bring a motion to rest on its path.
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave open
 mode, move the arm and come back; one set-point further at full speed would then be a jump. Hence,
 after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the
-set-point sent last, or of that carried on by the steps that were missed, and its velocity (D2)
-within half the velocity sent last or what counts as standstill; an arm that itself stands (D4) is
-held against the latter too. Where packets came late by the clock although none is missing, the
-velocity of the arm (D4) is held against that sent last. A motion whose target was carried on skips
-the set-points that were missed, and is then stopped on its path. Corrections of targets that the
-controller generates (modes 2, 7, 8, 9) are refused after such a gap unless they were zero. A link
-may say how old each value is: one that is needed for such a decision, for the first set-point, or
-to be given back to an open axis, and was not sent in this very packet counts as unknown and
-refuses.
+set-point sent last, and its velocity (D2) within half the velocity sent last or what counts as
+standstill; an arm that itself stands (D4) is held against the latter too. Where packets came late
+by the clock although none is missing, the velocity of the arm (D4) is held against that sent last.
+Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such a gap
+unless they were zero. A link may say how old each value is: one that is needed for such a decision,
+for the first set-point, or to be given back to an open axis, and was not sent in this very packet
+counts as unknown and refuses.
 
 After the motion the end is held for `settle_cycles`; the next answer asks for the end of open mode
 (status byte 1), and asks again every `EXIT_RETRY_CYCLES` in case that answer was lost; after
@@ -273,9 +271,7 @@ class ReplyPolicy:
         ring.age[row] = 0 if ages is None else ages[self.wire.joint_slots].max(axis=0)
         self.wire.read(words.view(np.float32), ring.measured[row], ages)
 
-    def note_gap(
-        self, unanswered: int, paused: bool, machine: Machine, reading: Reading, commanded: Array
-    ) -> None:
+    def note_gap(self, unanswered: int, paused: bool, machine: Machine, reading: Reading) -> None:
         """So many packets before this one were not answered, or it came late by the clock.
 
         After a long gap open mode goes on only where the controller carried it on, moving, at
@@ -284,7 +280,6 @@ class ReplyPolicy:
 
         Raises:
             NotFinite, MotionNotCarriedOn, MotionHeld, MotionPaused: it did not.
-            RefusalError: the motion cannot skip what was missed.
         """
         open_mode = self._open_mode
         if open_mode is None:
@@ -294,11 +289,7 @@ class ReplyPolicy:
         if not in_open or machine.entering:
             return
         if unanswered > self._max_gap:
-            execution = machine.execution
-            moving = machine.state is State.OPEN and execution is not None and execution.started
-            open_mode.require_carried_on(
-                execution if moving else None, reading, commanded, machine.cycle
-            )
+            open_mode.require_carried_on(reading, machine.cycle)
         elif paused:
             open_mode.require_no_pause(reading, machine.cycle)
 

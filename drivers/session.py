@@ -375,7 +375,7 @@ class Session:
             if machine.state is State.FAULTED and before is not State.FAULTED:
                 refusal = ModeRefused(*reading.faulty, machine.cycle)
             measured, commanded = ring.measured[row], ring.commanded[row]
-            policy.note_gap(unanswered, late > PAUSE_CYCLES, machine, reading, commanded)
+            policy.note_gap(unanswered, late > PAUSE_CYCLES, machine, reading)
             status = policy.answer(machine, reading, words, measured, commanded)
         except BaseException as error:
             # Whatever it was, the controller is told to stop, by the answer that is due now.

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from drivers import Counters, CyclicPacket, State
 from drivers.packets import DRIVE_ON, Mode, cyclic_length, is_init, next_number, packet_number
@@ -96,21 +95,7 @@ def broken_in_records(records: NDArray[np.void], still: slice | None) -> Iterato
     if still is not None and np.any(np.nan_to_num(records["commanded_velocity"][still])):
         yield "set-points that move after the motion was lost or refused"
     for first, last in _stretches(sent & (records["state"] != State.OPENING)):
-        yield from _broken_bounds(_at_each_cycle(records[first:last]))
-
-
-def _at_each_cycle(records: NDArray[np.void]) -> Array:
-    """Set-points, and on a smooth curve those that a motion skipped after a long gap."""
-    q = records["commanded_position"]
-    step = np.linalg.norm(np.diff(q, axis=0, prepend=q[:1]), axis=1)
-    before = np.roll(step, 1)
-    skipped = np.round(np.divide(step, before, out=np.ones_like(step), where=before > 0.0)) - 1
-    skipped = np.where(records["gap"] > MAX_GAP, np.minimum(skipped, records["gap"]), 0)
-    skipped[0] = 0
-    if not skipped.any():
-        return np.asarray(q)
-    cycle = np.arange(len(q)) + np.cumsum(np.maximum(skipped, 0))
-    return np.asarray(CubicSpline(cycle, q)(np.arange(cycle[-1] + 1)))
+        yield from _broken_bounds(records["commanded_position"][first:last])
 
 
 def _broken_bounds(q: Array) -> Iterator[str]:

@@ -288,10 +288,11 @@ HEADING: Final = (
 )
 
 _STOPPED: Final = "505 MotionHeld / stopped / 505 MotionHeld"
+_TOO_FAR: Final = "505 MotionHeld / 505 MotionNotCarriedOn / 505 MotionHeld"
 _WENT_ON: Final = "stopped / completed / stopped"
 AT_SPEED: Final = {
     "3 packets lost": (_STOPPED,) * 4,
-    "5 packets lost": (_STOPPED,) * 4,
+    "5 packets lost": (_STOPPED, _STOPPED, _TOO_FAR, _TOO_FAR),
     "3 answers lost": (_WENT_ON,) * 4,
     "5 answers lost": (_WENT_ON,) * 4,
 }
