@@ -203,7 +203,7 @@ def serve(
             it falls silent at once.
         watch: called once a cycle, in the time that is left over, with the counts so far.
         clock: time; the machine's own if left out.
-        patience: see `wish`, s.
+        patience: see `request`, s.
         stretch: a cycle without an answer is made longer by up to so many s until one comes. No
             real controller does that; it is for PCs that are held up now and then. Once the end is
             wished, a PC that let such a wait pass counts as gone until it answers again.

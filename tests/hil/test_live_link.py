@@ -157,11 +157,12 @@ def taken_port() -> Iterator[int]:
 def test_a_refusal_comes_with_its_flight_recorder(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    # So slow a way to the first posture that the fault strikes on it.
-    text = replaced_value(cell.text, "campaign", "approach_speed", 0.1)
+    # So slow a way to the first posture, and the fault so late, that it strikes on that way even
+    # where a loaded computer takes seconds to begin.
+    text = replaced_value(cell.text, "campaign", "approach_speed", 0.01)
     slow = Cell.from_texts(text, cell.urdf, cell.path)
     campaign = campaign_of(tmp_path / "refused", on_loopback(slow), plan)
-    fault = ("--fault", "following-error@1500x200:axis=2:slip")
+    fault = ("--fault", "following-error@5000x1000:axis=2:slip")
     with (
         loopback_link(campaign.cell, options=(*PATIENT, *fault)) as link,
         pytest.raises(MotionFailedError) as failed,

@@ -217,7 +217,7 @@ class _Wishes(Buttons):
         super().__init__()
         self._page = page
 
-    def wish(self) -> Request:
+    def request(self) -> Request:
         if self._page.given_up:
             return Request.GIVE_UP
         return Request.END if self._page.finished else Request.GO_ON
