@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hil.archive import open_archive
 from hil.cell import Cell
 from identification.estimators.nominal_prior import NOMINAL_SHARE
+from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.factor import Estimate
 from identification.model.urdf_tree import urdf_tree
 from identification.selection.inner_prediction import DELAY, LOW_PASS
@@ -122,6 +123,7 @@ def _column_at(path: Path, field: str, time: Array) -> Array | None:
 _ROUNDING: Final = 1e-9
 _SMALL: Final = 0.01  # quantile of the moves between samples that is one step of a coarse encoder
 _COARSE: Final = 0.02  # share of the accelerations
+_FAST: Final = 2.0  # bandwidths of the motion: what ends above has no effect on what is fitted
 
 
 def surroundings_of(paths: Sequence[Path], prepared: Prepared, estimate: Estimate) -> Surroundings:
@@ -180,16 +182,27 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
             "condition",
         )
     width = how.torque_bandwidth
+    advice = "record the torque unfiltered"
     if LOW_PASS in chosen and width is not None:
+        if not how.torque_shape.causal:
+            advice += ", or state its low-pass with --torque-bandwidth"
         yield Finding(
             "torque bandwidth",
             "doubtful",
             f"the recorded torque seems to have come through a low-pass of {width:.3g} Hz"
             f" ({how.torque_shape}) before it was recorded; the model is filtered alike",
-            "record the torque unfiltered"
-            + (
-                "" if how.torque_shape.causal else ", or state its low-pass with --torque-bandwidth"
-            ),
+            advice,
+            "condition",
+        )
+        return
+    above = torque_noiseless_above(prepared.sources.training[0].recording)
+    if above is not None and width is None and above < _FAST * how.rigid_bandwidth:
+        yield Finding(
+            "torque bandwidth",
+            "doubtful",
+            f"the recorded torque has nothing above {above:.2g} Hz, not even noise: it came through"
+            " a low-pass before it was recorded, or was computed",
+            advice,
             "condition",
         )
 

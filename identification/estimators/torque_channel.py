@@ -24,6 +24,7 @@ from identification.signals.low_passes import (
 from identification.signals.masks import LONGEST_END, torn_rows
 from identification.signals.recording import Recording
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, prepare
+from identification.signals.spectrum import noiseless_above
 
 Array = NDArray[np.float64]
 
@@ -48,6 +49,13 @@ class LowPassFit(NamedTuple):
     misfit: float
     bandwidth: float
     shape: LowPassShape
+
+
+def torque_noiseless_above(recording: Recording) -> float | None:
+    """Frequency [Hz] above which the recorded torque has no noise; None where it has."""
+    if recording.torque is None:
+        return None
+    return noiseless_above(recording.time, recording.torque, recording.segments())
 
 
 def possible_low_passes(

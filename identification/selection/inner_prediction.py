@@ -2,7 +2,9 @@
 
 Each recording is cut into `FOLDS` stretches of time. Parameters are estimated from all stretches
 but one and predict the torque of that one: every row of it, at rest too. The score of a candidate
-is ``||e|| / ||tau||`` over all joints and stretches. What is held out of the fit is never read.
+is ``||e|| / ||tau||`` over all joints, its mean over the stretches: squared and summed, one stretch
+whose motion the others do not determine would decide alone. What is held out of the fit is never
+read.
 
 Only the factors of the stretches are needed (:mod:`identification.factor.phases`), so the samples
 are read once for each candidate way of preparing them, and any number of estimators are compared
@@ -59,7 +61,8 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
 )
 # A candidate replaces the simpler one before it only if it predicts better by this share; a
 # low-pass of the torque, which can stand in for much else, by more. Of estimators and rows none is
-# simpler, and the best is taken.
+# simpler, and the best is taken; what differs by less than a tie is rounding.
+TIE: Final = 1e-4
 WORTHWHILE: Final = 0.01
 LOW_PASS_WORTHWHILE: Final = 0.05
 TERM_WORTHWHILE: Final = 0.02
@@ -122,8 +125,8 @@ class Choice:
     Attributes:
         name: what was chosen.
         candidates: in words.
-        errors: ``||e|| / ||tau||`` of each candidate over all joints; of a low-pass the geometric
-            mean of those of each joint.
+        errors: ``||e|| / ||tau||`` of each candidate over all joints, mean over the stretches; of a
+            low-pass the geometric mean of those of each joint.
         chosen: index of the one that was taken.
     """
 
@@ -137,8 +140,8 @@ class Errors(NamedTuple):
     """Errors of predictions, infinite where some stretch cannot be predicted.
 
     Attributes:
-        overall: ``||e|| / ||tau||`` over all joints.
-        by_joint: geometric mean of those of each joint.
+        overall: ``||e|| / ||tau||`` over all joints, mean over the stretches.
+        by_joint: geometric mean of those of each joint over all stretches.
     """
 
     overall: float = math.inf
@@ -189,19 +192,24 @@ class Folds:
 
     def errors(self, estimate: Callable[[int, Factor], Array]) -> Errors:
         """Errors of predictions by ``estimate(k, factor without stretch k)``."""
-        squares = np.zeros(self.predicted[0].n_joints)
+        squares = np.zeros((FOLDS, self.predicted[0].n_joints))
         for k, target in enumerate(self.predicted):
             augmented = np.append(-estimate(k, self.without(k)), 1.0)
-            squares += np.einsum("i,jik,k->j", augmented, target.gram, augmented)
-        torque = np.sum([target.gram[:, -1, -1] for target in self.predicted], axis=0)
+            squares[k] = np.einsum("i,jik,k->j", augmented, target.gram, augmented)
+        torque = np.array([target.gram[:, -1, -1] for target in self.predicted])
         if not torque.any():
             return Errors(math.nan, math.nan)
-        loaded = torque > 0.0
-        shares = np.maximum(squares[loaded] / torque[loaded], np.finfo(np.float64).tiny)
         return Errors(
-            math.sqrt(max(float(squares.sum()), 0.0) / float(torque.sum())),
-            math.exp(0.5 * float(np.log(shares).mean())),
+            float(np.mean(_relative(squares.sum(axis=1), torque.sum(axis=1)))),
+            math.exp(float(np.log(_relative(squares.sum(axis=0), torque.sum(axis=0))).mean())),
         )
+
+
+def _relative(squares: Array, torque: Array) -> Array:
+    """Relative errors of those sums of squares that have any torque, above zero."""
+    loaded = torque > 0.0
+    shares = squares[loaded] / torque[loaded]
+    return np.sqrt(np.maximum(shares, np.finfo(np.float64).tiny))
 
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
@@ -282,7 +290,7 @@ def choose_settings(
     if "estimator" in questions:
         weights = PRIOR_WEIGHTS if now.shrinkage.strength > 0.0 else (now.shrinkage.prior_weight,)
         candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
-        found = trial.decide("estimator", candidates, 0.0)
+        found = trial.decide("estimator", candidates, TIE)
         now, choices = found.settings, [*choices, found.choice]
     if not math.isfinite(trial.errors(now).overall):
         return start, ()
@@ -337,7 +345,7 @@ class _Trial:
 
     def _predicted(self, settings: Settings) -> Errors:
         shrinkage, folds = settings.shrinkage, self._reduced(settings)
-        if not all(np.all(factor.samples > 0) for factor in folds.fitted):
+        if not all(folds.without(k).samples.any() for k in range(FOLDS)):
             return Errors()
 
         def estimate(k: int, factor: Factor) -> Array:

@@ -23,6 +23,7 @@ from identification.factor.standard_gram import StandardGram, gravity_loads, sol
 from identification.model.robot import RobotModel
 from identification.model.wrench import LINK_SYMBOLS
 from identification.signals.samples import Samples
+from identification.signals.spectrum import noiseless_above
 from identification.validation.causes import Causes, find_causes
 from identification.validation.findings.finding import Finding
 from identification.validation.gravity_direction import GravityDirection, find_gravity
@@ -373,12 +374,15 @@ def _noise_floor(
     recordings: Sequence[Samples],
     bandwidth: float,
     steady: Repeatability | None,
-) -> Array:
+) -> Array | None:
     """Standard deviation of the noise of each joint's torque (n,), NaN of one without rows.
 
     White noise of the power that the residual has above the bandwidth, and what differs between
-    repetitions below it.
+    repetitions below it. None where a low-pass has left no noise to measure.
     """
+    first = recordings[0]
+    if steady is None and noiseless_above(first.motion.time, first.torque, first.segments):
+        return None
     squares, rows = np.zeros((2, model.n_joints))
     for samples in recordings:
         fast = residual(model, values, samples) - residual(model, values, samples, bandwidth)

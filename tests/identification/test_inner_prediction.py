@@ -107,6 +107,17 @@ class TestChosenSettings:
         assert settings.shrinkage.strength == 0.0
         assert choices[-1].candidates[choices[-1].chosen] == "least squares"
 
+    def test_a_joint_that_rests_for_a_stretch_is_no_reason_not_to_choose(self) -> None:
+        """Joints that move one after the other have stretches without a row of their own."""
+        recording = a_recording()
+        position = recording.position.copy()
+        position[: CUT // 4, 0] = position[CUT // 4, 0]
+        settings, choices = chosen(
+            replace(recording, position=position), {"presliding", "rows", "estimator"}
+        )
+        assert [one.name for one in choices][-1] == "estimator"
+        assert all(np.isfinite(one.errors).all() for one in choices)
+
     def test_what_is_not_asked_stays(self) -> None:
         start = Settings(MODEL, Preprocessing(rigid_bandwidth=33.0))
         settings, choices = choose_settings(lambda *_: [], start, set(), lambda *_: 1.0)

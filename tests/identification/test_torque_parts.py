@@ -16,7 +16,8 @@ from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.signals.spectrum import spectrum
+from identification.signals.low_passes import LowPassShape, low_passed
+from identification.signals.spectrum import noiseless_above, spectrum
 
 Array = NDArray[np.float64]
 
@@ -161,3 +162,35 @@ class TestSpectrum:
         alone = spectrum(time[40:], signals[40:], [slice(0, 260)])
         np.testing.assert_array_equal(both.density, alone.density)
         assert spectrum(time, signals, [slice(0, 10)]).frequency.size == 0
+
+
+class TestNoise:
+    """A measured torque has noise at every frequency, unless it came through a low-pass."""
+
+    TIME = np.arange(4000) * 0.005
+    SHAPE = LowPassShape(order=4)
+
+    def torque(self, noise: float) -> Array:
+        slow = 20.0 * np.sin(2.0 * np.pi * np.array([0.3, 0.9]) * self.TIME[:, None])
+        return np.asarray(slow + noise * np.random.default_rng(3).standard_normal(slow.shape))
+
+    def above(self, torque: Array) -> float | None:
+        return noiseless_above(self.TIME, torque, [slice(0, len(torque))])
+
+    def test_of_half_a_per_cent_is_seen(self) -> None:
+        assert self.above(self.torque(0.1)) is None
+
+    @pytest.mark.parametrize("bandwidth", [2.0, 5.0, 10.0])
+    def test_ends_above_a_low_pass(self, bandwidth: float) -> None:
+        found = self.above(low_passed(self.TIME, self.torque(0.5), bandwidth, self.SHAPE))
+        assert found is not None
+        assert bandwidth < found < 2.5 * bandwidth
+
+    def test_of_one_joint_is_enough_for_the_channel(self) -> None:
+        torque = self.torque(0.1)
+        torque[:, 1] = low_passed(self.TIME, torque[:, 1:], 5.0, self.SHAPE)[:, 0]
+        assert self.above(torque) is None
+
+    def test_of_a_constant_or_a_few_samples_is_not_judged(self) -> None:
+        assert self.above(np.ones((4000, 2))) is None
+        assert self.above(self.torque(0.0)[:20]) is None
