@@ -112,9 +112,8 @@ class TestChosenSettings:
         recording = a_recording()
         position = recording.position.copy()
         position[: CUT // 4, 0] = position[CUT // 4, 0]
-        settings, choices = chosen(
-            replace(recording, position=position), {"presliding", "rows", "estimator"}
-        )
+        rested = replace(recording, position=position)
+        _, choices = chosen(rested, {"presliding", "rows", "estimator"})
         assert [one.name for one in choices][-1] == "estimator"
         assert all(np.isfinite(one.errors).all() for one in choices)
 

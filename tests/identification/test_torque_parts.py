@@ -15,8 +15,8 @@ from identification.model.elements import TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
 from identification.signals.low_passes import LowPassShape, low_passed
+from identification.signals.samples import Samples
 from identification.signals.spectrum import noiseless_above, spectrum
 
 Array = NDArray[np.float64]
