@@ -182,6 +182,8 @@ def imported(
             stamp[value] = stamp[value - 1]  # type: ignore[index, operator]
         elif key == "fall":
             stamp[value] -= 10**9  # type: ignore[index]
+        elif key == "noise":
+            torques += value * np.random.default_rng(1).standard_normal(torques.shape)
     write_samples(
         path,
         Samples(stamp, position, None, torques if torque else None, None),
@@ -228,6 +230,15 @@ def test_a_single_recording_is_split_and_the_split_is_called_what_it_is(tmp_path
 def test_a_repetition_of_what_was_fitted_is_not_called_unseen(campaign: Campaign) -> None:
     found = identify_archives(campaign.folder.completed("excitation"), Silent())
     assert found.verdict.line.startswith("The model predicts a repetition of the fitted motion")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_torque_without_noise_is_named(tmp_path: Path, noise: float) -> None:
+    """It came through a low-pass, or was computed; a measured one has noise at all frequencies."""
+    found = identify_archives([imported(tmp_path / "smooth.mcap", noise=noise)], Silent())
+    assert found.results.judgement is not None
+    named = [one.check for one in found.results.judgement.findings]
+    assert ("torque bandwidth" in named) == (noise == 0.0)
 
 
 def test_a_recording_without_torque_is_refused(tmp_path: Path) -> None:
